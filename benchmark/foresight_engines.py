@@ -42,6 +42,7 @@ from mtv_world_ros.assembly import (
     fingerprint,
     robot_path,
 )
+from mtv_world_ros.cli.shared_options import names
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.splits import refuse_test_kinds
 from mtv_world_ros.data_types import BoolArray, FloatArray
@@ -58,7 +59,6 @@ from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.success.foreseen import foreseen_of
 from mtv_world_ros.success.task import load_tasks, match_task
 
-VIEWS = ('low', 'high')
 OLD = '0.1.0: networks and DART'
 #: plans begin so many frames apart, among the first frames of the bundled episode
 _STRIDE, _FRAMES = 7, 60
@@ -140,6 +140,7 @@ def more(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('dataset', type=Path, nargs='?', help='episodes to judge')
     parser.add_argument('--no-old', action='store_true', help='this version alone')
     parser.add_argument('--robot', help="YAML file or bundled name; default: the checkpoint's")
+    parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
     parser.add_argument('--contact', default='bundled', help='checkpoint, or of fit-contact')
     parser.add_argument('--chunks', type=int, default=0, help='plans to imagine in turns')
     parser.add_argument('--futures', type=int, nargs='+', default=[16, 64])
@@ -229,29 +230,31 @@ class New:
             for number in futures
         }
 
-    def ask(self, path: Path) -> tuple[bool, dict[str, tuple[float, float]]]:
+    def ask(
+        self, path: Path, views: tuple[str, ...]
+    ) -> tuple[bool, dict[str, tuple[float, float]]]:
         """Returns the outcome, and share and seconds by row; none = it cannot tell."""
-        episode = read_episode(path, views=VIEWS)
+        episode = read_episode(path, views=views)
         found = match_task(load_tasks(share_path('config', 'tasks')), episode.info.instruction)
         success = episode.info.outcome == 'success'
         if found is None or episode.masks is None or episode.joint_states is None:
             return success, {}
         task, bound = found
-        names, frame = tuple(episode.info.objects), first_frame(episode, self.robot, VIEWS)
-        _, positions = fine_commands(episode, self.robot, VIEWS)
+        named, frame = tuple(episode.info.objects), first_frame(episode, self.robot, views)
+        _, positions = fine_commands(episode, self.robot, views)
         answers = {}
         for row, engine in self._engines.items():
             begin = time.process_time()
-            tracked = engine.find(names, frame.masks, frame.cameras, frame.poses)
+            tracked = engine.find(named, frame.masks, frame.cameras, frame.poses)
             ahead = FoundObjects.at(
-                names=names,
+                names=named,
                 frames=np.zeros((*frame.masks[:, 0].shape, 3), np.uint8),
                 masks=frame.masks,
                 poses=np.stack(frame.poses),
                 tracked=tracked,
             ).after(positions)
             foreseen = foreseen_of(self.robot, ahead, len(ahead.motions[0].points))
-            ends = foreseen.ends(task, bound, np.full((len(names), 3), np.nan))
+            ends = foreseen.ends(task, bound, np.full((len(named), 3), np.nan))
             if ends is None:
                 return success, {}
             answers[row] = ends.share, time.process_time() - begin
@@ -270,7 +273,7 @@ def answers(options: argparse.Namespace, folder: Path | None) -> Iterator[tuple[
     new = New(options.futures, options.contact, options.robot)
     old = None if folder is None else Old(folder)
     for number, path in enumerate(paths[k] for k in order):
-        success, said = new.ask(path)
+        success, said = new.ask(path, tuple(options.views))
         theirs = old.ask(path) if said and old is not None else {}
         print(f'{number} {path.name}', {k: round(v[0], 2) for k, v in said.items()}, flush=True)
         if said and (theirs or old is None):

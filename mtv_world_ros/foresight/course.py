@@ -47,19 +47,25 @@ class Course:
         if not steps:
             return self
 
-        def shifted(rows: FloatArray, before: FloatArray | None, skip: int) -> FloatArray:
-            if before is None:
-                first = np.repeat(rows[:1], steps, axis=0)
-            else:
-                first = before[len(before) - skip - steps : len(before) - skip]
+        if last is None:
+            last = self._rest(steps)
+
+        def shifted(rows: FloatArray, before: FloatArray, skip: int) -> FloatArray:
+            first = before[len(before) - skip - steps : len(before) - skip]
             return np.concatenate([first, rows[: len(rows) - steps]])
 
         return Course(
-            controls=shifted(self.controls, None if last is None else last.controls, 0),
-            pushes=shifted(self.pushes, None if last is None else last.pushes, 0),
-            positions=shifted(self.positions, None if last is None else last.positions, 1),
-            velocities=shifted(self.velocities, None if last is None else last.velocities, 1),
+            controls=shifted(self.controls, last.controls, 0),
+            pushes=shifted(self.pushes, last.pushes, 0),
+            positions=shifted(self.positions, last.positions, 1),
+            velocities=shifted(self.velocities, last.velocities, 1),
         )
+
+    def _rest(self, steps: int) -> Course:
+        """So many steps in which the arms are told to be where this course begins."""
+        where = np.repeat(self.positions[:1], steps + 1, axis=0)
+        still = np.zeros_like(where)
+        return Course(controls=where[1:], pushes=still[1:], positions=where, velocities=still)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

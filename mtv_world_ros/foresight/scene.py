@@ -188,7 +188,7 @@ def _empty_spec() -> Any:
     # sizes change after the trees of boxes were built; what diverges is looked at, not reset
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    spec.compiler.balanceinertia = True
+    spec.compiler.balanceinertia, spec.compiler.degree = True, False
     soft = [_SOFT_STEPS * STEP_S, 1.0]
     spec.default.geom.solref = soft
     spec.default.joint.solref_limit = soft

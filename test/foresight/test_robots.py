@@ -106,6 +106,17 @@ def test_there_is_room_between_the_prongs_of_a_gripper_that_is_one_mesh(tmp_path
     assert all(Delaunay(part.points).find_simplex([[0, 0, 0.06]])[0] < 0 for part in parts)
 
 
+def test_fingers_that_turn_go_from_one_end_of_their_joint_to_the_other(tmp_path):
+    engine = Engine(Arms(fork(tmp_path), None))
+    batch = engine.begin(draw_futures(SETTINGS, (), engine.arms.drives))
+    np.testing.assert_allclose(batch.model.joint('jaw').range, [0.0, 1.0])
+    times = np.arange(0, 2.0, 0.02)
+    commands = np.stack([np.full(len(times), 0.3), np.where(times < 0.1, 0.0, 0.9)], -1)
+    joints = batch.advance(commands, 1)[0].joints[0, :, 1]
+    assert joints[0] == pytest.approx(0.0, abs=0.01)
+    assert joints[-1] == pytest.approx(0.9, abs=0.01)
+
+
 def test_a_copy_of_a_robot_keeps_the_pieces_of_its_gripper(tmp_path):
     robot = fork(tmp_path)
     parts = [part for part in load_parts(robot).parts if part.link == 'hand']

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 import os
 from pathlib import Path
 import re
@@ -320,12 +321,13 @@ def save_robot(file: Path, folder: Path) -> Path:
 def _with_hulls(urdf: Path, folder: Path, grips: set[str]) -> Any:
     tree = ElementTree.parse(urdf)
     stored: dict[Path, str] = {}
+    made: list[str] = []
     for link in tree.iter('link'):
         if link.get('name') in grips:
-            _split_collisions(link, urdf, folder)
+            made += _split_collisions(link, urdf, folder, len(made))
     for mesh in tree.iter('mesh'):
         file = find_mesh(mesh.get('filename', ''), urdf)
-        if file is None or mesh.get('filename', '').startswith(_PIECES):
+        if file is None or mesh.get('filename') in made:
             continue
         if file not in stored:
             stored[file] = f'{_MESHES}/{len(stored)}_{file.stem}.stl'
@@ -334,10 +336,21 @@ def _with_hulls(urdf: Path, folder: Path, grips: set[str]) -> Any:
     return tree
 
 
-def _split_collisions(link: Any, urdf: Path, folder: Path) -> None:
-    """Puts convex pieces in the place of the meshes with which a link touches things."""
-    touching = link.findall('collision') or link.findall('visual')
-    for element in touching:
+def _split_collisions(link: Any, urdf: Path, folder: Path, first: int) -> list[str]:
+    """Puts convex pieces in the place of the meshes with which a link touches; their files.
+
+    Args:
+        link: of the URDF.
+        urdf: its file.
+        folder: of the copy.
+        first: number of the first piece.
+    """
+    made: list[str] = []
+    if not link.findall('collision'):  # then what is drawn is what touches
+        for drawn in map(deepcopy, link.findall('visual')):
+            drawn.tag = 'collision'
+            link.append(drawn)
+    for element in link.findall('collision'):
         mesh = element.find('geometry/mesh')
         file = None if mesh is None else find_mesh(mesh.get('filename', ''), urdf)
         if mesh is None or file is None:
@@ -345,10 +358,9 @@ def _split_collisions(link: Any, urdf: Path, folder: Path) -> None:
         loaded = load_mesh(file)
         scale = np.array(mesh.get('scale', '1 1 1').split(), float)
         pieces = convex_pieces(np.asarray(loaded.vertices()) * scale, edges_of(loaded))
-        if element.tag == 'collision':
-            link.remove(element)
+        link.remove(element)
         for points in pieces:
-            name = f'{_PIECES}/{len(list(folder.glob(f"{_PIECES}/*")))}_{file.stem}.stl'
+            made.append(name := f'{_PIECES}/{first + len(made)}_{file.stem}.stl')
             write_convex_hull(points, folder / name)
             piece = ElementTree.SubElement(link, 'collision')
             if (origin := element.find('origin')) is not None:
@@ -356,6 +368,7 @@ def _split_collisions(link: Any, urdf: Path, folder: Path) -> None:
             ElementTree.SubElement(
                 ElementTree.SubElement(piece, 'geometry'), 'mesh', filename=name
             )
+    return made
 
 
 def _tool(entry: ToolEntry) -> Tool:

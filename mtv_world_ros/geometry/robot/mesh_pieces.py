@@ -115,7 +115,7 @@ def convex_pieces(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatA
         pieces[number : number + 1] = [(half, *_best_cut(half)) for half in halves]
     flat = _THINNEST * _hull_volume(whole)
     bodies = [piece for piece, _, _ in pieces if _hull_volume(piece) > flat]
-    return [outermost(segments.reshape(-1, 3)) for segments in bodies]
+    return [outermost(points.reshape(-1, 3)) for points in bodies or [whole]]
 
 
 def write_convex_hull(points: FloatArray, out: Path) -> None:

@@ -1,0 +1,124 @@
+"""The bundled model's foresight over the running node: doubt that comes of what really happens."""
+
+import numpy as np
+import pytest
+from sensor_msgs.msg import CameraInfo
+from std_msgs.msg import String
+
+from mtv_world_ros.assembly import checkpoint_robot
+from mtv_world_ros.data.recording import load_recording
+from mtv_world_ros.data_types import JointTrajectory, WorldModelSpec
+from mtv_world_ros.files import share_path
+from mtv_world_ros.ros.messages.conversions import to_joint_state, to_trajectory_message
+from mtv_world_ros.ros.messages.image_messages import to_image
+from mtv_world_ros.ros.messages.stamps import make_header, NANO
+from mtv_world_ros.success.physics_watch import SAYS
+
+#: of the bundled model; two of its chunks, in which the first block is picked up and set down
+FPS, PLAN_S = 5.0, 6.4
+EPISODE = share_path('resource', 'demo_episode')
+
+
+@pytest.fixture(scope='module')
+def recording():
+    spec = WorldModelSpec(
+        views=('low', 'high'), fps=FPS, num_frames=16, width=384, height=288, robot='yam_bimanual'
+    )
+    return load_recording(EPISODE, spec, checkpoint_robot('bundled'))
+
+
+@pytest.fixture(scope='module')
+def node(ros, tmp_path_factory):
+    values = (
+        'pace:=burst',
+        f'calibration_file:={EPISODE / "calibration.yaml"}',
+        'max_image_age_s:=600.0',
+        'max_joint_state_age_s:=600.0',
+        'num_inference_steps:=1',
+    )
+    program = ('-m', 'mtv_world_ros.ros.world_model.node')
+    process = ros.start_node(tmp_path_factory.mktemp('node'), *values, program=program)
+    client = ros.Client()
+    client.wait(client.diagnostic_values, 'the node', 120)
+    yield client
+    client.close()
+    assert process.stop() == 0, process.output()
+
+
+def show(client, recording, frame, stamp_ns, hidden=()):
+    """Publishes a recorded frame of every view, grey of hidden ones, and where the joints were."""
+    for view, camera in enumerate(recording.cameras):
+        header = make_header(stamp_ns, f'{camera.view}_optical_frame')
+        info = CameraInfo(header=header, width=camera.width, height=camera.height)
+        info.distortion_model, info.d, info.k = 'plumb_bob', [0.0] * 5, camera.K.ravel()
+        info.p = np.column_stack([camera.K, np.zeros(3)]).ravel()
+        client.publish(f'/{camera.view}/camera_info', info)
+        pixels = recording.frames[view, frame]
+        pixels = np.full_like(pixels, 128) if camera.view in hidden else pixels
+        client.publish(f'/{camera.view}/image_raw', to_image(pixels, header))
+    names, at = recording.commands.joint_names, recording.positions[frame]
+    client.publish('/joint_states', to_joint_state(names, at, make_header(stamp_ns)))
+
+
+def send_plan(client, recording, start_ns, hidden=()):
+    """Shows the first frame and sends the plan that was recorded from there; returns its end."""
+    commands, since = recording.commands, len(client.report_values())
+    kept = (commands.times > 1e-6) & (commands.times <= PLAN_S)
+    plan = JointTrajectory(
+        joint_names=commands.joint_names,
+        times=commands.times[kept],
+        positions=commands.positions[kept],
+    )
+    show(client, recording, 0, start_ns, hidden)
+    client.publish('/joint_trajectory', to_trajectory_message(plan, make_header(start_ns)))
+    return client.next_end(since)
+
+
+def execute(client, recording, frames):
+    """Sends the plan, then frames as if they came of it."""
+    start_ns = client.now_ns()
+    compared = len(client.report_values('fidelity'))
+    assert send_plan(client, recording, start_ns)['state'] == 'done'
+    for number, frame in enumerate(frames, start=1):
+        show(client, recording, frame, start_ns + round(number / FPS * NANO))
+        client.spin_for(0.12)  # the node's subscriptions have depth 1, as for any camera
+    client.wait(lambda: len(client.report_values('fidelity')) >= compared + 2, 'the comparison')
+    client.reset()
+
+
+def test_the_node_says_that_its_physics_is_another_one_and_estimates_widen(node, recording):
+    count = round(PLAN_S * FPS)
+    node.publish('/instruction', String(data=recording.instruction))
+    execute(node, recording, range(1, count + 1))
+    node.wait(lambda: node.diagnostic_values().get('physics', '').startswith('as it was'), 'it')
+    sure = node.report_values('chunk')[-1]
+    for _ in range(3):  # the blocks stay where they are, whatever the arm does
+        execute(node, recording, [0] * count)
+    node.wait(lambda: SAYS in node.diagnostic_values().get('physics', ''), 'the doubt')
+    execute(node, recording, range(1, count + 1))
+    doubted = node.report_values('chunk')[-1]
+    assert SAYS in doubted['success_reasons']
+    assert float(doubted['success']) < float(sure['success'])
+    assert width(doubted) > width(sure) + 0.3
+
+
+def width(chunk) -> float:
+    """Of a chunk's interval."""
+    return float(chunk['success_high']) - float(chunk['success_low'])
+
+
+def test_objects_that_one_view_alone_shows_are_counted_and_the_next_plan_is_judged(
+    node, recording
+):
+    node.publish('/instruction', String(data=recording.instruction))
+    before = int(node.diagnostic_values().get('chunks_without_verdict', '0'))
+    refused = send_plan(node, recording, node.now_ns(), hidden=('high',))
+    chunk = node.report_values('chunk')[-1]
+    assert refused['state'] == 'done' and 'is seen by one view alone' in chunk['success_reasons']
+    assert chunk['success'] == 'nan'
+    count = str(before + 2)
+    node.wait(lambda: node.diagnostic_values().get('chunks_without_verdict') == count, 'the count')
+    node.reset()
+    assert send_plan(node, recording, node.now_ns())['state'] == 'done'
+    assert np.isfinite(float(node.report_values('chunk')[-1]['success']))
+    node.reset()
