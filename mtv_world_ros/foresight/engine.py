@@ -33,6 +33,8 @@ _REST_RAD_S, _REST_M_S = 0.02, 0.002
 _ON_WAY, _ON_WAY_SPEED = 1e-3, 0.02
 #: what comes as near to a solid may touch it [m]
 _NEAR_M = 0.015
+#: fingers that come as near to the table may touch it [m]
+_NEAR_TABLE_M = 0.002
 #: rows for which all is still before arms only pass by
 _STILL_ROWS = 1
 #: what no object does on a table: places [m], speeds [m/s], [rad/s]
@@ -285,8 +287,9 @@ class Batch:
 
     def _is_clear(self, run: _Run, number: int, row: int) -> bool:
         """Whether the arms pass by all solids in a row."""
-        steps = range(run.first_step(row), run.first_step(row + 1) + 1, 2 * SUBSTEPS)
-        where = run.courses[number].positions[list(steps)] + self.futures[number].zeros
+        last = run.first_step(row + 1)
+        steps = [*range(run.first_step(row), last, 2 * SUBSTEPS), last]
+        where = run.courses[number].positions[steps] + self.futures[number].zeros
         return self._nearby.is_clear(run.qpos(number), where)
 
 
@@ -407,15 +410,17 @@ class _Run:
 
 
 class _Nearby:
-    """Tells whether arms come near solids."""
+    """Tells whether arms come near solids, or fingers to the table."""
 
     def __init__(self, scene: Scene, model: Any) -> None:
         self._scene, self._model = scene, model.__copy__()
         of_arms = self._model.geom_contype > SOLIDS
         of_solids = self._model.geom_contype == SOLIDS
-        self._model.geom_contype[:] = np.where(of_arms, 2, 0)
+        fingers = of_arms & (self._model.geom_priority > 0)
+        self._model.geom_contype[:] = np.where(of_arms, 2, 0) + np.where(fingers, 4, 0)
         self._model.geom_conaffinity[:] = np.where(of_solids, 2, 0)
-        self._model.geom_margin[of_solids] = _NEAR_M
+        self._model.geom_conaffinity[0] = 4  # the table
+        self._model.geom_margin[of_solids], self._model.geom_margin[0] = _NEAR_M, _NEAR_TABLE_M
         self._data = mujoco.MjData(self._model)
 
     def is_clear(self, qpos: FloatArray, arms: FloatArray) -> bool:

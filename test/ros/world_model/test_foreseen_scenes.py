@@ -74,32 +74,40 @@ def send_plan(client, recording, start_ns, hidden=()):
     return client.next_end(since)
 
 
-def execute(client, recording, frames):
-    """Sends the plan, then frames as if they came of it."""
+def execute(client, recording, at):
+    """Sends the plan, then the recorded frames of some times [s] as if they came of it."""
     start_ns = client.now_ns()
     compared = len(client.report_values('fidelity'))
     assert send_plan(client, recording, start_ns)['state'] == 'done'
-    for number, frame in enumerate(frames, start=1):
-        show(client, recording, frame, start_ns + round(number / FPS * NANO))
-        client.spin_for(0.12)  # the node's subscriptions have depth 1, as for any camera
+    for number, frame in enumerate(np.searchsorted(recording.times, at), start=1):
+        stamp_ns = start_ns + round(number / FPS * NANO)
+        client.spin_for(max((stamp_ns - client.now_ns()) / NANO, 0.1))
+        show(client, recording, int(frame), stamp_ns)
     client.wait(lambda: len(client.report_values('fidelity')) >= compared + 2, 'the comparison')
     client.reset()
 
 
 def test_the_node_says_that_its_physics_is_another_one_and_estimates_widen(node, recording):
-    count = round(PLAN_S * FPS)
+    truly = np.arange(1, round(PLAN_S * FPS) + 1) / FPS
     node.publish('/instruction', String(data=recording.instruction))
-    execute(node, recording, range(1, count + 1))
-    node.wait(lambda: node.diagnostic_values().get('physics', '').startswith('as it was'), 'it')
+    execute(node, recording, truly)
+    node.wait(lambda: said(node) == 'as it was fitted, by 2 executed chunks', 'it')
     sure = node.report_values('chunk')[-1]
     for _ in range(3):  # the blocks stay where they are, whatever the arm does
-        execute(node, recording, [0] * count)
-    node.wait(lambda: SAYS in node.diagnostic_values().get('physics', ''), 'the doubt')
-    execute(node, recording, range(1, count + 1))
+        execute(node, recording, 0 * truly)
+    node.wait(lambda: said(node).startswith(f'{SAYS}: 6 of the last 8'), 'the doubt')
+    execute(node, recording, truly)
     doubted = node.report_values('chunk')[-1]
     assert SAYS in doubted['success_reasons']
     assert float(doubted['success']) < float(sure['success'])
     assert width(doubted) > width(sure) + 0.3
+    node.wait(lambda: 'of the last 10' in said(node), 'two more chunks')
+    assert said(node).startswith(f'{SAYS}: 6 of')
+
+
+def said(node) -> str:
+    """What `/diagnostics` says of the physics."""
+    return node.diagnostic_values().get('physics', '')
 
 
 def width(chunk) -> float:
