@@ -9,9 +9,13 @@ from mtv_world_ros.assembly import checkpoint_robot
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data_types import JointTrajectory, WorldModelSpec
 from mtv_world_ros.files import share_path
-from mtv_world_ros.ros.messages.conversions import to_joint_state, to_trajectory_message
+from mtv_world_ros.ros.messages.conversions import (
+    make_header,
+    NANO,
+    to_joint_state,
+    to_trajectory_message,
+)
 from mtv_world_ros.ros.messages.image_messages import to_image
-from mtv_world_ros.ros.messages.stamps import make_header, NANO
 from mtv_world_ros.success.physics_watch import SAYS
 
 #: of the bundled model; two of its chunks, in which the first block is picked up and set down
