@@ -270,9 +270,9 @@ class ObjectMasks:
         status: V tuples of O words: `ok`, or why the mask is not to be trusted: never seen
             (`absent`), seen and then missing (`lost`; `out_of_view` from the image's edge on),
             seen as a sliver (`barely_visible`), one of several or of no known colour
-            (`ambiguous`, `out_of_palette`, `too_large`), found without certainty
-            (`low_confidence`), jumps (`area_jump`, `teleport`), a frame that the simulator's
-            masks do not cover (`not_recorded`).
+            (`ambiguous`, `out_of_palette`), found without certainty (`low_confidence`), jumps
+            (`area_jump`, `teleport`), a frame that the simulator's masks do not cover
+            (`not_recorded`).
     """
 
     names: tuple[str, ...]

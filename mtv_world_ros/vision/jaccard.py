@@ -17,7 +17,7 @@ from mtv_world_ros.data_types import BoolArray, FloatArray, ObjectMasks
 from mtv_world_ros.errors import MtvWorldError
 
 #: a prediction of this status cannot be scored; any other (`absent`, ...) is the model's doing
-UNSCORABLE = frozenset({'ambiguous', 'out_of_palette', 'too_large'})
+UNSCORABLE = frozenset({'ambiguous', 'out_of_palette'})
 
 
 def jaccard(pred: BoolArray, true: BoolArray, void: BoolArray | None = None) -> FloatArray:

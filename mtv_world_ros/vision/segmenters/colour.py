@@ -55,8 +55,6 @@ _EDGE_RANGE = (0.25, 0.6)
 _MIN_LIGHTNESS_8BIT = ceil(0.08 * 255)
 #: of pixels with the hue of a word, saturation in HSV as a share of that in CIELAB, at the least
 _HSV_SHARE = 0.6
-#: what covers more of the image is a cloth, a table or a wall, not the thing of a colour word
-_MOST_OF_IMAGE = 0.2
 _TRACKING = TrackingConfig()
 #: pixels of at least this share of the core's saturation say what colour the object has
 _STRONG_SHARE = 0.8
@@ -142,8 +140,6 @@ class ColourSegmenter:
             found = track(pixels, first, _TRACKING, taken=others, out=out[index])
             if rivals and first is None and found.status == 'ok':
                 found = ObjectTrack(masks=found.masks, status='ambiguous')
-            if first is None and found.masks.any() and _typical_share(found) > _MOST_OF_IMAGE:
-                found = ObjectTrack.missing(frames.shape[:3], 'too_large')
             tracks.append(found)
         return [
             self._complete(tracks, index, name, firsts, images) for index, name in enumerate(names)
@@ -217,12 +213,6 @@ class ColourSegmenter:
             floor = max(floor, _edge(colour, images.background, core))
         pixels.reshape(-1)[inside[saturation > floor]] = True
         return pixels
-
-
-def _typical_share(found: ObjectTrack) -> float:
-    """Median share of the image in the frames in which an object is found."""
-    shares = found.masks.mean(axis=(1, 2))
-    return float(np.median(shares[shares > 0]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
