@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[3]
 def preset(config: TrainingConfig, folder: Path, steps: int = 3) -> Path:
     """Three clips a step, two processes: one gets two of them."""
     values = json.loads(json.dumps(config.model_dump()))
-    values['optimizer'] |= {'batch_size': 3, 'steps': steps, 'max_grad_norm': 1e9}
+    values['optimizer'] |= {'batch_size': 3, 'steps': steps, 'max_grad_norm': 1e6}
     file = folder / 'preset.yaml'
     file.write_text(yaml.safe_dump(values))
     return file
