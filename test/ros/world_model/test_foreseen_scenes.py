@@ -16,7 +16,7 @@ from mtv_world_ros.ros.messages.conversions import (
     to_trajectory_message,
 )
 from mtv_world_ros.ros.messages.image_messages import to_image
-from mtv_world_ros.success.physics_watch import SAYS
+from mtv_world_ros.success.doubts import SAYS
 
 #: of the bundled model; two of its chunks, in which the first block is picked up and set down
 FPS, PLAN_S = 5.0, 6.4
