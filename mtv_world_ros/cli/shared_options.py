@@ -34,7 +34,8 @@ def names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(',') if name.strip())
 
 
-def _num_steps(text: str) -> int:
+def number_or_0(text: str) -> int:
+    """Returns a whole number, 0 for the default, as an option's type."""
     number = int(text)
     if number < 0:
         raise argparse.ArgumentTypeError(f'{number}; it must be 1 or more, or 0')
@@ -54,7 +55,7 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
         '--robot': {'help': 'robot YAML; default: the one of the checkpoint'},
         '--device': {'default': 'cpu'},
         '--threads': {
-            'type': int,
+            'type': number_or_0,
             'default': 0,
             'help': 'CPU threads; 0 = all but one, of two both',
         },
@@ -71,7 +72,7 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
             'cameras',
         },
         '--steps': {
-            'type': _num_steps,
+            'type': number_or_0,
             'default': 0,
             'help': 'denoising steps; 0 = as the checkpoint says, else 4',
         },

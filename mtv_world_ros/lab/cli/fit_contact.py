@@ -6,7 +6,7 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from mtv_world_ros.cli.shared_options import add_options, names
+from mtv_world_ros.cli.shared_options import add_options, names, number_or_0
 from mtv_world_ros.files import check_free
 
 
@@ -37,7 +37,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
     parser.add_argument('--episodes', type=int, default=50, help='at most; 20 to 50 will do')
     parser.add_argument('--motions', type=int, default=16, help='that are foreseen later')
-    parser.add_argument('--threads', type=int, default=0, help='that foresee; 0 = all but one')
+    parser.add_argument(
+        '--threads', type=number_or_0, default=0, help='that foresee; 0 = all but one'
+    )
     add_options(parser, 'overwrite')
     parser.set_defaults(handler=_fit)
 

@@ -11,7 +11,7 @@ import shlex
 import shutil
 from typing import Any, TYPE_CHECKING
 
-from mtv_world_ros.cli.shared_options import add_options
+from mtv_world_ros.cli.shared_options import add_options, number_or_0
 from mtv_world_ros.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     add_options(parser, 'describer segmenter dtype')
     parser.add_argument(
         '--threads',
-        type=int,
+        type=number_or_0,
         default=0,
         help='CPU threads per process; 0 = its share of all cores',
     )
