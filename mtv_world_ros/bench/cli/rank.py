@@ -151,7 +151,7 @@ def _rank(arguments: argparse.Namespace) -> int:
         workers=arguments.workers,
         ray_address=arguments.ray,
         overwrite=arguments.overwrite,
-        **({'watch': viewer.add} if viewer else {}),
+        watch=viewer.add if viewer else lambda _: None,
     )
     # the benchmark of faults is about policies whose names say their faults
     optimism = {
