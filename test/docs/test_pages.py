@@ -55,6 +55,24 @@ def test_the_readme_and_the_results_page_have_the_same_table():
     assert tables[0][1] == tables[1][1]
 
 
+#: letters and words that a reader cannot guess
+TERMS = re.compile(
+    r'\b(MMRV|AUROC|ECE|FVD|contact flips?)\b'
+    r'|(?<![\w.`|-] )(?<![\w.`,])J(?= (of|per|beside|with)\b)'
+)
+
+
+@pytest.mark.parametrize('page', sorted((ROOT / 'docs').glob('*.md')), ids=lambda page: page.stem)
+def test_terms_are_linked_to_the_glossary_where_a_page_uses_them_first(page):
+    if page.stem in ('glossary', 'parameters'):
+        return
+    text = re.sub(r'```.*?```|<!--.*?-->', '', page.read_text(), flags=re.S)
+    used = TERMS.search(text)
+    if used is not None:
+        line_end = text.find('\n', used.end())
+        assert 'glossary.md' in text[:line_end], f'{used[0]} is not explained'
+
+
 def test_every_page_is_linked_from_the_readme():
     readme = (ROOT / 'README.md').read_text()
     for page in (ROOT / 'docs').glob('*.md'):

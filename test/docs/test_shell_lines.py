@@ -4,6 +4,11 @@ A block of lines is run, in the order of the pages and in one temporary folder, 
 before it says what it needs that is not at hand: `<!-- needs: gpu -->`, see `NEEDS`. A comment
 `<!-- small: --episodes 1 -->` appends options to the `mtv-world` lines of the block when they are
 run here. Lines that are not run are checked against the real command line all the same.
+
+What comes of a block stands on the page, and is compared: `<!-- shows: TEXT -->` before it (`...`
+= anything) is in what it prints, `<!-- makes: PATHS -->` are files and folders that it leaves, and
+`<!-- printed -->` before a `text` block after it is all that it prints. `<!-- file: NAME -->`
+before a block of Python or YAML is a file that the lines below it find.
 """
 
 from __future__ import annotations
@@ -12,6 +17,8 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 import contextlib
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from importlib.util import find_spec
 import io
 from pathlib import Path
 import re
@@ -36,6 +43,7 @@ NEEDS: dict[str, Callable[[], str | None] | None] = {
     'native_ros': None,
     'network': None,
     'opengl': missing_opengl,
+    'rclpy': lambda: None if find_spec('rclpy') else 'rclpy is not installed',
     'root': None,
     'ros': None,  # runs until it is stopped, or waits for somebody; test/ros has such tests
     'server': None,
@@ -52,7 +60,7 @@ FOREIGN_OPTIONS = {
     '--feedback', '--generate', '--head', '--show-args', '--symlink-install',
     '--system-site-packages',
 }  # fmt: skip
-_COMMENT = re.compile(r'<!-- (needs|small): (.+?) -->')
+_COMMENT = re.compile(r'<!-- (needs|small|shows|makes|file|printed)(?:: (.+?))? -->')
 _CODE = re.compile(r'`([^`\n]+)`')
 
 
@@ -65,6 +73,10 @@ class Block:
     lines: list[str] = field(default_factory=list)
     needs: list[str] = field(default_factory=list)
     small: str = ''
+    shows: list[str] = field(default_factory=list)
+    makes: list[str] = field(default_factory=list)
+    printed: str = ''
+    files: dict[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
         return f'{self.page}:{self.number}'
@@ -124,18 +136,29 @@ def fences(text: str) -> Iterator[tuple[int, str, list[str], list[str]]]:
 
 
 def blocks_of(page: str, text: str) -> Iterator[Block]:
+    block, files = None, {}
     for number, language, lines, comments in fences(text):
+        found = _COMMENT.findall('\n'.join(comments))
         if language == 'bash':
-            block = Block(page=page, number=number, lines=lines)
-            for kind, value in _COMMENT.findall('\n'.join(comments)):
+            block = Block(page=page, number=number, lines=lines, files=dict(files))
+            for kind, value in found:
                 if kind == 'small':
                     block.small = value
                 else:
-                    block.needs.append(value)
+                    {'needs': block.needs, 'shows': block.shows, 'makes': block.makes}[
+                        kind
+                    ].append(value)
             yield block
+        for kind, value in found:
+            if kind == 'file':
+                files[value] = '\n'.join(lines) + '\n'
+            elif kind == 'printed':
+                assert block is not None and language == 'text', f'{page}:{number}'
+                block.printed = '\n'.join(lines)
 
 
 TEXTS = {str(path.relative_to(ROOT)): path.read_text() for path in pages()}
+#: a list: what stands below a block of lines may belong to it
 BLOCKS = [block for page, text in TEXTS.items() for block in blocks_of(page, text)]
 
 
@@ -163,7 +186,7 @@ def check(block: Block) -> None:
         assert program in PROGRAMS, f'{program} is not known to this test'
         check_files(rest)
         runnable = PROGRAMS[program](rest)
-        needed = [need for need in block.needs if need != 'opengl']
+        needed = [need for need in block.needs if NEEDS[need.split(' ')[0]] is None]
         assert runnable or needed, f"'{program}' is not run: say what it needs"
 
 
@@ -302,6 +325,7 @@ def check_make(words: Sequence[str]) -> bool:
 
 PROGRAMS: dict[str, Callable[[Sequence[str]], bool]] = {
     'accelerate': check_launcher,
+    'export': lambda words: '=' in words[0],
     'make': check_make,
     'mtv-world': check_mtv_world,
     'python': check_python,
@@ -316,13 +340,13 @@ PROGRAMS: dict[str, Callable[[Sequence[str]], bool]] = {
             'apt',
             'cd',
             'cp',
-            'export',
             'git',
             'hf',
             'mkdir',
             'pip',
             'ray',
             'rosdep',
+            'rviz2',
             'sed',
             'touch',
         ),
@@ -420,9 +444,9 @@ def workplace(tmp_path_factory) -> Iterator[Path]:
 
 
 @pytest.fixture(scope='module')
-def done() -> set[str]:
-    """Lines that were run, which are not run again where another page has them, too."""
-    return set()
+def done() -> dict[str, str]:
+    """What lines printed that were run; they are not run again where another page has them."""
+    return {}
 
 
 def run(command: Sequence[str], small: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -434,19 +458,64 @@ def run(command: Sequence[str], small: str, monkeypatch: pytest.MonkeyPatch) -> 
             status = end.code
         assert status == 0, f'{shlex.join(command)}: exit status {status}'
     elif program == 'make':
-        subprocess.run(['make', '-C', str(ROOT), *rest], check=True, capture_output=True)
+        made = ['make', '-C', str(ROOT), *rest]
+        print(subprocess.run(made, check=True, capture_output=True, text=True).stdout)
+    elif program == 'export':
+        name, _, value = rest[0].partition('=')
+        value = value.replace('$PWD', str(Path.cwd()))
+        monkeypatch.setenv(name, value)
+        if name == 'PYTHONPATH':
+            monkeypatch.syspath_prepend(value)
     elif program == 'python':
         monkeypatch.setattr(sys, 'argv', rest)
         runpy.run_path(rest[0], run_name='__main__')
 
 
 @pytest.mark.parametrize('block', BLOCKS, ids=str)
-def test_lines_run(block, workplace, done, monkeypatch):
+def test_lines_run(block, workplace, done, monkeypatch, capsys):
+    """Also that they come to what the page says."""
     if obstacle := block.obstacle():
         pytest.skip(obstacle)
     monkeypatch.chdir(workplace)
+    for name, text in block.files.items():
+        Path(name).write_text(text)
+    printed = ''
     for command in block.commands():
         line = shlex.join([*command, block.small])
-        if line not in done:
+        if command[0] == 'export' or line not in done:
+            capsys.readouterr()
             run(command, block.small, monkeypatch)
-        done.add(line)
+            said = capsys.readouterr()
+            done[line] = said.out + said.err
+        printed += done[line]
+    check_outcome(block, printed)
+
+
+def check_outcome(block: Block, printed: str) -> None:
+    """Fails where the page says something else."""
+    for text in block.shows:
+        assert is_like(printed, f'...{text}...'), f'{text}\n\nis not in\n\n{printed}'
+    if block.printed:
+        assert is_like(printed, block.printed), f'{printed}\n\nis not\n\n{block.printed}'
+    for name in ' '.join(block.makes).split():
+        assert list(Path().glob(name)), f'there is no {name}'
+        assert all(path.is_dir() or path.stat().st_size for path in Path().glob(name)), name
+
+
+def is_like(text: str, pattern: str) -> bool:
+    """Whether a text is a pattern in which `...` is anything, whatever the spaces."""
+    wanted = ' '.join(pattern.split()).replace('[', '[[]').replace('...', '*')
+    wanted = wanted.replace('?', '[?]')
+    return fnmatchcase(' '.join(text.split()), wanted)
+
+
+def test_a_pattern_is_not_like_everything():
+    assert is_like('rate: 1 of 1 = 1.00 [0.21 1.00]\n', 'rate: 1 of ... [0.21 1.00]')
+    assert not is_like('rate: 0 of 1 = 0.00', 'rate: 1 of ...')
+    assert not is_like('rate 1', 'rate ?') and not is_like('a b', 'a')
+
+
+@pytest.mark.parametrize('block', [b for b in BLOCKS if not b.obstacle()], ids=str)
+def test_a_page_says_what_comes_of_lines_that_are_run(block):
+    programs = {command[0] for command in block.commands()} - {'source', 'cd', 'export'}
+    assert block.shows or block.makes or block.printed or not programs

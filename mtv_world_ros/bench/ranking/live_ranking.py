@@ -40,8 +40,8 @@ class LiveRanking:
         table = rerun.TextDocument(rates_table(self._results), media_type='text/markdown')
         self._stream.log(rerun_log.escaped(TABLE), table, static=True)
         for shown in last_rollouts(self._folder, results, _MAX_TABS):
-            rerun_log.log_any(self._stream, shown, shown.name)
-            self._tabs[shown.name] = shown
+            rerun_log.log_any(self._stream, shown, f'/{shown.name}')
+            self._tabs[f'/{shown.name}'] = shown
         self._tabs = dict(list(self._tabs.items())[-_MAX_TABS:])
         self._stream.send_blueprint(
             rerun_log.layout(self._tabs, table=TABLE, active=len(self._tabs))

@@ -45,6 +45,8 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _fit(arguments: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.foresight.arms import Arms
@@ -85,7 +87,8 @@ def _fit(arguments: argparse.Namespace) -> int:
         arms,
         load_contact(folder),
         threads=arguments.threads or threads_each(1),
-        report=partial(print, flush=True),
+        report=tqdm.write,
+        progress=partial(tqdm, desc='foreseeing', unit='ep', disable=None),
     )
     settings = settings.replace(num_motions=arguments.motions)
     folder.mkdir(parents=True, exist_ok=True)

@@ -453,8 +453,10 @@ def _estimate_fixed(
     arguments: argparse.Namespace,
 ) -> CameraEstimate:
     from dataclasses import replace
+    from functools import partial
 
     import numpy as np
+    from tqdm import tqdm
 
     from mtv_world_ros.geometry.robot.shape import load_shape
     from mtv_world_ros.geometry.transforms import inverse
@@ -475,7 +477,11 @@ def _estimate_fixed(
             'the meshes of its URDF'
         )
     fixed = FixedCamera(track, on_base, robot, shape.parts, joints)
-    found = fixed.estimate(guess=arguments.guess, seed=arguments.seed)
+    found = fixed.estimate(
+        guess=arguments.guess,
+        seed=arguments.seed,
+        progress=partial(tqdm, desc='aligning', unit='pose', disable=None),
+    )
     pose = inverse(rest(link)) @ found.camera.T_mount_camera
     return replace(found, camera=replace(found.camera, mount_link=link, T_mount_camera=pose))
 

@@ -149,13 +149,16 @@ def read_for_checks(
 
 
 def _read_all(arguments: argparse.Namespace) -> tuple[list[Episode], Path]:
+    from tqdm import tqdm
+
     from mtv_world_ros.geometry.robot.file import load_robot
 
     paths = recordings(arguments.episodes)
     file, source = robot_file(arguments, paths[0])
     robot = load_robot(file)
     episodes = [
-        read_for_checks(path, arguments.views, source, robot, robot.base_link) for path in paths
+        read_for_checks(path, arguments.views, source, robot, robot.base_link)
+        for path in tqdm(paths, desc='reading', unit='ep', disable=None)
     ]
     return episodes, file
 

@@ -178,7 +178,10 @@ class LeRobotDataset:
             return
         part = entry.videos[feature]
         tolerance = _TIME_TOLERANCE / self.fps
-        yield from frames_at(part.file, timestamps + part.start_s, tolerance)
+        try:
+            yield from frames_at(part.file, timestamps + part.start_s, tolerance)
+        except EpisodeError as error:
+            raise EpisodeError(f'{error}{self._stale_video(feature)}') from error
 
     def _info(self) -> Mapping[str, Any]:
         file = self.root / _INFO
@@ -281,6 +284,21 @@ class LeRobotDataset:
             f'; rows of it are in {named}: the file index in meta/ is of an earlier state of the '
             "dataset (the columns 'data/chunk_index' and 'data/file_index' of meta/episodes in "
             'v3.0); write it again, or merge or convert the dataset anew with LeRobot'
+        )
+
+    def _stale_video(self, feature: str) -> str:
+        """Says which video files no episode names; empty where none."""
+        named = {entry.videos[feature].file for entry in self.episodes.values()}
+        there = {f for f in (self.root / 'videos').rglob('*.mp4') if feature in f.parts}
+        others = sorted(there - named)
+        if not others:
+            return ''
+        shown = ', '.join(f"'{other.relative_to(self.root)}'" for other in others)
+        return (
+            f'; no episode names {shown}: the video index in meta/ is of an earlier state of the '
+            f"dataset (the columns 'videos/{feature}/chunk_index', 'file_index' and "
+            "'from_timestamp' of meta/episodes in v3.0); write it again, or merge or convert the "
+            'dataset anew with LeRobot'
         )
 
     @cached_property

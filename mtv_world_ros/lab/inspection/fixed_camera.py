@@ -7,9 +7,9 @@ which drawn and seen changes correlate most. It needs no markers and no feature 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -155,24 +155,31 @@ class FixedCamera:
         self.centre = self.points.reshape(-1, 3).mean(axis=0)
         self.pairs = self._far_pairs()
 
-    def estimate(self, *, guess: bool = True, seed: int = 0) -> CameraEstimate:
+    def estimate(
+        self,
+        *,
+        guess: bool = True,
+        seed: int = 0,
+        progress: Callable[[Sequence[Any]], Iterable[Any]] = iter,
+    ) -> CameraEstimate:
         """Estimates the pose, in the robot's base link.
 
         Args:
             guess: start from the camera's pose; False = from cameras all around the robot.
             seed: of those.
+            progress: wraps what is tried, e.g. in a progress bar.
 
         Raises:
             CalibrationError: no pose explains the pictures.
         """
         T = self.camera.T_mount_camera
-        starts = [(T, reading) for reading in READINGS] if guess else self._search(seed)
+        starts = [(T, reading) for reading in READINGS] if guess else self._search(seed, progress)
         found = []
         sizes = {
             reading: (self.changes(*_WIDE, reading), self.changes(*_MIDDLE, reading))
             for reading in dict.fromkeys(reading for _, reading in starts)
         }
-        for start, reading in starts:
+        for start, reading in progress(starts):
             wide, middle = sizes[reading]
             pose = self._aligned(self._aligned(start, wide), middle)
             found.append((self.fit(pose, middle), pose, reading))
@@ -352,7 +359,9 @@ class FixedCamera:
         )
         return moved(T, np.asarray(result.x) @ steps, self.centre)
 
-    def _search(self, seed: int) -> list[tuple[FloatArray, Reading]]:
+    def _search(
+        self, seed: int, progress: Callable[[Sequence[Any]], Iterable[Any]] = iter
+    ) -> list[tuple[FloatArray, Reading]]:
         """The best of many upright cameras around the robot, and how each reads changes best."""
         generator = np.random.default_rng(seed)
         changes = {reading: self.changes(*_COARSE, reading) for reading in READINGS}
@@ -361,7 +370,7 @@ class FixedCamera:
                         self.camera.height / self.camera.K[1, 1])  # fmt: skip
         rough = [roughened(one) for one in changes.values()]
         tried = []
-        for _ in range(_NUM_TRIED):
+        for _ in progress(range(_NUM_TRIED)):
             away = reach / narrowest * generator.uniform(0.7, 3.5)
             T = random_camera(self.centre, away, reach, generator)
             fits = self.rough_fits(T, changes[READINGS[0]], rough)
@@ -376,7 +385,7 @@ class FixedCamera:
         steps = np.diag([0.25] * 3 + [0.1] * 3)
         improved = [
             (self._refined(T, changes[reading], steps, evaluations=70), reading)
-            for T, reading in best
+            for T, reading in progress(best)
         ]
         improved.sort(key=lambda one: -self.fit(one[0], changes[one[1]]))
         return improved[:3]

@@ -243,6 +243,24 @@ def test_a_stale_file_index_is_the_reason(is_there, datasets, make_mapping, tmp_
     assert 'earlier state of the dataset' in said
 
 
+@pytest.mark.parametrize('is_there', [True, False])
+def test_a_stale_video_index_is_the_reason(is_there, datasets, make_mapping, tmp_path):
+    """Videos were split anew, and meta/ still says where they were."""
+    root = Path(shutil.copytree(datasets('v3.0'), tmp_path / 'set'))
+    video = root / 'videos/observation.images.front/chunk-000/file-000.mp4'
+    for episode, name in enumerate(('file-000.mp4', 'file-001.mp4')):
+        own = f'videos/chunk-000/observation.images.front/episode_{episode:06d}.mp4'
+        shutil.copy(datasets('v2.1') / own, video.with_name(name))
+    if not is_there:
+        video.rename(video.with_name('file-002.mp4'))
+    summary = import_dataset(root, make_mapping(), tmp_path / 'out')
+    assert summary.made == ([0] if is_there else [])
+    said = summary.failed[1]
+    assert ('ends at 1.1000 s' if is_there else 'cannot be read') in said
+    assert "no episode names 'videos/observation.images.front/chunk-000/file-001.mp4'" in said
+    assert 'the video index in meta/ is of an earlier state of the dataset' in said
+
+
 def test_bars_with_the_time_left_are_drawn_on_a_terminal_only(datasets, make_mapping, tmp_path):
     command = ['import-dataset', str(datasets('v2.1')), '--mapping', str(make_mapping())]
     words = [sys.executable, '-m', 'mtv_world_ros.cli', *command]

@@ -10,7 +10,7 @@ Shape letters: T steps, O objects, J joints, N draws, P numbers, E episodes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -301,6 +301,7 @@ def fit_contact(
     first: ContactSettings | None = None,
     threads: int = 1,
     report: Callable[[str], None] = lambda line: None,
+    progress: Callable[[Sequence[int]], Iterable[int]] = iter,
 ) -> tuple[ContactSettings, list[Finding]]:
     """Returns likely settings with their spread, and what was found with intervals.
 
@@ -311,6 +312,7 @@ def fit_contact(
             `first_settings`, and with fingers as `fit_fingers` finds them.
         threads: that foresee.
         report: is told how each round went.
+        progress: wraps the numbers of what is foreseen, e.g. in a progress bar.
 
     Raises:
         TrainingError: no recording says where an object went.
@@ -326,7 +328,7 @@ def fit_contact(
     first = first.model_copy(update={'table_m': table.value, 'delay_s': delay.value})
     engine = Engine(arms, threads)
     trials = [_Trial.of(one, first) for one in recordings]
-    factors, likelihoods, weights = _populations(engine, trials, first, report)
+    factors, likelihoods, weights = _populations(engine, trials, first, report, progress)
     found = [
         _finding(name, column, np.log(_scales(first)[name]) + factors, likelihoods, weights)
         for column, name in enumerate(RANGES)
@@ -360,6 +362,7 @@ def _populations(
     trials: Sequence[_Trial],
     first: ContactSettings,
     report: Callable[[str], None],
+    progress: Callable[[Sequence[int]], Iterable[int]],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Draws (N, P) as logarithms, their log likelihoods (N, E), and weights (N,)."""
     low, high = np.log(np.array(list(RANGES.values())).T)
@@ -370,11 +373,14 @@ def _populations(
     )
     draws, likelihoods = np.zeros((0, len(RANGES))), np.zeros((0, len(trials)))
     proposals: list[tuple[FloatArray, FloatArray] | None] = [None]
-    weights = np.zeros(0)
+    weights, steps = np.zeros(0), iter(progress(range(_ROUNDS * len(trials))))
     for number in range(_ROUNDS):
         draws = np.concatenate([draws, drawn])
         settings = [_settings(first, one) for one in drawn]
-        rows = np.stack([trial.likelihoods(engine, settings) for trial in trials], axis=-1)
+        rows = np.stack(
+            [trial.likelihoods(engine, settings) for trial, _ in zip(trials, steps, strict=False)],
+            axis=-1,
+        )
         likelihoods = np.concatenate([likelihoods, rows])
         densities = [
             np.full(len(draws), uniform)

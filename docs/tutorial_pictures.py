@@ -1,0 +1,141 @@
+"""Makes the pictures of the tutorials from what their commands wrote.
+
+    python docs/tutorial_pictures.py FOLDER
+
+FOLDER is where the lines of the tutorials were run, for example the folder `docs0` that
+`pytest test/docs/test_shell_lines.py --basetemp FOLDER` leaves. Pages and viewers are opened in a
+headless Chromium.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from functools import partial
+import http.server
+import itertools
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+
+import cv2
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / 'test' / 'viewing'))
+from browser import Browser  # noqa: E402
+
+WIDTH = 900
+#: colours of a picture: it is to be small
+NUM_COLOURS = 128
+FILES = {
+    'expert': 'out/judge/expert/episode_00000/contact_sheet.png',
+    'mine': 'out/judge/mine/episode_00000/contact_sheet.png',
+    'doctor': 'out/tutorial/doctor/low.png',
+    'imagined': 'out/tutorial/imagined/contact_sheet.png',
+}
+PAGES = {'ranking': 'out/judge/ranking/ranking.html', 'scores': 'out/tutorial/scores/report.html'}
+VIEWS = {
+    'live': 'out/judge/live.rrd',
+    'view': 'out/tutorial/view.rrd',
+    'watched': 'out/tutorial/live.rrd',
+}
+_PORTS = itertools.count(9390, 2)
+
+
+def save(picture: Path, name: str) -> None:
+    """Writes a picture at most `WIDTH` wide, in few colours, as docs/tutorial_NAME.png."""
+    from PIL import Image
+
+    shown = cv2.imread(str(picture))
+    factor = min(1.0, WIDTH / shown.shape[1])
+    small = cv2.resize(shown, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    image = Image.fromarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB))
+    out = ROOT / 'docs' / f'tutorial_{name}.png'
+    image.quantize(NUM_COLOURS).save(out, optimize=True)
+    sys.stdout.write(f'{out}: {out.stat().st_size // 1024} kB\n')
+
+
+def page_picture(folder: Path, page: str, picture: Path) -> None:
+    """Opens a page of a folder."""
+    with served(folder) as address, opened(picture.parent) as browser:
+        browser.open(f'{address}/{page}')
+        browser.picture(picture)
+
+
+class served:
+    """Serves a folder to this machine."""
+
+    def __init__(self, folder: Path) -> None:
+        handler: Callable[..., http.server.SimpleHTTPRequestHandler] = partial(
+            http.server.SimpleHTTPRequestHandler, directory=str(folder)
+        )
+        self._server = http.server.ThreadingHTTPServer(('127.0.0.1', 0), handler)
+
+    def __enter__(self) -> str:
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        return f'http://127.0.0.1:{self._server.server_port}'
+
+    def __exit__(self, *_: object) -> None:
+        self._server.shutdown()
+
+
+class opened:
+    """A browser that ends."""
+
+    def __init__(self, folder: Path) -> None:
+        self._browser = Browser(Path(tempfile.mkdtemp(dir=folder)))
+
+    def __enter__(self) -> Browser:
+        return self._browser
+
+    def __exit__(self, *_: object) -> None:
+        self._browser.close()
+
+
+def viewer_picture(file: Path, picture: Path, wait_s: float) -> None:
+    """Opens a file in Rerun's viewer for browsers."""
+    port = next(_PORTS)
+    command = [sys.executable, '-m', 'rerun', str(file), '--serve-web', '--port', str(port + 1)]
+    command += ['--web-viewer-port', str(port)]
+    quiet = subprocess.DEVNULL
+    viewer = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
+    try:
+        time.sleep(5)
+        with opened(picture.parent) as browser:
+            data = f'rerun%2Bhttp://127.0.0.1:{port + 1}/proxy'
+            browser.open(f'http://127.0.0.1:{port}/?url={data}')
+            time.sleep(wait_s)
+            browser.picture(picture)
+    finally:
+        os.killpg(viewer.pid, signal.SIGTERM)  # the viewer is a child of its Python
+        viewer.wait()
+
+
+def main() -> None:
+    """Makes them all."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('folder', type=Path)
+    parser.add_argument('--only', nargs='*', help='names of pictures')
+    parser.add_argument('--wait', type=float, default=45.0, help='for the viewer to draw [s]')
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as made:
+        for name, file in {**FILES, **PAGES, **VIEWS}.items():
+            if options.only and name not in options.only:
+                continue
+            source, picture = options.folder / file, Path(made) / f'{name}.png'
+            if name in FILES:
+                picture = source
+            elif name in PAGES:
+                page_picture(options.folder, file, picture)
+            else:
+                viewer_picture(source, picture, options.wait)
+            save(picture, name)
+
+
+if __name__ == '__main__':
+    main()
