@@ -71,3 +71,35 @@ def test_a_watched_port_that_is_taken_is_told_before_anything_runs(tmp_path, cap
         assert main([*command, '--watch', str(port)]) == 1
     assert f'port {port} cannot be used' in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
+
+
+def test_a_rollout_that_fails_ends_with_1_and_its_reason_and_the_others_count(
+    tmp_path, capsys, monkeypatch
+):
+    if reason := missing_opengl():
+        pytest.skip(reason)
+    (tmp_path / 'failing_in_rank.py').write_text(
+        """
+class Failing:
+    name = 'failing'
+
+    def reset(self, *, seed):
+        pass
+
+    def act(self, observation, instruction):
+        raise ValueError('actions have shape (7,), expected (50, 14)')
+"""
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    file = tmp_path / 'policies.yaml'
+    file.write_text(
+        'policies:\n- {name: expert, policy: expert}\n'
+        "- {name: broken, policy: {kind: python, factory: 'failing_in_rank:Failing'}}\n"
+    )
+    command = ['rank', '--policies', str(file), '--tasks', 'stack_blocks_two', '--episodes', '1']
+    command += ['--max-chunks', '1', '--segmenter', 'colour', '--no-video']
+    assert main([*command, '--out', str(tmp_path / 'out')]) == 1
+    said = capsys.readouterr()
+    assert 'mtv-world: stack_blocks_two_00000_broken has no result: ' in said.err
+    assert 'actions have shape (7,), expected (50, 14)' in said.err
+    assert f'report: {tmp_path / "out" / "ranking.html"}' in said.out
