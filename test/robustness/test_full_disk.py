@@ -141,6 +141,21 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     check_refused(WRITERS[name](full_disk), full_disk, capfd)
 
 
+@pytest.mark.parametrize('name', ['train', 'rank', 'import-bag', 'collect', 'export-dataset'])
+def test_a_disk_that_fills_up_in_the_middle_is_one_line(
+    name: str, full_disk: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (full_disk / 'others').unlink()
+    words = WRITERS[name](full_disk)
+    for _ in range(2):  # and when it is run again
+        status = main(words)
+        said = capfd.readouterr().err.splitlines()
+        assert status == 1, said
+        assert 'Traceback (most recent call last):' not in said
+        (line,) = [line for line in said if line.startswith(('mtv-world: ', 'episode 0: '))]
+        assert any(word in line for word in ('No space left', 'os error 28', 'disk full')), said
+
+
 @pytest.mark.parametrize('is_full', [True, False], ids=['full', 'fills_up'])
 @pytest.mark.parametrize('name', PREPARED)
 def test_a_disk_that_is_full_or_fills_up_keeps_no_part_of_an_import_or_a_report(
