@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 import yaml
 
+from mtv_world_ros.bench.ranking.policy_list import load_policy_list
+from mtv_world_ros.data.bag_mapping import load_source
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.policies.policy import load_policy_config
@@ -121,8 +123,15 @@ def test_yaml_in_the_pages_can_be_used(block, tmp_path):
     elif 'kind' in values:
         robot = load_robot(ROOT / 'config' / 'robots' / 'yam_bimanual.yaml')
         load_policy_config(file, robot)
+    elif 'joint_states' in values:
+        assert load_source(file, None).mapping is not None
     elif 'views' in values:
         load_calibration(file)
+    elif 'policies' in values:  # beside those of the same page
+        mine = tmp_path / 'my_policy.yaml'
+        mine.write_text('kind: scripted\nvariant: expert\n')
+        robot = load_robot(ROOT / 'config' / 'robots' / 'yam_bimanual.yaml')
+        assert len(load_policy_list(file, robot)) == len(values['policies'])
     else:
         assert 'qos_overrides' in values
 

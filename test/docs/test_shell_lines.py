@@ -241,12 +241,11 @@ def check_values(given: dict[str, Any]) -> None:
     )
     if given.get('control'):
         check_control(given['control'])
-    names = [*each(given.get('policies') or ()), given.get('policy') or '']
-    assert all(
-        (ROOT / name).is_file() for name in each(given.get('policies') or ()) if '/' in name
-    )
-    for name in names:
-        if name.startswith('expert') or (name in names[:-1] and '/' not in name):
+    # those that begin so are the reader's own
+    listed = [n for n in each(given.get('policies') or ()) if not n.startswith('my_')]
+    assert all((ROOT / name).is_file() for name in listed if '/' in name)
+    for name in [*listed, given.get('policy') or '']:
+        if name.startswith('expert') or (name in listed and '/' not in name):
             parse_variant(name)
     for key in ('task', 'tasks'):
         if given.get(key) not in (None, '', 'all') and not given[key].endswith('.yaml'):
