@@ -149,7 +149,7 @@ def test_each_picture_is_segmented_once(tmp_path):
         (('low.png', 'put_away.yaml'), 'is no picture; use PNG or JPEG'),
         (('pictures', 'picture'), r"unknown key 'picture' \(did you mean 'pictures'"),
         (('subject: a', 'subject: a\n  min_jaccard: 2'), r"'min_jaccard' is 2; .* in \(0, 1\]"),
-        (('subject: a', 'subject: a\n  min_jaccard: no'), "'min_jaccard' is False, must be a"),
+        (('subject: a', 'subject: a\n  min_jaccard: no'), "'min_jaccard' is False; it must be in"),
     ],
 )
 def test_wrong_pictures_say_what_is_wrong(tmp_path, change, message):
