@@ -204,7 +204,7 @@ def episode_recorder(folder: Path, one: Signal) -> None:
 # processes of a recording through the node
 
 
-def make_episode(folder: Path) -> Path:
+def make_episode(folder: Path, *, compressed: bool = True) -> Path:
     """Five seconds of an arm that turns."""
     from mtv_world_ros.data.episode_writer import EpisodeWriter
     from mtv_world_ros.geometry.calibration_file import load_calibration
@@ -223,7 +223,7 @@ def make_episode(folder: Path) -> Path:
             writer.write_joint_states(stamp_ns, ros().JOINTS, ros().HOME)
             for view, camera in cameras.items():
                 writer.write_camera_info(view, stamp_ns, camera)
-                writer.write_image(view, stamp_ns, ros().make_pixels(view))
+                writer.write_image(view, stamp_ns, ros().make_pixels(view), compressed=compressed)
             if step % 40 == 20:
                 writer.write_trajectory(stamp_ns, plan)
     return path

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable
 import json
 from pathlib import Path
+import shutil
 import signal
 import sys
 import time
@@ -220,7 +221,8 @@ def players(out: Path, count: int, rng: np.random.Generator) -> list[dict[str, A
     worlds = [World(out / space, space=space) for space in spaces]
     for world in worlds:
         world.follow()
-    episode = make_episode(out)
+    shutil.rmtree(out / 'episode', ignore_errors=True)
+    episode = make_episode(out, compressed=False)
     words = [sys.executable, '-m', 'mtv_world_ros.ros.bags.player', str(episode), '--loop']
     words += ['--lock-step', '--rate', '2', '--wait-timeout', '60', '--ros-args', '-r']
     processes = [
