@@ -52,6 +52,7 @@ def save(picture: Path, name: str) -> None:
     from PIL import Image
 
     shown = cv2.imread(str(picture))
+    assert shown is not None, f'{picture} is no picture'
     factor = min(1.0, WIDTH / shown.shape[1])
     small = cv2.resize(shown, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     image = Image.fromarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB))

@@ -325,6 +325,7 @@ def test_relations_on_recorded_poses_say_what_was_recorded(data_set, robot):
     for name in _names(data_set):
         episode = read_episode(data_set / name)
         task, scene = task_named(episode.info.task), scene_of(episode, workcell_of(robot))
+        assert episode.object_poses is not None
         stamps, poses = episode.object_poses
         rows = np.searchsorted(episode.joint_states.stamps_ns, stamps)
         openings = robot.gripper_openings(episode.joint_states.positions[rows])
