@@ -20,6 +20,8 @@ from mtv_world_ros.ros.messages.conversions import values_of
 _ANSWER_S = 30.0
 #: where several nodes offer a service, one of them killed, a request is sent again after this [s]
 _ASK_AGAIN_S = 2.0
+#: rmw_fastrtps drops the answer to whom it has not matched yet: asked again after this [s]
+_LOST_ANSWER_S = 8.0
 
 
 class Peers:
@@ -91,9 +93,10 @@ class Peers:
         asked: list[tuple[float, Future]] = []
 
         def is_answered() -> bool:
-            is_due = not asked or time.monotonic() > asked[-1][0] + _ASK_AGAIN_S
             # the graph shows a killed node for a while: it may have been the one that was asked
-            if is_due and (not asked or self._node.count_services(client.srv_name) > 1):
+            is_twice = self._node.count_services(client.srv_name) > 1
+            silence_s = _ASK_AGAIN_S if is_twice else _LOST_ANSWER_S
+            if not asked or time.monotonic() > asked[-1][0] + silence_s:
                 asked.append((time.monotonic(), client.call_async(request)))
             return any(future.done() for _, future in asked)
 

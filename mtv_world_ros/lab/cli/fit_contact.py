@@ -69,6 +69,7 @@ def _fit(arguments: argparse.Namespace) -> int:
 
     folder = arguments.checkpoint / OBJECT_MOTION_FOLDER
     check_free(folder / CONTACT_FILE, arguments.overwrite)
+    begun = load_contact(folder).replace(num_motions=arguments.motions)
     robot = load_robot(robot_path(arguments.robot))
     paths = spread(find_episodes(arguments.dataset), arguments.episodes)
     refuse_test_kinds(paths, 'training')
@@ -85,7 +86,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     settings, _ = fit_contact(
         recordings,
         arms,
-        load_contact(folder),
+        begun,
         threads=arguments.threads or threads_each(1),
         report=tqdm.write,
         progress=partial(tqdm, desc='foreseeing', unit='ep', disable=None),

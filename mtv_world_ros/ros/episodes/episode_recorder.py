@@ -25,14 +25,17 @@ class EpisodeRecorder(Recorder):
     silent_after_s = float('inf')  # nothing comes before an episode begins
 
     def _open(self) -> BagWriter | None:
-        self._number = 0
+        self._number, self._bag = 0, self._options.out
         self._end_before_s = float('inf')
         self.create_service(Trigger, '~/begin', self._on_begin)
         self.create_service(Trigger, '~/end', self._on_end)
         return None
 
     def _on_begin(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Begins a bag; one that is still open is closed."""
+        """Begins a bag; one that is ending is closed, one that has just begun is named again."""
+        if self._writer is not None and self._end_before_s == float('inf'):
+            response.success, response.message = True, str(self._bag)
+            return response
         self._close_bag()
         path = self._options.out / f'episode_{self._number:05d}'
         try:
@@ -43,7 +46,7 @@ class EpisodeRecorder(Recorder):
         self._number += 1
         for topic, msgtype, qos in self._declared:
             writer.declare(topic, msgtype, qos)
-        self._writer = writer
+        self._writer, self._bag = writer, path
         response.success, response.message = True, str(path)
         return response
 
