@@ -50,6 +50,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.foresight.arms import Arms
+    from mtv_world_ros.foresight.contact_settings import ContactSettings
     from mtv_world_ros.foresight.loading import (
         CONTACT_FILE,
         load_contact,
@@ -69,7 +70,8 @@ def _fit(arguments: argparse.Namespace) -> int:
 
     folder = arguments.checkpoint / OBJECT_MOTION_FOLDER
     check_free(folder / CONTACT_FILE, arguments.overwrite)
-    begun = load_contact(folder).replace(num_motions=arguments.motions)
+    first = load_contact(folder)
+    ContactSettings().replace(num_motions=arguments.motions)  # refused before the work begins
     robot = load_robot(robot_path(arguments.robot))
     paths = spread(find_episodes(arguments.dataset), arguments.episodes)
     refuse_test_kinds(paths, 'training')
@@ -86,7 +88,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     settings, _ = fit_contact(
         recordings,
         arms,
-        begun,
+        first,
         threads=arguments.threads or threads_each(1),
         report=tqdm.write,
         progress=partial(tqdm, desc='foreseeing', unit='ep', disable=None),
