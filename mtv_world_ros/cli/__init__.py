@@ -9,10 +9,12 @@ from contextlib import suppress
 import errno
 from importlib import import_module, metadata
 import os
+from pathlib import Path
 import shlex
 import signal
 import sys
 from types import ModuleType
+from typing import Any
 
 from mtv_world_ros.entry_points import broken, COMMANDS, load, registered
 from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest, TrainingInterrupted
@@ -39,6 +41,7 @@ _ORDER = (
     'datasets',
     'import_weights',
 )
+_EMPTY = "it is empty; leave it out, or give a path or a name ('.' is the present folder)"
 #: commands that left, and the last version that has them
 _REMOVED = {'distill': '0.1.0', 'train-motion': '0.1.0'}
 _ADVICE = {
@@ -52,9 +55,7 @@ _ADVICE = {
 
 def make_parser() -> argparse.ArgumentParser:
     """Returns the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='mtv-world', description='An online embodied world model for ROS 2.'
-    )
+    parser = _Parser(prog='mtv-world', description='An online embodied world model for ROS 2.')
     parser.add_argument('--version', action=_Version, nargs=0, help='print the version, then exit')
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
     for entry in _commands():
@@ -80,6 +81,29 @@ def _commands() -> Iterable[metadata.EntryPoint]:
         )
     others = sorted(found.keys() - set(_ORDER))
     return [found[name] for name in (*_ORDER, *others) if name in found]
+
+
+class _Parser(argparse.ArgumentParser):
+    """Takes no empty path, which Python reads as the present folder; commands are parsed by it."""
+
+    def __init__(self, **how: Any) -> None:
+        super().__init__(**how)
+        self.register('type', Path, _path)
+
+
+def _path(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError(_EMPTY)
+    return Path(text)
+
+
+def _check_texts(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """Refuses an empty text, unless it is what the option is without one."""
+    for action in parser._actions:
+        given = getattr(arguments, action.dest, None)
+        is_empty = '' in given if isinstance(given, list) else given == ''
+        if is_empty and action.type is None and '' not in (action.default, action.const):
+            parser.error(str(argparse.ArgumentError(action, _EMPTY)))
 
 
 class _Version(argparse.Action):
@@ -110,6 +134,7 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
         options = commands.choices[words[0]]._option_string_actions
         hints = [f'{word}{nearest(word, options)}' for word in more]
         parser.error(f'unrecognized arguments: {" ".join(hints)}')
+    _check_texts(commands.choices[words[0]], arguments)
     return arguments
 
 

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from pydantic import TypeAdapter
+from pydantic import ConfigDict, TypeAdapter
 from tqdm import tqdm
 
 from mtv_world_ros.bench.collect.episode_jobs import CollectJob, episode_seed
@@ -49,6 +49,8 @@ class Sibling:
         size: size of its fault.
         diverges_s: time of the first command that is not the expert's [s]; 0 for the expert.
     """
+
+    __pydantic_config__ = ConfigDict(extra='forbid')
 
     scene: str
     number: int
@@ -92,6 +94,8 @@ class SearchedScene:
         siblings: the expert, then pairs that just succeed and just fail.
         skipped: fault kinds without a boundary here, and why.
     """
+
+    __pydantic_config__ = ConfigDict(extra='forbid')
 
     siblings: tuple[Sibling, ...]
     skipped: Mapping[str, str]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import ConfigDict
 
 from mtv_world_ros.bench.shapes import shape_named, Size
 from mtv_world_ros.bench.world.arm import actuators_of, bodies_xml
@@ -35,6 +36,8 @@ class SceneObject:
         yaw: about z [rad].
     """
 
+    __pydantic_config__ = ConfigDict(extra='forbid')
+
     role: str
     name: str
     shape: str
@@ -47,6 +50,8 @@ class SceneObject:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneLook:
     """Table and light of an episode; colours (3,) in 0..1, light direction (3,)."""
+
+    __pydantic_config__ = ConfigDict(extra='forbid')
 
     table_rgb: tuple[float, float, float] = (0.7, 0.68, 0.64)
     ambient: float = 0.45

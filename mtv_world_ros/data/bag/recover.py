@@ -62,7 +62,8 @@ def recover(source: Path, out: Path | None = None) -> Recovered:
             `_recovered` if it is taken.
 
     Raises:
-        EpisodeError: `source` cannot be read, or the new bag cannot be written.
+        EpisodeError: `source` cannot be read or has no whole message before it is cut off, or
+            the new bag cannot be written.
     """
     path = out or _default_path(source)
     reader = BagReader(source)
@@ -81,6 +82,11 @@ def recover(source: Path, out: Path | None = None) -> Recovered:
                 message.stamp_ns,
                 message.data,
                 publish_ns=message.publish_ns,
+            )
+        if reader.truncated and not counts:
+            raise EpisodeError(
+                f"nothing can be recovered of '{source}', which has no whole message: "
+                f'{reader.truncated}'
             )
         for name, values in reader.metadata.items():
             if name != 'rosbag2':

@@ -8,8 +8,10 @@ import sys
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import add_options
+from mtv_world_ros.errors import ConfigError, EpisodeError
 
 if TYPE_CHECKING:
+    from mtv_world_ros.data.bag.recover import Recovered
     from mtv_world_ros.data.bag_mapping import BagMapping
     from mtv_world_ros.lab.importing.stored_objects import ObjectStage
 
@@ -42,20 +44,28 @@ def _add_recover(commands: argparse._SubParsersAction) -> None:
 def _recover(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.bag.recover import find_damaged, recover
 
-    damaged = find_damaged(arguments.bag)
+    damaged, lost = find_damaged(arguments.bag), []
     for source in damaged:
         out = arguments.out
         if out is not None and len(damaged) > 1:
             out = out / source.name.strip('.')
-        bag = recover(source, out)
-        total = sum(bag.num_messages.values())
-        print(f"recovered '{bag.path}': {total} messages over {bag.seconds:.1f} s")
-        for topic, count in sorted(bag.num_messages.items()):
-            print(f'  {topic} {count}')
-        for line in bag.lost:
-            print(f'  lost: {line}')
-        print(f"  '{source}' is as it was; delete it once you have looked at the new bag")
+        try:
+            _print_recovered(recover(source, out))
+        except EpisodeError as error:  # of this one; the others may hold something
+            lost.append(str(error))
+    if lost:
+        raise EpisodeError('; '.join(lost))
     return 0
+
+
+def _print_recovered(bag: Recovered) -> None:
+    total = sum(bag.num_messages.values())
+    print(f"recovered '{bag.path}': {total} messages over {bag.seconds:.1f} s")
+    for topic, count in sorted(bag.num_messages.items()):
+        print(f'  {topic} {count}')
+    for line in bag.lost:
+        print(f'  lost: {line}')
+    print(f"  '{bag.source}' is as it was; delete it once you have looked at the new bag")
 
 
 def _add_objects(parser: argparse.ArgumentParser) -> None:
@@ -271,7 +281,6 @@ def _guessed_mapping(arguments: argparse.Namespace) -> Path:
     """Writes OUT/mapping.yaml for columns and views that are named like joints and cameras."""
     import yaml
 
-    from mtv_world_ros.errors import ConfigError
     from mtv_world_ros.files import write_whole
     from mtv_world_ros.lab.importing.lerobot import LeRobotDataset
     from mtv_world_ros.lab.importing.mapping import guess_mapping
@@ -293,8 +302,6 @@ def _guessed_mapping(arguments: argparse.Namespace) -> Path:
 
 
 def _numbers(text: str | None) -> list[int] | None:
-    from mtv_world_ros.errors import ConfigError
-
     if text is None:
         return None
     try:
@@ -332,7 +339,6 @@ def _export(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from mtv_world_ros.data.episode_reader import list_episodes
-    from mtv_world_ros.errors import ConfigError
     from mtv_world_ros.files import bundled
     from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.lab.importing.lerobot_writer import export_dataset, MAPPING
@@ -356,8 +362,6 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def _size(text: str) -> tuple[int, int] | None:
-    from mtv_world_ros.errors import ConfigError
-
     if not text:
         return None
     width, _, height = text.partition('x')

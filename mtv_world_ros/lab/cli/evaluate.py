@@ -111,12 +111,14 @@ def parse_entries(texts: list[str]) -> list[Entry]:
     """Returns checkpoints by name; `NAME=FOLDER` gives the name, else the folder does.
 
     Raises:
-        ConfigError: two are called alike.
+        ConfigError: two are called alike, or one has no folder.
     """
     entries = []
     for text in texts:
         label, mark, path = text.partition('=')
         is_named = bool(mark) and not Path(text).is_dir()
+        if is_named and not path:
+            raise ConfigError(f"checkpoint '{text}' names no folder; give NAME=FOLDER")
         entries.append(Entry(path, label, True) if is_named else Entry(text, _label(text)))
     labels = [entry.label for entry in entries]
     doubled = [label for label in labels if labels.count(label) > 1]

@@ -4,7 +4,12 @@ import pytest
 
 from mtv_world_ros.bench.collect.collect_dataset import collect
 from mtv_world_ros.bench.collect.episode_maker import CollectConfig
-from mtv_world_ros.bench.collect.siblings import find_boundary, SIBLINGS_FILE
+from mtv_world_ros.bench.collect.siblings import (
+    find_boundary,
+    SceneJob,
+    search_siblings,
+    SIBLINGS_FILE,
+)
 from mtv_world_ros.bench.world.randomize import RandomizationConfig
 from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.data.splits import select
@@ -48,6 +53,25 @@ def test_sizes_out_of_reach_are_not_taken_for_failures():
 def test_siblings_need_fault_kinds_and_at_least_two(config):
     with pytest.raises(SimulatorError, match='set --siblings and --faults'):
         CollectConfig(**config)
+
+
+@pytest.mark.parametrize('at', ['scene', 'sibling'])
+def test_unknown_keys_of_what_an_earlier_run_found_are_refused(at, tmp_path):
+    sibling = {'scene': 'a_00000', 'number': 0, 'seed': 7, 'attempt': 0, 'policy': 'expert'}
+    scene = {'siblings': [sibling], 'skipped': {}}
+    (sibling if at == 'sibling' else scene)['sise'] = 0.1
+    (tmp_path / SIBLINGS_FILE).write_text(json.dumps({'a_00000': scene}))
+
+    def search():
+        return search_siblings(
+            [SceneJob(task='a', index=0, seed=7)], pytest.fail, tmp_path, 1, progress=False
+        )
+
+    with pytest.raises(SimulatorError, match=f'{SIBLINGS_FILE}.*sise.*move it away'):
+        search()
+    (sibling if at == 'sibling' else scene).pop('sise')
+    (tmp_path / SIBLINGS_FILE).write_text(json.dumps({'a_00000': scene}))
+    assert search()['a_00000'].siblings[0].seed == 7
 
 
 def test_siblings_share_a_scene_and_their_outcomes_differ(tmp_path, opengl):

@@ -90,6 +90,19 @@ def test_a_damaged_scene_is_refused(demo, text):
         scene_of(damaged, WORKCELL)
 
 
+def test_unknown_keys_of_a_stored_scene_are_refused(demo):
+    stored = json.loads(demo.info.metadata[SCENE])
+    for part in (stored['look'], stored['objects'][0]):
+        part['colour'] = 1
+        metadata = {**demo.info.metadata, SCENE: json.dumps(stored)}
+        with pytest.raises(EpisodeError, match='colour'):
+            scene_of(replace(demo, info=replace(demo.info, metadata=metadata)), WORKCELL)
+        del part['colour']
+    metadata = {**demo.info.metadata, SCENE: json.dumps(stored)}
+    whole = replace(demo, info=replace(demo.info, metadata=metadata))
+    assert scene_of(whole, WORKCELL) == scene_of(demo, WORKCELL)
+
+
 def test_the_expert_of_a_recording_commands_what_was_recorded(demo):
     """The same plan: commands of the expert in a scene of its own differ by much more."""
     from mtv_world_ros.assembly import assemble_policy

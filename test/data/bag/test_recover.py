@@ -168,6 +168,32 @@ def test_nothing_to_recover_is_said(tmp_path, capsys) -> None:
     assert '0 messages' in capsys.readouterr().out
 
 
+@pytest.mark.parametrize('content', [b'', b'\x89MC', b'\x89MCAP0\r\n'])
+def test_a_file_without_a_whole_message_is_said_and_no_bag_is_made(
+    content, tmp_path, capsys
+) -> None:
+    (tmp_path / 'a.mcap').write_bytes(content)
+    for words in ([], ['--out', str(tmp_path / 'out')]):
+        assert main(['recover', str(tmp_path / 'a.mcap'), *words]) == 1
+        said = capsys.readouterr()
+        assert "nothing can be recovered of '" in said.err and 'no whole message' in said.err
+        assert said.out == ''
+    assert [path.name for path in tmp_path.iterdir()] == ['a.mcap']
+
+
+def test_an_empty_recording_does_not_keep_others_from_being_recovered(tmp_path, capsys) -> None:
+    (tmp_path / '.a.1.tmp').mkdir()
+    (tmp_path / '.a.1.tmp' / 'a_0.mcap').write_bytes(b'')
+    with BagWriter(tmp_path / 'whole') as writer:
+        writer.write_raw('/noise', TYPE, 0, payload(0))
+    (tmp_path / 'whole').rename(tmp_path / '.b.1.tmp')
+    assert main(['recover', str(tmp_path)]) == 1
+    said = capsys.readouterr()
+    assert ".a.1.tmp', which has no whole message" in said.err
+    assert '/noise 1' in said.out
+    assert [m.topic for m in iter_messages(tmp_path / 'b')] == ['/noise']
+
+
 def test_flushing_costs_little_time(tmp_path) -> None:
     with BagWriter(tmp_path / 'bag', keep=True) as writer:
         begin = time.process_time()
