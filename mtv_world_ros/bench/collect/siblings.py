@@ -264,8 +264,9 @@ def _read(path: Path) -> dict[str, SearchedScene]:
     try:
         return _SCENES.validate_python(read_json(path))
     except (OSError, ValueError) as error:
+        reason = f'{type(error).__name__}: {" ".join(str(error).split())}'
         raise SimulatorError(
-            f"'{path}' is not what 'collect --siblings' writes ({error!r}); move it away"
+            f"'{path}' is not what 'collect --siblings' writes ({reason}); move it away"
         ) from error
 
 

@@ -91,7 +91,8 @@ def _parsed(episode: Episode, stored: str) -> Scene:
             goals=goals,
         )
     except (ValueError, LookupError, TypeError) as error:
-        raise EpisodeError(f"'{path}' has a scene that cannot be used: {error}") from error
+        reason = ' '.join(str(error).split())
+        raise EpisodeError(f"'{path}' has a scene that cannot be used: {reason}") from error
 
 
 def _drawn(episode: Episode, workcell: Workcell) -> Scene:

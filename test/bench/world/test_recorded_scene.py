@@ -100,7 +100,7 @@ def test_unknown_keys_of_a_stored_scene_are_refused(demo):
         del part['colour']
     metadata = {**demo.info.metadata, SCENE: json.dumps(stored)}
     whole = replace(demo, info=replace(demo.info, metadata=metadata))
-    assert scene_of(whole, WORKCELL) == scene_of(demo, WORKCELL)
+    assert scene_of(whole, WORKCELL).objects == scene_of(demo, WORKCELL).objects
 
 
 def test_the_expert_of_a_recording_commands_what_was_recorded(demo):
