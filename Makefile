@@ -36,7 +36,7 @@ style: $(STAMP)
 types: $(STAMP)
 	$(BIN)/pyright
 
-test: style  ## the linters and all tests (about 8 minutes)
+test: style  ## the linters and all tests (8 to 15 minutes)
 	@$(MAKE) --no-print-directory --jobs=2 types tests
 
 tests: $(STAMP)
