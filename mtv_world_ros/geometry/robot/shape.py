@@ -25,7 +25,7 @@ from mtv_world_ros.geometry.robot.mesh_pieces import (
     outermost,
     slices,
 )
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel, Tool
 from mtv_world_ros.geometry.transforms import inverse
 
 #: corners of a round shape's rims
@@ -112,15 +112,27 @@ def moving_links(robot: RobotModel) -> set[str]:
 
 def grip_links(robot: RobotModel) -> set[str]:
     """Returns the links that hold things: those of tools, and what gripper joints move."""
-    model = robot.pinocchio_model
-    frames = {f.name: f.parentJoint for f in model.frames if f.type == pin.FrameType.BODY}
-    grippers = {tool.gripper_joint for tool in robot.tools if tool.gripper_joint}
-    moved = grippers | {m.joint for m in robot.mimics if m.source in grippers}
+    frames = _joint_frames(robot)
     hands = {frames[tool.link] for tool in robot.tools if tool.gripper_joint} - {0}
+    moved = {link for tool in robot.tools for link in gripper_links(robot, tool)}
+    return moved | {link for link, joint in frames.items() if joint in hands}
+
+
+def gripper_links(robot: RobotModel, tool: Tool) -> set[str]:
+    """Returns the links that a tool's gripper joint moves, itself or by mimics; none without."""
+    model, gripper = robot.pinocchio_model, tool.gripper_joint
+    moved = {m.joint for m in robot.mimics if m.source == gripper} | {gripper}
     return {
         link
-        for link, joint in frames.items()
-        if joint in hands or any(model.names[j] in moved for j in model.supports[joint])
+        for link, joint in _joint_frames(robot).items()
+        if any(model.names[j] in moved for j in model.supports[joint])
+    }
+
+
+def _joint_frames(robot: RobotModel) -> dict[str, int]:
+    """The joint that carries each link."""
+    return {
+        f.name: f.parentJoint for f in robot.pinocchio_model.frames if f.type == pin.FrameType.BODY
     }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 import time
 
@@ -15,6 +15,7 @@ from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data.stored_rollout import join, save_rollout, StoredRollout
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.geometry.robot.shape import load_shape, RobotShape
 from mtv_world_ros.lab.evaluation.imagined_stretches import (
     imagine_stretch,
     last_chunk,
@@ -23,9 +24,15 @@ from mtv_world_ros.lab.evaluation.imagined_stretches import (
     Stretch,
     stretches,
 )
+from mtv_world_ros.lab.evaluation.metrics.arm_masks import arm_scenes, ArmScene
 from mtv_world_ros.lab.evaluation.metrics.frechet.feature_store import feature_path, FeatureTaker
 from mtv_world_ros.lab.evaluation.metrics.image_quality import ImageQuality
-from mtv_world_ros.lab.evaluation.metrics.picture_scores import HELD, picture_scores, SHUFFLED
+from mtv_world_ros.lab.evaluation.metrics.picture_scores import (
+    HELD,
+    picture_scores,
+    RECORDED,
+    SHUFFLED,
+)
 from mtv_world_ros.lab.evaluation.metrics.scores import (
     find_masks,
     score_frames,
@@ -89,6 +96,7 @@ class _Found:
     shown: list[StoredRollout] = field(default_factory=list)
     quality: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
     pictures: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
+    scenes: list[ArmScene | None] = field(default_factory=list)
     notes: dict[str, None] = field(default_factory=dict)
     chunk_seconds: list[float] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
@@ -125,6 +133,8 @@ class EpisodeScorer:
         found = _Found()
         with found.timed('reading'):
             recording, donor = self._load(job.path), self._donor(job)
+            if self._shape.is_known:
+                found.scenes += arm_scenes(recording, self.pipeline.robot, self._shape.parts)
         found.notes.update(dict.fromkeys(recording.warnings))
         features = self.instruments.features and self.instruments.features.start()
         success, observed, resumed = None, {}, {}
@@ -211,7 +221,8 @@ class EpisodeScorer:
             found.rows += score_rows(stretch, views, truth, predicted, others, masks)
         with found.timed('features'):
             found.quality.append((stretch.num_frames, self._quality(frames, real)))
-            found.pictures.append((stretch.num_frames, self._pictures(stretch, frames, shuffled)))
+            pictures = self._pictures(stretch, frames, shuffled, found.scenes)
+            found.pictures.append((stretch.num_frames, pictures))
         stored = stored_stretch(
             chunks,
             stretch,
@@ -280,13 +291,17 @@ class EpisodeScorer:
         return scores, shuffled
 
     def _pictures(
-        self, stretch: Stretch, frames: ByteArray, shuffled: ByteArray | None
+        self,
+        stretch: Stretch,
+        frames: ByteArray,
+        shuffled: ByteArray | None,
+        scenes: Sequence[ArmScene | None],
     ) -> dict[str, dict[str, float]]:
-        """Picture scores by view: imagined, first frame held, shuffled commands."""
+        """Picture scores by view: imagined, first frame held, shuffled commands, recorded."""
         held = np.repeat(stretch.frames[:, :1], frames.shape[1], axis=1)
         compared = {'': frames, f'_{HELD}': held}
         compared |= {} if shuffled is None else {f'_{SHUFFLED}': shuffled}
-        return {
+        scores = {
             view: {
                 f'{name}{suffix}': value
                 for suffix, shown in compared.items()
@@ -296,6 +311,17 @@ class EpisodeScorer:
             }
             for v, view in enumerate(self.pipeline.spec.views)
         }
+        compared[f'_{RECORDED}'] = stretch.frames[:, 1:]
+        for v, (numbers, scene) in enumerate(zip(scores.values(), scenes, strict=False)):
+            if scene is not None:
+                masks = scene.masks(stretch.positions[1:])
+                for suffix, shown in compared.items():
+                    numbers[f'j_arm{suffix}'] = masks.jaccard(shown[v])
+        return scores
+
+    @cached_property
+    def _shape(self) -> RobotShape:
+        return load_shape(self.pipeline.robot)
 
     def _ceilings(self, stretch: Stretch, truth: Truth, found: _Found) -> dict[str, ObjectScores]:
         """Scores of the recorded frames: as they are, and through the autoencoder."""

@@ -2,7 +2,16 @@
 
 from dataclasses import replace
 
-from crane import FPS, load, make_cameras, make_positions, render, START_NS, write_robot
+from crane import (
+    FPS,
+    load,
+    looking_at,
+    make_cameras,
+    make_positions,
+    render,
+    START_NS,
+    write_robot,
+)
 import numpy as np
 import pytest
 
@@ -131,6 +140,25 @@ def test_a_moved_camera_and_who_belongs_where_are_named(inspected):
     line = next(line for line in text.splitlines() if 'the camera stands at' in line)
     assert 'moved' in line and line.startswith('suspicious')
     assert found.verdict == 'broken'
+
+
+def test_a_gripper_with_open_and_closed_swapped_is_named(tmp_path):
+    robot = load(tmp_path)
+    near = looking_at((0.95, 0.3, 1.1), (0.6, 0.12, 0.65))
+    camera = replace(make_cameras()['door'], T_mount_camera=near)
+    moves = make_positions(4.0, seed=0)
+    moves[:, :5] = moves.mean(0)[:5] + 0.3 * (moves - moves.mean(0))[:, :5]
+    swapped = moves.copy()
+    swapped[:, 5] = 0.04 - moves[:, 5]  # of 0 .. 0.04
+    frames = render(robot, camera, moves)
+    write(tmp_path / 'data' / 'right', robot, camera, moves, frames)
+    write(tmp_path / 'data' / 'swapped', robot, camera, moves, frames, states=swapped)
+    inspector = Inspector(robot, load_shape(robot), QUICK)
+    found, _ = inspect_folder(list_episodes(tmp_path / 'data'), inspector, read_episode)
+    text = folder_text(found)
+    for line in text.splitlines()[1:]:
+        said = "fingers move like those of 'jaw_left' with open and closed swapped" in line
+        assert said == line.startswith('swapped '), text
 
 
 def test_the_command_writes_a_table_and_a_picture(folder, tmp_path, capsys):

@@ -17,8 +17,16 @@ from numpy.typing import NDArray
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate, mean_interval, MIN_EPISODES
 
-#: what is scored: imagined, first frame held, another episode's commands
-HELD, SHUFFLED = 'held', 'shuffled'
+#: what is scored: imagined, first frame held, another episode's commands, and recorded frames
+#: themselves, whose J of the arm is the most that a calibration allows
+HELD, SHUFFLED, RECORDED = 'held', 'shuffled', 'recorded'
+#: what is shown in tables, by the end of a number's name
+KINDS = {
+    '': 'imagined',
+    f'_{HELD}': 'first frame held',
+    f'_{SHUFFLED}': 'other commands',
+    f'_{RECORDED}': 'recorded',
+}
 #: numbers by name, and how tables call them
 MEASURES = {
     'psnr': 'PSNR [dB]',
@@ -26,6 +34,7 @@ MEASURES = {
     'psnr_changed': 'PSNR where it changes [dB]',
     'ssim_changed': 'SSIM where it changes',
     'j_changed': 'J of changed pixels',
+    'j_arm': 'J of the arm',
 }
 #: a pixel has changed if a channel of it, blurred, differs by more [grey levels]
 _CHANGED = 20.0
@@ -38,7 +47,7 @@ _SIGMA, _C1, _C2 = 1.5, (0.01 * 255) ** 2, (0.03 * 255) ** 2
 
 
 def picture_scores(frames: ByteArray, real: ByteArray, first: ByteArray) -> dict[str, float]:
-    """Returns `MEASURES` of a view, means over frames; NaN where nothing changes.
+    """Returns `MEASURES` of a view but `j_arm`, means over frames; NaN where nothing changes.
 
     Args:
         frames: (T, H, W, 3) uint8 RGB imagined.
@@ -48,7 +57,7 @@ def picture_scores(frames: ByteArray, real: ByteArray, first: ByteArray) -> dict
     rows = [_frame_scores(a, b, first) for a, b in zip(frames, real, strict=True)]
     return {
         name: float(np.nanmean(values)) if np.isfinite(values).any() else nan
-        for name in MEASURES
+        for name in rows[0]
         for values in [np.array([row[name] for row in rows])]
     }
 
@@ -56,8 +65,8 @@ def picture_scores(frames: ByteArray, real: ByteArray, first: ByteArray) -> dict
 def _frame_scores(frame: ByteArray, real: ByteArray, first: ByteArray) -> dict[str, float]:
     error = (frame.astype(np.float64) - real) ** 2
     similar = ssim_map(frame, real)
-    changes, imagined = _changed(real, first), _changed(frame, first)
-    scores = dict.fromkeys(MEASURES, nan)
+    changes, imagined = changed(real, first), changed(frame, first)
+    scores = dict.fromkeys((name for name in MEASURES if name != 'j_arm'), nan)
     scores |= {'psnr': _psnr(error), 'ssim': float(similar.mean())}
     if changes.mean() < _LEAST_CHANGED:
         return scores
@@ -74,8 +83,8 @@ def _psnr(error: NDArray[np.float64]) -> float:
     return float(10 * np.log10(255.0**2 / max(float(error.mean()), 0.25 / error.size)))
 
 
-def _changed(frame: ByteArray, first: ByteArray) -> NDArray[np.bool_]:
-    """(H, W) whether a pixel differs from the first frame."""
+def changed(frame: ByteArray, first: ByteArray) -> NDArray[np.bool_]:
+    """Returns (H, W) whether a pixel differs between two frames (H, W, 3)."""
     apart = np.abs(frame.astype(np.float32) - first.astype(np.float32)).max(axis=-1)
     return np.asarray(cv2.GaussianBlur(apart, (0, 0), 0.8) > _CHANGED)
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from mtv_world_ros.lab.documents import number, Table, with_interval
-from mtv_world_ros.lab.evaluation.metrics.picture_scores import HELD, MEASURES, SHUFFLED
+from mtv_world_ros.lab.evaluation.metrics.picture_scores import KINDS, MEASURES
 from mtv_world_ros.lab.evaluation.metrics.success_agreement import Judgement, reliability_bins
 from mtv_world_ros.lab.evaluation.report.charts import reliability_chart
 from mtv_world_ros.lab.evaluation.report.headline import all_views, cell, hue, letter, Mark, mark
@@ -124,14 +124,13 @@ def task_tables(evaluations: Sequence[Evaluated]) -> list[Table]:
 
 def pictures(evaluations: Sequence[Evaluated]) -> list[tuple[Mark | None, Table]]:
     """Returns picture scores beside the held frame and other commands, where they were made."""
-    kinds = {'': 'imagined', f'_{HELD}': 'first frame held', f'_{SHUFFLED}': 'other commands'}
     tables = []
     for index, found in enumerate(evaluations):
         rows = [
             [view, words, *(_estimate(numbers.get(f'{key}{suffix}')) for key in MEASURES)]
             for view, numbers in found.metrics.get('pictures', {}).items()
-            for suffix, words in kinds.items()
-            if f'psnr{suffix}' in numbers
+            for suffix, words in KINDS.items()
+            if any(f'{key}{suffix}' in numbers for key in MEASURES)
         ]
         if rows:
             table = Table(head=['View', 'Shown', *MEASURES.values()], rows=rows, num_labels=2)

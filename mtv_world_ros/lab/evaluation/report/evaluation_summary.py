@@ -16,10 +16,9 @@ from mtv_world_ros.lab.evaluation.metrics.horizon import by_chunk, Curve, curve
 from mtv_world_ros.lab.evaluation.metrics.picture_scores import (
     Following,
     following,
-    HELD,
+    KINDS,
     MEASURES,
     picture_estimates,
-    SHUFFLED,
 )
 from mtv_world_ros.lab.evaluation.metrics.scores import FRAME_FIELDS, MOVING_RULE, ScoreRow
 from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate, METHOD, summarise
@@ -219,13 +218,13 @@ class EvaluationSummary:
         episodes = [result.pictures for result in self.results if result.pictures]
         if not episodes:
             return ''
-        kinds = {'': 'imagined', f'_{HELD}': 'first frame held', f'_{SHUFFLED}': 'other commands'}
         rows = [
             [f'{view or "all views"} · {words}',
              *(tables.cell(found.get(f'{name}{suffix}')) for name in MEASURES)]
             for view in (*self.spec.views, None)
             for found in [picture_estimates(episodes, view)]
-            for suffix, words in kinds.items()
+            for suffix, words in KINDS.items()
+            if any(f'{name}{suffix}' in found for name in MEASURES)
         ]  # fmt: skip
         return Table(head=['pictures', *MEASURES.values()], rows=rows).text()
 
