@@ -1,19 +1,23 @@
 """What are verdicts worth where the truth is another physics, and who earns them?
 
     python benchmark/shifted_worlds.py --faults drawn:4 --log out/shifted.jsonl
-    python benchmark/shifted_worlds.py --physics bold --checkpoints bundled,runs/refitted --log out/fitted.jsonl
+    python benchmark/shifted_worlds.py --physics nominal,bold --contact out/fitted --log out/fitted.jsonl
 
 In each physics of `config/physics.yaml` the expert and faulty policies act in the same scenes of the
 simulator; kinds of faults have the size `--size`, a factor of what was drawn. Each plan is foreseen
 from the pictures of the first frame alone, as the node does: cameras are checked against the arm's
 outline, objects are found by the segmenter. Judges: *foreseen motions alone*, the share of futures
 that succeed; where `--pictures` says so, *pictures alone* (the paper's way) and *both* (the estimate);
-where `--real` says so, *real frames*, the estimate on the simulator's; the *no-picture rule*: an object
-sticks to a gripper that closes near it. From .75 on it is called a success, below .5 a failure.
+where `--real` says so, *real frames*, the estimate on the simulator's; where `--contact FOLDER` has a
+folder `FOLDER/PHYSICS` that `fit-contact` wrote in that physics, *foreseen motions, fitted there*; the
+*no-picture rule*: an object sticks to a gripper that closes near it. From .75 on it is called a success,
+below .5 a failure.
 False success is of real failures that have a verdict, false failure of real successes. Intervals over
 scenes: AUROC jackknife, shares clustered Wilson. The log keeps what was done, and the same command
 goes on; physics that show the same first picture share what is imagined. `--no-camera-check` leaves
-cameras as they are told.
+cameras as they are told. The last table is of the node's watch, which compares the end of every
+executed chunk (here where objects truly are) with the futures: how many rollouts it takes to say that
+the physics is another one, over random orders.
 """  # noqa: E501
 
 from __future__ import annotations
@@ -46,13 +50,16 @@ from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation, SuccessEstimate
 from mtv_world_ros.errors import MtvWorldError, PolicyError, SimulatorError
 from mtv_world_ros.foresight.arm_response import PERIOD_S
+from mtv_world_ros.foresight.loading import load_foresight
 from mtv_world_ros.geometry.camera import camera_poses
-from mtv_world_ros.geometry.object_motion import FoundObjects
+from mtv_world_ros.geometry.object_motion import FoundObjects, ObjectMotionModel
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.imagined_episode import ImaginedEpisode
 from mtv_world_ros.lab.evaluation.metrics.statistics import clustered_wilson
+from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.success.doubts import NEAR_M, PhysicsWatch, unforeseen
 from mtv_world_ros.success.estimator import capped, verdict
 from mtv_world_ros.success.foreseen import foreseen_of
 from mtv_world_ros.success.situation import CannotTell
@@ -70,8 +77,14 @@ HEAD = (
 )  # fmt: skip
 ACROSS = ('judged by', 'truths', 'AUROC, mean', 'worst', 'false success, mean', 'worst',
           'no verdict, mean')  # fmt: skip
+WATCHED = (
+    'truth', 'foreseen by', 'chunks that ended unforeseen',
+    'says so after rollouts: median [5 %, 95 %]', 'orders in which it never does',
+)  # fmt: skip
 FORESEEN, PICTURES, BOTH = 'foreseen motions alone', 'pictures alone (paper)', 'both'
-REAL, RULE = 'real frames', 'no-picture rule'
+REAL, RULE, FITTED = 'real frames', 'no-picture rule', 'foreseen motions, fitted there'
+#: random orders of rollouts in which the watch sees them
+_ORDERS = 100
 #: what pictures are made for
 IMAGINED = (PICTURES, BOTH)
 Job = tuple[str, str, int, int, str]
@@ -84,6 +97,7 @@ def more(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--pictures', default='', metavar='PHYSICS', help='of these, or all')
     parser.add_argument('--real', default='', metavar='PHYSICS', help='of these, or all')
     parser.add_argument('--checkpoints', default='bundled', help='each sees the same rollouts')
+    parser.add_argument('--contact', type=Path, help='FOLDER/PHYSICS, which fit-contact wrote')
     parser.add_argument('--faults', default='drawn:0', help='a split, or drawn:SEED')
     parser.add_argument('--size', type=float, default=1.1, help='of drawn kinds')
     parser.add_argument('--tasks', default=','.join(TASKS))
@@ -101,10 +115,40 @@ def policies_of(faults: str, size: float, count: int) -> list[str]:
     return [EXPERT, *(PolicyVariant.of({k: v}).name for k, v in sizes.items())][:count]
 
 
-def share_of(
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ahead:
+    """What is foreseen of a rollout.
+
+    Attributes:
+        share: of the futures that succeed; NaN = they do not tell.
+        names: of the O objects.
+        points: (K, 1 + C, O, 3) centres at first and at the ends of chunks [m].
+        times: (1 + C,) [s].
+    """
+
+    share: float
+    names: tuple[str, ...]
+    points: FloatArray
+    times: FloatArray
+
+    def said(self, sim: SimEpisode, take: Take) -> Said:
+        """Returns the share, and how far each chunk's end truly was from all futures [m]."""
+        items = {item.name: number for number, item in enumerate(sim.scene.objects)}
+        known = [number for number, name in enumerate(self.names) if name in items]
+        frames = np.rint(self.times / _RECORD.frame_period_s).astype(int)
+        centres = take.object_poses[..., :3, 3]
+        columns = [items[self.names[number]] for number in known]
+        real = centres[np.minimum(frames, len(centres) - 1)][:, columns]
+        points = self.points[:, :, known]
+        chunks = [slice(chunk, chunk + 2) for chunk in range(len(self.times) - 1)]
+        apart = [unforeseen(points[:, chunk], real[chunk]) for chunk in chunks]
+        return {'value': self.share if isfinite(self.share) else None, 'apart': apart}
+
+
+def foreseen_by(
     pipeline: Pipeline, episode: ImaginedEpisode, observation: Observation, commands: FloatArray
-) -> float:
-    """Returns the share of futures that succeed under commands (C, J); NaN = they do not tell."""
+) -> Ahead:
+    """Returns what is foreseen of commands (C, J)."""
     model, names = pipeline.object_motion, episode.names
     assert model is not None
     masks = pipeline.segmenter.segment(observation.frames[:, None], names).masks[:, :, 0]
@@ -117,9 +161,17 @@ def share_of(
     tracked = model.find(names, masks, observation.cameras, list(poses))
     objects = FoundObjects.at(names, observation.frames, masks, poses, tracked)
     (ahead,) = objects.foresee([commands])
-    motions = foreseen_of(pipeline.robot, ahead, len(ahead.motions[0].points))
+    num_rows = len(ahead.motions[0].points)
+    motions = foreseen_of(pipeline.robot, ahead, num_rows)
     ends = pipeline.estimator.foresee(motions, episode.instruction)
-    return nan if ends is None or ahead.tracked.refusal else ends.share
+    each = round(pipeline.spec.num_frames / pipeline.spec.fps / motions.step_s)
+    rows = np.array([*range(0, num_rows - 1, each), num_rows - 1])
+    return Ahead(
+        share=nan if ends is None or ahead.tracked.refusal else ends.share,
+        names=names,
+        points=motions.points[:, rows],
+        times=rows * motions.step_s,
+    )
 
 
 def features_of(estimate: SuccessEstimate) -> dict[str, float] | None:
@@ -165,6 +217,12 @@ class Scenes:
 
     def __init__(self, pipelines: dict[str, Pipeline], options: argparse.Namespace) -> None:
         self._pipelines, self._known = pipelines, dict[tuple, Any]()
+        self._fitted = dict[str, ObjectMotionModel]()
+        for physics in options.physics.split(',') if options.contact else ():
+            folder = options.contact / physics / OBJECT_MOTION_FOLDER
+            robot = next(iter(pipelines.values())).robot
+            if folder.is_dir() and (motion := load_foresight(folder, robot)) is not None:
+                self._fitted[physics] = motion
         self._of = {
             key: set(catalogue()) if names == 'all' else set(names.split(','))
             for key, names in (('pictures', options.pictures), ('real', options.real))
@@ -173,7 +231,8 @@ class Scenes:
 
     def wanted(self, physics: str) -> list[str]:
         """Returns the judges of a physics."""
-        more = [*(IMAGINED if physics in self._of['pictures'] else ())]
+        more = [FITTED] if physics in self._fitted else []
+        more += IMAGINED if physics in self._of['pictures'] else ()
         return [FORESEEN, *more, *([REAL] if physics in self._of['real'] else ())]
 
     def rollout(self, job: Job) -> dict[str, Any]:
@@ -196,10 +255,19 @@ class Scenes:
         commands = resample(take.commands, sim.home, np.arange(0.0, end, PERIOD_S))
         said: dict[str, Any] = {}
         for name, pipeline in self._pipelines.items():
-            judges = [judge for judge in self.wanted(physics) if judge != REAL]
-            said[name] = {
+            judges = [judge for judge in self.wanted(physics) if judge not in (REAL, FITTED)]
+            found = {
                 judge: self._once(name, judge, first, sim.instruction, commands, seed)
                 for judge in judges[::-1]
+            }
+            if physics in self._fitted:
+                motion = self._fitted[physics]
+                found[FITTED] = self._once(
+                    name, FITTED, first, sim.instruction, commands, seed, motion
+                )
+            said[name] = {
+                judge: one.said(sim, take) if isinstance(one, Ahead) else one
+                for judge, one in found.items()
             }
             if is_real:
                 begun = pipeline.begin(first, instruction=sim.instruction, seed=seed)
@@ -227,17 +295,22 @@ class Scenes:
         instruction: str,
         commands: FloatArray,
         seed: int,
-    ) -> Said:
-        """What a judge says, who is asked once for all physics that look the same."""
+        motion: ObjectMotionModel | None = None,
+    ) -> Said | Ahead:
+        """What a judge says, who is asked once for all physics that look the same.
+
+        The motion is that of the physics, and None is the checkpoint's.
+        """
         cameras = [camera.T_mount_camera.tobytes() for camera in first.cameras]
         same = (first.frames.tobytes(), first.positions.tobytes(), commands.tobytes(), *cameras)
-        key = (name, judge, *same)
+        key = (name, judge, motion, *same)
         if key not in self._known:
             whole = self._pipelines[name]
             check = self._check(whole, (name, *same), first)
             if check.refusal and judge != RULE:
                 return {'refused': True}
-            pipeline = replace(whole, camera_checker=None)
+            motion = motion or whole.object_motion
+            pipeline = replace(whole, camera_checker=None, object_motion=motion)
             if judge == PICTURES:
                 pipeline = pipeline.without_foresight()
             first = check.corrected_observation(first)
@@ -263,7 +336,7 @@ class Scenes:
         episode: ImaginedEpisode,
         first: Observation,
         commands: FloatArray,
-    ) -> Said:
+    ) -> Said | Ahead:
         if judge == RULE:
             try:
                 return {'value': float(judge_without_pictures(episode, commands))}
@@ -271,8 +344,7 @@ class Scenes:
                 return {'value': None}
         if judge in IMAGINED:
             return imagined(pipeline, episode, commands)
-        share = share_of(pipeline, episode, first, commands)
-        return {'value': share if isfinite(share) else None}
+        return foreseen_by(pipeline, episode, first, commands)
 
 
 def jobs(options: argparse.Namespace) -> Iterator[Job]:
@@ -417,6 +489,48 @@ def rows_of(
     return rows
 
 
+def watch_rows(
+    options: argparse.Namespace, found: Sequence[dict[str, Any]], names: Iterable[str]
+) -> list[list[str]]:
+    """Returns what the watch makes of executed chunks, in each physics."""
+    rows = []
+    for physics in options.physics.split(','):
+        for name in names:
+            for judge in (FORESEEN, FITTED):
+                said = [r['said'][name].get(judge, {}) for r in found if r['job'][0] == physics]
+                apart = [one['apart'] for one in said if 'apart' in one]
+                if any(np.isfinite(one).any() for one in apart):
+                    title = judge if len(list(names)) == 1 else f'{judge}, {name}'
+                    rows.append([physics, title, *watch_cells(apart)])
+    return rows
+
+
+def watch_cells(apart: Sequence[Sequence[float]]) -> list[str]:
+    """Returns the rest of a row, of how far the chunks of each rollout ended from all futures."""
+    told = np.concatenate([np.array(one) for one in apart])
+    told = told[np.isfinite(told)]
+    rng = np.random.default_rng(0)
+    counts = np.array([needed(apart, rng.permutation(len(apart))) for _ in range(_ORDERS)])
+    said = counts[counts > 0]
+    after = '–'
+    if len(said):
+        low, middle, high = np.percentile(said, (5, 50, 95))
+        after = f'{middle:.0f} [{low:.0f}, {high:.0f}]'
+    unlike = int((told > NEAR_M).sum())
+    return [f'{unlike} of {len(told)}', after, f'{(counts == 0).sum()} of {_ORDERS}']
+
+
+def needed(apart: Sequence[Sequence[float]], order: Iterable[int]) -> int:
+    """Returns after how many rollouts the watch says that the physics is another; 0 = never."""
+    watch = PhysicsWatch()
+    for count, number in enumerate(order, 1):
+        for away in apart[number]:
+            watch.take(away)
+        if watch.doubt:
+            return count
+    return 0
+
+
 def main() -> None:
     """Prints a row for each physics and judge, and writes them as a page."""
     options = parse_arguments(__doc__, 1, more)
@@ -428,8 +542,8 @@ def main() -> None:
     if not found:
         raise MtvWorldError('no rollout was done; give more time (--until)')
     rows = rows_of(options, pipelines, found)
-    asked = ('faults', 'size', 'physics', 'pictures', 'real', 'scenes', 'policies', 'seed',
-             'checkpoints')  # fmt: skip
+    asked = ('faults', 'size', 'physics', 'pictures', 'real', 'contact', 'scenes', 'policies',
+             'seed', 'checkpoints')  # fmt: skip
     command = ' '.join(
         f'--{key} {getattr(options, key)}' for key in asked if getattr(options, key)
     )
@@ -444,6 +558,8 @@ def main() -> None:
                 table(HEAD, [r.cells for r in rows]),
                 'Over all truths but the nominal one:',
                 table(ACROSS, across(rows)),
+                'Executed chunks against the futures:',
+                table(WATCHED, watch_rows(options, found, list(pipelines))),
             ]
         ),
         options,

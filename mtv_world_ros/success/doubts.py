@@ -14,7 +14,7 @@ from mtv_world_ros.data_types import FloatArray, SuccessEstimate
 
 #: an object that is nearer to one of its futures went as foreseen [m]: masks of small pictures,
 #: and a future in K, know no better
-_NEAR_M = 0.035
+NEAR_M = 0.035
 #: less movement says nothing of contact [m]
 _MOVES_M = 0.03
 #: share of chunks that end unforeseen where the physics is the fitted one, at most
@@ -52,7 +52,7 @@ class PhysicsWatch:
     def take(self, away_m: float) -> None:
         """Takes how far a chunk's end was from the nearest future [m]; NaN = it tells nothing."""
         if np.isfinite(away_m):
-            self._parted.append(away_m > _NEAR_M)
+            self._parted.append(away_m > NEAR_M)
 
     def forget(self) -> None:
         """Begins anew: another task, or another fit."""

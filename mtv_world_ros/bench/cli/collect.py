@@ -73,7 +73,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--pictures',
         choices=('all', 'first'),
         default='all',
-        help='first: render the first frame only, for fit-contact',
+        help='first: render the first frame only, for foresight alone; fit-contact needs all',
     )
     add_physics(parser)
     parser.add_argument('--seed', type=int, default=0)
