@@ -153,6 +153,8 @@ _WORDS = {
 _USUAL = 1.0
 #: draws of a round, and rounds
 _DRAWS, _ROUNDS = 64, 3
+#: draws that are worth fewer alike ones do not show how uncertain a number is
+_FEW = 5.0
 #: an object this far from where it was foreseen is about as unlikely as it gets [m]; farther ones
 #: may be lost by the masks
 _NEAR_M, _LOST_M = 0.008, 0.1
@@ -349,6 +351,12 @@ def fit_contact(
     )
     for one in found:
         report(str(one))
+    if _worth(weights) < _FEW:
+        report(
+            f'{_worth(weights):.1f} draws decide: these numbers are likely together, but their '
+            'intervals are too narrow; friction and stiffness of fingers and density make up for '
+            'each other'
+        )
     return first.model_copy(update={**values, 'spread': spread}), [table, delay, *found]
 
 
@@ -395,12 +403,17 @@ def _populations(
         weights /= weights.sum()
         mean = weights @ draws
         spread = np.sqrt(weights @ (draws - mean) ** 2)
-        report(f'round {number + 1}: {len(draws)} draws, worth {1 / (weights**2).sum():.1f} alike')
+        report(f'round {number + 1}: {len(draws)} draws, worth {_worth(weights):.1f} alike')
         wide = np.diag(np.maximum(_WIDER * spread, _LEAST) ** 2)
         proposals.append((mean, wide))
         rng = np.random.default_rng((_SEED, number))
         drawn = np.clip(rng.multivariate_normal(mean, wide, _DRAWS), low, high)
     return draws, likelihoods, weights
+
+
+def _worth(weights: FloatArray) -> float:
+    """Number of draws of one weight that would tell as much as these (N,), which sum to 1."""
+    return float(1 / (weights**2).sum())
 
 
 def _settings(first: ContactSettings, logs: FloatArray) -> ContactSettings:

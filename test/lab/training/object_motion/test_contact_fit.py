@@ -84,7 +84,8 @@ def test_the_search_finds_what_made_the_motions(robot, response, settings, recor
     )
     (motion,), _ = tracked.advance(recording.positions)
     made = replace(recording, ways=motion.points - motion.points[0])
-    found, numbers = fit_contact([made] * 4, Arms(robot, response), settings)
+    told = list[str]()
+    found, numbers = fit_contact([made] * 4, Arms(robot, response), settings, report=told.append)
     by_name = {one.name: one for one in numbers}
     # the search begins at 1.6; a block that slips bounds the friction from above
     assert by_name['grip_friction'].value < 0.3
@@ -92,6 +93,11 @@ def test_the_search_finds_what_made_the_motions(robot, response, settings, recor
     assert found.grip_friction == by_name['grip_friction'].value
     assert found.spread.grip == pytest.approx(np.clip(by_name['grip_friction'].spread, 0.1, 0.8))
     assert by_name['grip_friction'].count == 4
+    # four times the same recording: few draws decide, and that is said
+    last = next(line for line in told if line.startswith('round 2'))
+    worth = float(last.split('worth ')[1].split()[0])
+    assert worth < 5 and told[-1].startswith(f'{worth:.1f} draws decide')
+    assert 'too narrow' in told[-1]
 
 
 def test_how_late_commands_arrive_is_found(recording, robot, response):
