@@ -93,11 +93,10 @@ def test_the_search_finds_what_made_the_motions(robot, response, settings, recor
     assert found.grip_friction == by_name['grip_friction'].value
     assert found.spread.grip == pytest.approx(np.clip(by_name['grip_friction'].spread, 0.1, 0.8))
     assert by_name['grip_friction'].count == 4
-    # four times the same recording: few draws decide, and that is said
+    # enough draws are likely that their intervals tell something
     last = next(line for line in told if line.startswith('round 2'))
-    worth = float(last.split('worth ')[1].split()[0])
-    assert worth < 5 and told[-1].startswith(f'{worth:.1f} draws decide')
-    assert 'too narrow' in told[-1]
+    assert float(last.split('worth ')[1].split()[0]) > 5
+    assert 'too narrow' not in ' '.join(told)
 
 
 def test_how_late_commands_arrive_is_found(recording, robot, response):
@@ -172,6 +171,7 @@ def test_how_arms_follow_is_found_where_a_checkpoint_does_not_know(
     assert main(['fit-contact', str(DEMO), '--out', str(tmp_path / 'new')]) == 0
     told = capsys.readouterr().out
     assert 'how 14 joints follow commands was not found' in told and 'one episode' in told
+    assert 'draws decide' in told and 'intervals are too narrow' in told  # of four draws
     assert load_foresight(tmp_path / 'new' / 'object_motion', robot).response is None
 
 
