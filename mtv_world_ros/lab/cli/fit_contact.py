@@ -50,7 +50,6 @@ def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.foresight.arms import Arms
-    from mtv_world_ros.foresight.contact_settings import ContactSettings
     from mtv_world_ros.foresight.loading import (
         CONTACT_FILE,
         load_contact,
@@ -60,6 +59,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     )
     from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.lab.training.object_motion.contact_fit import (
+        first_settings,
         fit_contact,
         read_recordings,
     )
@@ -71,8 +71,9 @@ def _fit(arguments: argparse.Namespace) -> int:
     folder = arguments.checkpoint / OBJECT_MOTION_FOLDER
     check_free(folder / CONTACT_FILE, arguments.overwrite)
     first = load_contact(folder)
-    ContactSettings().replace(num_motions=arguments.motions)  # refused before the work begins
     robot = load_robot(robot_path(arguments.robot))
+    likely = first or first_settings(Arms(robot, None))
+    likely.replace(num_motions=arguments.motions)  # refused before the work begins
     paths = spread(find_episodes(arguments.dataset), arguments.episodes)
     refuse_test_kinds(paths, 'training')
     response = load_response(folder, robot)
