@@ -305,7 +305,8 @@ def _in_processes(
 class WorkerPool(ProcessPoolExecutor):
     """Processes whose `run_job` runs jobs; they end with this process, however that ends.
 
-    One that stands still (SIGSTOP) is killed: the pool breaks, and nobody waits on.
+    One that stands still (SIGSTOP) is killed: the pool breaks, and nobody waits on. So is one that
+    the SIGTERM of a broken pool does not end, e.g. as it was forked with another's handler.
 
     Args:
         make_run: makes what runs a job, once in every process.
@@ -328,12 +329,15 @@ class WorkerPool(ProcessPoolExecutor):
         self._closed.set()
 
     def _kill_still(self) -> None:
-        still = StandStill()
+        still, broken_s = StandStill(), float('inf')
         while not self._closed.wait(_LOOK_S):
-            found = still.find(list(self._processes or ()))
-            if found is not None:
-                with suppress(ProcessLookupError):
-                    os.kill(found, signal.SIGKILL)
+            workers = dict(self._processes or {})
+            found = still.find(workers)
+            if self._broken:
+                broken_s = min(broken_s, time.monotonic())
+            for pid, worker in workers.items():
+                if pid == found or time.monotonic() > broken_s + STILL_S:
+                    worker.kill()
 
 
 @contextmanager

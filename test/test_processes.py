@@ -8,7 +8,8 @@ import time
 
 import pytest
 
-from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.errors import MtvWorldError, TrainingError
+from mtv_world_ros.lab.training.clips.batches import ClipWorkers
 from mtv_world_ros.processes import run_all, StandStill, STILL_S, stop_process
 
 
@@ -58,3 +59,20 @@ def test_a_stopped_worker_is_an_error_within_seconds():
     with pytest.raises(MtvWorldError, match='2 workers died'):
         list(run_all([1, 2, 3, 4], StopsItself(), 2))
     assert time.monotonic() - begin_s < 60.0
+
+
+def test_forked_workers_that_note_sigterm_as_training_does_end_with_a_broken_pool():
+    before = signal.signal(signal.SIGTERM, lambda *_: None)
+    workers = ClipWorkers(lambda step, number: os.getpid(), 2)
+    try:
+        (pid, _) = workers.clips(0, (0, 1))
+        os.kill(pid, signal.SIGKILL)
+        with pytest.raises(TrainingError, match='was killed at step 1'):
+            for _ in range(100):
+                workers.clips(1, (0, 1))
+                time.sleep(0.01)
+    finally:
+        begin_s = time.monotonic()
+        workers.close()
+        signal.signal(signal.SIGTERM, before)
+    assert time.monotonic() - begin_s < 4 * STILL_S

@@ -28,6 +28,8 @@ COUNTS = (0, 1, 2, 35, 36, 72, 96, 97, 1000, 65_535, 2**31 - 1, 2**32 - 1)
 WORDS = ('', 'rgb8', 'bgr8', 'mono8', 'rgba8', 'bgra8', '16UC1', '32FC1', 'bayer_rggb8', 'yuv422',
          'jpeg', 'png', 'plumb_bob', 'equidistant', 'rational_polynomial', 'left_joint1',
          'left_gripper', '\N{SNOWMAN}' * 9, 'x' * 20_000, '../../x', '%s%n')  # fmt: skip
+#: of a list that was changed
+MOST_ITEMS = 30_000
 NOW_NS = 1_000_000_000_000
 
 
@@ -81,7 +83,9 @@ def changed_list(rng: np.random.Generator, values: list[Any], new: Callable[[], 
         elif how == 4:
             out = [out[k] for k in rng.permutation(len(out))]
         else:
-            out = (out * int(rng.choice([0, 2, 2, 300])))[:30_000]
+            times = int(rng.choice([0, 2, 2, 300]))
+            # no more copies than are kept: 300 of a list that is long already take 72 MB
+            out = (out * min(times, MOST_ITEMS // max(len(out), 1) + 1))[:MOST_ITEMS]
     return out
 
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import resource
+import tracemalloc
 
 from accidents import ACCIDENTS
 from file_kinds import Kind, KINDS
 import fuzz
+import node_messages
+import numpy as np
 import pytest
 
 from mtv_world_ros.errors import MtvWorldError
@@ -51,6 +54,21 @@ def test_an_error_that_is_not_ours_and_a_slow_case_are_failures(tmp_path) -> Non
     assert 'KeyError' in fuzz.attempt(kind, b'x', tmp_path)[0]
     slow = Kind(lambda: [b'x'], lambda data, folder: sum(range(10**6)), most_s=0.0)
     assert 'took' in fuzz.attempt(slow, b'x', tmp_path)[0]
+
+
+def test_a_list_that_is_made_longer_takes_no_more_than_is_kept_of_it() -> None:
+    values = [0.0] * 30_000
+    tracemalloc.start()
+    try:
+        lengths = [
+            len(node_messages.changed_list(np.random.default_rng(seed), values, lambda: 1.0))
+            for seed in range(40)
+        ]
+        peak_mb = tracemalloc.get_traced_memory()[1] / 2**20
+    finally:
+        tracemalloc.stop()
+    assert max(lengths) >= 30_000
+    assert peak_mb < 5  # 300 copies before the cut: 69 MB
 
 
 def _die(data, folder):
