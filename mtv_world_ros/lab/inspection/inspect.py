@@ -86,8 +86,8 @@ _LAG_GAIN_OF_A_FRAME = 0.1
 _MIRRORED = 'the drawn robot moves like the mirrored image: the camera mirrors its images'
 _SWAPPED = "fingers move like those of '{}' with open and closed swapped"
 _MIRRORED_GAIN = 0.02
-#: the same of what a gripper moves: on ten real recordings, two views each, right ones lost .067
-#: to .210, and swapped ones gain as much
+#: the same of what a gripper moves: on ten real recordings, two views each, right ones lost .073
+#: to .229, and swapped ones gain as much
 _SWAPPED_GAIN = 0.04
 _ALONE = ResidualSearch(lags_s=(0.0,), rolls_deg=(), zooms=())
 
