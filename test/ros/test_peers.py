@@ -72,9 +72,7 @@ def test_a_lost_answer_is_asked_for_again(soon, lost):
 
 def test_nobody_answers(soon):
     _, ask = _ask(1000)
-    with pytest.raises(
-        ConfigError, match="vain for an answer of service 'recorder/begin'"
-    ):
+    with pytest.raises(ConfigError, match="vain for an answer of service 'recorder/begin'"):
         ask()
 
 
