@@ -362,7 +362,8 @@ def _start_worker(make_run: Callable[[], Run], threads: int, parent: int) -> Non
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     import cv2
 
-    cv2.setNumThreads(threads)
+    # 1 would wait for threads that a fork left behind; 0 is one thread, too
+    cv2.setNumThreads(threads if threads > 1 else 0)
     try:
         _run = make_run()
     except MtvWorldError as error:

@@ -76,3 +76,24 @@ def test_forked_workers_that_note_sigterm_as_training_does_end_with_a_broken_poo
         workers.close()
         signal.signal(signal.SIGTERM, before)
     assert time.monotonic() - begin_s < 4 * STILL_S
+
+
+#: the pool of OpenCV's threads has been used before clips are made
+AFTER_OPENCV = """
+import os, time, cv2, numpy as np
+from mtv_world_ros.lab.training.clips.batches import ClipWorkers
+cv2.setNumThreads(3)
+image, grid = np.zeros((600, 600), np.uint8), np.zeros((600, 600), np.float32)
+tasks = len(os.listdir('/proc/self/task'))
+cv2.remap(image, grid, grid, cv2.INTER_LINEAR)
+assert len(os.listdir('/proc/self/task')) > tasks, 'OpenCV has no pool here'
+time.sleep(0.5)  # its threads wait
+workers = ClipWorkers(lambda step, number: cv2.remap(image, grid, grid, 1).sum(), 2)
+assert workers.clips(0, (0, 1)) == [0, 0]
+workers.close()
+"""
+
+
+def test_forked_workers_begin_after_opencv_had_threads():
+    """Its pool does not survive the fork: whoever waits for its threads waits for ever."""
+    subprocess.run([sys.executable, '-c', AFTER_OPENCV], check=True, timeout=60)
