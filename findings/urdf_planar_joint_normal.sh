@@ -10,8 +10,8 @@ set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT
 python3 -m venv "$place/env"
-"$place/env/bin/pip" install -q --disable-pip-version-check \
-    urchin==0.0.30 yourdfpy==0.0.60 mujoco==4.0.0 pin==4.1.0 numpy==2.4.6
+"$place/env/bin/pip" install -q --disable-pip-version-check urchin==0.0.30 \
+    yourdfpy==0.0.60 mujoco==4.0.0 pin==4.1.0 numpy==2.4.6
 cd "$place"
 "$place/env/bin/python" - <<'PYTHON'
 import mujoco

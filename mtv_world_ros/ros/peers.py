@@ -92,11 +92,15 @@ class Peers:
         self.wait(client.service_is_ready, f"service '{name}'; is its node running?", wait_s)
         asked: list[tuple[float, Future]] = []
 
-        def is_answered() -> bool:
+        def is_due() -> bool:
+            silent_s = time.monotonic() - asked[-1][0] if asked else float('inf')
+            if silent_s > _LOST_ANSWER_S:
+                return True
             # the graph shows a killed node for a while: it may have been the one that was asked
-            is_twice = self._node.count_services(client.srv_name) > 1
-            silence_s = _ASK_AGAIN_S if is_twice else _LOST_ANSWER_S
-            if not asked or time.monotonic() > asked[-1][0] + silence_s:
+            return silent_s > _ASK_AGAIN_S and self._node.count_services(client.srv_name) > 1
+
+        def is_answered() -> bool:
+            if is_due():
                 asked.append((time.monotonic(), client.call_async(request)))
             return any(future.done() for _, future in asked)
 

@@ -1,11 +1,12 @@
-"""`mtv-world recover`, `import-bag`, `import-dataset` and `export-dataset`."""
+"""`mtv-world recover`, `import-bag`, `import-videos`, `import-dataset` and `export-dataset`."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import add_options
 from mtv_world_ros.errors import ConfigError, EpisodeError
@@ -13,6 +14,7 @@ from mtv_world_ros.errors import ConfigError, EpisodeError
 if TYPE_CHECKING:
     from mtv_world_ros.data.bag.recover import Recovered
     from mtv_world_ros.data.bag_mapping import BagMapping
+    from mtv_world_ros.lab.importing.convert import ImportSummary
     from mtv_world_ros.lab.importing.stored_objects import ObjectStage
 
 
@@ -154,13 +156,19 @@ def _import_bag(arguments: argparse.Namespace) -> int:
     for bag in summary.made:
         place = arguments.out / episode_name(bag)
         print(summary_line(place, objects=bool(arguments.segmenter)))
-    for bag, lines in summary.warnings.items():
-        for line in lines:
-            print(f'{bag}: {line}', file=sys.stderr)
-    print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
-    for bag, reason in summary.failed.items():
-        print(f'{bag}: {reason}', file=sys.stderr)
+    status = _import_status(summary, str)
     print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
+    return status
+
+
+def _import_status(summary: ImportSummary[Any], name: Callable[[Any], str]) -> int:
+    """Prints what came of an import, with the names of its recordings; returns the exit status."""
+    for one, lines in summary.warnings.items():
+        for line in lines:
+            print(f'{name(one)}: {line}', file=sys.stderr)
+    print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
+    for one, reason in summary.failed.items():
+        print(f'{name(one)}: {reason}', file=sys.stderr)
     return 1 if summary.failed else 0
 
 
@@ -218,14 +226,9 @@ def _import_videos(arguments: argparse.Namespace) -> int:
     )
     for one in summary.made:
         print(summary_line(arguments.out / one.name, objects=bool(arguments.segmenter)))
-    for one, lines in summary.warnings.items():
-        for line in lines:
-            print(f'{one.name}: {line}', file=sys.stderr)
-    print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
-    for one, reason in summary.failed.items():
-        print(f'{one.name}: {reason}', file=sys.stderr)
+    status = _import_status(summary, lambda one: one.name)
     print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
-    return 1 if summary.failed else 0
+    return status
 
 
 def _add_import_dataset(commands: argparse._SubParsersAction) -> None:
@@ -266,15 +269,10 @@ def _import_dataset(arguments: argparse.Namespace) -> int:
         stage=_object_stage(arguments),
         progress=lambda numbers: tqdm(numbers, unit='ep', disable=None),
     )
-    for number, lines in summary.warnings.items():
-        for line in lines:
-            print(f'episode {number}: {line}', file=sys.stderr)
-    print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
-    for number, reason in summary.failed.items():
-        print(f'episode {number}: {reason}', file=sys.stderr)
+    status = _import_status(summary, 'episode {}'.format)
     if summary.made or summary.kept:
         print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
-    return 1 if summary.failed else 0
+    return status
 
 
 def _guessed_mapping(arguments: argparse.Namespace) -> Path:

@@ -72,13 +72,14 @@ def _fit(arguments: argparse.Namespace) -> int:
     check_free(folder / CONTACT_FILE, arguments.overwrite)
     first = load_contact(folder)
     robot = load_robot(robot_path(arguments.robot))
-    likely = first or first_settings(Arms(robot, None))
+    unfitted = Arms(robot, None)
+    likely = first or first_settings(unfitted)
     likely.replace(num_motions=arguments.motions)  # refused before the work begins
     paths = spread(find_episodes(arguments.dataset), arguments.episodes)
     refuse_test_kinds(paths, 'training')
     response = load_response(folder, robot)
     if response is None:
-        response, report = found_response(paths, Arms(robot, None).robot)
+        response, report = found_response(paths, unfitted.robot)
         print(report)
     arms = Arms(robot, response)
     for note in arms.notes:
