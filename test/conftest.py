@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from importlib.util import find_spec
 import os
 from pathlib import Path
 import shutil
+import sys
 
 import pytest
 
@@ -49,6 +51,14 @@ OBSTACLES = {
     'native_ros': _no_native_ros,
     'control_msgs': _no_control_msgs,
 }
+
+
+@pytest.fixture(autouse=True, scope='module')
+def _no_context_left_open() -> Iterator[None]:
+    """A file's tests end the default ROS context that they began: the next ones begin theirs."""
+    yield
+    rclpy = sys.modules.get('rclpy')
+    assert rclpy is None or not rclpy.ok(), 'rclpy.shutdown() is missing'
 
 
 @pytest.fixture(scope='session')

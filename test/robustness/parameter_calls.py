@@ -71,6 +71,17 @@ def _node(name: str) -> Any:
     return node
 
 
+def close() -> None:
+    """Ends the nodes, and the default context with them: whoever comes next may begin one."""
+    import rclpy
+
+    if _node.cache_info().currsize:
+        for name in NODES:
+            _node(name).destroy_node()
+        _node.cache_clear()
+        rclpy.try_shutdown()
+
+
 def _value(rng: np.random.Generator) -> Any:
     """A `ParameterValue` of any type, right or wrong."""
     from rcl_interfaces.msg import ParameterValue

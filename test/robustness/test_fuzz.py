@@ -11,6 +11,7 @@ from file_kinds import Kind, KINDS
 import fuzz
 import node_messages
 import numpy as np
+import parameter_calls
 import pytest
 
 from mtv_world_ros.errors import MtvWorldError
@@ -19,6 +20,12 @@ SEED = 20261122
 COUNT = 40
 #: more memory than an accident may take [MB]
 MOST_MB = 300
+
+
+@pytest.fixture(autouse=True, scope='module')
+def _nodes_end():
+    yield
+    parameter_calls.close()
 
 
 @pytest.mark.parametrize('name', KINDS)
