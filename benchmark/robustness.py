@@ -3,6 +3,7 @@
     make fuzz kills soak attacks
     python benchmark/robustness.py out/fuzz.json out/kills/kills.json --soak out/soak --out DIR
         --rate out/rate --cycles out/cycles --worlds out/odd_worlds --servers out/servers.json
+        --interrupts out/interrupts/interrupts.json
 
 Rows of one kind in several files are added up. Beside the page stand the plots of soak and cycles.
 `--before` and the like take the same of an earlier commit, for a table beside.
@@ -72,11 +73,15 @@ def soak_text(folder: Path) -> str:
 def plans_table(folders: list[Path]) -> str:
     """What became of plans at a rate, a row a run."""
     keys = ('model', 'commit', 'plans', 'without_end', 'several_ends', 'late', 'median_s', 'p95_s',
-            'p99_s', 'worst_s', 'load', 'tracebacks', 'memory_growth_mb_per_1000')  # fmt: skip
+            'p99_s', 'worst_s', 'stopped_answers', 'stopped_worst_s', 'worst_by_end_s',
+            'worst_on_quiet_cores_s', 'load', 'tracebacks',
+            'memory_growth_mb_per_1000')  # fmt: skip
     rows = [json.loads((folder / 'rate.json').read_text()) for folder in folders]
     return table(
         ('model', 'commit', 'plans', 'no end', 'several ends', 'late', 'median [s]', '95 % [s]',
-         '99 % [s]', 'worst [s]', 'load', 'tracebacks', 'memory [MB for 1,000]'),
+         '99 % [s]', 'worst [s]', 'through a stop', 'worst of these, net [s]', 'worst by end [s]',
+         'worst without waiting for a processor [s]', 'load', 'tracebacks',
+         'memory [MB for 1,000]'),
         [[_cell(row.get(key, '–')) for key in keys] for row in rows],
     )  # fmt: skip
 
@@ -128,6 +133,16 @@ def children_table(folders: list[Path]) -> str:
     )
 
 
+def interrupts_table(file: Path) -> str:
+    """How commands that were interrupted ended, a row a command."""
+    keys = ('kind', 'commit', 'tried', 'stopped', 'done', 'worst_s', 'failures')
+    return table(
+        ('command', 'commit', 'tried', 'stopped, whole when run again', 'done before',
+         'worst [s]', 'failed'),
+        [[_cell(row[key]) for key in keys] for row in json.loads(file.read_text())],
+    )  # fmt: skip
+
+
 def _cell(value: Any) -> str:
     if isinstance(value, dict):
         return ', '.join(f'{key} {count}' for key, count in value.items())
@@ -151,12 +166,14 @@ def attacks_text(options: argparse.Namespace) -> list[str]:
             name = f'robustness_cycles_{options.machine}.png'
             shutil.copy(options.cycles[-1] / 'cycles.png', options.out / name)
             body.append(f'![Memory, processes and descriptors over cycles]({name})')
-    if options.worlds:
-        body += ['## Odd worlds', worlds_table(options.worlds)]
-    if options.children:
-        body += ['## Children that are stopped or killed', children_table(options.children)]
-    if options.servers:
-        body += ['## Policy servers that misbehave', servers_table(options.servers)]
+    for title, given, make in (
+        ('Odd worlds', options.worlds, worlds_table),
+        ('Children that are stopped or killed', options.children, children_table),
+        ('Commands that are interrupted', options.interrupts, interrupts_table),
+        ('Policy servers that misbehave', options.servers, servers_table),
+    ):
+        if given:
+            body += [f'## {title}', make(given)]
     return body
 
 
@@ -173,6 +190,7 @@ def main() -> None:
         parser.add_argument('--cycles', **several, help='folders of cycles.py, likewise')
         parser.add_argument('--worlds', type=Path, help='folder of odd_worlds.py')
         parser.add_argument('--children', **several, help='folders of children.py')
+        parser.add_argument('--interrupts', type=Path, help='what interrupts.py wrote')
         parser.add_argument('--servers', type=Path, help='what policy_servers.py wrote')
 
     options = parse_arguments(__doc__, 1, more)

@@ -25,6 +25,8 @@ MOST_MB, MOST_DESCRIPTORS = 0.3, 0.02
 WARM = 0.3
 #: cycles in which a plan is imagined
 PLAN_EVERY = 3
+#: cycles between two writings of the table, so that a run that is cut off shows what it did
+WRITE_EVERY = 10
 #: a busy machine takes long to load a model [s]
 PATIENCE_S = 180.0
 NODE = ('-m', 'mtv_world_ros.ros.world_model.node')
@@ -98,6 +100,8 @@ class Cycles:
                 self._imagine(number)
             row = {'cycle': number, **usage(self.process.process.pid), 'seconds': seconds}
             self.rows.append(row)
+            if number % WRITE_EVERY == 0:
+                self.write()
 
     def _change(self, transition: int) -> bool:
         from lifecycle_msgs.msg import Transition
@@ -154,12 +158,11 @@ class Cycles:
         }
 
     def write(self) -> None:
-        """Writes the table and the plot."""
+        """Writes the table."""
         with (self.out / 'cycles.csv').open('w', newline='') as file:
             writer = csv.DictWriter(file, self.rows[0])
             writer.writeheader()
             writer.writerows(self.rows)
-        plot(self.rows, self.out / 'cycles.png')
 
     def close(self) -> None:
         """Ends both."""
@@ -197,6 +200,7 @@ def main() -> int:
     try:
         cycles.run(arguments.cases, arguments.seconds)
         cycles.write()
+        plot(cycles.rows, arguments.out / 'cycles.png')
         found = cycles.summary()
     finally:
         cycles.close()

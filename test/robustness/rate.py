@@ -2,26 +2,31 @@
 
 Plans are told apart by their stamps. Between bursts a plan goes out every `1 / --rate` seconds,
 and at times the node is stopped for a second (SIGSTOP), as a busy machine does to it: what
-arrives meanwhile waits, and nothing of it may be lost. Prints a row; the exit status is 1 if one
-got no end, more than one, or one too late, or if the log has a traceback.
+arrives meanwhile waits, and nothing of it may be lost. That time is no answer time of the node: it
+is taken off, and plans that waited through a stop are counted apart. How long the node waited for
+a processor that others had is counted, too. Prints a row; the exit status is 1 if one got no end,
+more than one, or one too late, or if the log has a traceback.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+import csv
 import json
 import os
 from pathlib import Path
 import signal
 import sys
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from node_messages import commit, ROOT, ros
 import numpy as np
 
-from mtv_world_ros.ros.messages.conversions import values_of
+from mtv_world_ros.ros.messages.conversions import NANO, to_ns, values_of
 
 #: an end that comes later than this after its plan is late, on a machine that is not busy [s]
 LATE_S = 2.0
@@ -34,9 +39,41 @@ PATIENCE_S = 180.0
 #: by then the node's buffers are full: it keeps 256 frames of a view, of which one comes with
 #: every tenth plan, and the bundled model's take 10 MB
 BUFFERS_FULL = 3000
+#: samples from then on, one with every tenth plan, that a line is fitted to
+LEAST_SAMPLES = 100
 PLANS, REPORT = '/joint_trajectory', '/world_model/report'
 #: what a plan is given to be answered with the bundled model
 NODE = ('-m', 'mtv_world_ros.ros.world_model.node')
+
+
+class Ended(NamedTuple):
+    """The end of a plan.
+
+    Attributes:
+        sent_s: when the plan was sent [s], of `time.monotonic`.
+        waited_s: from then until the end arrived here [s].
+        stopped_s: how long of it the node was stopped [s].
+        starved_s: how long of it a thread of the node waited for a processor at most [s].
+        node_s: until the node said so, by its stamp [s]; the rest is the way back.
+        state: of the report.
+    """
+
+    sent_s: float
+    waited_s: float
+    stopped_s: float
+    starved_s: float
+    node_s: float
+    state: str
+
+    @property
+    def net_s(self) -> float:
+        """How long the node, if it was not stopped, and the way there and back took [s]."""
+        return self.waited_s - self.stopped_s
+
+    @property
+    def quiet_s(self) -> float:
+        """What it would have taken, about, had a processor been free whenever one was needed."""
+        return max(self.net_s - self.starved_s, 0.0)
 
 
 class Rate:
@@ -44,9 +81,10 @@ class Rate:
 
     def __init__(self, out: Path, *, bundled: bool) -> None:
         self.out, self.bundled = out, bundled
-        self.sent: dict[int, float] = {}
+        self.sent: dict[int, tuple[float, dict[str, float]]] = {}
         self.ends: Counter[int] = Counter()
-        self.latencies: list[float] = []
+        self.ended: list[Ended] = []
+        self.stops: list[tuple[float, float]] = []
         self.memory: list[tuple[int, float]] = []
         program = {'program': NODE} if bundled else {}
         values = ('pace:=burst', 'max_horizon_s:=60.0', 'max_trajectory_age_s:=60.0')
@@ -65,9 +103,10 @@ class Rate:
 
     def send(self) -> None:
         """Sends a plan of its own stamp."""
+        starved = starved_s(self.process.process.pid)
         stamp_ns = self.client.now_ns()
         self.plans.publish(ros().make_trajectory(stamp_ns=stamp_ns))
-        self.sent[stamp_ns] = time.monotonic()
+        self.sent[stamp_ns] = (time.monotonic(), starved)
 
     def spin(self, seconds: float) -> None:
         """Takes what the node says for so long."""
@@ -85,7 +124,14 @@ class Rate:
             if values['state'] in ros().ENDS:
                 stamp_ns = int(values['trajectory_stamp_ns'])
                 self.ends[stamp_ns] += 1
-                self.latencies.append(now_s - self.sent.get(stamp_ns, now_s))
+                node_s = (to_ns(report.header.stamp) - stamp_ns) / NANO
+                sent_s, before = self.sent.get(stamp_ns, (now_s, {}))
+                waits = starved_s(self.process.process.pid)
+                starved = max((s - before.get(t, 0.0) for t, s in waits.items()), default=0.0)
+                stopped_s = sum(overlap_s((sent_s, now_s), stop) for stop in self.stops)
+                self.ended.append(
+                    Ended(sent_s, now_s - sent_s, stopped_s, starved, node_s, values['state'])
+                )
 
     def run(self, count: int, rate_hz: float) -> None:
         """Sends so many plans."""
@@ -93,6 +139,7 @@ class Rate:
         while len(self.sent) < count and self.process.process.poll() is None:
             number = len(self.sent)
             stops = number and number % STOP_EVERY < (BURST if number % BURST_EVERY == 0 else 1)
+            stop_s = time.monotonic()
             if stops:
                 self.process.process.send_signal(signal.SIGSTOP)
             for _ in range(BURST if number % BURST_EVERY == 0 else 1):
@@ -100,6 +147,7 @@ class Rate:
             if stops:
                 time.sleep(STOP_S)
                 self.process.process.send_signal(signal.SIGCONT)
+                self.stops.append((stop_s, time.monotonic()))
                 begin_s += STOP_S
             if number % 10 == 0:
                 self.client.send_scene()
@@ -114,9 +162,7 @@ class Rate:
     def row(self) -> dict[str, Any]:
         """What became of the plans."""
         log = self.process.output()
-        kept = [row for row in self.memory if row[0] >= BUFFERS_FULL] or [(0, 0.0)]
-        number, megabytes = np.array(kept).T
-        grown = np.polyfit(number, megabytes, 1)[0] * 1000 if len(kept) > 100 else float('nan')
+        waited = [one for one in self.ended if one.stopped_s]
         return {
             'model': 'bundled' if self.bundled else 'small',
             'commit': commit(),
@@ -124,21 +170,65 @@ class Rate:
             'without_end': len(set(self.sent) - set(self.ends)),
             'several_ends': sum(count > 1 for count in self.ends.values()),
             'unknown_ends': len(set(self.ends) - set(self.sent)),
-            'late': sum(latency > LATE_S + STOP_S for latency in self.latencies),
-            'median_s': float(np.median(self.latencies)) if self.latencies else None,
-            'worst_s': max(self.latencies, default=None),
-            'p95_s': float(np.quantile(self.latencies, 0.95)) if self.latencies else None,
-            'p99_s': float(np.quantile(self.latencies, 0.99)) if self.latencies else None,
+            'late': sum(one.net_s > LATE_S for one in self.ended),
+            'late_on_quiet_cores': sum(one.quiet_s > LATE_S for one in self.ended),
+            'stops': len(self.stops),
+            **answer_times([one for one in self.ended if not one.stopped_s], ''),
+            **answer_times(waited, 'stopped_'),
+            'worst_by_end_s': {
+                state: round(max(one.net_s for one in self.ended if one.state == state), 2)
+                for state in sorted({one.state for one in self.ended})
+            },
+            'worst_on_quiet_cores_s': max((one.quiet_s for one in self.ended), default=None),
             'load': os.getloadavg()[0],
-            'memory_growth_mb_per_1000': float(grown),
+            'memory_growth_mb_per_1000': growth(self.memory),
             'tracebacks': log.count('Traceback'),
             'died': self.process.process.poll() is not None,
         }
+
+    def write(self) -> None:
+        """Writes when each end came, and the memory over plans."""
+        for name, head, rows in (
+            ('ends.csv', Ended._fields, self.ended),
+            ('memory.csv', ('plan', 'memory_mb'), self.memory),
+        ):
+            with (self.out / name).open('w', newline='') as file:
+                csv.writer(file).writerows([head, *rows])
 
     def close(self) -> None:
         """Ends both."""
         self.process.stop()
         self.client.close()
+
+
+def overlap_s(one: tuple[float, float], other: tuple[float, float]) -> float:
+    """How long both last [s], each from a begin to an end."""
+    return max(min(one[1], other[1]) - max(one[0], other[0]), 0.0)
+
+
+def answer_times(ended: Sequence[Ended], name: str) -> dict[str, Any]:
+    """How many there are, and how long they waited net of stops of the node [s]."""
+    seconds = [one.net_s for one in ended]
+    shares = {'median_s': 0.5, 'p95_s': 0.95, 'p99_s': 0.99, 'worst_s': 1.0}
+    times = {key: float(np.quantile(seconds, q)) if seconds else None for key, q in shares.items()}
+    return {f'{name}{key}': value for key, value in {'answers': len(seconds), **times}.items()}
+
+
+def growth(memory: Sequence[tuple[int, float]]) -> float | str:
+    """Growth for 1,000 plans once buffers are full [MB], or why it was not measured."""
+    kept = [row for row in memory if row[0] >= BUFFERS_FULL]
+    if len(kept) < LEAST_SAMPLES:
+        return f'not measured: {memory[-1][0] if memory else 0} plans'
+    return float(np.polyfit(*np.array(kept).T, 1)[0]) * 1000
+
+
+def starved_s(pid: int) -> dict[str, float]:
+    """How long each thread of a process has waited for a processor so far [s]."""
+    waits = {}
+    for file in Path(f'/proc/{pid}/task').glob('*/schedstat'):
+        with suppress(OSError):  # it ended
+            waits[file.parent.name] = int(file.read_text().split()[1]) / NANO
+    return waits
 
 
 def _megabytes(pid: int) -> float:
@@ -161,6 +251,7 @@ def main() -> int:
     try:
         rate.run(arguments.cases, arguments.rate)
         row = rate.row()
+        rate.write()
     finally:
         rate.close()
     sys.stdout.write(json.dumps(row, indent=1) + '\n')
