@@ -52,14 +52,15 @@ kills: $(STAMP)  ## kill nodes, recorder and player at random moments (an hour);
 soak: $(STAMP)  ## 10,000 rollouts with faults (an hour); memory, threads, latency under out/soak/
 	$(BIN)/python test/robustness/soak.py
 
-attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy servers, stopped children, hostile paths (two hours)
+attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, hostile paths (three hours)
 	@mkdir -p out
 	$(BIN)/python test/robustness/rate.py
 	$(BIN)/python test/robustness/cycles.py --bundled
 	$(BIN)/python test/robustness/odd_worlds.py
 	$(BIN)/python test/robustness/policy_servers.py --json out/servers.json
 	$(BIN)/python test/robustness/children.py
-	MTV_WORLD_ATTACKS=all $(BIN)/python -m pytest -q test/robustness/test_commands.py
+	$(BIN)/python test/robustness/interrupts.py
+	MTV_WORLD_ATTACKS=all $(BIN)/python -m pytest -q test/robustness/test_commands.py test/robustness/test_examples.py
 
 format: $(STAMP)  ## sort imports and format the code
 	$(BIN)/ruff check --fix .

@@ -183,7 +183,7 @@ def write_whole(path: Path, content: bytes | str) -> None:
     try:
         beside.write_bytes(data)
         beside.replace(path)
-    except OSError:
+    except BaseException:  # a signal, too
         beside.unlink(missing_ok=True)
         raise
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import as_completed, ProcessPoolExecutor
+from concurrent.futures import as_completed, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import partial
 import importlib
 import multiprocessing
+from multiprocessing import resource_tracker
 import os
 from pathlib import Path
 import random
@@ -114,7 +115,7 @@ def stopped_by_sigterm() -> Iterator[None]:
         yield
         return
 
-    timer = threading.Timer(_TIDY_S, os._exit, (128 + signal.SIGTERM,))
+    timer = threading.Timer(_TIDY_S, _give_up_tidying)
     timer.daemon = True
 
     def stop(signum: int, _: FrameType | None) -> None:
@@ -129,6 +130,12 @@ def stopped_by_sigterm() -> Iterator[None]:
         timer.cancel()
         if signal.getsignal(signal.SIGTERM) is stop:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _give_up_tidying() -> None:
+    text = f'mtv-world: stopped (SIGTERM); it was not tidied up within {_TIDY_S:g} s\n'
+    os.write(2, text.encode())
+    os._exit(128 + signal.SIGTERM)
 
 
 def private_domain() -> dict[str, str]:
@@ -292,6 +299,9 @@ def _in_processes(
             futures = {pool.submit(run_job, job): job for job in jobs}
         for future in as_completed(futures):
             yield futures[future], future.result()
+    except (KeyboardInterrupt, GeneratorExit):
+        pool.kill()  # a job may take minutes; what is half done is done again
+        raise
     except BrokenProcessPool as error:
         raise MtvWorldError(
             f'one of {workers} workers died, most likely of lack of memory (one that is stopped '
@@ -322,6 +332,20 @@ class WorkerPool(ProcessPoolExecutor):
         super().__init__(workers, multiprocessing.get_context(method), _start_worker, arguments)
         self._closed = threading.Event()
         threading.Thread(target=self._kill_still, daemon=True).start()
+
+    def submit(self, *job: Any, **options: Any) -> Future[Any]:
+        """Starts processes; none of them gets a Ctrl-C that it does not ignore yet."""
+        resource_tracker.ensure_running()  # which lets SIGINT through
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return super().submit(*job, **options)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    def kill(self) -> None:
+        """Ends the processes in the middle of a job."""
+        for worker in list((self._processes or {}).values()):
+            worker.kill()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Ends the processes."""
@@ -359,6 +383,7 @@ def _start_worker(make_run: Callable[[], Run], threads: int, parent: int) -> Non
     """Prepares a worker; an error is raised by every job."""
     global _run
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops the pool
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     import cv2
 

@@ -1,29 +1,26 @@
 """Processes that stand still are found and ended."""
 
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
+from worker_jobs import LongJobs, make_held_back, make_stopping
 
 from mtv_world_ros.errors import MtvWorldError, TrainingError
 from mtv_world_ros.lab.training.clips.batches import ClipWorkers
-from mtv_world_ros.processes import run_all, StandStill, STILL_S, stop_process
-
-
-class StopsItself:
-    """A job that stops the process it runs in; travels to workers by its module's name."""
-
-    def __call__(self):
-        return stop_on_three
-
-
-def stop_on_three(number):
-    if number == 3:
-        os.kill(os.getpid(), signal.SIGSTOP)
-    return number
+from mtv_world_ros.processes import (
+    run_all,
+    run_job,
+    StandStill,
+    STILL_S,
+    stop_process,
+    WorkerPool,
+)
 
 
 @pytest.fixture
@@ -55,9 +52,12 @@ def test_one_that_stands_still_hears_that_it_is_to_end(child):
 
 
 def test_a_stopped_worker_is_an_error_within_seconds():
-    begin_s = time.monotonic()
+    begin_s, done = time.monotonic(), []
     with pytest.raises(MtvWorldError, match='2 workers died'):
-        list(run_all([1, 2, 3, 4], StopsItself(), 2))
+        for number, result in run_all([1, 2, 3, 4], make_stopping, 2):
+            assert number == result
+            done.append(number)
+    assert done and 3 not in done
     assert time.monotonic() - begin_s < 60.0
 
 
@@ -97,3 +97,39 @@ workers.close()
 def test_forked_workers_begin_after_opencv_had_threads():
     """Its pool does not survive the fork: whoever waits for its threads waits for ever."""
     subprocess.run([sys.executable, '-c', AFTER_OPENCV], check=True, timeout=60)
+
+
+def test_an_interrupted_command_does_not_wait_for_the_jobs_of_its_workers(tmp_path):
+    def interrupt():
+        while not list(tmp_path.iterdir()):
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    threading.Thread(target=interrupt, daemon=True).start()
+    begin_s = time.monotonic()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            list(run_all([1, 2, 3], LongJobs(tmp_path), 2))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert time.monotonic() - begin_s < 45.0  # of a busy machine; a job takes 60
+    assert not [pid for pid in tmp_path.iterdir() if is_alive(pid.name)]
+
+
+def is_alive(pid):
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.parametrize('method', ['spawn', 'fork'])
+def test_a_worker_neither_gets_nor_holds_back_the_ctrl_c_of_a_terminal(method):
+    pool = WorkerPool(make_held_back, 1, method=method)
+    try:
+        found = pool.submit(run_job).result(60)
+    finally:
+        pool.shutdown()
+    assert found == (False, True)
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
