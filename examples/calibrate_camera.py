@@ -13,7 +13,7 @@ from pathlib import Path
 
 from mtv_world_ros import read_episode
 from mtv_world_ros.assembly import robot_path
-from mtv_world_ros.files import share_path
+from mtv_world_ros.files import check_free, share_path
 from mtv_world_ros.geometry.calibration_file import save_calibration
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.shape import load_shape
@@ -28,8 +28,10 @@ parser.add_argument(
 parser.add_argument('--view', default='low')
 parser.add_argument('--robot', default='yam_bimanual')
 parser.add_argument('--out', type=Path, default=Path('out/examples/camera.yaml'))
+parser.add_argument('--overwrite', action='store_true', help='replace what is there')
 options = parser.parse_args()
 
+check_free(options.out, options.overwrite)
 robot = load_robot(robot_path(options.robot))
 episode = read_episode(options.episode, views=(options.view,))
 recorded = episode.cameras[options.view]

@@ -21,6 +21,7 @@ from mtv_world_ros.geometry.robot.file import load_robot
 
 parser = argparse.ArgumentParser()
 parser.add_argument('--out', type=Path, default=Path('out/examples/episode'))
+parser.add_argument('--overwrite', action='store_true', help='replace what is there')
 options = parser.parse_args()
 
 robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
@@ -39,7 +40,7 @@ with EpisodeWriter(
     robot=robot.name,
     cameras=tuple(cameras.values()),
     objects=('red block', 'blue block'),
-    overwrite=True,
+    overwrite=options.overwrite,
 ) as writer:
     start_ns = 1_700_000_000_000_000_000
     writer.write_instruction(start_ns)

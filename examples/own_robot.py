@@ -15,7 +15,7 @@ import shutil
 import numpy as np
 import yaml
 
-from mtv_world_ros.files import share_path
+from mtv_world_ros.files import check_free, share_path
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.guess import guess_robot
 
@@ -24,8 +24,10 @@ parser.add_argument(
     'urdf', type=Path, nargs='?', default=share_path('config', 'robots', 'franka.urdf')
 )
 parser.add_argument('--out', type=Path, default=Path('out/examples/robot'))
+parser.add_argument('--overwrite', action='store_true', help='replace what is there')
 options = parser.parse_args()
 
+check_free(options.out, options.overwrite)
 guessed = guess_robot(options.urdf)
 print(*(f'guessed: {note}' for note in guessed.notes), sep='\n')
 options.out.mkdir(parents=True, exist_ok=True)
