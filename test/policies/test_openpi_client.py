@@ -187,4 +187,4 @@ def test_what_is_sent_to_one_that_takes_nothing_ends_in_time():
         begin_s = time.monotonic()
         with pytest.raises(BlockingIOError):
             near.sendall(bytes(2**25))
-        assert time.monotonic() - begin_s < 5.0
+        assert time.monotonic() - begin_s < 30.0  # of a busy machine; it has no end without

@@ -72,14 +72,14 @@ def _node(name: str) -> Any:
 
 
 def close() -> None:
-    """Ends the nodes, and the default context with them: whoever comes next may begin one."""
-    import rclpy
-
+    """Ends the nodes, and ROS in this process if they began it."""
     if _node.cache_info().currsize:
+        import rclpy
+
         for name in NODES:
-            _node(name).destroy_node()
+            _node(name).close()
         _node.cache_clear()
-        rclpy.try_shutdown()
+        rclpy.shutdown()
 
 
 def _value(rng: np.random.Generator) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import os
 import resource
 import tracemalloc
@@ -22,8 +23,9 @@ COUNT = 40
 MOST_MB = 300
 
 
-@pytest.fixture(autouse=True, scope='module')
-def _nodes_end():
+@pytest.fixture(scope='module', autouse=True)
+def nodes_end() -> Iterator[None]:
+    """Those whose parameters were set are not there for the tests of another module."""
     yield
     parameter_calls.close()
 

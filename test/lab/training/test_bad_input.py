@@ -136,7 +136,7 @@ def test_a_killed_data_process_is_said_and_others_make_the_same_clips(
         assert torch.equal(found.trajectory, expected.trajectory)
     (first, *_) = multiprocessing.active_children()
     os.kill(first.pid, signal.SIGKILL)
-    first.join(10)
+    first.join(60)
     with pytest.raises(TrainingError, match='killed at step .*the last saved state is whole'):
         for step in range(3, 6):  # one batch was prepared before
             workers.batch(step)

@@ -25,6 +25,8 @@ TASKS = ('good', 'blocked', 'nan', 'other_robot', 'late', 'crashes', 'slow', 'go
 ENDS = ('done', 'reset', 'policy_failed', 'rejected', 'late', 'policy_failed', 'another_policy',
         'done', 'policy_died')  # fmt: skip
 NUM_CHUNKS = (3, 0, 1, 1, 1, 1, 1, 3, 1)
+#: a process ends within it on a busy machine, too [s]; the blocked rollout lasts for longer
+BUSY_S = 60.0
 PREDICTED = [f'/world_model/{view}/predicted/image_raw' for view in ('low', 'high')]
 
 
@@ -233,7 +235,7 @@ def test_two_policies_at_once_are_warned_of_by_both_nodes(results):
 
 
 def test_a_dead_policy_ends_the_run_with_its_record_closed(stack, results):
-    assert stack.policy.process.wait(5) == 3
+    assert stack.policy.process.wait(BUSY_S) == 3
     assert stack.runner.process.returncode == 1
     values = diagnostics_in(results[-1]['bag'], 'world_model')[-1].values
     assert values['mode'] == 'imagine'
@@ -246,6 +248,6 @@ def test_a_dead_recorder_ends_the_run_at_once_and_says_so(stack, ros):
     runner = stack.runner.process
     (recorder,) = Path(f'/proc/{runner.pid}/task/{runner.pid}/children').read_text().split()
     os.kill(int(recorder), signal.SIGKILL)
-    assert runner.wait(5) == 1
+    assert runner.wait(BUSY_S) == 1
     last = stack.runner.output().splitlines()[-1]
     assert last.startswith('EpisodeError: the recorder ended with status -9: ')
