@@ -13,10 +13,10 @@ import argparse
 from collections.abc import Callable
 from functools import partial
 import http.server
-import itertools
 import os
 from pathlib import Path
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -44,7 +44,6 @@ VIEWS = {
     'view': 'out/tutorial/view.rrd',
     'watched': 'out/tutorial/live.rrd',
 }
-_PORTS = itertools.count(9390, 2)
 
 
 def save(picture: Path, name: str) -> None:
@@ -98,18 +97,26 @@ class opened:
         self._browser.close()
 
 
+def free_ports() -> tuple[int, int]:
+    """Returns two ports that nobody serves: an earlier viewer would be the picture."""
+    with socket.socket() as page, socket.socket() as data:
+        for one in (page, data):
+            one.bind(('127.0.0.1', 0))
+        return page.getsockname()[1], data.getsockname()[1]
+
+
 def viewer_picture(file: Path, picture: Path, wait_s: float) -> None:
     """Opens a file in Rerun's viewer for browsers."""
-    port = next(_PORTS)
-    command = [sys.executable, '-m', 'rerun', str(file), '--serve-web', '--port', str(port + 1)]
-    command += ['--web-viewer-port', str(port)]
+    page, data = free_ports()
+    command = [sys.executable, '-m', 'rerun', str(file), '--serve-web', '--port', str(data)]
+    command += ['--web-viewer-port', str(page)]
     quiet = subprocess.DEVNULL
     viewer = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
     try:
         time.sleep(5)
+        assert viewer.poll() is None, f'the viewer of {file} ended'
         with opened(picture.parent) as browser:
-            data = f'rerun%2Bhttp://127.0.0.1:{port + 1}/proxy'
-            browser.open(f'http://127.0.0.1:{port}/?url={data}')
+            browser.open(f'http://127.0.0.1:{page}/?url=rerun%2Bhttp://127.0.0.1:{data}/proxy')
             time.sleep(wait_s)
             browser.picture(picture)
     finally:

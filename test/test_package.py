@@ -205,6 +205,13 @@ def test_help_starts_without_torch_and_diffusers():
     assert shown.stdout.strip() == '[]'
 
 
+def test_the_page_of_installation_has_every_extra(setup_arguments):
+    table = (ROOT / 'docs' / 'installation.md').read_text().partition('## Extras')[2]
+    rows = re.findall(r'^\| ((?:`\w+`(?:, )?)+) \|', table, re.M)
+    named = [name for row in rows for name in re.findall(r'`(\w+)`', row)]
+    assert sorted(named) == sorted(setup_arguments['extras_require'])
+
+
 def test_imports_are_declared(setup_arguments, manifest):
     extras = [name for names in setup_arguments['extras_require'].values() for name in names]
     requirements = setup_arguments['install_requires'] + extras

@@ -177,7 +177,7 @@ def watch_arguments(arguments: argparse.Namespace) -> tuple[str, ...] | None:
 
     check_installed()
     if watch.file is None:
-        check_ports(watch.port)
+        check_ports(watch.port, '--watch PORT')
         return '--port', str(watch.port)
     check_free(watch.file, arguments.overwrite, '--watch FILE.rrd')
     return '--save', str(watch.file)

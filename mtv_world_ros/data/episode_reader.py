@@ -373,6 +373,8 @@ class _EpisodeReader:
                 good.append((stamp, replace(plan, joint_names=self._renamed(plan.joint_names))))
             except MtvWorldError as error:
                 self._refuse(topic, error)
+        if topic not in self.types and (others := self._topics_of(messages.JOINT_TRAJECTORY)):
+            self._warn_once(f"no trajectories at '{topic}'; there are some at {_listed(others)}")
         return self._whole_plans(topic, in_order(topic, good, self.warnings), states)
 
     def _whole_plans(self, topic: str, plans: Stamped, states: JointStates | None) -> Stamped:

@@ -266,13 +266,18 @@ def serve(stream: Any, blueprint: Any, port: int) -> str:
     return f'http://localhost:{port}/?url={data}'
 
 
-def check_ports(port: int) -> None:
-    """Raises a `ConfigError` where the page's port or the one above it is taken."""
+def check_ports(port: int, option: str = '--port') -> None:
+    """Raises a `ConfigError` where the page's port or the one above it is taken.
+
+    Args:
+        port: of the page for browsers.
+        option: of the command, which sets it.
+    """
     for number in (port, port + 1):
-        _check_port(number)
+        _check_port(number, option)
 
 
-def _check_port(port: int) -> None:
+def _check_port(port: int, option: str) -> None:
     import socket
 
     with socket.socket() as probe:
@@ -281,6 +286,6 @@ def _check_port(port: int) -> None:
             probe.bind(('127.0.0.1', port))
         except OSError as error:
             raise ConfigError(
-                f'port {port} cannot be used ({error.strerror}); give another --port (the data '
-                'take the one above it)'
+                f'port {port} cannot be used ({error.strerror}): another viewer may still be '
+                f'served there; give another {option} (the data take the one above it)'
             ) from error

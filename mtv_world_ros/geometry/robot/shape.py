@@ -39,6 +39,10 @@ _SHORTEST_ROD_M = 0.01
 #: pixels are drawn with this many fractional bits
 _SHIFT_BITS = 4
 _FAR_PX = 4000
+_PACKAGES = (
+    ' (source the workspace that has the package, or set'
+    ' AMENT_PREFIX_PATH=/path/to/install/PACKAGE)'
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,7 +100,8 @@ def load_shape(robot: RobotModel) -> RobotShape:
     parts = tuple(part for shapes, _ in found.values() for part in shapes)
     missing = tuple(dict.fromkeys(text for name in moving for text in found[name][1]))
     if missing:
-        return rods(robot, f'there is no mesh {missing[0]}', missing)
+        where = _PACKAGES if 'package://' in missing[0] else ''
+        return rods(robot, f'there is no mesh {missing[0]}{where}', missing)
     if not any(part.link in moving for part in parts):
         return rods(robot, f"'{path.name}' has no shapes")
     return RobotShape(parts=parts, source=f"the shapes of '{path.name}'")

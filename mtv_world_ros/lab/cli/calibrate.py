@@ -86,6 +86,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     refuse_test_kinds(selection.paths, 'calibration')
     made = {**provenance(arguments), 'dataset': f'{arguments.dataset}: {selection}'}
     runs = _imagine(arguments, selection)
+    failed = say_failed([run.failed for run in runs])  # before what is too few is refused
     segmenter = str(runs[0].settings['segmenter'])
     samples = samples_of([run.results for run in runs], result_kinds(selection.paths))
     found = calibrate(samples, segmenter=segmenter, l2=arguments.l2, made=made)
@@ -98,7 +99,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         if horizon is not None:
             print(f'stored: {save_horizon(folder, horizon)}')
     print(text)
-    return int(say_failed([run.failed for run in runs]))
+    return int(failed)
 
 
 def _fitted_to(arguments: argparse.Namespace, selection: Selection) -> FittedTo:

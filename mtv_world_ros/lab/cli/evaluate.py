@@ -198,6 +198,7 @@ _J = (
 
 def in_short(metrics: Mapping[str, Any]) -> str:
     """Returns the one line of an evaluation that is printed; all else is in its report."""
+    from mtv_world_ros.lab.documents import number
     from mtv_world_ros.lab.evaluation.metrics.statistics import MIN_EPISODES
     from mtv_world_ros.lab.evaluation.report.headline import cell
 
@@ -207,9 +208,11 @@ def in_short(metrics: Mapping[str, Any]) -> str:
         for key, words, held in _J
         if numbers.get(key) is not None
     ][:1]
-    psnr = numbers.get('psnr')
-    said += [f'PSNR {cell(numbers, "psnr")} dB'] if isinstance(psnr, float) else []
-    said = said or ['no object was found and no picture compared: give --quality psnr']
+    pictures = metrics.get('pictures', {}).get('overall', {})
+    if 'psnr' in pictures:
+        psnr, held = (number(pictures[key]['value'], 1) for key in ('psnr', 'psnr_held'))
+        said.append(f'PSNR {psnr} dB (first frame held: {held} dB)')
+    said = said or ['no object was found and no picture compared']
     few = f'; no intervals below {MIN_EPISODES} episodes' if count < MIN_EPISODES else ''
     failed = metrics['num_episodes_failed']
     lost = f'; {failed} episodes failed, see the report' if failed else ''

@@ -22,7 +22,7 @@ import yaml
 from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, WorldModelSpec
-from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.errors import EpisodeError, TrajectoryError
 from mtv_world_ros.files import check_free, write_json
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.resample import nearest_rows, resample
@@ -122,7 +122,10 @@ def _rows(path: Path, robot: RobotModel, fps: int) -> _Rows:
     spec = WorldModelSpec(
         views=found.views, fps=fps, num_frames=1, width=width, height=height, robot=robot.name
     )
-    recording = load_recording(path, spec, robot)
+    try:
+        recording = load_recording(path, spec, robot)
+    except TrajectoryError as error:
+        raise EpisodeError(f"episode '{path}': {error}") from error
     if recording.camera_tracks:
         raise EpisodeError(
             f"episode '{path}': the camera of view '{min(recording.camera_tracks)}' moves by "

@@ -69,7 +69,8 @@ def test_a_watched_port_that_is_taken_is_told_before_anything_runs(tmp_path, cap
         port = taken.getsockname()[1]
         command = ['rank', '--episodes', '1', '--out', str(tmp_path / 'out')]
         assert main([*command, '--watch', str(port)]) == 1
-    assert f'port {port} cannot be used' in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f'port {port} cannot be used' in said and 'give another --watch PORT' in said
     assert not (tmp_path / 'out').exists()
 
 

@@ -37,11 +37,15 @@ def test_checkpoints_are_compared_in_one_set_of_tables(episodes, tmp_path, capsy
     assert '1 of 3 episodes, split all' in printed and '| b c ' not in printed
     assert len(printed.splitlines()) == 5  # the data, a line a checkpoint, tables, report
     assert (
-        'b c: follows the commands: cannot tell' in printed
+        'b c: follows the commands: cannot tell (episodes: 1, give at least 3); ' in printed
         and '; J of ' in printed
         and 'first frame held: ' in printed
     )
     assert 'no intervals below 3 episodes' in printed
+    pictures = json.loads((out / 'b_c' / 'metrics.json').read_text())['pictures']['overall']
+    psnr, held = (pictures[name]['value'] for name in ('psnr', 'psnr_held'))
+    assert 5 < held < 60 and 5 < psnr < 60
+    assert f'PSNR {psnr:.1f} dB (first frame held: {held:.1f} dB)' in printed
     assert '| b c ' in (out / 'paper_tables.md').read_text()
     assert 'Cannot tell from 1 episode: give at least 3.' in (out / 'report.html').read_text()
     metrics = json.loads((out / 'metrics.json').read_text())

@@ -80,3 +80,10 @@ def test_commands_are_followed_where_both_margins_are_shown(over_held, over_shuf
 def test_without_other_commands_nothing_is_said():
     found = following(picture_estimates([{'low': {'psnr_changed': 15.0}}] * 4))
     assert found.word == 'cannot tell' and 'no frames were imagined' in found.why
+
+
+def test_one_episode_is_told_how_many_it_takes():
+    found = following(picture_estimates([{'low': {'psnr_changed': 15.0}}]))
+    assert found.line == 'follows the commands: cannot tell (episodes: 1, give at least 3)'
+    few = following(picture_estimates(episodes((2.0, 2.5), (3.0, 3.2))))
+    assert few.line.endswith('2 episodes, give at least 3)')

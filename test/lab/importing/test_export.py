@@ -79,6 +79,12 @@ def test_nothing_is_replaced_or_left_behind(exported, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+def test_an_episode_of_another_robot_is_named(tmp_path, capsys):
+    command = ['export-dataset', str(DEMO), '--robot', 'franka', '--out', str(tmp_path / 'out')]
+    assert main(command) == 1
+    assert f"mtv-world: episode '{DEMO}': joints ['panda_joint1', " in capsys.readouterr().err
+
+
 def test_small_png_images_are_imported_again_without_loss(tmp_path):
     out = tmp_path / 'dataset'
     wanted = ['--fps', '5', '--size', '95x72', '--images']

@@ -211,6 +211,7 @@ def test_boxes_and_meshes_are_drawn_where_a_pinhole_sees_them(tmp_path):
         robot, shape = lamp(tmp_path, geometry)
         if 'nowhere' in geometry:
             assert not shape.is_known and 'nowhere' in shape.source
+            assert 'AMENT_PREFIX_PATH=/path/to/install/PACKAGE' in shape.source
             continue
         images = draw_silhouettes(shape.parts, camera, robot, np.array([[0.0], [np.pi / 2]]))
         for image, (across, along) in zip(images, ((0.2, 0.4), (0.4, 0.2)), strict=True):

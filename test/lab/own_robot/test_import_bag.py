@@ -121,6 +121,28 @@ def test_a_bag_without_commands_says_how_to_take_the_measured_ones(robot, scene,
     assert "set 'action: state'" in capsys.readouterr().err
 
 
+def test_a_bag_with_plans_elsewhere_says_where(robot, scene, tmp_path, capsys):
+    cameras, positions, frames = scene
+    point = messages.make(
+        'trajectory_msgs/msg/JointTrajectoryPoint',
+        positions=positions[-1], velocities=np.empty(0), accelerations=np.empty(0),
+        effort=np.empty(0),
+        time_from_start=messages.make('builtin_interfaces/msg/Duration', sec=1, nanosec=0),
+    )  # fmt: skip
+    plan = messages.make(
+        messages.JOINT_TRAJECTORY, header=messages.make_header(START_NS, ''),
+        joint_names=list(robot.joint_names), points=[point],
+    )  # fmt: skip
+
+    def write(bag):
+        bag.write('/arm_controller/plan', messages.JOINT_TRAJECTORY, START_NS, plan)
+
+    bag = record(tmp_path / 'plan', robot, cameras, positions, frames=frames, more=write)
+    assert run(tmp_path, bag, mapping={**MAPPING, 'action': 'joint_trajectory'}) == 1
+    said = capsys.readouterr().err
+    assert "at '/cell/joint_trajectory'; there are some at /arm_controller/plan" in said
+
+
 def test_without_commands_the_measured_ones_are_taken_if_the_command_line_says_so(
     robot, scene, tmp_path, capsys
 ):

@@ -162,15 +162,17 @@ def following(estimates: Mapping[str, Estimate]) -> Following:
     shuffled = estimates.get(f'margin_over_{SHUFFLED}')
     held = estimates.get(f'margin_over_{HELD}')
     if shuffled is None or held is None or not np.isfinite([shuffled.value, held.value]).all():
-        return Following(
-            word='cannot tell', why="no frames were imagined with another episode's commands"
-        )
+        compared = estimates.get('psnr_changed')
+        why = "no frames were imagined with another episode's commands"
+        if compared is not None and compared.num_episodes < MIN_EPISODES:
+            why = f'episodes: {compared.num_episodes}, give at least {MIN_EPISODES}'
+        return Following(word='cannot tell', why=why)
     why = (
         f'where the picture changes, {_signed(shuffled)} against other commands, '
         f'{_signed(held)} against the held frame; {shuffled.num_episodes} episodes'
     )
     if min(shuffled.num_episodes, held.num_episodes) < MIN_EPISODES:
-        return Following(word='cannot tell', why=f'{why}, too few')
+        return Following(word='cannot tell', why=f'{why}, give at least {MIN_EPISODES}')
     if shuffled.interval[0] > 0 and held.interval[0] > 0:
         return Following(word='yes', why=why)
     is_no = shuffled.interval[1] < _NO_MARGIN_DB or held.interval[1] < 0
