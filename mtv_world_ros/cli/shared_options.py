@@ -119,7 +119,7 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
         '--segmenter': {
             'default': 'auto',
             'help': 'auto, colour, sam2 or sam3; auto = sam2 where MTV_WORLD_WEIGHTS has it, '
-            'else colour',
+            'else colour; or the objects.safetensors of an import with --objects',
         }
     },
     'describer': {

@@ -225,6 +225,16 @@ class Episode:
     truncated: bool = False
     warnings: tuple[str, ...] = ()
 
+    def mask_areas(self) -> dict[str, FloatArray]:
+        """Returns (O, T) areas of the objects in the stored masks by view [share of the image]."""
+        found = {}
+        for view, track in (self.masks or {}).items():
+            ids = np.asarray(track.frames[:])
+            flat = ids.reshape(len(ids), -1)
+            each = [(flat == n).mean(axis=1) for n in range(1, len(self.info.objects) + 1)]
+            found[view] = np.array(each).reshape(-1, len(ids))
+        return found
+
     def camera(self, view: str, index: int) -> CameraModel:
         """Returns the camera of a view as it is at one of its images."""
         camera, track = self.cameras[view], self.camera_tracks.get(view)

@@ -22,7 +22,6 @@ import yaml
 
 from mtv_world_ros.config import ListOf, Model, Schema
 from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest
-from mtv_world_ros.vision.segmenters.choose import SegmenterName
 
 Span = tuple[float, float]
 Mode = Literal['observe', 'imagine']
@@ -92,9 +91,10 @@ class Settings(NodeSettings):
     task: str = at_start(
         '', 'Task to judge: name or YAML file; empty = the one the instruction matches.'
     )
-    segmenter: SegmenterName = at_start(
+    segmenter: str = at_start(
         'auto',
-        'What finds the objects; auto = sam2 if MTV_WORLD_WEIGHTS has its weights, else colour.',
+        'What finds the objects: auto, colour, sam2, sam3 or a file of examples; auto = sam2 if '
+        'MTV_WORLD_WEIGHTS has its weights, else colour.',
     )
     describer: str = at_start(
         '',

@@ -232,6 +232,7 @@ def check_values(given: dict[str, Any]) -> None:
     from mtv_world_ros.model.actions import check_control
     from mtv_world_ros.model.serving import ServingOptions
     from mtv_world_ros.vision.segmenters.choose import SEGMENTERS
+    from mtv_world_ros.vision.segmenters.examples import SUFFIX
 
     def each(names: str | Sequence[str]) -> list[str]:
         return names.split(',') if isinstance(names, str) else list(names)
@@ -252,7 +253,8 @@ def check_values(given: dict[str, Any]) -> None:
             tasks_named(given[key])
     kinds_named(given.get('zero_shot') or '')
     ServingOptions.parse(given.get('serving') or '')
-    assert given.get('segmenter') in (None, *SEGMENTERS)
+    segmenter = given.get('segmenter')
+    assert segmenter in (None, *SEGMENTERS) or segmenter.endswith(SUFFIX)
     if given.get('robot') and not given['robot'].startswith('my_'):  # those are the reader's own
         robot_path(given['robot'])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
@@ -14,6 +14,7 @@ from mtv_world_ros.errors import ConfigError, EpisodeError
 if TYPE_CHECKING:
     from mtv_world_ros.data.bag.recover import Recovered
     from mtv_world_ros.data.bag_mapping import BagMapping
+    from mtv_world_ros.data.episode import Episode
     from mtv_world_ros.lab.importing.convert import ImportSummary
     from mtv_world_ros.lab.importing.stored_objects import ObjectStage
 
@@ -80,6 +81,41 @@ def _add_objects(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--device', default='cpu', help='of the segmenter')
 
 
+def _add_boxes(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        '--objects',
+        type=Path,
+        metavar='FILE',
+        help='boxes around objects in a few frames; their masks are stored with the episodes, and '
+        'OUT/objects.safetensors, for --segmenter of other commands, with what was learnt',
+    )
+
+
+def _boxed_stage(
+    arguments: argparse.Namespace, found: Mapping[str, Any], read: Callable[[Any], Episode]
+) -> ObjectStage:
+    """What names and finds objects, by boxes where there are any."""
+    from mtv_world_ros.lab.importing.object_boxes import learn_objects, load_object_boxes
+    from mtv_world_ros.lab.importing.stored_objects import ObjectStage
+    from mtv_world_ros.vision.segmenters.examples import ExampleSegmenter
+
+    if arguments.objects is None:
+        return _object_stage(arguments)
+    if arguments.segmenter is not None or arguments.describer is not None:
+        raise ConfigError(
+            '--objects finds and names the objects; leave --segmenter and --describer out'
+        )
+    boxed = learn_objects(load_object_boxes(arguments.objects), found, read)
+    file = arguments.out / 'objects.safetensors'
+    boxed.examples.save(file)
+    segmenter = ExampleSegmenter(boxed.examples)
+    for name, stands_out in segmenter.stands_out.items():
+        how = 'its colours' if stands_out else 'its picture: its colours are around it, too'
+        print(f'object {name}: found by {how}')
+    print(f'objects: {file}')
+    return ObjectStage(segmenter=segmenter, boxed=boxed, key=arguments.objects.read_bytes())
+
+
 def _object_stage(arguments: argparse.Namespace) -> ObjectStage:
     from mtv_world_ros.assembly import asked_describer, assemble_segmenter
     from mtv_world_ros.lab.importing.stored_objects import ObjectStage, stage_key
@@ -114,6 +150,7 @@ def _add_import_bag(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--calibration', type=Path, help="default: the bags' TF and CameraInfo")
     parser.add_argument('--out', type=Path, required=True)
     _add_objects(parser)
+    _add_boxes(parser)
     parser.set_defaults(handler=_import_bag)
 
 
@@ -122,6 +159,7 @@ def _import_bag(arguments: argparse.Namespace) -> int:
     import yaml
 
     from mtv_world_ros.data.bag_mapping import BagMapping, load_bag_mapping
+    from mtv_world_ros.data.episode_reader import read_episode
     from mtv_world_ros.files import write_whole
     from mtv_world_ros.geometry.robot.file import ROBOT_YAML
     from mtv_world_ros.lab.importing.bags import (
@@ -138,13 +176,17 @@ def _import_bag(arguments: argparse.Namespace) -> int:
     bags = find_bags(arguments.bags)
     mapping = with_guessed_views(mapping, bags[0])
     robot = _robot_of_bags(arguments, mapping, bags[0])
+
+    def frames(bag: Path) -> Episode:
+        return read_episode(bag, views=list(mapping.views), mapping=mapping, with_cameras=False)
+
     summary = import_bags(
         bags,
         arguments.out,
         mapping,
         robot,
         calibration=arguments.calibration,
-        stage=_object_stage(arguments),
+        stage=_boxed_stage(arguments, {episode_name(bag): bag for bag in bags}, frames),
         progress=lambda paths: tqdm(paths, unit='bag', disable=None),
     )
     values = mapping.replace(robot='robot/robot.yaml').model_dump(
@@ -155,7 +197,7 @@ def _import_bag(arguments: argparse.Namespace) -> int:
         print(f'view {view}: {mapping.topic(row.image)}')
     for bag in summary.made:
         place = arguments.out / episode_name(bag)
-        print(summary_line(place, objects=bool(arguments.segmenter)))
+        print(summary_line(place, objects=bool(arguments.segmenter or arguments.objects)))
     status = _import_status(summary, str)
     print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
     return status
@@ -206,6 +248,7 @@ def _add_import_videos(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--out', type=Path, required=True)
     _add_objects(parser)
+    _add_boxes(parser)
     parser.set_defaults(handler=_import_videos)
 
 
@@ -214,18 +257,26 @@ def _import_videos(arguments: argparse.Namespace) -> int:
 
     from mtv_world_ros.geometry.robot.file import ROBOT_YAML
     from mtv_world_ros.lab.importing.bags import summary_line
-    from mtv_world_ros.lab.importing.videos import import_videos, load_video_mapping
+    from mtv_world_ros.lab.importing.videos import (
+        find_recordings,
+        import_videos,
+        load_video_mapping,
+        read_recording,
+    )
 
+    mapping = load_video_mapping(arguments.mapping)
+    found = {one.name: one for one in find_recordings(arguments.folder, mapping)}
     summary = import_videos(
         arguments.folder,
         arguments.out,
-        load_video_mapping(arguments.mapping),
+        mapping,
         calibration=arguments.calibration,
-        stage=_object_stage(arguments),
+        stage=_boxed_stage(arguments, found, lambda one: read_recording(one, mapping)),
         progress=lambda recordings: tqdm(recordings, unit='ep', disable=None),
     )
     for one in summary.made:
-        print(summary_line(arguments.out / one.name, objects=bool(arguments.segmenter)))
+        looked = bool(arguments.segmenter or arguments.objects)
+        print(summary_line(arguments.out / one.name, objects=looked))
     status = _import_status(summary, lambda one: one.name)
     print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
     return status

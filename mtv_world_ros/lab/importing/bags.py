@@ -14,7 +14,7 @@ import yaml
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag_mapping import BagMapping, guess_views
-from mtv_world_ros.data.episode import Episode, MASKS_BY, Track, UNKNOWN_CAMERAS
+from mtv_world_ros.data.episode import Episode, MASKS_BY, UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
@@ -191,22 +191,18 @@ def summary_line(path: Path, objects: bool = False) -> str:
     parts = [f'{seconds:.1f} s', f'frames: {counts}', f"'{episode.info.instruction}'"]
     if episode.info.objects or objects:
         parts.append(f'objects: {", ".join(episode.info.objects) or "none named"}')
-    if episode.masks:
-        shares = [
-            _object_shares(track, len(episode.info.objects)) for track in episode.masks.values()
+    areas = episode.mask_areas()
+    if areas:
+        seen = [
+            ', '.join(f'{view} {(area[n] > 0).mean():.0%}' for view, area in areas.items())
+            for n in range(len(episode.info.objects))
         ]
-        found = zip(episode.info.objects, np.max(shares, axis=0), strict=True)
-        parts.append('seen: ' + ', '.join(f'{name} {share:.0%}' for name, share in found))
+        found = zip(episode.info.objects, seen, strict=True)
+        parts.append('seen: ' + '; '.join(f'{name} in {share}' for name, share in found))
     unknown = episode.info.metadata.get(UNKNOWN_CAMERAS, '')
     if unknown:
         parts.append(f'cameras not known: {unknown}')
     return f'{path.name}: {"; ".join(parts)}'
-
-
-def _object_shares(track: Track, count: int) -> FloatArray:
-    """(O,) share of the frames in which each object has a mask."""
-    ids = np.asarray(track.frames)
-    return np.array([(ids == n).any(axis=(1, 2)).mean() for n in range(1, count + 1)])
 
 
 def convert_bag(
@@ -275,6 +271,7 @@ def write_imported(
     ]
     told = mapping.instruction or episode.info.instruction
     names = stage.names(
+        out.name,
         told,
         lambda: np.asarray(episode.images[episode.views[0]].frames[0]),
         given=mapping.objects,
@@ -294,7 +291,7 @@ def write_imported(
         jpeg_quality=mapping.jpeg_quality,
     ) as writer:
         writer.outcome = mapping.outcome if mapping.outcome != 'unknown' else episode.info.outcome
-        masks = stage.masks(writer)
+        masks = stage.masks(out.name, writer)
         for write in _in_order(
             episode, writer, masks, robot, stamps, positions, commands, mapping
         ):

@@ -180,7 +180,7 @@ def convert_episode(
             robot=mapping.robot.name,
             cameras=cameras,
             objects=stage.names(
-                texts[0], lambda: next(iter(first.values())), given=mapping.objects
+                out.name, texts[0], lambda: next(iter(first.values())), given=mapping.objects
             ),
             metadata={
                 'source': dataset.root.resolve().name,
@@ -190,7 +190,7 @@ def convert_episode(
             jpeg_quality=mapping.jpeg_quality,
         )
         stack.enter_context(writer)
-        masks = stage.masks(writer)
+        masks = stage.masks(out.name, writer)
         writer.outcome = _outcome(rows, mapping)
         stamps = [START_NS + round(float(t - times[0]) * 1e9) for t in times]
         commands = dict(_commands(times, commanded, mapping, dataset.fps))

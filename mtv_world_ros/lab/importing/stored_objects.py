@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,13 @@ from mtv_world_ros.config import read_yaml
 from mtv_world_ros.data.episode import MASKS_BY
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import BoolArray, ByteArray
+from mtv_world_ros.lab.importing.object_boxes import BoxedObjects
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
-#: frames that are segmented together; the next ones follow the masks of the last of them
-_PIECE = 32
+#: frames that are segmented together, at least, and as many as fit into so many bytes; the next
+#: ones follow the masks of the last of them
+_PIECE, _PIECE_BYTES = 32, 64 * 2**20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,15 +29,18 @@ class ObjectStage:
     Attributes:
         describer: names the objects; None = the mapping or the recording does.
         segmenter: finds the masks that are stored; None = those recorded are kept.
-        key: changes with both.
+        boxed: objects with boxes, which name those of their recordings and start their masks.
+        key: changes with all of them.
     """
 
     describer: Describer | None = None
     segmenter: Segmenter | None = None
+    boxed: BoxedObjects | None = None
     key: bytes = b''
 
     def names(
         self,
+        recording: str,
         instruction: str,
         first_frame: Callable[[], ByteArray],
         *,
@@ -44,11 +49,15 @@ class ObjectStage:
     ) -> tuple[str, ...]:
         """Returns the names to store, by `name_objects`.
 
-        The colour words of an instruction are stored only with masks.
+        The colour words of an instruction are stored only with masks. Objects with boxes go
+        before all others.
 
         Raises:
             DescriptionError: the describer failed.
         """
+        drawn = () if self.boxed is None else self.boxed.boxes.names(recording)
+        if drawn:
+            return drawn
         if self.describer is None and self.segmenter is None:
             return tuple(given or stored)
         return name_objects(
@@ -59,11 +68,23 @@ class ObjectStage:
             stored=stored,
         )
 
-    def masks(self, writer: EpisodeWriter) -> MaskWriter:
+    def masks(self, recording: str, writer: EpisodeWriter) -> MaskWriter:
         """Returns what finds and stores the masks of the episode's objects."""
         if self.segmenter is not None and writer.objects:
             writer.metadata[MASKS_BY] = self.segmenter.name
-        return MaskWriter(writer=writer, segmenter=self.segmenter)
+        starts = {} if self.boxed is None else self.boxed.starts.get(recording, {})
+        return MaskWriter(
+            writer=writer, segmenter=self.segmenter, _last=dict(_starts(starts, writer.objects))
+        )
+
+
+def _starts(
+    starts: Mapping[str, tuple[ByteArray, Mapping[str, BoolArray]]], names: Sequence[str]
+) -> Iterator[tuple[str, tuple[BoolArray, ByteArray]]]:
+    """By view the masks (O, H, W) that were drawn in its first frame, and the frame."""
+    for view, (frame, drawn) in starts.items():
+        none = np.zeros(frame.shape[:2], np.bool_)
+        yield view, (np.stack([drawn.get(name, none) for name in names]), frame)
 
 
 #: stores what the mapping and the recording say
@@ -101,7 +122,7 @@ class MaskWriter:
             return
         waiting = self._waiting.setdefault(view, [])
         waiting.append((stamp_ns, frame))
-        if len(waiting) == _PIECE:
+        if len(waiting) >= max(_PIECE, _PIECE_BYTES // frame.nbytes):
             self._write(view)
 
     def finish(self) -> None:

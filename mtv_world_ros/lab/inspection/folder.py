@@ -8,10 +8,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mtv_world_ros.data.episode import Episode
-from mtv_world_ros.data_types import ByteArray
+from mtv_world_ros.data_types import ByteArray, CameraModel
 from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.geometry.transforms import inverse
 from mtv_world_ros.lab.inspection.inspect import Inspector
 from mtv_world_ros.lab.inspection.inspection_report import (
     broken,
@@ -25,6 +27,9 @@ from mtv_world_ros.lab.inspection.places import background, CameraPlaces, find_p
 
 #: width of a tile of the picture, and the episodes it shows at most [px]
 _TILE, _MOST_ROWS = 320, 24
+#: a pose that moved with its camera shifts what it shows by this share of the background's shift,
+#: at least; no background is further away than this [share of the width]
+_FOLLOWS, _FAR = 0.25, 0.04
 #: focal lengths of a view that differ by more are of different cameras
 _SAME_FOCAL = 0.02
 
@@ -39,6 +44,7 @@ class FolderInspection:
         places: where each view's camera stands in `members`, by view.
         members: names of the episodes that have the view, by view.
         findings: about all episodes.
+        notes: other things to know of all episodes.
     """
 
     episodes: dict[str, Inspection]
@@ -46,6 +52,7 @@ class FolderInspection:
     places: dict[str, CameraPlaces]
     members: dict[str, list[str]]
     findings: tuple[Finding, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -75,7 +82,8 @@ def inspect_folder(
     failed: dict[str, str] = {}
     pictures: dict[str, dict[str, ByteArray]] = {}
     backgrounds: dict[str, dict[str, ByteArray]] = {}
-    focal: dict[str, dict[str, float]] = {}
+    known: dict[str, dict[str, CameraModel]] = {}
+    posed: dict[str, dict[str, CameraModel]] = {}
     for path in paths:
         try:
             episode = read(path)
@@ -89,22 +97,24 @@ def inspect_folder(
         for view in episode.views:
             if inspector.stands_still(episode, view):
                 backgrounds.setdefault(view, {})[path.name] = background(episode.images[view])
-            camera = episode.cameras[view]
-            if 'intrinsics' in episode.unknown.get(view, ''):
-                continue
-            focal.setdefault(view, {})[path.name] = float(camera.K[0, 0]) / camera.width
+            unknown = episode.unknown.get(view, '')
+            if not unknown:
+                posed.setdefault(view, {})[path.name] = episode.cameras[view]
+            if 'intrinsics' not in unknown:
+                known.setdefault(view, {})[path.name] = episode.cameras[view]
     places = {view: find_places(list(found.values())) for view, found in backgrounds.items()}
     members = {view: list(found) for view, found in backgrounds.items()}
     found = FolderInspection(
         episodes=inspections, failed=failed, places=places, members=members,
-        findings=(*_focal_findings(focal),),
+        findings=(*_focal_findings(known),),
     )  # fmt: skip
-    return _with_strangers(found), pictures
+    return _with_places(_with_strangers(found), posed), pictures
 
 
-def _focal_findings(focal: dict[str, dict[str, float]]) -> list[Finding]:
+def _focal_findings(known: dict[str, dict[str, CameraModel]]) -> list[Finding]:
     found = []
-    for view, each in focal.items():
+    for view, cameras in known.items():
+        each = {name: camera.K[0, 0] / camera.width for name, camera in cameras.items()}
         middle = float(np.median(list(each.values())))
         others = [name for name, value in each.items() if abs(value / middle - 1) > _SAME_FOCAL]
         if others:
@@ -119,11 +129,10 @@ def _focal_findings(focal: dict[str, dict[str, float]]) -> list[Finding]:
 
 
 def _with_strangers(found: FolderInspection) -> FolderInspection:
-    """Names moved cameras, and episodes whose pictures share nothing with the others."""
-    findings, inspections = list(found.findings), dict(found.episodes)
+    """Names episodes whose pictures share nothing with the others."""
+    inspections = dict(found.episodes)
     for view, places in found.places.items():
         names = found.members[view]
-        count = len(set(places.place.tolist()))
         alone = np.isinf(places.apart).sum(axis=1) == len(names) - 1
         if len(names) > 2 and alone.any() and not alone.all():
             for number in np.flatnonzero(alone):
@@ -133,15 +142,57 @@ def _with_strangers(found: FolderInspection) -> FolderInspection:
                     'or scene, a mirrored or turned image'
                 )
                 inspections[name] = _with(inspections[name], view, broken(text))
-        if count > 1:
-            groups = [' '.join(np.array(names)[places.place == place]) for place in range(count)]
+    return replace(found, episodes=inspections)
+
+
+def _with_places(
+    found: FolderInspection, posed: dict[str, dict[str, CameraModel]]
+) -> FolderInspection:
+    """Says where each view's camera stands, and whether it was moved without another pose."""
+    findings, notes = list(found.findings), list(found.notes)
+    for view, places in found.places.items():
+        names = found.members[view]
+        count = len(set(places.place.tolist()))
+        if count < 2:
+            continue
+        groups = [' '.join(np.array(names)[places.place == place]) for place in range(count)]
+        text = f"view '{view}': the camera stands at {count} places ({'; '.join(groups)})"
+        stale = _stale(names, places, posed.get(view, {}))
+        if stale:
+            pairs = ', '.join(f'{a} has the pose of {b}' for a, b in stale.items())
             findings.append(
                 suspicious(
-                    f"view '{view}': the camera stands at {count} places ({'; '.join(groups)}): "
-                    'one calibration for all is wrong (mtv-world calibrate-camera FOLDER)'
+                    f'{text}, but {pairs}: one calibration for all is wrong (mtv-world '
+                    'calibrate-camera FOLDER)'
                 )
             )
-    return replace(found, findings=tuple(findings), episodes=inspections)
+        else:
+            notes.append(text)
+    return replace(found, findings=tuple(findings), notes=tuple(notes))
+
+
+def _stale(
+    names: Sequence[str], places: CameraPlaces, posed: dict[str, CameraModel]
+) -> dict[str, str]:
+    """Episodes whose pose is that of an earlier one, though the camera was moved between them."""
+    stale: dict[str, str] = {}
+    for late, name in enumerate(names):
+        for early, other in enumerate(names[:late]):
+            if places.place[early] == places.place[late] or not {name, other} <= posed.keys():
+                continue
+            shift = _shift(posed[other], posed[name])
+            if shift < _FOLLOWS * min(places.apart[early, late], _FAR):
+                stale.setdefault(name, other)
+    return stale
+
+
+def _shift(a: CameraModel, b: CameraModel) -> float:
+    """By how much what is a metre away shifts between two poses [share of the width]."""
+    if a.mount_link != b.mount_link:
+        return np.inf
+    between = inverse(a.T_mount_camera) @ b.T_mount_camera
+    turn = np.linalg.norm(Rotation.from_matrix(between[:3, :3]).as_rotvec())
+    return float((turn + np.linalg.norm(between[:3, 3])) * a.K[0, 0] / a.width)
 
 
 def _with(inspection: Inspection, view: str, finding: Finding) -> Inspection:
@@ -182,6 +233,7 @@ def folder_text(found: FolderInspection) -> str:
         for row in rows
     ]
     lines += [f'{finding.verdict}: {finding.text}' for finding in found.findings]
+    lines += found.notes
     return '\n'.join(line.rstrip() for line in lines)
 
 
@@ -190,6 +242,7 @@ def folder_markdown(found: FolderInspection, picture: str) -> str:
     head, *rows = table(found)
     lines = [f'# {found.verdict}', '']
     lines += [f'- {finding.verdict}: {finding.text}' for finding in found.findings]
+    lines += [f'- {note}' for note in found.notes]
     lines += ['', f'| {" | ".join(head)} |', f'|{"---|" * len(head)}']
     lines += [f'| {" | ".join(cell.replace("|", "/") for cell in row)} |' for row in rows]
     return '\n'.join([*lines, '', f'![all episodes]({picture})', ''])

@@ -50,6 +50,7 @@ from mtv_world_ros.lab.inspection.motion_residual import (
 )
 from mtv_world_ros.lab.inspection.pictures import check_frozen, check_lengths, mirrored
 from mtv_world_ros.lab.inspection.places import keeps_place
+from mtv_world_ros.lab.inspection.stored_masks import check_masks
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,
     render_trajectory_video,
@@ -317,6 +318,7 @@ class Inspector:
         checks = [
             check_limits('measured', self.robot, joints.positions),
             check_rate('joint states', joints.stamps_ns),
+            check_masks(episode),
         ]
         try:
             commands = self._commands(episode, origin)

@@ -8,6 +8,7 @@ from typing import get_args, Literal
 
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from mtv_world_ros.vision.segmenters.examples import ExampleSegmenter, ObjectExamples, SUFFIX
 from mtv_world_ros.vision.segmenters.sam import sam2_segmenter, sam3_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 from mtv_world_ros.vision.segmenters.weights import find_weights, VISION_MODELS
@@ -26,7 +27,7 @@ def choose_segmenter(
 
     Args:
         choice: `auto` (SAM 2 where the weights are present, else by colour), `colour`, `sam2`
-            (MM-Grounding-DINO and SAM 2) or `sam3`.
+            (MM-Grounding-DINO and SAM 2), `sam3`, or a file of examples, `*.safetensors`.
         weights: folder of weights, at any depth up to two; default: `MTV_WORLD_WEIGHTS`.
         device: of the models: `cpu`, `cuda`, ...
 
@@ -34,10 +35,12 @@ def choose_segmenter(
         ConfigError: no such segmenter, no folder, or its weights are not in there.
         CheckpointError: weights cannot be read.
     """
+    if choice.endswith(SUFFIX):
+        return ExampleSegmenter(ObjectExamples.load(Path(choice).expanduser()))
     if choice not in SEGMENTERS:
         raise ConfigError(
             f"segmenter is '{choice}'{nearest(choice, SEGMENTERS)}; it must be one of "
-            f'{", ".join(SEGMENTERS)}'
+            f'{", ".join(SEGMENTERS)}, or the objects.safetensors of an import with --objects'
         )
     named = os.environ.get(WEIGHTS_VARIABLE, '')
     folder = weights or (Path(named).expanduser() if named else None)

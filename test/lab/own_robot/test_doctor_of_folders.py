@@ -1,6 +1,7 @@
 """`mtv-world doctor FOLDER`: each kind of bad recording is named, with its episode."""
 
 from dataclasses import replace
+import shutil
 
 from crane import (
     FPS,
@@ -26,6 +27,7 @@ from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.lab.inspection.folder import folder_text, inspect_folder
 from mtv_world_ros.lab.inspection.inspect import Inspector
 from mtv_world_ros.lab.inspection.motion_residual import ResidualSearch
+from mtv_world_ros.lab.inspection.stored_masks import check_masks
 from mtv_world_ros.lab.training.training_run import check_recording
 
 SECONDS = 3.0
@@ -140,6 +142,47 @@ def test_a_moved_camera_and_who_belongs_where_are_named(inspected):
     line = next(line for line in text.splitlines() if 'the camera stands at' in line)
     assert 'moved' in line and line.startswith('suspicious')
     assert found.verdict == 'broken'
+
+
+@pytest.mark.parametrize('has_own_pose', [True, False])
+def test_a_moved_camera_is_a_fault_only_with_the_pose_of_before(folder, tmp_path, has_own_pose):
+    robot, data = folder
+    for name in ('good0', 'good1'):
+        (tmp_path / name).symlink_to(data / name)
+    if has_own_pose:
+        (tmp_path / 'moved').symlink_to(data / 'moved')
+    else:
+        shutil.copytree(data / 'moved', tmp_path / 'moved')
+        shutil.copy(data / 'good0' / 'calibration.yaml', tmp_path / 'moved')
+    inspector = Inspector(robot, load_shape(robot), QUICK)
+    found, _ = inspect_folder(list_episodes(tmp_path), inspector, read_episode)
+    line = folder_text(found).splitlines()[-1]
+    assert 'the camera stands at 2 places (good0 good1; moved)' in line
+    if has_own_pose:
+        assert found.verdict == 'ok' and line.startswith('view')
+    else:
+        assert 'moved has the pose of good0' in line and line.startswith('suspicious')
+
+
+@pytest.mark.parametrize(
+    ('rows', 'said'),
+    [((0, 6), ''), ((0, 0), 'is found in 0% of the frames'), ((0, 40), 'more than 15%')],
+)
+def test_masks_of_an_import_that_cannot_be_the_object_are_named(tmp_path, rows, said):
+    robot, camera = load(tmp_path), make_cameras()['door']
+    ids = np.zeros((camera.height, camera.width), np.uint8)
+    ids[rows[0] : round(rows[1] / 40 * camera.height)] = 1
+    ids[:, camera.width // 2 :] = 0
+    with EpisodeWriter(
+        tmp_path / 'one', task='', instruction='move', robot=robot.name, cameras=[camera],
+        objects=['blue block'], metadata={'masks_by': 'colour'},
+    ) as writer:  # fmt: skip
+        for stamp in (START_NS, START_NS + 10**9):
+            writer.write_image(camera.view, stamp, np.zeros((*ids.shape, 3), np.uint8))
+            writer.write_mask(camera.view, stamp, ids)
+    measures, findings = check_masks(read_episode(tmp_path / 'one', with_cameras=False))
+    assert measures == {'blue block, seen in': f'door {100 if rows[1] else 0}%'}
+    assert [said in finding.text for finding in findings] == [True] * bool(said)
 
 
 def test_a_gripper_with_open_and_closed_swapped_is_named(tmp_path):
