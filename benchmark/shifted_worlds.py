@@ -15,14 +15,17 @@ below .5 a failure.
 False success is of real failures that have a verdict, false failure of real successes. Intervals over
 scenes: AUROC jackknife, shares clustered Wilson. The log keeps what was done, and the same command
 goes on; physics that show the same first picture share what is imagined. `--no-camera-check` leaves
-cameras as they are told. The last table is of the node's watch, which compares the end of every
-executed chunk (here where objects truly are) with the futures: how many rollouts it takes to say that
-the physics is another one, over random orders.
+cameras as they are told. Flips of contact, as `mtv-world rank` has them: of rollouts whose true outcome
+is another than the expert's in the same scene, the share in which the last imagined frame is nearer to
+what really happened than to what the expert's commands make happen, where objects are. The last table is
+of the node's watch, which compares the end of every executed chunk (here where objects truly are) with
+the futures: how many rollouts it takes to say that the physics is another one, over random orders.
 """  # noqa: E501
 
 from __future__ import annotations
 
 import argparse
+import base64
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import json
@@ -31,6 +34,7 @@ from pathlib import Path
 import time
 from typing import Any
 
+import cv2
 import numpy as np
 from page import parse_arguments, publish, table
 
@@ -41,13 +45,20 @@ from mtv_world_ros.bench.expert.expert import Expert
 from mtv_world_ros.bench.expert.faults.catalogue import EXPERT, FAULTS, kinds_of, PolicyVariant
 from mtv_world_ros.bench.expert.faults.drawn import is_drawn
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
+from mtv_world_ros.bench.ranking.flips import is_nearer, objects_png
 from mtv_world_ros.bench.ranking.no_picture_rule import judge_without_pictures
 from mtv_world_ros.bench.ranking.scores import area_interval
 from mtv_world_ros.bench.tasks.tasks import task_named
 from mtv_world_ros.bench.world.physics import catalogue, physics_named
 from mtv_world_ros.bench.world.simulator import CONTROL_PERIOD_S, SimEpisode
 from mtv_world_ros.data.episode import NOMINAL
-from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation, SuccessEstimate
+from mtv_world_ros.data_types import (
+    ByteArray,
+    FloatArray,
+    JointTrajectory,
+    Observation,
+    SuccessEstimate,
+)
 from mtv_world_ros.errors import MtvWorldError, PolicyError, SimulatorError
 from mtv_world_ros.foresight.arm_response import PERIOD_S
 from mtv_world_ros.foresight.loading import load_foresight
@@ -59,6 +70,7 @@ from mtv_world_ros.imagined_episode import ImaginedEpisode
 from mtv_world_ros.lab.evaluation.metrics.statistics import clustered_wilson
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.rendering.images import encode_png, resize_frames
 from mtv_world_ros.success.doubts import NEAR_M, PhysicsWatch, unforeseen
 from mtv_world_ros.success.estimator import capped, verdict
 from mtv_world_ros.success.foreseen import foreseen_of
@@ -81,6 +93,7 @@ WATCHED = (
     'truth', 'foreseen by', 'chunks that ended unforeseen',
     'says so after rollouts: median [5 %, 95 %]', 'orders in which it never does',
 )  # fmt: skip
+FLIPPED = ('truth', 'imagined by', 'flips of contact that are imagined')
 FORESEEN, PICTURES, BOTH = 'foreseen motions alone', 'pictures alone (paper)', 'both'
 REAL, RULE, FITTED = 'real frames', 'no-picture rule', 'foreseen motions, fitted there'
 #: random orders of rollouts in which the watch sees them
@@ -186,7 +199,28 @@ def imagined(pipeline: Pipeline, episode: ImaginedEpisode, commands: FloatArray)
         joint_names=pipeline.robot.joint_names, times=times, positions=commands[1:]
     )
     *_, last = episode.extend(plan)
-    return {'features': features_of(last.success)}
+    return {'features': features_of(last.success), 'ends': packed(episode.observation.frames)}
+
+
+def packed(frames: ByteArray) -> str:
+    """Returns frames (V, H, W, 3) uint8 RGB, views in a row, as text."""
+    return base64.b64encode(encode_png(np.concatenate(list(frames), axis=1))).decode()
+
+
+def unpacked(text: str) -> ByteArray:
+    """Returns what `packed` was given, (H, V * W, 3)."""
+    data = np.frombuffer(base64.b64decode(text), np.uint8)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+
+
+def ends_of(pipeline: Pipeline, sim: SimEpisode, names: tuple[str, ...]) -> dict[str, str]:
+    """Returns the picture that a rollout ends with, and where objects are in it, as text."""
+    last = observed(sim, sim.observe())
+    size = pipeline.spec.width, pipeline.spec.height
+    frames = np.stack([resize_frames(frame[None], *size)[0] for frame in last.frames])
+    masks = pipeline.segmenter.segment(frames[:, None], names).masks[:, :, 0]
+    objects = base64.b64encode(objects_png(masks)).decode()
+    return {'ends': packed(frames), 'objects': objects}
 
 
 def observed(sim: SimEpisode, seen: Any) -> Observation:
@@ -249,6 +283,10 @@ class Scenes:
             seen = sim.reset(seed, task)
             first = observed(sim, seen)
             take = carry_out(sim, task_named(task), plan, seen, record)
+            ends: dict[str, str] = {}
+            if physics in self._of['pictures']:
+                names = tuple(item.name for item in sim.scene.objects)
+                ends = ends_of(next(iter(self._pipelines.values())), sim, names)
         finally:
             sim.close()
         end = take.control_positions.shape[0] * CONTROL_PERIOD_S
@@ -273,7 +311,7 @@ class Scenes:
                 begun = pipeline.begin(first, instruction=sim.instruction, seed=seed)
                 said[name][REAL] = frames_judged(pipeline, begun, take)
         rule = self._once(name, RULE, first, sim.instruction, commands, seed)
-        return {'final': take.final, 'said': said, 'rule': rule}
+        return {'final': take.final, 'said': said, 'rule': rule, **ends}
 
     def _plan(self, job: Job, robot: RobotModel) -> tuple[JointTrajectory, FloatArray]:
         """The policy's plan, and where it begins; one a table and size of objects."""
@@ -450,13 +488,19 @@ def across(rows: Sequence[Row]) -> list[list[str]]:
         least = min(of, key=lambda r: r.auroc if isfinite(r.auroc) else 2.0)
         most = max(of, key=lambda r: r.false_success if isfinite(r.false_success) else -1.0)
         lines.append(
-            [judge, str(len(of)), f'{np.nanmean([r.auroc for r in of]):.2f}',
+            [judge, str(len(of)), f'{_mean([r.auroc for r in of]):.2f}',
              f'{least.auroc:.2f} ({least.physics})',
-             f'{np.nanmean([r.false_success for r in of]):.2f}',
+             f'{_mean([r.false_success for r in of]):.2f}',
              f'{most.false_success:.2f} ({most.physics})',
              f'{np.mean([r.unknown for r in of]):.2f}']
         )  # fmt: skip
     return lines
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Mean of those that are known; NaN = none is."""
+    known = [value for value in values if isfinite(value)]
+    return float(np.mean(known)) if known else nan
 
 
 def _share(hits: np.ndarray, among: np.ndarray, scenes: Sequence[tuple[str, int]]) -> str:
@@ -487,6 +531,35 @@ def rows_of(
         rule = [nan if r['rule']['value'] is None else r['rule']['value'] for r in chosen]
         rows.append(row(physics, RULE, chosen, np.array(rule)))
     return rows
+
+
+def flip_rows(
+    options: argparse.Namespace, found: Sequence[dict[str, Any]], names: Iterable[str]
+) -> list[list[str]]:
+    """Returns how many flips of contact each way of imagining shows, in each physics."""
+    rows, names = [], list(names)
+    for physics in options.physics.split(','):
+        chosen = [r for r in found if r['job'][0] == physics and 'ends' in r]
+        experts = {tuple(r['job'][1:3]): r for r in chosen if r['job'][4] == EXPERT}
+        pairs = [(r, experts.get(tuple(r['job'][1:3]))) for r in chosen]
+        flips = [(r, e) for r, e in pairs if e is not None and e['final'] != r['final']]
+        for name in names:
+            for judge in IMAGINED:
+                known = [(r, e) for r, e in flips if 'ends' in r['said'][name].get(judge, {})]
+                hits = np.array([is_flip(r, e, r['said'][name][judge]['ends']) for r, e in known])
+                scenes = [(r['job'][1], r['job'][2]) for r, _ in known]
+                if known:
+                    title = judge if len(names) == 1 else f'{judge}, {name}'
+                    share = _share(hits, np.ones(len(known), np.bool_), scenes)
+                    rows.append([physics, title, share])
+    return rows
+
+
+def is_flip(faulty: dict[str, Any], expert: dict[str, Any], imagined_ends: str) -> bool:
+    """Returns whether an imagined end is nearer to the faulty rollout's than to the expert's."""
+    own, other, imagined_end = map(unpacked, (faulty['ends'], expert['ends'], imagined_ends))
+    objects = (unpacked(faulty['objects']) > 127) | (unpacked(expert['objects']) > 127)
+    return is_nearer(imagined_end, own, other, np.asarray(objects.any(-1)))
 
 
 def watch_rows(
@@ -558,6 +631,8 @@ def main() -> None:
                 table(HEAD, [r.cells for r in rows]),
                 'Over all truths but the nominal one:',
                 table(ACROSS, across(rows)),
+                'Flips of contact:',
+                table(FLIPPED, flip_rows(options, found, list(pipelines))),
                 'Executed chunks against the futures:',
                 table(WATCHED, watch_rows(options, found, list(pipelines))),
             ]

@@ -6,6 +6,7 @@ Shape letters: V views, O objects, S solids, K futures, T steps, J joints.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -28,6 +29,9 @@ STEP_S = COMMANDS_A_STEP * PERIOD_S
 _ENOUGH = 0.5
 #: solids that reach into each other by more were not found well [m]
 _OVERLAP_M = 0.01
+#: solids whose bottoms differ by less stand on one table; it is where the numbers of contact say
+#: if it is as near, and corrected if it is no further away [m]
+_LEVEL_M, _SAME_TABLE_M, _NEAR_TABLE_M = 0.004, 0.003, 0.03
 #: what is further from the robot's base was not found on its table [m]
 _TABLE_REACH_M = 2.0
 
@@ -83,7 +87,27 @@ class SolidForesight:
             cameras: V cameras at the masks' size.
             poses: V of T_base_camera (4, 4).
         """
-        return self._found(names, masks, cameras, poses, [None] * len(names))
+        given, unknown = (names, masks, cameras, poses), [None] * len(names)
+        found, told = self._found(*given, unknown), self.settings.table_m
+        table = _table_under(found.solids)
+        if not _SAME_TABLE_M < abs(table - told) < _NEAR_TABLE_M:
+            return found
+        # solids are drawn to the table that they are fitted on
+        found = self._on_table(table)._found(*given, unknown)
+        again = _table_under(found.solids)
+        table = again if np.isfinite(again) else table
+        word = 'higher' if table > told else 'lower'
+        note = (
+            f'the table seems {1e3 * abs(table - told):.0f} mm {word} than contact.json has it; '
+            'corrected for this episode (mtv-world fit-contact finds it)'
+        )
+        return replace(found, foresight=self._on_table(table), note=note)
+
+    def _on_table(self, height: float) -> SolidForesight:
+        """The same on a table of another height [m]."""
+        other = copy.copy(self)
+        other.settings = self.settings.model_copy(update={'table_m': height})
+        return other
 
     def find_again(
         self,
@@ -95,12 +119,12 @@ class SolidForesight:
     ) -> tuple[TrackedSolids, BoolArray, BoolArray]:
         """Returns objects that something may hide in part by now; see `ObjectMotionModel`."""
         points = locate_all(cameras, poses, centroids(masks))
-        floor = self.settings.table_m
+        floor = whole.foresight.settings.table_m
         solids = [
             solid and find_solid(solid, masks[:, item], points[item], cameras, poses, floor)
             for item, solid in enumerate(whole.solids)
         ]
-        anew = self._found(names, masks, cameras, poses, solids)
+        anew = whole.foresight._found(names, masks, cameras, poses, solids)
         same = np.array([solid is not None for solid in solids], np.bool_)
         hidden = np.array([solid is not None and solid.is_hidden for solid in solids], np.bool_)
         turned = np.tile(np.eye(3), (len(names), 1, 1))
@@ -111,7 +135,8 @@ class SolidForesight:
             turned[item], reference[item] = was.turn_to(now), was.centre
         # one view alone tells how far away it is by its size, which is not to be relied on
         by_two = np.asarray(masks.any((-2, -1)).sum(0) > 1)
-        return replace(anew, reference=reference, turned=turned), same & by_two, hidden
+        anew = replace(anew, reference=reference, turned=turned, note=whole.note)
+        return anew, same & by_two, hidden
 
     def _found(
         self,
@@ -134,7 +159,7 @@ class SolidForesight:
             foresight=self,
             names=tuple(names),
             solids=solids,
-            doubts=_doubts(names, masks, solids),
+            doubts=_doubts(names, masks, solids, floor),
         )
 
 
@@ -147,6 +172,7 @@ class TrackedSolids:
         names: O of them.
         solids: O, as found; None = not seen by two views.
         doubts: number of an object -> why nothing is foreseen of it.
+        note: what was corrected, in words; empty = nothing.
         reference: (O, 3) where their motions count from [m]; None = where they were found.
         turned: (O, 3, 3) from there to where they were found.
         batch: what computes their futures; None = nothing has moved yet.
@@ -157,6 +183,7 @@ class TrackedSolids:
     names: tuple[str, ...]
     solids: tuple[Solid | None, ...]
     doubts: Mapping[int, str] = field(default_factory=dict)
+    note: str = ''
     reference: FloatArray | None = None
     turned: FloatArray | None = None
     batch: Batch | None = None
@@ -199,7 +226,7 @@ class TrackedSolids:
     @property
     def reasons(self) -> tuple[str, ...]:
         """Why nothing is foreseen, or what speaks against it, in words."""
-        doubts = tuple(dict.fromkeys(self.doubts.values()))
+        doubts = (*dict.fromkeys(self.doubts.values()), *([self.note] if self.note else ()))
         if self.state is None or not self.state.lost:
             return doubts
         lost, count = self.state.lost, self.foresight.settings.num_motions
@@ -289,8 +316,19 @@ def _upright(solid: Solid) -> FloatArray:
     return replace(solid, yaw=0.0).turn_to(solid)
 
 
+def _bottom(solid: Solid) -> float:
+    return float(solid.centre[2] - solid.size[2] / 2)
+
+
+def _table_under(solids: Sequence[Solid | None]) -> float:
+    """Height of the table that the lowest solids stand on [m]; NaN = one alone does not tell."""
+    bottoms = np.array([_bottom(solid) for solid in solids if solid is not None])
+    level = bottoms[bottoms < bottoms.min(initial=np.inf) + _LEVEL_M]
+    return float(level.mean()) if len(level) > 1 else float('nan')
+
+
 def _doubts(
-    names: Sequence[str], masks: BoolArray, solids: Sequence[Solid | None]
+    names: Sequence[str], masks: BoolArray, solids: Sequence[Solid | None], table: float
 ) -> dict[int, str]:
     """What of the objects cannot be so, in words that name them."""
     doubts: dict[int, str] = {}
@@ -300,6 +338,9 @@ def _doubts(
             doubts[number] = f"'{name}' is seen by one view alone: where it is is not known"
         elif solid is not None and np.abs(solid.centre[:2]).max() > _TABLE_REACH_M:
             doubts[number] = f"'{name}' seems to lie off the table"
+        elif solid is not None and _bottom(solid) < table - _NEAR_TABLE_M:
+            depth = 1e3 * (table - _bottom(solid))
+            doubts[number] = f"'{name}' seems to lie {depth:.0f} mm below the table"
     known = [(n, s) for n, s in enumerate(solids) if s is not None]
     for count, (one, solid) in enumerate(known):
         for other, second in known[:count]:
@@ -311,7 +352,7 @@ def _doubts(
 
 def _floats(solid: Solid, others: Sequence[Solid], table: float) -> float:
     """How far above the table a solid is on which nothing holds it [m]; 0 = it stands."""
-    height = float(solid.centre[2] - solid.size[2] / 2) - table
+    height = _bottom(solid) - table
     if height < 3 * STANDS_M or any(_apart(solid, other) < 0 for other in others):
         return 0.0
     return height
@@ -321,7 +362,7 @@ def _overlap(one: Solid, other: Solid) -> bool:
     """Whether solids reach into each other, and neither stands in or on the other."""
     depth = -_apart(one, other)
     tops = [solid.centre[2] + solid.size[2] / 2 for solid in (one, other)]
-    bottoms = [solid.centre[2] - solid.size[2] / 2 for solid in (one, other)]
+    bottoms = [_bottom(solid) for solid in (one, other)]
     over = min(tops) - max(bottoms)
     return depth > _OVERLAP_M and over > _OVERLAP_M and not (one.is_open or other.is_open)
 

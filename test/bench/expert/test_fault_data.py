@@ -208,3 +208,21 @@ def test_the_command_prints_kinds(capsys):
     assert 'drawn_5_0: drawn, test; 1, at most 3' in said
     assert main(['faults', 'hihg']) == 1
     assert "did you mean 'high'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('number', range(NUM_DRAWN))
+def test_a_drawn_kind_of_contact_changes_a_grasp_a_hold_or_a_release(number):
+    name = f'drawn_contact_{number}_{number}'
+    assert kinds_of(f'drawn_contact:{number}')[number] == name
+    kind = FAULTS[name]
+    assert kind.split == 'test' and not kind.commands and 1 <= len(kind.edits) <= 2
+    assert FAULTS[name] == kind  # its name alone gives it again
+    assert FAULTS[f'drawn_{number}_{number}'] != kind
+
+
+def test_a_gripper_opens_no_further_than_it_can():
+    wide = [{'edit': {'phases': ['lift', 'carry'], 'opening': {'least': [0.0, 0.7]}}}]
+    for size, expected in ((1.0, 0.7), (3.0, 1.0)):
+        found = edited(wide, stops(), size, draws())
+        openings = [stop.opening for stop in found if stop.phase in ('lift', 'carry')]
+        assert openings == [expected] * 2

@@ -1,5 +1,7 @@
 """The bundled model's foresight over the running node: doubt that comes of what really happens."""
 
+import re
+
 import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo
@@ -95,16 +97,30 @@ def test_the_node_says_that_its_physics_is_another_one_and_estimates_widen(node,
     truly = np.arange(1, round(PLAN_S * FPS) + 1) / FPS
     node.publish('/instruction', String(data=recording.instruction))
     execute(node, recording, truly)
-    node.wait(lambda: said(node) == 'as it was fitted, by 2 executed chunks', 'it')
+    node.wait(lambda: said(node).startswith('as it was fitted, by '), 'it')
     sure = node.report_values('chunk')[-1]
-    for _ in range(3):  # the blocks stay where they are, whatever the arm does
+    # the blocks stay where they are, whatever the arm does; a chunk of which a frame was lost, as
+    # on a busy machine, does not count, so that three plans are enough but more may be needed
+    for _ in range(6):
         execute(node, recording, 0 * truly)
-    node.wait(lambda: said(node).startswith(f'{SAYS}: 6 of the last 8'), 'the doubt')
+        if parted(node):
+            break
+    node.wait(lambda: parted(node), 'the doubt')
+    unforeseen, of = parted(node)
+    assert 4 <= unforeseen < of
     execute(node, recording, truly)
     doubted = node.report_values('chunk')[-1]
     assert SAYS in doubted['success_reasons']
     assert float(doubted['success']) < float(sure['success'])
     assert width(doubted) > width(sure) + 0.3
+    # what goes as foreseen is no further surprise
+    assert not parted(node) or parted(node)[0] == unforeseen
+
+
+def parted(node) -> tuple[int, ...]:
+    """Chunks that ended unforeseen, and all that count; none where there is no doubt."""
+    found = re.match(rf'{SAYS}: (\d+) of the last (\d+) executed', said(node))
+    return tuple(map(int, found.groups())) if found else ()
 
 
 def said(node) -> str:

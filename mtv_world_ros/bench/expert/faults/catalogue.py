@@ -18,7 +18,12 @@ import numpy as np
 from pydantic import AfterValidator
 
 from mtv_world_ros.bench.expert.faults.commands import COMMANDS
-from mtv_world_ros.bench.expert.faults.drawn import drawn_names, drawn_values, is_drawn
+from mtv_world_ros.bench.expert.faults.drawn import (
+    drawn_names,
+    DRAWN_SETS,
+    drawn_values,
+    is_drawn,
+)
 from mtv_world_ros.bench.expert.faults.edits import PRIMITIVES, ROW
 from mtv_world_ros.bench.expert.faults.second_arm import SecondArm
 from mtv_world_ros.config import ListOf, Number, read_yaml, Schema, validated
@@ -160,18 +165,18 @@ def kinds_named(text: str) -> tuple[str, ...]:
 
 
 def kinds_of(split: str) -> tuple[str, ...]:
-    """Returns the fault kinds of a split, or of `drawn:SEED`.
+    """Returns the fault kinds of a split, of `drawn:SEED` or of `drawn_contact:SEED`.
 
     Raises:
         PolicyError: no such split.
     """
     word, _, seed = split.partition(':')
-    if word == 'drawn' and seed.isdecimal() and len(seed) < 10:
-        return drawn_names(int(seed))
+    if word in DRAWN_SETS and seed.isdecimal() and len(seed) < 10:
+        return drawn_names(int(seed), word)
     if split not in SPLITS:
         raise PolicyError(
             f"unknown split of fault kinds '{split}'{nearest(split, SPLITS)}; known are "
-            f'{", ".join(SPLITS)} and drawn:SEED'
+            f'{", ".join((*SPLITS, *(f"{drawn}:SEED" for drawn in DRAWN_SETS)))}'
         )
     return tuple(name for name, kind in FAULTS.items() if kind.split == split)
 

@@ -1,7 +1,8 @@
 """Fault kinds composed from a seed: steps with a drawn phase, direction and size.
 
 A drawn kind is called `drawn_SEED_NUMBER`, and its name alone gives it again. It belongs to the
-split `test`: nothing learns from it.
+split `test`: nothing learns from it. A kind `drawn_contact_SEED_NUMBER` changes a grasp, a hold or
+a release a little, so that what is touched decides.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ import numpy as np
 NUM_DRAWN = 12
 #: the sizes of a drawn kind are factors of what was drawn: in rankings, and the largest
 RANKED, LARGEST = (0.6, 1.2), 3.0
-_NAME = re.compile(r'drawn_(\d{1,9})_(\d{1,3})')
+_NAME = re.compile(r'(drawn|drawn_contact)_(\d{1,9})_(\d{1,3})')
+#: sets that a seed draws
+DRAWN_SETS = ('drawn', 'drawn_contact')
 #: way points that are changed together; where rows are inserted, like which way point, and in
 #: which phase
 _GROUPS = (
@@ -46,11 +49,24 @@ _COMMANDS: tuple[tuple[str, dict[str, Any], tuple[float, float]], ...] = (
     ('quantise', {}, (0.06, 0.14)),
     ('limit_speed', {}, (0.3, 0.3)),
 )
+#: way points of a grasp, of what is held, and of the way down
+_GRASP, _HELD, _DOWN = ('above', 'grasp', 'close'), ('close', 'lift', 'carry', 'lower'), ('lower',)
+#: what a drawn kind of contact does, and the range of what is drawn
+_CONTACT: tuple[tuple[str, tuple[float, float]], ...] = (
+    ('the grasp is {:g} m off along the fingers', (0.008, 0.025)),
+    ('the grasp is {:g} m off across the fingers', (0.008, 0.025)),
+    ('the grasp is {:g} m too high', (0.01, 0.035)),
+    ('the grasp is turned by {:g} rad', (0.3, 0.9)),
+    ('the gripper holds at least {:g} open', (0.3, 0.8)),
+    ('on the way down it opens {:g}', (0.5, 1.0)),
+    ('while it opens it goes {:g} m aside', (0.02, 0.07)),
+    ('what is held is shaken by {:g} m', (0.03, 0.08)),
+)
 
 
-def drawn_names(seed: int) -> tuple[str, ...]:
-    """Returns the names of the kinds of a seed."""
-    return tuple(f'drawn_{seed}_{number}' for number in range(NUM_DRAWN))
+def drawn_names(seed: int, drawn: str = 'drawn') -> tuple[str, ...]:
+    """Returns the names of the kinds of a seed, in one of the sets."""
+    return tuple(f'{drawn}_{seed}_{number}' for number in range(NUM_DRAWN))
 
 
 def is_drawn(name: str) -> bool:
@@ -61,16 +77,24 @@ def is_drawn(name: str) -> bool:
 def drawn_values(name: str) -> dict[str, Any]:
     """Returns the entry of a drawn kind, as `config/faults` has those of the others.
 
-    Steps are one edit of way points, or two, or one of them and one of commands.
+    Steps are one edit of way points, or two, or one of them and one of commands; of contact one
+    edit or two different ones.
     """
     match = _NAME.fullmatch(name)
     assert match is not None, name
-    rng = np.random.default_rng([int(match[1]), int(match[2])])
+    drawn, seed, number = match[1], int(match[2]), int(match[3])
+    rng = np.random.default_rng([seed, number, *([1] if drawn == 'drawn_contact' else [])])
     edits, commands, said = [], [], []
-    for is_edit in ((True,), (True, True), (True, False), (False,))[int(rng.integers(4))]:
-        step, text = _edit(rng) if is_edit else _command(rng)
-        (edits if is_edit else commands).append(step)
-        said.append(text)
+    if drawn == 'drawn_contact':
+        for which in rng.choice(len(_CONTACT), int(rng.integers(1, 3)), replace=False):
+            step, text = _touched(int(which), rng)
+            edits.append(step)
+            said.append(text)
+    else:
+        for is_edit in ((True,), (True, True), (True, False), (False,))[int(rng.integers(4))]:
+            step, text = _edit(rng) if is_edit else _command(rng)
+            (edits if is_edit else commands).append(step)
+            said.append(text)
     return {
         'family': 'drawn',
         'split': 'test',
@@ -112,6 +136,29 @@ def _edit(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
             rows = [{'by': {'drawn': [0.0, sign * far]}} for sign in (1, -1, 1)]
             options = {**where, 'seconds': seconds, 'rows': [*rows, {}]}
             return {'insert': options}, f'{at}, it goes to and fro by {far:g} m'
+
+
+def _touched(which: int, rng: np.random.Generator) -> tuple[dict[str, Any], str]:
+    """A step of a kind of contact, and what it is in words."""
+    text, (least, most) = _CONTACT[which]
+    far = _round(rng.uniform(least, most))
+    size = [0.0, far]
+    match which:
+        case 0 | 1 | 2:
+            way = ('along', 'across', 'up')[which]
+            step = {'edit': {'phases': list(_GRASP), 'by': {way: size}}}
+        case 3:
+            step = {'edit': {'phases': list(_GRASP), 'yaw': {'add': size, 'side': 'drawn'}}}
+        case 4 | 5:
+            held = list(_HELD if which == 4 else _DOWN)
+            step = {'edit': {'phases': held, 'opening': {'least': size}}}
+        case 6:
+            step = {'edit': {'phases': ['open', 'retreat'], 'by': {'anywhere': size}}}
+        case _:
+            rows = [{'by': {'drawn': [0.0, sign * far]}} for sign in (1, -1, 1)]
+            where = {'at': 'after lift', 'like': 'lift', 'phase': 'carry', 'seconds': 0.2}
+            step = {'insert': {**where, 'rows': [*rows, {}]}}
+    return step, text.format(far)
 
 
 def _command(rng: np.random.Generator) -> tuple[dict[str, Any], str]:

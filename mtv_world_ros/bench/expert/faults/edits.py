@@ -34,7 +34,7 @@ def _number(spec: Any, old: float, move: EditedMove, stop: WayPoint, weight: flo
     old = move.stop(spec['like']).opening if 'like' in spec else old
     match spec:
         case {'least': value}:
-            return max(old, move.length(value))
+            return max(old, min(move.length(value), 1.0))  # of openings: it opens no further
         case {'times': value}:
             return old * move.length(value)
         case {'add': value, 'side': side}:

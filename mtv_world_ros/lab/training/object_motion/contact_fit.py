@@ -148,13 +148,19 @@ _WORDS = {
     'finger_stiffness': 'stiffness of fingers [N/m]',
     'delay_s': 'commands arrive late by [s]',
     'table_m': 'height of the table [m]',
+    'hold': 'friction x stiffness of fingers / density: whether things slip [N m^2/kg]',
 }
+#: exponents of numbers that make up for each other: an object slips where this product is small
+_HOLD = {'grip_friction': 1, 'finger_stiffness': 1, 'density': -1}
 #: how far settings usually are from the first ones, as the deviation of a logarithm
 _USUAL = 1.0
 #: draws of a round, and rounds
 _DRAWS, _ROUNDS = 64, 3
-#: draws that are worth fewer alike ones do not show how uncertain a number is
-_FEW = 5.0
+#: draws worth fewer alike ones do not show how uncertain a number is. Where they are worth
+#: fewer than enough, or than a share of all, the likelihood counts less, down to a share
+_FEW, _ENOUGH, _ENOUGH_SHARE, _LEAST_COUNTS = 5.0, 16.0, 1 / 8, 0.01
+#: numbers whose interval is so many times wider than if the others were known are not told apart
+_APART = 2.0
 #: an object this far from where it was foreseen is about as unlikely as it gets [m]; farther ones
 #: may be lost by the masks
 _NEAR_M, _LOST_M = 0.008, 0.1
@@ -202,13 +208,16 @@ class Finding:
     """A number that was found.
 
     Attributes:
-        name: of the setting.
-        value: most likely.
-        low: lower end of its 90 % interval.
+        name: of the setting, or of a product of settings.
+        value: the mean of what is likely.
+        low: lower end of its 90 % interval, whatever the other numbers are.
         high: upper end.
-        spread: standard deviation, of factors that of the logarithm.
-        count: episodes, or objects, that say something of it.
+        spread: standard deviation if the other numbers are as found, of factors that of the
+            logarithm.
+        count: recordings, or objects, that say something of it.
         of: that were looked at.
+        counted: what `count` and `of` are.
+        apart: its interval is hardly wider than if the other numbers were known.
     """
 
     name: str
@@ -218,11 +227,15 @@ class Finding:
     spread: float
     count: int
     of: int
+    counted: str = 'recordings'
+    apart: bool = True
 
     def __str__(self) -> str:
-        rests = f'rests on {self.count} of {self.of} recordings'
+        rests = f'rests on {self.count} of {self.of} {self.counted}'
         if not self.count:
-            rests = f'none of {self.of} recordings tells: this is what was thought before'
+            rests = f'none of {self.of} {self.counted} tells: this is what was thought before'
+        elif not self.apart:
+            rests += '; not told apart from the other numbers by these'
         return f'{_WORDS[self.name]}: {self.value:.3g} [{self.low:.3g}, {self.high:.3g}] ({rests})'
 
 
@@ -331,10 +344,14 @@ def fit_contact(
     engine = Engine(arms, threads)
     trials = [_Trial.of(one, first) for one in recordings]
     factors, likelihoods, weights = _populations(engine, trials, first, report, progress)
+    logs = factors + np.log([_scales(first)[name] for name in RANGES])
+    known = _conditional(logs, weights).tolist()
     found = [
-        _finding(name, column, np.log(_scales(first)[name]) + factors, likelihoods, weights)
-        for column, name in enumerate(RANGES)
+        _finding(name, values, likelihoods, weights, spread)
+        for name, values, spread in zip(RANGES, logs.T, known, strict=True)
     ]
+    products = logs @ [_HOLD.get(name, 0) for name in RANGES]
+    hold = _finding('hold', products, likelihoods, weights)
     values = {one.name: one.value for one in found}
     heavier = values['density'] / first.density
     stiffer = values['finger_stiffness'] / first.finger_stiffness
@@ -349,15 +366,14 @@ def fit_contact(
     spread = first.spread.model_copy(
         update={**spreads, 'delay_s': max(delay.spread, first.spread.delay_s)}
     )
-    for one in found:
+    for one in (*found, hold):
         report(str(one))
     if _worth(weights) < _FEW:
         report(
             f'{_worth(weights):.1f} draws decide: these numbers are likely together, but their '
-            'intervals are too narrow; friction and stiffness of fingers and density make up for '
-            'each other'
+            'intervals are too narrow'
         )
-    return first.model_copy(update={**values, 'spread': spread}), [table, delay, *found]
+    return first.model_copy(update={**values, 'spread': spread}), [table, delay, *found, hold]
 
 
 def _scales(first: ContactSettings) -> dict[str, float]:
@@ -398,17 +414,50 @@ def _populations(
         ]
         mixture = np.logaddexp.reduce(densities, axis=0) - np.log(len(proposals))
         usual = -(((draws - middle) / _USUAL) ** 2).sum(-1) / 2
-        logs = likelihoods.sum(-1) + usual - mixture
-        weights = np.exp(logs - logs.max())
-        weights /= weights.sum()
-        mean = weights @ draws
-        spread = np.sqrt(weights @ (draws - mean) ** 2)
-        report(f'round {number + 1}: {len(draws)} draws, worth {_worth(weights):.1f} alike')
-        wide = np.diag(np.maximum(_WIDER * spread, _LEAST) ** 2)
+        weights, counts = _weights(likelihoods.sum(-1), usual - mixture)
+        mean, wide = weights @ draws, _WIDER**2 * _covariance(draws, weights)
+        wide += _LEAST**2 * np.eye(len(mean))
+        tempered = '' if counts == 1 else f', {counts:.2g} of the likelihood counted'
+        worth = f'worth {_worth(weights):.1f} alike'
+        report(f'round {number + 1}: {len(draws)} draws, {worth}{tempered}')
         proposals.append((mean, wide))
         rng = np.random.default_rng((_SEED, number))
         drawn = np.clip(rng.multivariate_normal(mean, wide, _DRAWS), low, high)
     return draws, likelihoods, weights
+
+
+def _weights(likelihoods: FloatArray, others: FloatArray) -> tuple[FloatArray, float]:
+    """Weights (N,) of draws, which sum to 1, and the share of the likelihood that counts.
+
+    Foresight is rough whatever the settings, which a likelihood of many recordings does not know:
+    few draws would decide. So as much of it counts as leaves enough draws (tempering).
+
+    Args:
+        likelihoods: (N,) logarithms.
+        others: (N,) all other logarithms of weights.
+    """
+    enough = min(_ENOUGH, _ENOUGH_SHARE * len(likelihoods))
+    weights, share = np.zeros(0), 1.0
+    for share in np.geomspace(1, _LEAST_COUNTS, 40):
+        logs = share * likelihoods + others
+        weights = np.exp(logs - logs.max())
+        weights /= weights.sum()
+        if _worth(weights) >= enough:
+            break
+    return weights, float(share)
+
+
+def _covariance(draws: FloatArray, weights: FloatArray) -> FloatArray:
+    """(P, P) of draws (N, P) with weights (N,)."""
+    off = draws - weights @ draws
+    return (weights * off.T) @ off
+
+
+def _conditional(draws: FloatArray, weights: FloatArray) -> FloatArray:
+    """(P,) standard deviations of numbers if the others are known, of draws (N, P)."""
+    covariance = _covariance(draws, weights)
+    floor = 1e-9 * np.eye(len(covariance))
+    return np.asarray(np.diag(np.linalg.inv(covariance + floor)) ** -0.5, np.float64)
 
 
 def _worth(weights: FloatArray) -> float:
@@ -431,17 +480,29 @@ def _settings(first: ContactSettings, logs: FloatArray) -> ContactSettings:
 
 
 def _finding(
-    name: str, column: int, logs: FloatArray, likelihoods: FloatArray, weights: FloatArray
+    name: str,
+    values: FloatArray,
+    likelihoods: FloatArray,
+    weights: FloatArray,
+    conditional: float | None = None,
 ) -> Finding:
-    """What draws (N, P), given as logarithms with their likelihoods, say of a number."""
-    values = logs[:, column]
+    """What draws of a number say of it.
+
+    Args:
+        name: of the number.
+        values: (N,) logarithms.
+        likelihoods: (N, E) of the draws.
+        weights: (N,) of the draws, which sum to 1.
+        conditional: standard deviation if the other numbers are known; None = it stands alone.
+    """
     order = np.argsort(values)
     shares = np.cumsum(weights[order]) - weights[order] / 2
-    low, middle, high = np.interp((0.05, 0.5, 0.95), shares, values[order])
-    spread = float(np.sqrt(weights @ (values - weights @ values) ** 2))
+    middle = weights @ values
+    low, high = np.interp((0.05, 0.95), shares, values[order])
+    spread = float(np.sqrt(weights @ (values - middle) ** 2))
     thirds = np.quantile(values[:_DRAWS], (1 / 3, 2 / 3))
     ends = [likelihoods[:_DRAWS][part].mean(0) for part in
-            (values[:_DRAWS] < thirds[0], values[:_DRAWS] > thirds[1])]  # fmt: skip
+            (values[:_DRAWS] <= thirds[0], values[:_DRAWS] >= thirds[1])]  # fmt: skip
     count = int((np.abs(ends[0] - ends[1]) > _SAYS).sum())
     low, middle, high = np.exp([low, middle, high]).tolist()
     return Finding(
@@ -449,9 +510,10 @@ def _finding(
         value=middle,
         low=low,
         high=high,
-        spread=spread,
+        spread=spread if conditional is None else conditional,
         count=count,
         of=likelihoods.shape[1],
+        apart=conditional is None or bool(spread < _APART * conditional),
     )
 
 
@@ -546,16 +608,17 @@ def find_table(recordings: Sequence[ContactRecording]) -> Finding:
             ]  # fmt: skip
             # logarithms: what is no box or cylinder fits badly at any height
             errors.append([np.nan if s is None else np.log(s.error_px + 0.05) for s in row])
-    return _least('table_m', np.array(errors), _HEIGHTS)
+    return _least('table_m', np.array(errors), _HEIGHTS, 'objects')
 
 
-def _least(name: str, errors: FloatArray, values: FloatArray) -> Finding:
-    """The value with the least errors (E, N), with an interval from resampled episodes."""
+def _least(
+    name: str, errors: FloatArray, values: FloatArray, counted: str = 'recordings'
+) -> Finding:
+    """The value with the least errors (E, N), with an interval from resampled ones."""
     known = errors[np.isfinite(errors).all(-1)]
     if not len(known):
-        return Finding(
-            name=name, value=0.0, low=0.0, high=0.0, spread=0.0, count=0, of=len(errors)
-        )
+        nothing = dict.fromkeys(('value', 'low', 'high', 'spread'), 0.0)
+        return Finding(name=name, count=0, of=len(errors), counted=counted, **nothing)
     rng = np.random.default_rng(_SEED)
     rows = rng.integers(0, len(known), (_RESAMPLED, len(known)))
     found = np.array([_lowest(known[row].mean(0), values) for row in rows])
@@ -568,6 +631,7 @@ def _least(name: str, errors: FloatArray, values: FloatArray) -> Finding:
         spread=float(found.std()),
         count=len(known),
         of=len(errors),
+        counted=counted,
     )
 
 
