@@ -1,13 +1,14 @@
-"""Runs everything that wants a GPU, in nine minutes at most, and prints one page.
+"""Runs everything that wants a GPU, in ten minutes at most, and prints one page.
 
     python benchmark/gpu.py pack gpu.tar.xz      on a machine with a network and git
     tar xf gpu.tar.xz && python3 gpu/benchmark/gpu.py run     on one with a GPU and PyTorch
 
 The second machine needs no network: this tree and the packages that such a machine lacks are in
-the file. What is run: the tests marked `gpu`; the speed of `wan-1.3b` at 4 and 16 steps beside
-diffusers' own pipeline, plain, compiled, with cuDNN's attention and a tiny autoencoder; its
-training; `wan-14b` for two steps. `run --tiny` runs the same parts on a CPU with a small model, to
-see that they run. Only the standard library is used here.
+the file. What is run: the speed of `wan-1.3b`, compiled, at 4 and 16 steps beside diffusers' own
+pipeline, and plain, offloaded and with a tiny autoencoder; its training, plain, compiled and
+without recomputing blocks; the tests marked `gpu`; `wan-14b` for two steps. `run --tiny` runs the
+same parts on a CPU with a small model, to see that they run. Only the standard library is used
+here.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ import tempfile
 import time
 
 ROOT = Path(__file__).resolve().parents[1]
-#: packages that a machine with PyTorch and transformers lacks; versions: the tested ones
+#: packages that a machine with PyTorch lacks, or has in other versions than the tested ones
 PACKAGES = (
-    'annotated-types', 'coal', 'diffusers', 'eigenpy', 'importlib_metadata', 'libcoal',
-    'libpinocchio', 'lz4', 'mcap', 'mcap-ros2-support', 'peft', 'accelerate', 'pin', 'pydantic',
-    'pydantic_core', 'rosbags', 'ruamel.yaml', 'simplejpeg', 'typing-inspection', 'zipp',
-    'zstandard',
+    'annotated-types', 'coal', 'diffusers', 'eigenpy', 'huggingface_hub', 'importlib_metadata',
+    'libcoal', 'libpinocchio', 'lz4', 'mcap', 'mcap-ros2-support', 'peft', 'accelerate', 'pin',
+    'pydantic', 'pydantic_core', 'rosbags', 'ruamel.yaml', 'simplejpeg', 'tokenizers',
+    'transformers', 'typing-inspection', 'zipp', 'zstandard',
 )  # fmt: skip
 #: what the measured code imports and never calls
 _STAND_INS = ('av', 'dartpy', 'mujoco')
@@ -39,15 +40,16 @@ _PLATFORMS = tuple(f'manylinux{name}_x86_64' for name in ('2014', '_2_17', '_2_2
 _LEFT_OUT = (':!docs', ':!benchmark/results', ':!.github', ':!findings')
 _TESTS = (
     'test/model/serving/test_serving.py',
+    'test/model/serving/test_wan_serving.py',
     'test/lab/training/test_trainer.py',
     'test/lab/training/test_wan_training.py',
     'test/vision/segmenters/test_prompted.py',
 )
+_SERVING = 'compile=true'
 _COMPARED = (
-    'compile=true',
-    'attention=_native_cudnn',
-    'compile=true attention=_native_cudnn',
+    _SERVING,
     'compile=true tiny_decoder=random tiny_encoder=true',
+    'offload=true',
 )
 #: a model of a few thousand numbers
 _TINY = (
@@ -68,32 +70,43 @@ class Part:
 
 
 def parts(tiny: bool) -> list[Part]:
-    """Everything, in the order of what is wanted most; 530 s in all."""
+    """Everything, in the order of what is wanted most; 590 s in all."""
     more = ('--set', *_TINY) if tiny else ()
     device = ('--device', 'cpu' if tiny else 'cuda', '--repeats', '1' if tiny else '2')
-    steps, compared = (('1',), _COMPARED[3:]) if tiny else (('4', '16'), _COMPARED)
+    steps, compared, serving = ('4', '16'), _COMPARED, ('--serving', _SERVING)
     if tiny:  # compiling takes g++ a minute
-        compared = tuple(text.replace('compile=true ', '') for text in compared)
-    speed = ('benchmark/wan_speed.py', *device, *more)
-    training = [x for value in _TINY if tiny for x in ('--set', value)]
-    training += ['--set', 'optimizer.batch_size=1']
+        steps, compared, serving = ('1',), (_COMPARED[1].removeprefix(f'{_SERVING} '),), ()
+    speed = ('benchmark/wan_speed.py', *device, *more, *serving)
+    tests = ('-m', 'pytest', '-q', '-m', 'gpu', '-p', 'no:cacheprovider', *_TESTS)
+    compiled = () if tiny else ('optimizer.compile=true',)
+    kept = 'optimizer.gradient_checkpointing=false'
     return [
-        Part('Tests', 110, ('-m', 'pytest', '-q', '-m', 'gpu', '-p', 'no:cacheprovider', *_TESTS)),
-        Part('Speed', 230, (*speed, '--steps', *steps, '--compare', *compared)),
-        Part('Training', 90, ('benchmark/wan_training_speed.py', *device, *training)),
-        Part('14B', 100, (*speed, '--preset', 'wan-14b', '--steps', '2', '--compare')),
+        Part('Speed', 200, (*speed, '--steps', *steps, '--compare', *compared)),
+        Part('Training', 60, _training(device, tiny)),
+        Part('Training compiled', 70, _training(device, tiny, *compiled)),
+        Part('Training blocks kept', 70, _training(device, tiny, *compiled, kept)),
+        Part('Tests', 80, tests),
+        Part('14B', 110, (*speed, '--preset', 'wan-14b', '--steps', '2', '--compare')),
     ]
+
+
+def _training(device: tuple[str, ...], tiny: bool, *values: str) -> tuple[str, ...]:
+    set_ = (*(_TINY if tiny else ()), 'optimizer.batch_size=1', *values)
+    options = (x for value in set_ for x in ('--set', value))
+    return ('benchmark/wan_training_speed.py', *device, *options)
 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the parts; prints and writes the page. Returns how many of them failed."""
     options.out.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, **_environment(options.out)}
-    sections, failed = [], 0
+    head, sections, failed = f'# Run on a GPU, {date.today()}\n\n{_machine()}', [], 0
+    print(head, flush=True)
     for part in parts(options.tiny):
         if part.title not in (options.parts or [part.title]):
             continue
-        begun, log = time.monotonic(), options.out / f'{part.title.lower()}.log'
+        begun = time.monotonic()
+        log = options.out / f'{part.title.lower().replace(" ", "_")}.log'
         with log.open('wb') as stream:
             try:
                 status = subprocess.run(
@@ -113,9 +126,9 @@ def run(options: argparse.Namespace) -> int:
         told = '\n'.join(_worth(log.read_text(errors='replace')))
         spent = time.monotonic() - begun
         sections.append(f'## {part.title}: {ended}, {spent:.0f} s\n\n{told}')
-    page = '\n\n'.join([f'# Run on a GPU, {date.today()}', _machine(), *sections]) + '\n'
-    (options.out / 'page.md').write_text(page)
-    print(page)
+        # at once: the machine may be gone before the next part ends
+        (options.out / 'page.md').write_text('\n\n'.join([head, *sections]) + '\n')
+        print(f'\n{sections[-1]}', flush=True)
     return failed
 
 
@@ -208,6 +221,9 @@ def pack(options: argparse.Namespace) -> int:
             stdout=subprocess.PIPE,
         )
         subprocess.run(['tar', 'x', '-C', str(tree)], input=archive.stdout, check=True)
+        git = ['git', '-C', str(ROOT), 'rev-parse', '--short', 'HEAD']
+        commit = subprocess.run(git, check=True, capture_output=True, text=True).stdout.strip()
+        (tree / 'COMMIT').write_text(commit)
         # commands are found by entry points, which stand in a package's metadata
         subprocess.run([sys.executable, 'setup.py', '--quiet', 'egg_info'], cwd=tree, check=True)
         _install(work / 'site', options.python)

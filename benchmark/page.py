@@ -197,7 +197,9 @@ def made_line(what: str, checkpoint: str | Path | None = None) -> str:
         checkpoint: folder or `bundled`; None = as `OF_A_CHECKPOINT` says.
     """
     kind = max((name for name in DESCRIBES if what.startswith(name)), key=len, default='')
-    commit = _git(ROOT, 'rev-parse', '--short', 'HEAD') or 'unknown'
+    packed = ROOT / 'COMMIT'  # of a tree that `gpu.py pack` made
+    commit = packed.read_text() if packed.is_file() else 'unknown'
+    commit = _git(ROOT, 'rev-parse', '--short', 'HEAD') or commit
     changed = '+' if _git(ROOT, 'status', '--porcelain', '--untracked-files=no') else ''
     held = 'no checkpoint'
     if checkpoint is None and kind in ('', *OF_A_CHECKPOINT):

@@ -24,7 +24,7 @@ from mtv_world_ros.model.conditioning import (
 )
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
-from mtv_world_ros.model.serving import prepare, ServingOptions
+from mtv_world_ros.model.serving import compile_norms, prepare, ServingOptions
 from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.world_model import denoise, sample_latents
@@ -48,6 +48,8 @@ class Bench:
         home = torch.device('cpu') if serving.offload else self.device
         self.transformer = self._random(transformer, home)
         self.autoencoder = self.decoder = self._random(autoencoder, self.device)
+        if serving.compile:
+            compile_norms(self.autoencoder)
         if serving.tiny_decoder:
             self.decoder = self._random(TinyAutoencoder(), self.device)
         if serving.tiny_encoder:

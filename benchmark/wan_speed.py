@@ -104,9 +104,11 @@ def measure(config: TrainingConfig, options: argparse.Namespace) -> str:
         f'{work.flop / 1e12:.3f} TFLOP; a large {options.dtype} matrix product reaches '
         f'{matrix / 1e12:.2f} TFLOP/s here.'
     )
-    served, compared = _served(config, options, work, plain), _compared(config, work, plain)
+    tables = [chunk, *_served(config, options, work, plain)]
+    if options.compare:
+        tables += ['All options, each in turns with plain:', _compared(config, work, plain)]
     plain.close()
-    return '\n\n'.join([chunk, *served, 'All options, each in turns with plain:', compared])
+    return '\n\n'.join(tables)
 
 
 def _told(text: str) -> str:

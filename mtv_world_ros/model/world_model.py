@@ -32,6 +32,7 @@ from mtv_world_ros.model.parts import check_video, Scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.serving import (
     check_memory,
+    compile_norms,
     decoder_of,
     prepare,
     ServingOptions,
@@ -213,6 +214,8 @@ class DiffusionWorldModel:
         self._adapters.use(checkpoint.adapter)
         prepare(self.transformer, serving, self.device)
         self.autoencoder = place(checkpoint.autoencoder, self.device, dtype).eval()
+        if serving.compile:
+            compile_norms(self.autoencoder)
         self._decoder = decoder_of(self.autoencoder, serving, dtype)
         self.scheduler = checkpoint.scheduler
         self.spec = checkpoint.card.spec

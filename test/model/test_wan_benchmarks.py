@@ -41,9 +41,9 @@ def test_the_run_on_a_gpu_goes_through_on_a_cpu_at_tiny_size(tmp_path: Path) -> 
     assert 'Error' not in page  # a row of a table says so where an option does not run
 
 
-def test_a_run_on_a_gpu_fits_nine_minutes(scripts: SimpleNamespace) -> None:
+def test_a_run_on_a_gpu_fits_ten_minutes(scripts: SimpleNamespace) -> None:
     gpu: ModuleType = scripts.gpu
-    assert sum(part.seconds for part in gpu.parts(tiny=False)) <= 540
+    assert sum(part.seconds for part in gpu.parts(tiny=False)) <= 590
     listed = {str(ROOT / name) for name in gpu._TESTS}
     marked = {
         str(file)

@@ -56,6 +56,7 @@ from mtv_world_ros.model.conditioning import check_history
 from mtv_world_ros.model.lora import save_adapter
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.serving import compile_blocks
 from mtv_world_ros.model.transformer.stem import with_new_source
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
@@ -145,6 +146,8 @@ class Trainer:
         if settings.gradient_checkpointing:
             transformer.enable_gradient_checkpointing()
         self.weights = AveragedWeights(transformer, self.device, dtype, settings.ema_decay)
+        if settings.compile:
+            compile_blocks(self.weights.worker, self.device)
         self.optimizer = torch.optim.AdamW(
             self.weights.parameters,
             lr=settings.learning_rate,

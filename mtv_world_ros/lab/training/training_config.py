@@ -197,6 +197,9 @@ class OptimizerConfig(Schema):
     gradient_checkpointing: bool = Field(
         default=False, description='recompute blocks in the backward pass instead of keeping them'
     )
+    compile: bool = Field(
+        default=False, description="compile the transformer's repeated block; minutes on a CPU"
+    )
     steps: int = Field(default=5000, description='of the whole training')
     epochs: Annotated[float | None, expected('positive, or null')] = Field(
         default=None,

@@ -6,6 +6,7 @@ from dataclasses import replace
 import json
 from pathlib import Path
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from mtv_world_ros.lab.training.training_config import (
     TrainingRun,
 )
 from mtv_world_ros.lab.training.training_run import find_episodes, train
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
@@ -57,6 +59,28 @@ def test_a_killed_run_continues_as_if_nothing_had_happened(
         whole.weights.ema.shadow_params, resumed.weights.ema.shadow_params, strict=True
     ):
         assert torch.equal(one, other)
+
+
+def test_a_compiled_run_learns_as_a_plain_one(
+    tiny: TrainingConfig, source: BatchSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`eager` traces as inductor does, and leaves the minute that g++ takes to the benchmark."""
+    compiles, calls = MultiViewWanTransformer.compile_repeated_blocks, []
+
+    def traced(self: MultiViewWanTransformer, **how: object) -> None:
+        calls.append(how)
+        compiles(self, **how, backend='eager')
+
+    monkeypatch.setenv('CXX', sys.executable)
+    monkeypatch.setattr(MultiViewWanTransformer, 'compile_repeated_blocks', traced)
+    for checkpointing in (False, True):
+        chosen = tiny.optimizer.replace(gradient_checkpointing=checkpointing)
+        compiled = tiny.replace(optimizer=chosen.replace(compile=True))
+        trainer = make(compiled, tmp_path / f'compiled{checkpointing}')
+        plain = make(tiny.replace(optimizer=chosen), tmp_path / f'plain{checkpointing}')
+        assert run(trainer, source) == pytest.approx(run(plain, source), rel=1e-4)
+        trainer.export(tmp_path / f'checkpoint{checkpointing}')
+    assert len(calls) == 2
 
 
 @pytest.mark.gpu

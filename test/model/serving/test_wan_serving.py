@@ -24,6 +24,7 @@ from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
 from mtv_world_ros.model.conditioning import condition, decode_frames, encode_chunk
 from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.lora import add_adapter, save_adapter
+from mtv_world_ros.model.serving import compile_norms
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 
 
@@ -174,6 +175,27 @@ def test_latents_are_normalised_and_undone(autoencoder: WanAutoencoder) -> None:
         mean, std = vae.config.latents_mean[channel], vae.config.latents_std[channel]
         torch.testing.assert_close(latents[:, channel], (raw[:, channel] - mean) / std)
     torch.testing.assert_close(autoencoder.decode(latents), vae.decode(raw).sample)
+
+
+@torch.inference_mode()
+def test_norms_are_compiled_on_a_gpu_alone(autoencoder: WanAutoencoder) -> None:
+    clip, other = torch.randn(1, 3, 5, 32, 32), copy.deepcopy(autoencoder)
+    compile_norms(other)
+    assert not any(m._compiled_call_impl for m in other.modules())
+    assert torch.equal(other.encode(clip), autoencoder.encode(clip))
+
+
+@pytest.mark.gpu
+@torch.inference_mode()
+def test_compiled_norms_change_nothing_beyond_rounding(autoencoder: WanAutoencoder) -> None:
+    plain = copy.deepcopy(autoencoder).to('cuda')
+    quick = copy.deepcopy(plain)
+    compile_norms(quick)
+    for size in (5, 9):
+        clip = torch.rand(2, 3, size, 32, 32, device='cuda') * 2 - 1
+        latents = plain.encode(clip)
+        torch.testing.assert_close(quick.encode(clip), latents, rtol=0, atol=2e-2)
+        torch.testing.assert_close(quick.decode(latents), plain.decode(latents), rtol=0, atol=2e-2)
 
 
 @torch.inference_mode()
