@@ -165,6 +165,8 @@ def _read_all(arguments: argparse.Namespace) -> tuple[list[Episode], Path]:
 
 def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_known: bool) -> str:
     """Returns the table: a line a recording, with its place, the doctor's measures and doubts."""
+    import numpy as np
+
     view, width = estimate.cameras[0].view, estimate.cameras[0].width
     how = 'as given' if focal_known or estimate.kept_guess else 'estimated'
     count = len(set(estimate.places.place.tolist()))
@@ -172,6 +174,12 @@ def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_kno
     focal = f'focal length {estimate.focal_px:.1f} px of {width} ({how}'
     focal += ')' if focal_known else f', fy is {K[1, 1] / K[0, 0]:.3f} fx)'
     lines = [f"view '{view}': {focal}; {count} places in {len(episodes)} recordings"]
+    if len(estimate.apart_px):
+        lines.append(
+            f'seen points: {np.median(estimate.apart_px):.1f} px beside where they are drawn in '
+            f'the median of {len(estimate.apart_px)}; 95 % of tool points are expected within '
+            f'{estimate.within_px:.1f} px'
+        )
     if estimate.kept_guess:
         lines.append("the guess fits better by the doctor's measure and is kept")
     for number, episode in enumerate(episodes):

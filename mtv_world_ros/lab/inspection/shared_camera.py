@@ -13,11 +13,18 @@ from mtv_world_ros.config import read_yaml
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, ConfigError
+from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import LinkShape, moving_links
 from mtv_world_ros.lab.inspection.clocks import JointTrack
 from mtv_world_ros.lab.inspection.fixed_camera import FixedCamera
-from mtv_world_ros.lab.inspection.joint_camera import JointCamera, JointState, SeenPoint, zoomed
+from mtv_world_ros.lab.inspection.joint_camera import (
+    JointCamera,
+    JointState,
+    SeenPoint,
+    STAGES,
+    zoomed,
+)
 from mtv_world_ros.lab.inspection.motion_residual import (
     measure_residual,
     MotionResidual,
@@ -35,6 +42,11 @@ _DOUBTED = 0.02
 #: real recordings a view with the right focal length had .35 to .47, and .23 to .32 with one a
 #: third too long; another view had .37 to .56 with any of three focal lengths
 _LEAST_MATCH = 0.335
+#: standard deviations of x and y within which 95 % of distances lie
+_WITHIN = 2.45
+#: points that were left out are this much farther away than those that poses were fitted to: 1.0
+#: and 2.1 times in two views of ten real recordings
+_WIDENED = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +61,7 @@ class SharedEstimate:
         kept_guess: whether the guess fits better and is what `cameras` has.
         focal_px: estimated, or the one given.
         fits: (R,) correlation of drawn and seen changes of each recording.
+        apart_px: (N,) how far the tool points that somebody saw are drawn from there.
     """
 
     cameras: tuple[CameraModel, ...]
@@ -58,6 +71,19 @@ class SharedEstimate:
     kept_guess: bool
     focal_px: float
     fits: FloatArray
+    apart_px: FloatArray
+
+    @property
+    def within_px(self) -> float:
+        """Distance from where it is within which 95 % of tool points are drawn; NaN = not known.
+
+        From the seen points, as of errors that are normal in x and y, widened for points that
+        the poses were fitted to; at least a pixel of the images that are compared.
+        """
+        if not len(self.apart_px):
+            return np.nan
+        found = _WIDENED * _WITHIN * float(np.sqrt(np.mean(self.apart_px**2) / 2))
+        return max(found, self.cameras[0].width / STAGES[-1][0])
 
     def doubts(self, number: int) -> str:
         """Why the pose of a recording may be wrong; empty where nothing says so."""
@@ -253,15 +279,23 @@ def _judged(
     measures, before = measured(ends), measured(view.cameras) if guess else ()
     kept = bool(before) and _mean_match(before) > _mean_match(measures)
     focal = float(view.cameras[0].K[0, 0])
+    best = view.cameras if kept else ends
     return SharedEstimate(
-        cameras=tuple(view.cameras if kept else ends),
+        cameras=tuple(best),
         places=view.places,
         measures=before if kept else measures,
         guess_measures=before,
         kept_guess=kept,
         focal_px=focal if kept else focal * float(state.zoom[0]),
         fits=view.joint.fits(view.given if kept else state),
+        apart_px=np.array([_apart(point, best[point.recording]) for point in view.points]),
     )
+
+
+def _apart(point: SeenPoint, camera: CameraModel) -> float:
+    """Distance of a tool point, as it is drawn, from where it was seen [px]."""
+    pixels, _ = project(camera, camera.T_mount_camera[None], point.position[None])
+    return float(np.linalg.norm(pixels[0] - point.pixel))
 
 
 def _mean_match(measures: Sequence[MotionResidual]) -> float:
