@@ -219,7 +219,8 @@ def growth(memory: Sequence[tuple[int, float]]) -> float | str:
     kept = [row for row in memory if row[0] >= BUFFERS_FULL]
     if len(kept) < LEAST_SAMPLES:
         return f'not measured: {memory[-1][0] if memory else 0} plans'
-    return float(np.polyfit(*np.array(kept).T, 1)[0]) * 1000
+    number, megabytes = np.array(kept).T
+    return float(np.polyfit(number, megabytes, 1)[0]) * 1000
 
 
 def starved_s(pid: int) -> dict[str, float]:
