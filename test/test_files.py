@@ -14,17 +14,20 @@ def test_file_has_the_content_and_nothing_lies_beside_it(tmp_path, content, data
     assert os.listdir(path.parent) == ['file']
 
 
-def test_what_was_there_stays_where_the_new_cannot_be_written(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    'error', [OSError(28, 'No space left on device'), KeyboardInterrupt()], ids=['full', 'Ctrl-C']
+)
+def test_what_was_there_stays_where_the_new_is_not_written(tmp_path, monkeypatch, error):
     path = tmp_path / 'file'
     write_whole(path, 'old')
 
-    def full(self, data):
+    def half(self, data):
         with self.open('wb') as file:
             file.write(data[:2])
-        raise OSError(28, 'No space left on device')
+        raise error
 
-    monkeypatch.setattr('pathlib.Path.write_bytes', full)
-    with pytest.raises(OSError, match='No space left'):
+    monkeypatch.setattr('pathlib.Path.write_bytes', half)
+    with pytest.raises(type(error)):
         write_whole(path, 'new content')
     assert path.read_text() == 'old'
     assert os.listdir(tmp_path) == ['file']
