@@ -95,9 +95,9 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     if arguments.store:
         fitted_to = _fitted_to(arguments, selection)
         stored = found.calibration.replace(fitted_to=fitted_to)
-        print(f'stored: {save_calibration(folder, stored)}')
-        if horizon is not None:
+        if horizon is not None:  # first: with the calibration the checkpoint counts as calibrated
             print(f'stored: {save_horizon(folder, horizon)}')
+        print(f'stored: {save_calibration(folder, stored)}')
     print(text)
     return int(failed)
 
