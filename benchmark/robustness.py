@@ -12,6 +12,7 @@ Rows of one kind in several files are added up. Beside the page stand the plots 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 from pathlib import Path
 import shutil
@@ -20,6 +21,8 @@ from typing import Any
 import numpy as np
 from page import parse_arguments, publish, table
 
+#: an end that comes later than this after its plan is late [s], as in `rate.py`
+LATE_S = 2.0
 HEAD = ('kind', 'tried', 'rejected', 'survived', 'failed', 'worst time [s]', 'worst memory [MB]')
 
 
@@ -84,6 +87,27 @@ def plans_table(folders: list[Path]) -> str:
          'memory [MB for 1,000]'),
         [[_cell(row.get(key, '–')) for key in keys] for row in rows],
     )  # fmt: skip
+
+
+def ends_table(folder: Path) -> str:
+    """How long plans of a run waited for each kind of end, net of stops of the node."""
+    with (folder / 'ends.csv').open() as file:
+        ends = list(csv.DictReader(file))
+    kinds: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for end in ends:
+        stopped_s, starved_s = float(end['stopped_s']), float(end['starved_s'])
+        net_s = float(end['waited_s']) - stopped_s
+        kind = (end['state'], 'yes' if stopped_s else 'no')
+        kinds.setdefault(kind, []).append((net_s, max(net_s - starved_s, 0.0)))
+    rows = []
+    for kind, times in sorted(kinds.items()):
+        net, quiet = np.array(times).T
+        worst = (*np.quantile(net, (0.5, 0.95, 0.99, 1.0)), np.median(quiet), quiet.max())
+        rows.append([*kind, str(len(net)), str((net > LATE_S).sum()), *map(_cell, worst)])
+    head = ('end', 'through a stop', 'plans', 'late', 'median [s]', '95 % [s]', '99 % [s]',
+            'worst [s]', 'median without waiting for a processor [s]',
+            'worst of these [s]')  # fmt: skip
+    return table(head, rows)
 
 
 def cycles_table(folders: list[Path]) -> str:
@@ -159,7 +183,7 @@ def attacks_text(options: argparse.Namespace) -> list[str]:
         body += ['## The same attacks before', table(HEAD, cells), commits_text(options.before)]
     if options.rate:
         body += ['## Plans at 10 Hz, with bursts and a node that is stopped now and then',
-                 plans_table(options.rate)]  # fmt: skip
+                 plans_table(options.rate), ends_table(options.rate[-1])]  # fmt: skip
     if options.cycles:
         body += ['## Lifecycle cycles with the bundled model', cycles_table(options.cycles)]
         if options.out:
