@@ -72,13 +72,13 @@ COMMANDS: dict[str, Callable[[Path, Path], list[str]]] = {
         *(word for value in TINY.split() for word in ('--set', value))],
     'evaluate': lambda given, out: [
         'evaluate', 'bundled', str(given / 'set'), '--split', 'all', '--actions', 'true',
-        '--no-ceiling', '--workers', '2', '--out', str(out / 'evaluation'), *ONE_STEP],
+        '--no-ceiling', '--out', str(out / 'evaluation'), *ONE_STEP],
     'calibrate': lambda given, out: [
         'calibrate', str(out / 'checkpoint'), str(given / 'set'), '--split', 'all',
         '--out', str(out / 'calibration'), *ONE_STEP],
     'rank': lambda given, out: [
         'rank', '--policies', 'expert,expert-miss-0.5', '--tasks', TASK, '--episodes', '1',
-        '--max-chunks', '1', '--workers', '2', '--out', str(out / 'ranking'), *ONE_STEP],
+        '--max-chunks', '1', '--out', str(out / 'ranking'), *ONE_STEP],
     'fit-contact': lambda given, out: [
         'fit-contact', str(given / 'set'), '--episodes', '2', '--motions', '2', '--threads', '1',
         '--out', str(out / 'contact')],
