@@ -205,8 +205,9 @@ class RolloutWorker:
     def submit(self, request: Request) -> None:
         """Starts a request; it pre-empts a running one and replaces a waiting one.
 
-        Where the rollout before the running one was pre-empted without a chunk, the running one
-        completes its first chunk: plans that come faster than chunks still get estimates.
+        From when a rollout was pre-empted without a chunk until one ends with none waiting, each
+        completes its first chunk: of plans that come faster than chunks, as many as there is time
+        for get estimates.
         """
         with self._changed:
             if self._pending is not None:
@@ -303,7 +304,8 @@ class RolloutWorker:
                 if not self._abandoned:
                     self._put(ended)
                 is_preempted = ended.state == 'preempted' and not self._abandoned
-                self._is_starved = is_preempted and not ended.num_chunks
+                are_fast = self._is_starved and self._pending is not None
+                self._is_starved = are_fast or (is_preempted and not ended.num_chunks)
                 self._running, self._abandoned = None, False
 
     def _next(self) -> Request | None:

@@ -1,0 +1,107 @@
+"""Which plans the worker computes where they come faster than chunks, without any clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import threading
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.data_types import JointTrajectory
+from mtv_world_ros.errors import RolloutPreempted
+from mtv_world_ros.ros.world_model.worker import Ended, Request, RolloutWorker, TimeLimits
+
+LONGEST_S = 120.0
+
+
+def request(number: int) -> Request:
+    plan = JointTrajectory(
+        joint_names=('joint',), times=np.array([0.1]), positions=np.zeros((1, 1))
+    )
+    limits = TimeLimits(trajectory_age=1.0, horizon=10.0)
+    given: dict[str, Any] = {'instruction': '', 'objects': (), 'seed': 0, 'received_s': 0.0}
+    return Request(
+        rollout=number, trajectory=plan, stamp_ns=0, scene=SimpleNamespace(), imagine=False,
+        num_inference_steps=1, limits=limits, **given,
+    )  # fmt: skip
+
+
+@dataclass
+class Plans:
+    """A policy that sends so many plans while the first chunk of one is computed.
+
+    Attributes:
+        started: plans that were begun.
+        judged: plans of which a first chunk was computed.
+        arrivals: numbers of plans that come during the chunks to come.
+    """
+
+    started: list[int] = field(default_factory=list)
+    judged: list[int] = field(default_factory=list)
+    arrivals: list[int] = field(default_factory=list)
+    sent: int = 0
+
+    def send(self, worker: RolloutWorker) -> None:
+        self.sent += 1
+        worker.submit(request(self.sent))
+
+    def imagine(self, worker: Any, running: Request) -> None:
+        self.started.append(running.rollout)
+        for _ in range(self.arrivals.pop(0) if self.arrivals else 0):
+            self.send(worker)
+        if worker._should_stop():
+            raise RolloutPreempted('a newer plan came')
+        worker._known.append(SimpleNamespace())
+        self.judged.append(running.rollout)
+        # the second chunk of a long plan is left for a newer one in any case
+        if worker._should_stop():
+            raise RolloutPreempted('a newer plan came')
+
+    def run(self, monkeypatch, *bursts: list[int]) -> list[Ended]:
+        """Sends a plan, and those that come during its chunks and the next ones, of each burst.
+
+        Returns:
+            How all ended.
+        """
+        news = threading.Semaphore(0)
+        monkeypatch.setattr(RolloutWorker, '_imagine', lambda w, r: self.imagine(w, r))
+        pipeline: Any = SimpleNamespace(spec=SimpleNamespace(fps=5.0, num_frames=16))
+        worker = RolloutWorker(pipeline, news.release)
+        worker.start()
+        ends: list[Ended] = []
+        try:
+            for burst in bursts:
+                self.arrivals = list(burst)
+                self.send(worker)
+                end_s = time.monotonic() + LONGEST_S
+                while len(ends) < self.sent or worker.busy:
+                    assert time.monotonic() < end_s
+                    news.acquire(timeout=0.02)
+                    ends += [one for one in worker.take() if isinstance(one, Ended)]
+        finally:
+            worker.close()
+        return ends
+
+
+@pytest.mark.parametrize('each', [1, 2, 3])
+def test_of_plans_faster_than_chunks_all_that_are_begun_but_the_first_are_judged(
+    each, monkeypatch
+):
+    plans = Plans()
+    ends = plans.run(monkeypatch, [each] * 20)
+    assert sorted(end.request.rollout for end in ends) == list(range(1, plans.sent + 1))
+    assert plans.judged == plans.started[1:] and len(plans.judged) == 20
+    # the newest plan is taken each time
+    assert plans.started == [1, *(1 + each * (1 + k) for k in range(20))]
+
+
+def test_plans_that_come_slowly_again_are_left_at_once_for_a_newer_one(monkeypatch):
+    plans = Plans()
+    ends = plans.run(monkeypatch, [1, 1, 0], [1, 0])
+    assert plans.started == [1, 2, 3, 4, 5] and plans.judged == [2, 3, 5]
+    states = {end.request.rollout: (end.state, end.num_chunks) for end in ends}
+    assert states[4] == ('preempted', 0) and states[5] == ('done', 1)
