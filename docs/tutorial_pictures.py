@@ -129,7 +129,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('folder', type=Path)
     parser.add_argument('--only', nargs='*', help='names of pictures')
-    parser.add_argument('--wait', type=float, default=45.0, help='for the viewer to draw [s]')
+    parser.add_argument('--wait', type=float, default=60.0, help='for the viewer to draw [s]')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as made:
         for name, file in {**FILES, **PAGES, **VIEWS}.items():

@@ -23,7 +23,7 @@ from mtv_world_ros.bench.ranking.scores import (
 )
 from mtv_world_ros.files import write_json, write_whole
 from mtv_world_ros.lab.documents import DASH, render, Table
-from mtv_world_ros.lab.evaluation.metrics.statistics import MIN_SCENES
+from mtv_world_ros.lab.evaluation.metrics.statistics import MIN_EPISODES, MIN_SCENES
 from mtv_world_ros.lab.evaluation.report.charts import Point, scatter_chart
 from mtv_world_ros.success.estimator import FAILURE_BELOW, SUCCESS_FROM
 
@@ -47,7 +47,9 @@ _WORTH = (
     'foreseen motions alone: the share of those that succeed, from the commands and the first '
     "frame. Pictures alone: the paper's way, trails and first masks are drawn and no motion is "
     'foreseen. Both: the estimate. The no-picture rule: an object sticks to a gripper that closes '
-    "near it. Real frames: the same estimator on the simulator's. n: rollouts with an estimate."
+    "near it. Real frames: the same estimator on the simulator's. n: rollouts with an estimate. "
+    'Cells: value [95 % interval] count; false success: real failures called a success, of those '
+    'with a verdict.'
 )
 _INTERVALS = (
     'Intervals of rates: Wilson, 95 %. The noise of few scenes makes the observed r too small and '
@@ -56,8 +58,7 @@ _INTERVALS = (
     'by how far its true rates lie apart; 0 is perfect.'
 )
 _OPTIMISM = (
-    'Cells: value [95 % interval] count. False success: real failures called a success, of those '
-    'with a verdict. AUROC: of the rollouts with an estimate. Flips: a command whose true '
+    'AUROC: of the rollouts with an estimate. Flips: a command whose true '
     "outcome differs from the expert's in the same scene; how often the imagined last frame is "
     'nearer to what really happened than to what happened under the expert, over the pixels in '
     'which these differ; chance is .5. No pictures: a rule that sees the commands and the first '
@@ -425,18 +426,11 @@ def _failures(summary: Summary) -> list[Table]:
 
 
 def console(summary: Summary) -> str:
-    """Returns what is worth a look at once: agreement, rates over all tasks, speed."""
-    tables = [
-        _worth(summary),
-        *optimism_tables(summary.optimism),
-        _agreement(summary),
-        _rates(summary, None),
-        _powered(summary),
-        _speed(summary),
-        *_failures(summary),
-    ]
+    """Returns what is worth a look at once: what decides, and rates; the report has the rest."""
+    tables = [_worth(summary), _rates(summary, None), *_failures(summary)]
     parts = [f'{found.caption}\n\n{found.text()}' for found in tables]
-    return '\n\n'.join([*parts, *remarks(summary)[2:]])
+    said = [_truth_remark(summary), _agreement_remark(summary)]
+    return '\n\n'.join([*parts, *filter(None, said)])
 
 
 def markdown(summary: Summary) -> str:
@@ -470,19 +464,23 @@ def write_ranking(summary: Summary, out: Path) -> Path:
     return path
 
 
-def _answer(summary: Summary) -> tuple[str, bool]:
-    """Returns whether looking at the imagined pictures pays, and whether that is shown."""
+def _answer(summary: Summary) -> tuple[str, str]:
+    """Returns whether looking at the imagined pictures pays, and its class in the style sheet."""
     imagined, rule, gain = summary.gain_over_rule
     shares = (
         f'imagination is right in {imagined:.2f} of {gain.count} rollouts, a rule that sees the '
         f'commands and the first frame alone in {rule:.2f}: {gain.value:+.2f} '
         f'{_interval(gain.interval)}'
     )
+    scenes = len({(result.task, result.index) for result in summary.results})
+    if scenes < MIN_EPISODES:
+        count = f'{scenes} scene{"s" * (scenes != 1)}'
+        return f'Cannot tell from {count}: give at least {MIN_EPISODES} ({shares}).', 'few'
     if gain.interval[0] > 0:
-        return f'Yes: {shares}.', True
+        return f'Yes: {shares}.', ''
     if gain.interval[1] < 0:
-        return f'No, they mislead: {shares}.', False
-    return f'Not shown: {shares}.', False
+        return f'No, they mislead: {shares}.', 'doubt'
+    return f'Not shown: {shares}.', 'doubt'
 
 
 def _tiles(summary: Summary) -> list[tuple[str, str, str]]:

@@ -97,6 +97,25 @@ def test_the_page_says_that_two_policies_prove_nothing(make_result):
     assert 'Of two policies r is 1 or -1 whatever they do' in ' '.join(remarks(two))
 
 
+@pytest.mark.parametrize(
+    ('scenes', 'shown'),
+    [
+        (1, ('few', 'Cannot tell from 1 scene: give at least 3 (imagination is right in 0.50')),
+        (2, ('few', 'Cannot tell from 2 scenes: give at least 3 (imagination is right in 0.50')),
+        (3, ('doubt', 'Not shown: imagination is right in 0.50')),
+    ],
+)
+def test_the_first_line_of_the_page_tells_few_scenes_from_a_failure(
+    scenes, shown, make_result, tmp_path
+):
+    pair = [make_result(p, i, p == 'a', 0.9, rule=p == 'a') for p in 'ab' for i in range(scenes)]
+    path = write_ranking(Summary(results=pair, failed={}, num_true=1, provenance={}), tmp_path)
+    page = path.read_text()
+    style, text = re.search(r'<p class="verdict (\w*)">([^<]*)<', page).groups()
+    assert style == shown[0] and text.startswith(shown[1])
+    assert 'Cells: value [95 % interval] count' in page
+
+
 def test_files_hold_the_same_numbers_and_the_page_is_whole(summary, tmp_path):
     path = write_ranking(summary, tmp_path)
     held = json.loads((tmp_path / 'ranking.json').read_text())
@@ -122,6 +141,7 @@ def test_tables_fit_a_console_and_no_column_is_empty(summary, make_result):
     ]
     many = Summary(results=long, failed=summary.failed, num_true=2, provenance={})
     for one in (summary, many):
+        assert 'Agreement with' not in console(one) and 'Agreement with' in markdown(one)
         rows = [line for line in console(one).splitlines() if line.startswith('|')]
         assert rows and max(map(len, rows)) <= 100
         for part in re.findall(r'(?:^\|.*\|\n?)+', console(one), re.M):
