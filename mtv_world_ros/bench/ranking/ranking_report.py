@@ -89,16 +89,19 @@ def tables(summary: Summary) -> list[Table]:
 
 def remarks(summary: Summary) -> list[str]:
     """Returns what has to be known to read the numbers."""
-    found = [
+    return [
         _MEANING,
         _CEILING.format(seen=REPORTED['seen'].capitalize()),
-        _truth_remark(summary),
         _WORTH,
-        _agreement_remark(summary),
-        _unknown_remark(summary),
         _INTERVALS,
-        _OPTIMISM if summary.optimism else '',
+        *([_OPTIMISM] if summary.optimism else []),
+        *_notes(summary),
     ]
+
+
+def _notes(summary: Summary) -> list[str]:
+    """What holds of this ranking."""
+    found = [_truth_remark(summary), _agreement_remark(summary), _unknown_remark(summary)]
     reasons = ' '.join(reason for result in summary.results for reason in result.imagined.reasons)
     if 'uncalibrated' in reasons:
         weights = (
@@ -429,8 +432,7 @@ def console(summary: Summary) -> str:
     """Returns what is worth a look at once: what decides, and rates; the report has the rest."""
     tables = [_worth(summary), _rates(summary, None), *_failures(summary)]
     parts = [f'{found.caption}\n\n{found.text()}' for found in tables]
-    said = [_truth_remark(summary), _agreement_remark(summary)]
-    return '\n\n'.join([*parts, *filter(None, said)])
+    return '\n\n'.join([*parts, *_notes(summary)])
 
 
 def markdown(summary: Summary) -> str:
