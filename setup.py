@@ -65,7 +65,6 @@ setup(
         'safetensors>=0.8',
         'scipy>=1.11',
         'simplejpeg>=1.8',
-        'tokenizers>=0.22',
         'torch>=2.6',
         'tqdm>=4.66',
         'zstandard>=0.22',

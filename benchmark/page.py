@@ -36,7 +36,6 @@ OLD_TAG = 'v0.1.0'
 DESCRIBES = {
     'camera_calibration': ('mtv_world_ros/lab/inspection',),
     'camera_check': ('mtv_world_ros/vision',),
-    'control_representations': ('mtv_world_ros/lab/training', 'mtv_world_ros/model'),
     'doctor': ('mtv_world_ros/lab/inspection',),
     'foresight': ('mtv_world_ros/ros',),
     'interval_coverage': ('mtv_world_ros/lab/evaluation/metrics',),

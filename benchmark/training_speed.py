@@ -33,7 +33,6 @@ from mtv_world_ros.data.splits import select
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.lab.cli.train import set_overrides
 from mtv_world_ros.lab.training.clips.batches import BatchSource, ClipBatch
-from mtv_world_ros.lab.training.clips.fit_actions import kept_actions, transformer_arguments
 from mtv_world_ros.lab.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.lab.training.objective import NoiseDraws
 from mtv_world_ros.lab.training.trainer import batch_loss, Trainer
@@ -65,7 +64,6 @@ def make(options: argparse.Namespace) -> tuple[Trainer, BatchSource]:
     spec, robot = config.spec, load_robot(robot_path(config.video.robot))
     paths = spread(select(options.train, default='train').paths, options.episodes)
     recordings, _ = load_recordings(paths, spec, robot, options.work / 'cache')
-    actions = kept_actions(options.work, config.video.control, recordings, spec, robot)
     trainer = Trainer(
         config,
         options.work,
@@ -73,7 +71,6 @@ def make(options: argparse.Namespace) -> tuple[Trainer, BatchSource]:
         device=options.device,
         dtype=choose_dtype(options.dtype, options.device),
         trained_on={},
-        actions=actions,
     )
     source = BatchSource(
         recordings,
@@ -81,7 +78,6 @@ def make(options: argparse.Namespace) -> tuple[Trainer, BatchSource]:
         robot=robot,
         segmenter=assemble_segmenter('colour'),
         seed=options.seed,
-        actions=actions,
         workers=options.data_workers,
     )
     return trainer, source
@@ -94,7 +90,7 @@ def plain_loop(trainer: Trainer, dtype: torch.dtype) -> Callable[[ClipBatch], No
     accelerator = Accelerator(
         cpu=trainer.device.type == 'cpu', mixed_precision='bf16' if half else 'no'
     )
-    made: Any = MultiViewWanTransformer(**transformer_arguments(config, trainer.actions))
+    made: Any = MultiViewWanTransformer(**config.transformer)
     if settings.gradient_checkpointing:
         made.enable_gradient_checkpointing()
     made = place(made, trainer.device, torch.float32)
@@ -148,7 +144,7 @@ def main() -> None:
     waited = sum(report.waited for report in whole) / sum(report.seconds for report in whole)
     running = statistics.median(report.seconds for report in whole)
     peak = statistics.median(peaks[_WARM_UP:])
-    ideal = ideal_seconds(trainer.config, trainer.actions, dtype, peak)
+    ideal = ideal_seconds(trainer.config, dtype, peak)
     rows = [
         ['steps/s of the trainer with its data', f'{1 / running:.4f}'],
         ['of it waited for data', f'{100 * waited:.2f} %'],

@@ -163,7 +163,6 @@ def load_pipeline(
         loaded,
         device=device,
         dtype=number_format,
-        robot=model,
         serving=options,
     )
     return assemble(

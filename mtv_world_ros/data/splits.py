@@ -219,8 +219,7 @@ def _check_siblings(
         if first.get('seed') != entry.get('seed'):
             raise ConfigError(
                 f'{names} are called siblings of scene {scene}, but their scenes are drawn from '
-                f'the seeds {first.get("seed")} and {entry.get("seed")}; siblings share a seed: '
-                "collect them with 'mtv-world collect --siblings'"
+                f'the seeds {first.get("seed")} and {entry.get("seed")}; siblings share a seed'
             )
         if places.get(first['name']) != places.get(entry['name']):
             raise ConfigError(

@@ -12,9 +12,10 @@ from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.config import expected, ListOf, Schema, validated
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.actions import CONTROLS
 
 CARD = 'world_model.json'
+#: how actions enter every model: drawn into its views
+TRAJECTORY_VIDEO = 'trajectory_video'
 #: the robot that a checkpoint was trained on (see `robot.file.save_robot`), and its cameras
 ROBOT_FOLDER, CAMERAS = 'robot', 'cameras.yaml'
 
@@ -57,10 +58,13 @@ class HistorySettings(Schema):
         return {'history': self.model_dump(include=names)} if self.on else {}
 
 
-def _known_control(name: str) -> str:
-    if name not in CONTROLS:
-        raise ValueError(f"'{name}' is not one of {', '.join(CONTROLS)}")
-    return name
+def _drawn(control: str) -> str:
+    if control != TRAJECTORY_VIDEO:
+        raise ValueError(
+            f"'{control}' is not {TRAJECTORY_VIDEO}; policy2vec, ee_mlp and fast_tokens are in "
+            'version 0.1.0 alone'
+        )
+    return control
 
 
 def _some_steps(count: int) -> int:
@@ -78,7 +82,7 @@ class CheckpointCard(Schema):
     width: int = Field(ge=1, le=16_384, description='of a view [px]')
     height: int = Field(ge=1, le=16_384, description='of a view [px]')
     robot: str
-    control: Annotated[str, AfterValidator(_known_control)]
+    control: Annotated[str, AfterValidator(_drawn)]
     object_mask: bool
     rendering: dict[str, Any]
     trained_on: dict[str, Any]

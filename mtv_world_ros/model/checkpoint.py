@@ -13,7 +13,6 @@ import torch
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError, MtvWorldError
 from mtv_world_ros.files import whole_folder
-from mtv_world_ros.model.actions import ActionEncoding, TRAJECTORY_VIDEO
 from mtv_world_ros.model.card import CheckpointCard, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.parts import Autoencoder, build_autoencoder, build_scheduler, Scheduler
@@ -25,6 +24,8 @@ WEIGHTS = 'diffusion_pytorch_model'
 ADAPTER_FOLDER = 'adapter'
 OBJECT_MOTION_FOLDER = 'object_motion'
 PARTS = ('transformer', 'autoencoder', 'scheduler')
+#: in transformers' configurations of version 0.1.0, for actions that are not drawn
+_OF_0_1 = ('control', 'action_dim', 'num_context_tokens')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +37,6 @@ class Checkpoint:
         autoencoder: pixels to latents and back.
         scheduler: noise levels and the step rule.
         card: inputs and outputs of the model, and its training data.
-        actions: how positions become the transformer's actions; None where they are drawn.
         text_encoder: umT5, in models with text.
         image_encoder: CLIP, in models with text.
         adapter: folder of a LoRA adapter to use on the transformer; see `lora.py`.
@@ -48,7 +48,6 @@ class Checkpoint:
     autoencoder: Autoencoder
     scheduler: Scheduler
     card: CheckpointCard
-    actions: ActionEncoding | None = None
     text_encoder: TextEncoder | None = None
     image_encoder: ImageEncoder | None = None
     adapter: Path | None = None
@@ -67,8 +66,6 @@ def save_checkpoint(
             partial / 'autoencoder', safe_serialization=True
         )
         checkpoint.scheduler.save_pretrained(partial / 'scheduler')
-        if checkpoint.actions is not None:
-            checkpoint.actions.save(partial)
         for encoder in (checkpoint.text_encoder, checkpoint.image_encoder):
             if encoder is not None:
                 encoder.save(partial)
@@ -115,8 +112,6 @@ def _load(folder: Path, dtype: torch.dtype) -> Checkpoint:
             f"checkpoint '{folder}' holds pickle files {sorted(pickles)}; only safetensors are "
             'loaded: convert them and remove these'
         )
-    control = card.control
-    drawn = control == TRAJECTORY_VIDEO
     with_text = (folder / 'text_encoder').is_dir()
     adapter, motion = folder / ADAPTER_FOLDER, folder / OBJECT_MOTION_FOLDER
     robot = folder / ROBOT_FOLDER
@@ -125,7 +120,6 @@ def _load(folder: Path, dtype: torch.dtype) -> Checkpoint:
         autoencoder=_load_autoencoder(folder / 'autoencoder', dtype),
         scheduler=build_scheduler(_config(folder / 'scheduler' / 'scheduler_config.json')),
         card=card,
-        actions=None if drawn else ActionEncoding.load(folder, control),
         text_encoder=TextEncoder(folder, dtype=dtype) if with_text else None,
         image_encoder=ImageEncoder.load(folder, dtype=dtype) if with_text else None,
         adapter=adapter if adapter.is_dir() else None,
@@ -139,8 +133,9 @@ def _load_transformer(folder: Path, dtype: torch.dtype) -> MultiViewWanTransform
     found, expected = config.get('_class_name'), MultiViewWanTransformer.__name__
     if found != expected:
         raise CheckpointError(f"'{folder}' holds a {found}, expected a {expected}")
+    given = {name: value for name, value in config.items() if name not in _OF_0_1}
     with torch.device('meta'):
-        transformer: Any = MultiViewWanTransformer.from_config(config)
+        transformer: Any = MultiViewWanTransformer.from_config(given)
     _fill(transformer, folder)
     return place(transformer, torch.device('cpu'), dtype).eval()
 

@@ -27,7 +27,6 @@ class Conditioning:
         start_control: (B, V, C, h, w) of its frame 0.
         start: (B, V, C, F, h, w) the start image's channel slot.
         reference: (B, V, C, h, w) of the start image.
-        actions: what `ActionEncoding` made of the commands, where they are not drawn.
         text: (B, 512, text_dim) umT5 tokens of the prompt, in models with text.
         negative_text: tokens of the text that guidance leads away from; None = no guidance.
         image: (B, V * 257, image_dim) CLIP tokens of the start image.
@@ -40,7 +39,6 @@ class Conditioning:
     start_control: Tensor
     start: Tensor
     reference: Tensor
-    actions: Tensor | None = None
     text: Tensor | None = None
     negative_text: Tensor | None = None
     image: Tensor | None = None
@@ -88,7 +86,7 @@ class Conditioning:
         return {name: value for name, value in values.items() if value is not None}
 
     def in_dtype(self, dtype: torch.dtype) -> Conditioning:
-        """Returns the same with latents and tokens in a number format; actions stay."""
+        """Returns the same with latents and tokens in a number format."""
         latents = ('control', 'start_control', 'start', 'reference', 'anchor', 'history')
         tokens = ('text', 'negative_text', 'image')
         held = {name: getattr(self, name) for name in (*latents, *tokens)}
@@ -159,29 +157,6 @@ def start_slot(reference: Tensor, num_latent_frames: int, includes_start: bool) 
     if includes_start:
         slot = torch.cat([slot[:, :, :, :1], torch.zeros_like(slot[:, :, :, 1:])], dim=3)
     return slot
-
-
-def condition_on_actions(
-    autoencoder: Autoencoder, start_frame: Tensor, actions: Tensor, num_frames: int
-) -> Conditioning:
-    """Returns the latents to denoise under where actions are not drawn: no trajectory video.
-
-    Its latents are zero, so that the transformer keeps its shape, and with it public weights.
-
-    Args:
-        autoencoder: of the preset.
-        start_frame: (B, V, H, W, 3) uint8 RGB.
-        actions: output of `ActionEncoding` for the whole batch.
-        num_frames: T.
-    """
-    reference, start = _start(autoencoder, start_frame, autoencoder.num_latent_frames(num_frames))
-    return Conditioning(
-        control=torch.zeros_like(start),
-        start_control=torch.zeros_like(reference),
-        start=start,
-        reference=reference,
-        actions=actions,
-    )
 
 
 def check_history(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from diffusers import FlowMatchEulerDiscreteScheduler
 import numpy as np
@@ -14,13 +14,11 @@ from torch import Tensor
 
 from mtv_world_ros.data_types import ByteArray, FloatArray, History
 from mtv_world_ros.errors import CheckpointError, ModelMemoryError, RolloutPreempted
-from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.model.card import check_same_model
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import (
     check_history,
     condition,
-    condition_on_actions,
     Conditioning,
     decode_frames,
     with_anchor,
@@ -154,15 +152,11 @@ def denoise(
         start_control=conditioning.start_control,
         encoder_hidden_states=text,
         encoder_hidden_states_image=conditioning.image,
-        actions=conditioning.actions,
         anchor=conditioning.anchor,
         history=conditioning.history,
         history_timestep=conditioning.history_timestep,
     ).float()
 
-
-if TYPE_CHECKING:
-    from mtv_world_ros.geometry.robot.model import RobotModel
 
 _PLAIN = ServingOptions()
 #: in errors that have no class of their own: of torch on a CPU, of CUDA, cuBLAS and cuDNN
@@ -170,17 +164,16 @@ _NO_MEMORY = ("can't allocate memory", 'out of memory', 'ALLOC_FAILED', 'ALLOCAT
 
 
 class DiffusionWorldModel:
-    """Denoises one chunk of multi-view video under a trajectory video, or under actions.
+    """Denoises one chunk of multi-view video under a trajectory video.
 
     Args:
         checkpoint: the trained parts.
         device: e.g. `cpu` or `cuda`.
         dtype: of the transformer's computations.
-        robot: the trained one; needed where the checkpoint takes actions that are not drawn.
         serving: options that make the model faster or smaller.
 
     Raises:
-        CheckpointError: the robot is needed and missing.
+        CheckpointError: the checkpoint's parts do not belong together.
         ConfigError: the serving options are not for this machine.
         ModelMemoryError: the model does not fit the device.
     """
@@ -191,15 +184,8 @@ class DiffusionWorldModel:
         *,
         device: str = 'cpu',
         dtype: torch.dtype = torch.float32,
-        robot: RobotModel | None = None,
         serving: ServingOptions = _PLAIN,
     ) -> None:
-        if checkpoint.actions is not None and robot is None:
-            raise CheckpointError(
-                f"a checkpoint of control '{checkpoint.actions.control}' needs the robot it was "
-                "trained with; load it by 'load_pipeline', or give `robot`"
-            )
-        self.actions, self.robot = checkpoint.actions, robot
         self.device = torch.device(device)
         self.card = checkpoint.card
         self._serving = serving
@@ -235,11 +221,10 @@ class DiffusionWorldModel:
         """Runs one prediction and discards it, so that the first real one does not wait."""
         spec = self.spec
         shape = (len(spec.views), 1 + spec.num_frames, spec.height, spec.width, 3)
-        num_joints = 0 if self.robot is None else len(self.robot.joint_names)
         self.predict(
             np.zeros((shape[0], *shape[2:]), np.uint8),
             np.zeros(shape, np.uint8),
-            positions=np.zeros((shape[1], num_joints)),
+            positions=np.zeros((shape[1], 0)),
             seed=0,
             num_inference_steps=1,
             should_stop=lambda: False,
@@ -311,7 +296,7 @@ class DiffusionWorldModel:
         self._check_size(trajectory_frames)
         try:
             with torch.inference_mode():
-                conditioning = self._condition(start_frame, trajectory_frames, positions)
+                conditioning = self._condition(start_frame, trajectory_frames)
                 conditioning = self._with_history(
                     conditioning, history or History.begin(start_frame)
                 )
@@ -345,14 +330,9 @@ class DiffusionWorldModel:
                 'video.views and video.num_frames set to what you need'
             )
 
-    def _condition(
-        self, start_frame: ByteArray, trajectory_frames: ByteArray, positions: FloatArray
-    ) -> Conditioning:
+    def _condition(self, start_frame: ByteArray, trajectory_frames: ByteArray) -> Conditioning:
         start = self._tensor(start_frame)
-        if self.actions is None:
-            latents = condition(self.autoencoder, start, self._tensor(trajectory_frames))
-        else:
-            latents = self._condition_on_actions(self.actions, start, positions)
+        latents = condition(self.autoencoder, start, self._tensor(trajectory_frames))
         return self._with_context(latents, start)
 
     def _with_history(self, latents: Conditioning, history: History) -> Conditioning:
@@ -367,15 +347,6 @@ class DiffusionWorldModel:
         frames = self._tensor(history.filled(count))
         sigmas = torch.full((1,), level, device=self.device)
         return with_history(self.autoencoder, latents, frames, sigmas)
-
-    def _condition_on_actions(
-        self, actions: ActionEncoding, start: torch.Tensor, positions: FloatArray
-    ) -> Conditioning:
-        assert self.robot is not None
-        encoded = torch.from_numpy(collate([actions.encode(self.robot, positions)]))
-        return condition_on_actions(
-            self.autoencoder, start, encoded.to(self.device), self.spec.num_frames
-        )
 
     def _with_context(self, latents: Conditioning, start: torch.Tensor) -> Conditioning:
         """Adds the prompt's and the start images' tokens, in models with text."""

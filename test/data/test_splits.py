@@ -73,3 +73,16 @@ def test_episodes_of_one_physics_are_chosen_and_all_are_counted(tmp_path, make_e
     assert names(late) == ['late'] and text == 'delay_100ms (1)'
     with pytest.raises(ConfigError, match="'delay_100' .*did you mean 'delay_100ms'.*not stated"):
         of_physics(found, 'delay_100')
+
+
+@pytest.mark.parametrize(
+    ('seeds', 'says'),
+    [((3, 3), 'keep the siblings of a scene in one split'), ((3, 4), 'siblings share a seed')],
+)
+def test_episodes_of_one_scene_are_in_one_split(dataset, seeds, says):
+    card = json.loads((dataset / 'dataset.json').read_text())
+    for entry, seed in zip(card['episodes'], seeds, strict=False):
+        entry.update(scene='stack_00000', seed=seed)
+    (dataset / 'dataset.json').write_text(json.dumps(card))
+    with pytest.raises(ConfigError, match=says):
+        select(dataset)

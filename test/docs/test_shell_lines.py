@@ -229,7 +229,6 @@ def check_values(given: dict[str, Any]) -> None:
     from mtv_world_ros.bench.world.zero_shot import kinds_named
     from mtv_world_ros.lab.cli.train import set_overrides
     from mtv_world_ros.lab.training.training_config import load_training_config
-    from mtv_world_ros.model.actions import check_control
     from mtv_world_ros.model.serving import ServingOptions
     from mtv_world_ros.vision.segmenters.choose import SEGMENTERS
     from mtv_world_ros.vision.segmenters.examples import SUFFIX
@@ -240,8 +239,6 @@ def check_values(given: dict[str, Any]) -> None:
     load_training_config(
         given.get('preset') or 'small', set_overrides(given.get('overrides') or [])
     )
-    if given.get('control'):
-        check_control(given['control'])
     # those that begin so are the reader's own
     listed = [n for n in each(given.get('policies') or ()) if not n.startswith('my_')]
     assert all((ROOT / name).is_file() for name in listed if '/' in name)

@@ -63,7 +63,7 @@ def test_operations_of_the_floor_are_those_of_a_dry_run(scripts: SimpleNamespace
     # 2 views x (reference + 2 history + 2 video frames of latents) x 2 x 2 patches
     assert tokens == 2 * 5 * 4
     step = found['one step of the transformer']
-    cost = step_cost(config, action_dim=14, dtype=torch.bfloat16)
+    cost = step_cost(config, dtype=torch.bfloat16)
     assert step.total == cost.forward_flop
     card = scripts.wan_floor.CARDS[0]
     assert 0 < step.floor(card) < step.compiled(card) < step.plain(card)

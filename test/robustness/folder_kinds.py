@@ -295,22 +295,6 @@ def _read_shards(folder: Path) -> Any:
     return [tensor.read() for tensor in open_tensors(folder).values()]
 
 
-def make_actions(folder: Path) -> None:
-    """Action statistics with a tokenizer."""
-    from mtv_world_ros.model.actions import ActionEncoding
-
-    robot = _yam()
-    rng = np.random.default_rng(0)
-    chunks = [rng.uniform(robot.lower, robot.upper, (9, len(robot.lower))) for _ in range(4)]
-    ActionEncoding.fit('fast_tokens', robot, chunks).save(folder)
-
-
-def _read_actions(folder: Path) -> Any:
-    from mtv_world_ros.model.actions import ActionEncoding
-
-    return ActionEncoding.load(folder, 'fast_tokens')
-
-
 def make_description(folder: Path) -> None:
     """A description that was kept."""
     from mtv_world_ros.vision.describers.vlm import DescriptionCache, read_answer
@@ -429,7 +413,6 @@ FOLDERS: dict[str, tuple[Callable[[Path], None], tuple[str, ...], Callable[[Path
     'LoRA': (make_lora, ('.safetensors',), _read_lora),
     'latent cache': (make_latents, ('.safetensors', '.json'), _read_latents),
     'weights in shards': (make_shards, ('.safetensors', '.json'), _read_shards),
-    'action statistics': (make_actions, ('.json',), _read_actions),
     'kept description': (make_description, ('.json',), _read_description),
     'mesh': (make_mesh, ('.stl', '.urdf'), _read_mesh),
     'LeRobot v2.1': (make_dataset_v2, ('.json', '.jsonl', '.parquet'), _read_dataset),

@@ -62,14 +62,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         'drawn:SEED, or a comma-separated list of kinds; keeps successes and failures alike',
     )
     parser.add_argument(
-        '--siblings',
-        type=int,
-        default=0,
-        metavar='K',
-        help='K episodes of each scene: the expert, and pairs of the kinds of --faults that just '
-        'succeed and just fail; --episodes then counts scenes',
-    )
-    parser.add_argument(
         '--pictures',
         choices=('all', 'first'),
         default='all',
@@ -112,7 +104,6 @@ def _collect(arguments: argparse.Namespace) -> int:
             moved_share=arguments.moved_cameras,
             policies=arguments.policies,
             kinds=kinds_named(arguments.faults) if arguments.faults else (),
-            siblings=arguments.siblings,
             physics=arguments.physics,
             record=RecordConfig(
                 pictures=arguments.pictures, frame_period_s=_period(arguments.fps)

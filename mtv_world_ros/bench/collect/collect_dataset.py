@@ -36,14 +36,7 @@ from mtv_world_ros.bench.collect.episode_maker import (
     EpisodeMaker,
     plain_config,
 )
-from mtv_world_ros.bench.collect.siblings import (
-    SceneJob,
-    search_siblings,
-    SearchedScene,
-    sibling_jobs,
-    skipped_text,
-)
-from mtv_world_ros.bench.tasks.tasks import Task, tasks_named
+from mtv_world_ros.bench.tasks.tasks import tasks_named
 from mtv_world_ros.bench.world.opengl import load_mujoco
 from mtv_world_ros.bench.world.zero_shot import kinds_named
 from mtv_world_ros.errors import SimulatorError
@@ -76,7 +69,7 @@ def collect(
 
     Args:
         tasks: names, comma-separated names, or `all`.
-        num_episodes: episodes per task, with siblings scenes per task; of zero-shot sets, in all.
+        num_episodes: episodes per task; of zero-shot sets, in all.
         seed: the data set's random seed.
         out: folder of the data set; one episode folder appears in it at a time.
         zero_shot: kinds of a zero-shot set (`view`, `task`, `object`); none = an ordinary set.
@@ -101,10 +94,10 @@ def collect(
             f'episodes is {num_episodes} and workers is {workers}; both must be at least 1'
         )
     out, config = Path(out), config or CollectConfig()
-    if kinds and (config.policies or config.moved_share or config.siblings):
+    if kinds and (config.policies or config.moved_share):
         raise SimulatorError(
             'a zero-shot set is acted by the expert and brings its own cameras; leave '
-            '--policies and --moved-cameras out, --siblings too, or --zero-shot'
+            '--policies and --moved-cameras out, or --zero-shot'
         )
     load_mujoco()
     if kinds:
@@ -113,8 +106,6 @@ def collect(
         num_missed = 0 if config.kinds else failures_of_ten
         jobs = jobs_of(chosen, num_episodes, seed, out, num_missed, config.policies)
     with locked(out):
-        if config.siblings:
-            jobs = _sibling_jobs(chosen, num_episodes, seed, out, workers, config, progress)
         data_set = _DataSet(out, ZERO_SHOT_SET if kinds else TASKS_SET, seed, config, jobs)
         data_set.make(jobs, workers, config, progress=progress)
         data_set.describe(sheets=sheets)
@@ -123,32 +114,6 @@ def collect(
 
 def _maker(config: CollectConfig) -> Callable[[CollectJob], None]:
     return EpisodeMaker(config).make
-
-
-def _searcher(config: CollectConfig) -> Callable[[SceneJob], SearchedScene]:
-    return EpisodeMaker(config).boundary_search().search
-
-
-def _sibling_jobs(
-    tasks: Sequence[Task],
-    num_scenes: int,
-    seed: int,
-    out: Path,
-    workers: int,
-    config: CollectConfig,
-    progress: bool,
-) -> list[CollectJob]:
-    scenes = [
-        SceneJob(task=task.name, index=index, seed=seed)
-        for index in range(num_scenes)
-        for task in tasks
-    ]
-    check_same_set(out, TASKS_SET, seed, plain_config(config))
-    search = partial(_searcher, config)
-    found = search_siblings(scenes, search, out, workers, progress=progress)
-    if progress:
-        tqdm.write(skipped_text(found))
-    return sibling_jobs(found, scenes, out)
 
 
 @contextmanager

@@ -65,7 +65,6 @@ def commands(card: Mapping[str, Any], entries: Iterable[CardEntry]) -> list[str]
         'moved-cameras': config['moved_share'],
         'policies': ','.join(config['policies']),
         'faults': ','.join(config['kinds']),
-        'siblings': config.get('siblings', 0),
         'pictures': config['record']['pictures'],
     }
     usual = {
@@ -109,7 +108,7 @@ def _robot(config: Mapping[str, Any]) -> str:
 def _is_usual(config: Mapping[str, Any]) -> bool:
     """Whether a command alone makes the set again."""
     usual = plain_config(CollectConfig(robot=_robot(config)))
-    for key in ('moved_share', 'policies', 'kinds', 'siblings'):
+    for key in ('moved_share', 'policies', 'kinds'):
         usual |= {key: config[key]} if key in config else {}
     for key in ('pictures', 'frame_period_s'):
         usual['record'][key] = config['record'][key]

@@ -30,8 +30,6 @@ class CollectJob:
         path: folder to make.
         zero_shot: `view`, `task` or `object`; None = an ordinary episode.
         policy: name of the scripted policy that acts in place of the expert; empty = the expert.
-        attempt: the only one to make; None = attempts until one is as wanted.
-        more: additional metadata of the episode.
     """
 
     task: str
@@ -41,8 +39,6 @@ class CollectJob:
     path: Path
     zero_shot: str | None = None
     policy: str = ''
-    attempt: int | None = None
-    more: tuple[tuple[str, str], ...] = ()
 
 
 def episode_seed(

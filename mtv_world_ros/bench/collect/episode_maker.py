@@ -11,7 +11,6 @@ import numpy as np
 from mtv_world_ros.bench.collect.dataset_card import GO_ON
 from mtv_world_ros.bench.collect.episode_jobs import CollectJob, episode_seed
 from mtv_world_ros.bench.collect.record import RecordConfig, simulate, Take, write_take
-from mtv_world_ros.bench.collect.siblings import BoundarySearch
 from mtv_world_ros.bench.expert.expert import Expert, ExpertConfig
 from mtv_world_ros.bench.expert.faults.catalogue import draw_variant, parse_variant, PolicyVariant
 from mtv_world_ros.bench.tasks.tasks import task_named
@@ -45,8 +44,6 @@ class CollectConfig:
         policies: scripted policies that take turns, `expert-late-0.6`; none = the expert, some of
             whose grasps miss.
         kinds: fault kinds that random policies are drawn from, one an episode; none = `policies`.
-        siblings: episodes of each scene, the expert's and some with faults of `kinds` whose sizes
-            lie on both sides of the boundary between success and failure; 0 = no siblings.
         physics: name in the catalogue of what is true.
     """
 
@@ -59,7 +56,6 @@ class CollectConfig:
     moves: tuple[CameraMoves, ...] = TRAINING_MOVES
     policies: tuple[str, ...] = ()
     kinds: tuple[str, ...] = ()
-    siblings: int = 0
     physics: str = NOMINAL
 
     def __post_init__(self) -> None:
@@ -71,11 +67,6 @@ class CollectConfig:
         physics_named(self.physics)
         for name in self.policies:
             parse_variant(name)
-        if self.siblings and (self.siblings < 2 or self.policies or not self.kinds):
-            raise SimulatorError(
-                f'{self.siblings} siblings of each scene: there must be at least 2, of the fault '
-                'kinds of a split; set --siblings and --faults, and leave --policies out'
-            )
 
 
 def plain_config(config: CollectConfig) -> dict[str, Any]:
@@ -83,7 +74,7 @@ def plain_config(config: CollectConfig) -> dict[str, Any]:
     workcell = workcell_of(load_robot(bundled('robots', config.robot, '--robot')))
     config = replace(config, randomization=config.randomization.of(workcell))
     values = json.loads(json.dumps(asdict(config)))
-    usual = {'robot': _DEFAULT_ROBOT, 'siblings': 0, 'physics': NOMINAL}
+    usual = {'robot': _DEFAULT_ROBOT, 'physics': NOMINAL}
     return {k: v for k, v in values.items() if k not in usual or v != usual[k]}
 
 
@@ -105,7 +96,7 @@ class EpisodeMaker:
                 cannot be written.
         """
         attempts = range(self._config.record.max_attempts)
-        for attempt in attempts if job.attempt is None else (job.attempt,):
+        for attempt in attempts:
             seed = episode_seed(job.seed, job.task, job.index, attempt, job.zero_shot)
             sim, take = self._attempt(job, seed)
             try:
@@ -125,18 +116,6 @@ class EpisodeMaker:
             'attempts; see bench/expert/expert.py'
         )
 
-    def boundary_search(self) -> BoundarySearch:
-        """Returns the search for siblings, with the physics of the episodes made here."""
-
-        def physics(seed: int) -> SimEpisode:
-            config = cameras_of(seed, self._config)
-            return self._sim(config, rendering=False)
-
-        record = replace(self._config.record, pictures='first')
-        return BoundarySearch(
-            self._expert, physics, self._config.kinds, self._config.siblings, record
-        )
-
     def _attempt(self, job: CollectJob, seed: int) -> tuple[SimEpisode, Take | None]:
         """The episode of a seed; no take where its scene or plan is impossible."""
         config = self._config
@@ -154,18 +133,13 @@ class EpisodeMaker:
         except (SimulatorError, PolicyError):
             return sim, None
 
-    def _sim(self, randomization: RandomizationConfig, *, rendering: bool = True) -> SimEpisode:
-        return SimEpisode(
-            self._robot,
-            self._expert.home,
-            randomization,
-            rendering=rendering,
-            physics=self._config.physics,
-        )
+    def _sim(self, randomization: RandomizationConfig) -> SimEpisode:
+        home, physics = self._expert.home, self._config.physics
+        return SimEpisode(self._robot, home, randomization, physics=physics)
 
     def _policy(self, job: CollectJob, seed: int) -> PolicyVariant | None:
         """What acts in place of the expert."""
-        if self._config.kinds and not self._config.siblings:
+        if self._config.kinds:
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
             return draw_variant(self._config.kinds, rng)
         return parse_variant(job.policy) if job.policy else None
@@ -173,7 +147,7 @@ class EpisodeMaker:
     def _write(
         self, job: CollectJob, sim: SimEpisode, take: Take, seed: int, attempt: int
     ) -> None:
-        extra = {'attempt': str(attempt), 'index': str(job.index), **dict(job.more)}
+        extra = {'attempt': str(attempt), 'index': str(job.index)}
         if job.zero_shot is not None:
             extra['zero_shot'] = job.zero_shot
         policy = self._policy(job, seed)

@@ -37,11 +37,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('dataset', type=Path, nargs='?', help='left out with --dry-run')
     parser.add_argument('--out', type=Path, help='resumes what is there')
     parser.add_argument('--preset', default='small', help='name or YAML file')
-    parser.add_argument(
-        '--control',
-        help='how actions enter: trajectory_video, policy2vec, ee_mlp or fast_tokens; '
-        'default: what the preset says',
-    )
     parser.add_argument('--views', help='e.g. low,high or low; default: those of the preset')
     parser.add_argument(
         '--object-mask', choices=('on', 'off'), help='object masks in the trajectory video'
@@ -218,8 +213,6 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     from mtv_world_ros.errors import ConfigError
 
     overrides: dict[str, Any] = {}
-    if arguments.control is not None:
-        overrides['video.control'] = arguments.control
     if arguments.views is not None:
         views = [view.strip() for view in arguments.views.split(',') if view.strip()]
         if not views:
@@ -255,18 +248,14 @@ def set_overrides(items: list[str]) -> dict[str, Any]:
 
 
 def _dry_run(config: TrainingConfig, arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.assembly import robot_path
-    from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.lab.training.dry_run import step_cost
-    from mtv_world_ros.model.actions import action_names
     from mtv_world_ros.model.runtime import choose_dtype
 
     dtype = choose_dtype(arguments.dtype, arguments.device)
     video = config.video
-    robot = load_robot(robot_path(video.robot))
-    cost = step_cost(config, action_dim=len(action_names(video.control, robot)), dtype=dtype)
+    cost = step_cost(config, dtype=dtype)
     print(
-        f'control {video.control}, {len(video.views)} views of {1 + video.num_frames} frames of '
+        f'{len(video.views)} views of {1 + video.num_frames} frames of '
         f'{video.width}x{video.height}, batch {config.optimizer.batch_size}, {dtype}'
     )
     print('per step, the transformer alone:', *cost.lines(), sep='\n')

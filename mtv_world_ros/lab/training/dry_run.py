@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 import time
@@ -14,7 +14,6 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
 from mtv_world_ros.lab.training.training_config import TrainingConfig
-from mtv_world_ros.model.actions import ActionEncoding, EE_MLP, FAST_TOKENS, TRAJECTORY_VIDEO
 from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
@@ -75,31 +74,25 @@ class StepCost:
         ]
 
 
-def step_cost(
-    config: TrainingConfig, *, action_dim: int, dtype: torch.dtype, fake: bool = True
-) -> StepCost:
+def step_cost(config: TrainingConfig, *, dtype: torch.dtype, fake: bool = True) -> StepCost:
     """Runs one step on shapes only and counts operations and bytes.
 
     Args:
         config: the preset.
-        action_dim: numbers an action, where the control does not draw them.
         dtype: of forward and backward.
         fake: shapes only; False computes the step on the CPU.
     """
-    arguments = dict(config.transformer)
-    if config.video.control != TRAJECTORY_VIDEO:
-        arguments |= {'control': config.video.control, 'action_dim': action_dim}
     # fake tensors have shapes and no numbers; said to be on the CPU, they take the attention that
     # keeps no attention matrix, as a GPU does (on `meta` they would take the one that does)
     with torch.device('meta' if fake else 'cpu'):
-        transformer = MultiViewWanTransformer(**arguments)
+        transformer = MultiViewWanTransformer(**config.transformer)
     if config.lora.rank:
         add_adapter(transformer, rank=config.lora.rank, alpha=config.lora.alpha)
     if config.optimizer.gradient_checkpointing:
         transformer.enable_gradient_checkpointing()
     with FakeTensorMode() if fake else nullcontext():
         fill(transformer, dtype)
-        inputs = _inputs(config, transformer, action_dim, dtype)
+        inputs = _inputs(config, transformer, dtype)
         parameters = list(transformer.parameters())
         with FlopCounterMode(display=False, custom_mapping=attention_operations()) as counter:
             with _kept(parameters) as sizes:
@@ -164,7 +157,6 @@ def _storage(tensor: Tensor) -> int:
 def _inputs(
     config: TrainingConfig,
     transformer: MultiViewWanTransformer,
-    action_dim: int,
     dtype: torch.dtype,
 ) -> dict[str, Tensor]:
     """Arguments of the transformer for one batch, all zero."""
@@ -195,21 +187,6 @@ def _inputs(
     if config.transformer.get('image_dim'):
         width = config.transformer['image_dim']
         values['encoder_hidden_states_image'] = zeros(views * _IMAGE_TOKENS, width)
-    return values | _action_inputs(config, action_dim, zeros)
-
-
-def _action_inputs(
-    config: TrainingConfig, action_dim: int, zeros: Callable[..., Tensor]
-) -> dict[str, Tensor]:
-    control, num_frames = config.video.control, config.video.num_frames
-    values = {}
-    if control == FAST_TOKENS:
-        # one token per number: an upper bound, byte-pair encoding leaves fewer
-        values['actions'] = zeros(num_frames * action_dim, kind=torch.int64)
-    elif control != TRAJECTORY_VIDEO:
-        values['actions'] = zeros(1 + num_frames, action_dim)
-    if control == EE_MLP:
-        values['actions_kept'] = zeros(kind=torch.bool)
     return values
 
 
@@ -243,18 +220,12 @@ def measured_peak(device: torch.device, dtype: torch.dtype) -> float:
     return together * 2 * size**3 / fastest
 
 
-def ideal_seconds(
-    config: TrainingConfig,
-    actions: ActionEncoding | None,
-    dtype: torch.dtype,
-    flops: float,
-) -> float:
+def ideal_seconds(config: TrainingConfig, dtype: torch.dtype, flops: float) -> float:
     """Returns the time of a step whose forward and backward run at a peak of operations a second.
 
     The transformer's alone: encoding, and what gradient checkpointing computes again, is not the
     model's arithmetic.
     """
-    dim = 0 if actions is None else actions.dim
     optimizer = config.optimizer.replace(gradient_checkpointing=False)
     config = config.replace(optimizer=optimizer)
-    return step_cost(config, action_dim=dim, dtype=dtype).step_flop / flops
+    return step_cost(config, dtype=dtype).step_flop / flops

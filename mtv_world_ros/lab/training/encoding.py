@@ -23,7 +23,6 @@ from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.card import HistorySettings
 from mtv_world_ros.model.conditioning import (
     condition,
-    condition_on_actions,
     Conditioning,
     encode_chunk,
     with_anchor,
@@ -100,12 +99,7 @@ def encode_batch(
 def condition_batch(encoders: Encoders, batch: ClipBatch, device: torch.device) -> Conditioning:
     """Returns the conditioning of a batch."""
     autoencoder, start = encoders.autoencoder, batch.start_frame.to(device)
-    if batch.actions is None:
-        assert batch.trajectory is not None
-        latents = condition(autoencoder, start, batch.trajectory.to(device))
-    else:
-        num_frames = batch.frames.shape[2] - 1
-        latents = condition_on_actions(autoencoder, start, batch.actions.to(device), num_frames)
+    latents = condition(autoencoder, start, batch.trajectory.to(device))
     latents = _with_past(encoders, latents, batch, device)
     if encoders.text is None or encoders.image is None:
         return latents

@@ -22,7 +22,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mtv_world_ros.bounded_input import parse_json, read_json
-from mtv_world_ros.data.recording import commanded, cut_clip, Recording
+from mtv_world_ros.data.recording import cut_clip, Recording
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.files import content_digest, write_whole
@@ -38,7 +38,6 @@ from mtv_world_ros.lab.training.training_config import (
     ObjectiveConfig,
     TrainingConfig,
 )
-from mtv_world_ros.model.actions import collate, TRAJECTORY_VIDEO
 from mtv_world_ros.model.conditioning import Conditioning, start_slot
 
 #: bytes of tensors that are gathered before they are written
@@ -231,14 +230,14 @@ def settings_of(
         'autoencoder': content_digest(base / 'autoencoder')[:16],
         'dtype': str(dtype),
         **{f'history.{k}': v for k, v in config.history.model_dump().items()},
-        'trajectory_video': config.video.control == TRAJECTORY_VIDEO,
+        'trajectory_video': True,
+        **{f'rendering.{k}': v for k, v in config.rendering.model_dump().items()},
+        'robot': _robot_digest(robot),
+        'video.object_mask': video['object_mask'],
+        'segmenter': segmenter if video['object_mask'] else None,
     }
     if (base / 'image_encoder').is_dir():
         settings['image_encoder'] = content_digest(base / 'image_encoder')[:16]
-    if settings['trajectory_video']:
-        settings |= {f'rendering.{k}': v for k, v in config.rendering.model_dump().items()}
-        settings |= {'robot': _robot_digest(robot), 'video.object_mask': video['object_mask']}
-        settings['segmenter'] = segmenter if video['object_mask'] else None
     return settings
 
 
@@ -277,25 +276,23 @@ def read_clip(
     Its anchor and history are drawn once, by its start.
     """
     cut = cut_clip(clip.recording, clip.start, spec)
-    trajectory, actions = controls.make(cut, clip.recording.names)
-    parts = (cut.frames, cut.frames[:, 0], trajectory, cut.object_ids)
-    frames, start, drawn, ids = (
-        None if part is None else torch.from_numpy(np.array(part))[None] for part in parts
-    )
-    assert frames is not None and start is not None
+    trajectory = controls.make(cut, clip.recording.names)
     past = None
     if history.on:
         rng = np.random.default_rng((_VERSION, clip.start))
         before = history_before(clip.recording, clip.start, spec, history, rng)
         past = draw_past(before, history, rng)
     return ClipBatch(
-        frames=frames,
-        start_frame=start,
-        trajectory=drawn,
-        object_ids=ids,
-        actions=None if actions is None else torch.from_numpy(collate([actions])),
+        frames=_alone(cut.frames),
+        start_frame=_alone(cut.frames[:, 0]),
+        trajectory=_alone(trajectory),
+        object_ids=None if cut.object_ids is None else _alone(cut.object_ids),
         **pasts([past]),  # type: ignore[arg-type]
     )
+
+
+def _alone(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.array(array))[None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -364,9 +361,7 @@ def _encode(
     encoded = encode_batch(encoders, batch, ObjectiveConfig(), device)
     cond = encoded.conditioning
     tensors = {'clean': encoded.clean, 'reference': cond.reference, 'image': cond.image}
-    tensors |= {'anchor': cond.anchor, 'history': cond.history}
-    if batch.trajectory is not None:
-        tensors['control'] = cond.control
+    tensors |= {'anchor': cond.anchor, 'history': cond.history, 'control': cond.control}
     held = {name: value[0].to(dtype) for name, value in tensors.items() if value is not None}
     if cond.history_sigmas is not None:
         held['history_sigma'] = cond.history_sigmas[0].float()
@@ -442,8 +437,6 @@ def cached(
         seed=seed,
         numbers=processes.share(config.optimizer.batch_size),
         device=processes.device,
-        controls=controls,
-        spec=spec,
     )
 
 
@@ -489,8 +482,6 @@ class CachedSource:
         seed: of the order.
         numbers: the clips of a step that this process takes; None: all.
         device: of the batches.
-        controls: encodes actions that are not drawn.
-        spec: sizes and rates of the model's inputs and outputs.
     """
 
     def __init__(
@@ -504,12 +495,9 @@ class CachedSource:
         seed: int,
         numbers: Sequence[int] | None = None,
         device: torch.device,
-        controls: ControlMaker,
-        spec: WorldModelSpec,
     ) -> None:
-        self.controls = controls
         self._cache, self._clips, self._objective = cache, clips, objective
-        self._text, self._device, self._spec = text, device, spec
+        self._text, self._device = text, device
         self._batch_size, self._seed = batch_size, seed
         self._numbers = range(batch_size) if numbers is None else numbers
 
@@ -525,13 +513,12 @@ class CachedSource:
         held = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
         held = {name: tensor.to(self._device) for name, tensor in held.items()}
         clean, reference = held['clean'], held['reference']
-        control = held.get('control', torch.zeros_like(clean))
+        control = held['control']
         cond = Conditioning(
             control=control,
             start_control=control[:, :, :, 0],
             start=start_slot(reference, clean.shape[3], includes_start=True),
             reference=reference,
-            actions=self._encoded(clips),
             text=self._repeated(self._text, len(rows)),
             image=held.get('image'),
             anchor=held.get('anchor'),
@@ -553,15 +540,6 @@ class CachedSource:
         epoch, place = divmod(step * self._batch_size + number, len(self._clips))
         order = np.random.default_rng((self._seed, epoch)).permutation(len(self._clips))
         return self._clips[order[place]]
-
-    def _encoded(self, clips: Sequence[CachedClip]) -> Tensor | None:
-        encoding = self.controls.actions
-        if encoding is None:
-            return None
-        times = np.arange(self._spec.num_frames + 1) / self._spec.fps
-        chunks = [commanded(clip.recording, clip.start, times) for clip in clips]
-        encoded = [encoding.encode(self.controls.robot, chunk) for chunk in chunks]
-        return torch.from_numpy(collate(encoded)).to(self._device)
 
     def _repeated(self, text: Tensor | None, count: int) -> Tensor | None:
         return None if text is None else text.to(self._device).expand(count, -1, -1)

@@ -18,6 +18,7 @@ from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import recover_folder, whole_folder
 from mtv_world_ros.lab.training.averaged_weights import AveragedWeights
 from mtv_world_ros.lab.training.training_config import TrainingConfig
+from mtv_world_ros.model.card import TRAJECTORY_VIDEO
 
 #: folder of the state in that of the training
 STATE = 'state'
@@ -89,6 +90,7 @@ def architecture(config: TrainingConfig) -> dict[str, Any]:
         **{f'autoencoder.{name}': value for name, value in config.autoencoder.items()},
         **{f'video.{n}': v for n, v in config.video.model_dump(exclude={'clip_stride_s'}).items()},
         'lora.rank': config.lora.rank,
+        'video.control': TRAJECTORY_VIDEO,
     }
     return json.loads(json.dumps(values))
 
@@ -117,20 +119,17 @@ def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -
     Args:
         folder: of the training.
         card: of the state.
-        mine: `seed`, `control` and `base` (a digest, or None) of this run.
+        mine: `seed` and `base` (a digest, or None) of this run.
 
     Raises:
-        TrainingError: seed, control or base of the state differ from this run's.
+        TrainingError: seed or base of the state differ from this run's.
     """
-    trained = {'control': 'trajectory_video', 'base': None, **card}
-    state = folder / STATE
-    for name in ('seed', 'control'):
-        if trained[name] != mine[name]:
-            raise TrainingError(
-                f"'{state}' was trained with {name} {trained[name]!r}, this run has "
-                f'{mine[name]!r}; '
-                f'give --{name} the same, or another --out'
-            )
+    trained, state = {'base': None, **card}, folder / STATE
+    if trained['seed'] != mine['seed']:
+        raise TrainingError(
+            f"'{state}' was trained with seed {trained['seed']!r}, this run has "
+            f'{mine["seed"]!r}; give --seed the same, or another --out'
+        )
     if trained['base'] != mine['base']:
         raise TrainingError(
             f"'{state}' was trained on top of other weights than those of --init; give the "

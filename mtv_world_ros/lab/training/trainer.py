@@ -11,14 +11,12 @@ import time
 from typing import Any
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.lab.training.averaged_weights import AveragedWeights
 from mtv_world_ros.lab.training.base import Base
 from mtv_world_ros.lab.training.clips.batches import BatchSource, ClipBatch
-from mtv_world_ros.lab.training.clips.fit_actions import transformer_arguments
 from mtv_world_ros.lab.training.distributed import memory_errors_named, Processes
 from mtv_world_ros.lab.training.encoding import (
     drop_conditions,
@@ -44,7 +42,6 @@ from mtv_world_ros.lab.training.resume import (
     STATE,
 )
 from mtv_world_ros.lab.training.training_config import OptimizerConfig, TrainingConfig
-from mtv_world_ros.model.actions import ActionEncoding, EE_MLP
 from mtv_world_ros.model.card import CheckpointCard, OPTIONAL_KEYS, ROBOT_FOLDER
 from mtv_world_ros.model.checkpoint import (
     Checkpoint,
@@ -108,7 +105,6 @@ class Trainer:
         device: e.g. `cpu`, `cuda`.
         dtype: of forward and backward; master weights stay float32.
         trained_on: entry of the checkpoint's card.
-        actions: how positions become actions, where the preset's control does not draw them.
         processes: that train together; None: those that the launcher started.
         base: checkpoint to train on top of; None: all weights are new.
 
@@ -125,7 +121,6 @@ class Trainer:
         device: str,
         dtype: torch.dtype,
         trained_on: dict[str, object],
-        actions: ActionEncoding | None = None,
         processes: Processes | None = None,
         base: Base | None = None,
     ) -> None:
@@ -135,11 +130,11 @@ class Trainer:
         self.clips = self._clips(settings)
         self.config, self.folder, self.seed = config, Path(folder), seed
         self.device = self.processes.device
-        self.trained_on, self.actions, self.base = trained_on, actions, base
+        self.trained_on, self.base = trained_on, base
         if base is None:
             autoencoder = place(build_autoencoder(config.autoencoder), self.device, torch.float32)
             self.encoders = Encoders(autoencoder=autoencoder, history=config.history)
-            transformer = MultiViewWanTransformer(**transformer_arguments(config, actions))
+            transformer = MultiViewWanTransformer(**config.transformer)
         else:
             self.encoders, transformer = base.encoders, base.checkpoint.transformer
         check_history(config.history, self.encoders.autoencoder, transformer.config)
@@ -310,7 +305,6 @@ class Trainer:
         return {
             **architecture(self.config),
             'seed': self.seed,
-            'control': self.config.video.control,
             'base': self.base and self.base.digest,
         }
 
@@ -318,7 +312,7 @@ class Trainer:
         """Continues from the saved state; returns whether there was one.
 
         Raises:
-            TrainingError: the state is damaged, or of another model, seed, control or base.
+            TrainingError: the state is damaged, or of another model, seed or base.
         """
         card = read_card(self.folder)
         if card is None:
@@ -342,7 +336,7 @@ class Trainer:
         # what `fit-contact` put there stays
         mine = folder / OBJECT_MOTION_FOLDER
         motion = mine if mine.is_dir() else self._object_motion
-        parts = (self.config, self.encoders, self.actions, motion, self.robot)
+        parts = (self.config, self.encoders, motion, self.robot)
         export_checkpoint(folder, self.weights, card, self.base, *parts, dtype)
 
     @property
@@ -366,7 +360,6 @@ def export_checkpoint(
     base: Base | None,
     config: TrainingConfig,
     encoders: Encoders,
-    actions: ActionEncoding | None,
     object_motion: Path | None,
     robot: Path | None,
     dtype: torch.dtype,
@@ -377,7 +370,6 @@ def export_checkpoint(
         autoencoder=encoders.autoencoder,
         scheduler=build_scheduler(config.scheduler),
         card=_with_text(card, base),
-        actions=actions,
         object_motion=object_motion,
         robot=robot,
         text_encoder=base and base.checkpoint.text_encoder,
@@ -417,7 +409,6 @@ def batch_loss(
     sigmas = draw_sigmas(draws, objective)
     noise = draws.normal(*clean.shape[1:]).to(device)
     noisy = add_noise(clean, noise, sigmas.to(device))
-    kept = _kept(draws, config, device)
     cond = batch.conditioning
     if transformer.start_image == 'either':
         cond = cond.with_one_start()
@@ -434,8 +425,6 @@ def batch_loss(
         start_control=cond.start_control,
         encoder_hidden_states=None if cond.text is None else cond.text.to(dtype),
         encoder_hidden_states_image=None if cond.image is None else cond.image.to(dtype),
-        actions=cond.actions,
-        actions_kept=kept,
         anchor=cond.anchor,
         history=cond.history,
         history_timestep=cond.history_timestep,
@@ -443,10 +432,3 @@ def batch_loss(
     target = clean if transformer.prediction == 'sample' else noise - clean
     by_sigma = sigma_weights(sigmas, objective).to(device)
     return sample_loss(predicted, target, batch.weights, objective.huber_delta, by_sigma)
-
-
-def _kept(draws: NoiseDraws, config: TrainingConfig, device: torch.device) -> Tensor | None:
-    """(B,) bool, False where a sample goes without its actions."""
-    if config.video.control != EE_MLP:
-        return None
-    return (draws.uniform() >= config.augment.action_dropout).to(device)

@@ -7,7 +7,7 @@ from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from mtv_world_ros.config import (
     Count,
@@ -24,8 +24,7 @@ from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import bundled
-from mtv_world_ros.model.actions import check_control, TRAJECTORY_VIDEO
-from mtv_world_ros.model.card import CheckpointCard, HistorySettings
+from mtv_world_ros.model.card import CheckpointCard, HistorySettings, TRAJECTORY_VIDEO
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 
 #: in a loss
@@ -43,10 +42,6 @@ class VideoConfig(Schema):
     width: Count = Field(default=96, description='[px]')
     height: Count = Field(default=72, description='[px]')
     robot: str = 'yam_bimanual'
-    control: Annotated[str, AfterValidator(check_control)] = Field(
-        default=TRAJECTORY_VIDEO,
-        description='how the actions enter, of `actions.CONTROLS`',
-    )
     object_mask: bool = Field(
         default=True, description="the trajectory video carries the objects' masks"
     )
@@ -111,10 +106,6 @@ class AugmentConfig(Schema):
         description='probability of a clip whose objects are cut out of its own first frame, '
         'where a gripper may hide half of them, as where a rollout begins in mid-episode; else '
         "out of the recording's first frame",
-    )
-    action_dropout: Share = Field(
-        default=0.05,
-        description='probability of a sample without actions; for `ee_mlp` (as in Ctrl-World)',
     )
     control_dropout: Share = Field(
         default=0.0, description='probability of a sample without its trajectory video'
@@ -270,6 +261,7 @@ class TrainingConfig(Schema):
         """Returns the checkpoint's card; `trained_on` says where weights come from."""
         return CheckpointCard(
             **self.video.model_dump(mode='json', exclude={'clip_stride_s'}),
+            control=TRAJECTORY_VIDEO,
             rendering=self.rendering.model_dump(),
             **self.history.as_card(),
             num_inference_steps=self.sampling.num_inference_steps,

@@ -40,7 +40,6 @@ from mtv_world_ros.geometry.robot.file import save_robot
 from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
 from mtv_world_ros.lab.training.base import load_base, needs_base
 from mtv_world_ros.lab.training.clips.batches import BatchSource
-from mtv_world_ros.lab.training.clips.fit_actions import kept_actions
 from mtv_world_ros.lab.training.distributed import Processes
 from mtv_world_ros.lab.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.lab.training.latent_cache import cached, CachedSource
@@ -217,9 +216,6 @@ def train(
             run.source,
             describer,
         )
-        actions = kept_actions(
-            out, config.video.control, recordings, config.spec, robot, initial=run.initial
-        )
     _save_robot(robot, recordings, out / ROBOT_FOLDER, processes)
     source: BatchSource | CachedSource = BatchSource(
         recordings,
@@ -227,7 +223,6 @@ def train(
         robot=robot,
         segmenter=segmenter,
         seed=run.seed,
-        actions=actions,
         workers=run.data_workers,
         numbers=processes.share(config.optimizer.batch_size),
     )
@@ -257,7 +252,6 @@ def train(
             'tasks': sorted({recording.task for recording in recordings}),
             'clips': source.num_clips,
         },
-        actions=actions,
         processes=processes,
         base=base,
     )
@@ -281,7 +275,7 @@ def train(
     ideal = None
     if run.peak_tflops is not None and processes.is_main:
         peak = 1e12 * run.peak_tflops or measured_peak(processes.device, dtype)
-        ideal = ideal_seconds(config, actions, dtype, peak * processes.count)
+        ideal = ideal_seconds(config, dtype, peak * processes.count)
     try:
         with disk_errors_named(out):
             _loop(trainer, source, run, held_out, ideal)

@@ -5,80 +5,14 @@ Shape letters: B batch, S tokens, R runs of as many tokens each, D width, H head
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 from diffusers.models.attention_dispatch import dispatch_attention_fn
 from diffusers.models.transformers.transformer_wan import WanTransformerBlock
 import torch
 from torch import nn, Tensor
-import torch.nn.functional as F
 
 from mtv_world_ros.errors import CheckpointError
-
-
-class Context(NamedTuple):
-    """Context tokens of a block's cross-attention.
-
-    Attributes:
-        tokens: (B, N, D) for all tokens alike, or (B, S, G, D): each time slot has its own.
-        num_views: V, to find the time slots in the token sequence.
-        mask: (B, N) bool, False = padding; None = all count.
-        image: (B, M, D) tokens that the added image attention looks at, or None.
-    """
-
-    tokens: Tensor
-    num_views: int
-    mask: Tensor | None = None
-    image: Tensor | None = None
-
-
-class ContextAttnProcessor:
-    """Wan's cross-attention for a `Context`: any number of tokens, padding, slots of their own."""
-
-    def __call__(
-        self,
-        attn: Any,
-        hidden_states: Tensor,
-        encoder_hidden_states: Context,
-        attention_mask: None = None,
-        rotary_emb: None = None,
-    ) -> Tensor:
-        """Returns (B, V * S * n, D) for a token sequence of that shape."""
-        del attention_mask, rotary_emb
-        context = encoder_hidden_states
-        query = attn.norm_q(attn.to_q(hidden_states))
-        out = _attend_context(attn, query, context)
-        if context.image is not None:
-            key = attn.norm_added_k(attn.add_k_proj(context.image))
-            out = out + _attend(attn.heads, query, key, attn.add_v_proj(context.image))
-        return attn.to_out[1](attn.to_out[0](out))
-
-
-def _attend_context(attn: Any, query: Tensor, context: Context) -> Tensor:
-    tokens = context.tokens
-    if tokens.ndim == 3:
-        mask = None if context.mask is None else context.mask[:, None, None]
-        return _attend(attn.heads, query, *_keys_values(attn, tokens), mask)
-    batch, slots = tokens.shape[:2]
-    # time slots become part of the batch, so that none sees the actions of another
-    grid = query.unflatten(1, (context.num_views, slots, -1)).transpose(1, 2)
-    own = grid.flatten(2, 3).flatten(0, 1)
-    out = _attend(attn.heads, own, *_keys_values(attn, tokens.flatten(0, 1)))
-    out = out.unflatten(0, (batch, slots)).unflatten(2, (context.num_views, -1))
-    return out.transpose(1, 2).flatten(1, 3)
-
-
-def _keys_values(attn: Any, tokens: Tensor) -> tuple[Tensor, Tensor]:
-    return attn.norm_k(attn.to_k(tokens)), attn.to_v(tokens)
-
-
-def _attend(
-    heads: int, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None = None
-) -> Tensor:
-    parts = [x.unflatten(2, (heads, -1)).transpose(1, 2) for x in (query, key, value)]
-    out = F.scaled_dot_product_attention(*parts, attn_mask=mask)
-    return out.transpose(1, 2).flatten(2).type_as(query)
-
 
 #: umT5 tokens; Wan's attention splits image from text tokens by this number
 NUM_TEXT_TOKENS = 512
@@ -113,14 +47,11 @@ class _NoContext(nn.Module):
         return torch.zeros_like(hidden_states)
 
 
-def fit_cross_attention(blocks: Any, *, with_actions: bool, with_text: bool) -> None:
-    """Lets the blocks' cross-attention look at a `Context`, or takes it out."""
+def without_cross_attention(blocks: Any) -> None:
+    """Takes the cross-attention out of the blocks of a model without context tokens."""
     for block in blocks:
-        if with_actions:
-            block.attn2.set_processor(ContextAttnProcessor())
-        elif not with_text:
-            block.attn2 = _NoContext()
-            block.norm2 = nn.Identity()
+        block.attn2 = _NoContext()
+        block.norm2 = nn.Identity()
 
 
 class RunwiseBlock(WanTransformerBlock):

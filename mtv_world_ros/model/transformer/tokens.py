@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.transformer.block import Context
 
 #: where the start image may enter: as reference tokens, in its channel slot, or both
 START_IMAGES = ('both', 'either', 'reference', 'channel')
@@ -292,14 +291,3 @@ def by_run(time_proj: Tensor, grid: TokenGrid) -> Tensor:
         time_proj[:, :1].expand(-1, frames - grid.num_history, -1, -1),
     ]
     return torch.cat(parts, dim=1).repeat(1, views, 1, 1)
-
-
-def fit_context(context: Context, grid: TokenGrid) -> Context:
-    """Returns a context of 1 + f time slots for the grid's token frames.
-
-    The history sees what the reference image sees; in its own frames the commands are done with.
-    """
-    if context.tokens.ndim == 3:
-        return context
-    first = context.tokens[:, :1].expand(-1, grid.num_before, -1, -1)
-    return context._replace(tokens=torch.cat([first, context.tokens[:, 1:]], dim=1))

@@ -15,11 +15,10 @@ from torch import nn, Tensor
 from torch.utils.checkpoint import checkpoint
 
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.transformer.action_context import build_control
 from mtv_world_ros.model.transformer.block import (
     check_tokens,
-    fit_cross_attention,
     hold_levels_by_run,
+    without_cross_attention,
 )
 from mtv_world_ros.model.transformer.stem import ConvStem, ReferenceDecoder, ReferenceStem
 from mtv_world_ros.model.transformer.tokens import (
@@ -30,9 +29,7 @@ from mtv_world_ros.model.transformer.tokens import (
     embed_history,
     embed_reference,
     embed_video,
-    fit_context,
     MultiViewRotaryPosEmbed,
-    TokenGrid,
     unembed,
 )
 
@@ -58,10 +55,6 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         context: `text_image` (cross-attention as in Wan) or `none`.
         view_offset: see `MultiViewRotaryPosEmbed`.
         prediction: `flow` (noise - clean, Wan) or `sample` (the clean latents).
-        control: how actions enter, see `action_context.py`; but for `trajectory_video` blocks have
-            cross-attention also where `context` is `none`.
-        action_dim: numbers an action, for controls other than `trajectory_video`.
-        num_context_tokens: learned tokens in place of the text where `context` is `none`.
         start_image: where the start image enters: `both`, `either` (see
             `Conditioning.with_one_start`), as `reference` tokens alone, or in its
             `channel` slot alone.
@@ -101,9 +94,6 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         context: str = 'text_image',
         view_offset: str = 'width',
         prediction: str = 'flow',
-        control: str = 'trajectory_video',
-        action_dim: int = 0,
-        num_context_tokens: int = 8,
         start_image: str = 'both',
         copies_control: bool = False,
     ) -> None:
@@ -147,18 +137,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             self.ref_conv = nn.Conv2d(latent_channels, dim, patch_size[1:], stride=patch_size[1:])  # type: ignore[arg-type]
             hold_levels_by_run(self.blocks)
         self.with_text = context != 'none'
-        # last, so that a seed gives what all controls share the same weights
-        self.action_control = build_control(
-            control,
-            with_text=self.with_text,
-            num_context_tokens=num_context_tokens,
-            action_dim=action_dim,
-            dim=dim,
-            frames_per_token=frames_per_token,
-        )
-        fit_cross_attention(
-            self.blocks, with_actions=self.action_control is not None, with_text=self.with_text
-        )
+        if not self.with_text:
+            without_cross_attention(self.blocks)
 
     def _build_conv_stem(
         self,
@@ -185,8 +165,6 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         start_control: Tensor | None = None,
         encoder_hidden_states: Tensor | None = None,
         encoder_hidden_states_image: Tensor | None = None,
-        actions: Tensor | None = None,
-        actions_kept: Tensor | None = None,
         anchor: Tensor | None = None,
         history: Tensor | None = None,
         history_timestep: Tensor | None = None,
@@ -202,8 +180,6 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             start_control: (B, V, C, H, W) latents of the control frame 0 (convolutional stem).
             encoder_hidden_states: (B, 512, text_dim) umT5 tokens.
             encoder_hidden_states_image: (B, V * 257, image_dim) CLIP tokens.
-            actions: what `ActionEncoding` gives, for controls other than `trajectory_video`.
-            actions_kept: (B,) bool, False = a sample without its actions; see `ActionControl`.
             anchor: (B, V, C, H, W) latents of the image that the reference tokens are made of, in
                 place of the start image: the first one of the rollout.
             history: (B, V, C, P, H, W) latents of what was seen before the chunk, as noisy as
@@ -220,7 +196,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
                 f'{num_views} views given, the model was built for '
                 f'{self.view_embedding.shape[0]}; set `views` to those, or train with num_views'
             )
-        if self.with_text and self.action_control is None:
+        if self.with_text:
             takes_image = self.config['added_kv_proj_dim'] is not None
             check_tokens(
                 encoder_hidden_states, encoder_hidden_states_image, takes_image, num_views
@@ -241,7 +217,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             None if history is None else embed_history(self, history, start, temb[:, -1]),
         )
         sequence = grid.tokens + self.view_embedding[:num_views, None, None, None]
-        context = self._context(text, image, actions, actions_kept, grid)
+        context = text if image is None else torch.cat([image, text], dim=1)
         sequence = self._run_blocks(
             sequence.flatten(1, 4),
             context,
@@ -275,7 +251,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         return temb, proj.unflatten(2, (6, -1)), text, image
 
     def _run_blocks(
-        self, sequence: Tensor, context: Any, time_proj: Tensor, rotary: tuple[Tensor, Tensor]
+        self, sequence: Tensor, context: Tensor, time_proj: Tensor, rotary: tuple[Tensor, Tensor]
     ) -> Tensor:
         for block in self.blocks:
             if torch.is_grad_enabled() and self.gradient_checkpointing:
@@ -285,25 +261,6 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             else:
                 sequence = block(sequence, context, time_proj, rotary)
         return sequence
-
-    def _context(
-        self,
-        text: Tensor,
-        image: Tensor | None,
-        actions: Tensor | None,
-        kept: Tensor | None,
-        grid: TokenGrid,
-    ) -> Any:
-        """Context tokens of the blocks' cross-attention."""
-        if self.action_control is None:
-            return text if image is None else torch.cat([image, text], dim=1)
-        if actions is None:
-            raise CheckpointError(f"control '{self.config['control']}' needs actions, got none")
-        num_views, num_frames = grid.tokens.shape[1:3]
-        slots_views = (1 + num_frames - grid.num_before, num_views)
-        text_or_none = text if self.with_text else None
-        context = self.action_control(actions, kept, text_or_none, image, slots_views)
-        return fit_context(context, grid)
 
 
 def copy_of(transformer: MultiViewWanTransformer) -> MultiViewWanTransformer:

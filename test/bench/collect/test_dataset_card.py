@@ -138,7 +138,7 @@ def test_the_command_on_the_card_makes_the_same_set(make):
     ('config', 'options'),
     [
         ({}, ''),
-        ({'kinds': ('high', 'miss'), 'siblings': 3}, ' --faults high,miss --siblings 3'),
+        ({'kinds': ('high', 'miss')}, ' --faults high,miss'),
         (
             {'record': RecordConfig(pictures='first', frame_period_s=0.2)},
             ' --fps 5 --pictures first',

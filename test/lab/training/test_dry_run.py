@@ -7,25 +7,12 @@ import torch
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.lab.training.dry_run import step_cost
-from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
+from mtv_world_ros.lab.training.training_config import load_training_config
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 
-@pytest.mark.parametrize('control', ['trajectory_video', 'policy2vec', 'ee_mlp', 'fast_tokens'])
-def test_counts_what_a_real_step_does(control: str) -> None:
-    config = _tiny(control)
-    fake = step_cost(config, action_dim=14, dtype=torch.float32)
-    real = step_cost(config, action_dim=14, dtype=torch.float32, fake=False)
-    assert fake == real
-    more = {} if control == 'trajectory_video' else {'control': control, 'action_dim': 14}
-    model = MultiViewWanTransformer(**config.transformer, **more)
-    assert fake.parameters == fake.trainable == sum(p.numel() for p in model.parameters())
-    # float32 weights twice; averaged weights, Adam's two moments, gradients twice
-    assert fake.weight_bytes + fake.training_bytes == fake.parameters * 4 * (2 + 5)
-
-
-def _tiny(control: str) -> TrainingConfig:
-    return load_training_config(
+def test_counts_what_a_real_step_does() -> None:
+    config = load_training_config(
         'small',
         {
             'transformer.num_attention_heads': 2,
@@ -35,9 +22,14 @@ def _tiny(control: str) -> TrainingConfig:
             'transformer.freq_dim': 16,
             'video.width': 48,
             'video.height': 40,
-            'video.control': control,
         },
     )
+    fake = step_cost(config, dtype=torch.float32)
+    assert fake == step_cost(config, dtype=torch.float32, fake=False)
+    model = MultiViewWanTransformer(**config.transformer)
+    assert fake.parameters == fake.trainable == sum(p.numel() for p in model.parameters())
+    # float32 weights twice; averaged weights, Adam's two moments, gradients twice
+    assert fake.weight_bytes + fake.training_bytes == fake.parameters * 4 * (2 + 5)
 
 
 @pytest.mark.parametrize('rank', [0, 8])
@@ -55,7 +47,7 @@ def test_operations_are_those_of_the_products(rank: int) -> None:
             'lora.rank': rank,
         },
     )
-    cost = step_cost(config, action_dim=14, dtype=torch.bfloat16)
+    cost = step_cost(config, dtype=torch.bfloat16)
     dim, ffn, text, image = 1536, 8960, 512, 2 * 257
     grid = 3 * 4 * 8  # latent frames, height, width of a view
     kept = 2 * grid // 4
@@ -84,8 +76,8 @@ def test_operations_are_those_of_the_products(rank: int) -> None:
 
 def test_the_command_prints_it_and_trains_nothing(capsys: pytest.CaptureFixture) -> None:
     smaller = ['--set', 'transformer.num_layers=1', '--set', 'video.num_frames=4']
-    assert main(['train', '--dry-run', '--control', 'policy2vec', *smaller]) == 0
+    assert main(['train', '--dry-run', *smaller]) == 0
     printed = capsys.readouterr().out
-    assert 'control policy2vec, 2 views of 5 frames of 96x72' in printed
+    assert '2 views of 5 frames of 96x72' in printed
     for word in ('parameters', 'trainable', 'TFLOP', 'memory', 'activations'):
         assert word in printed

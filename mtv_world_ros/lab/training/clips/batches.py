@@ -28,7 +28,6 @@ from mtv_world_ros.lab.training.clips.clip_controls import (
     Past,
 )
 from mtv_world_ros.lab.training.training_config import TrainingConfig
-from mtv_world_ros.model.actions import ActionEncoding, collate
 from mtv_world_ros.processes import run_job, WorkerPool
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
@@ -40,9 +39,8 @@ class ClipBatch:
     Attributes:
         frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
         start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model sees it (maybe disturbed).
-        trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB; None where actions are not drawn.
+        trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB.
         object_ids: (B, V, 1 + T, H, W) uint8, zero in clips without; None where no clip has them.
-        actions: output of `ActionEncoding`, where actions are not drawn.
         anchor: (B, V, H, W, 3) uint8 RGB, the first frame of the clip's rollout, in models with a
             history; see `draw_past`.
         history: (B, V, N, H, W, 3) uint8 RGB frames before the clip, in such models.
@@ -54,9 +52,8 @@ class ClipBatch:
 
     frames: Tensor
     start_frame: Tensor
-    trajectory: Tensor | None
+    trajectory: Tensor
     object_ids: Tensor | None
-    actions: Tensor | None = None
     anchor: Tensor | None = None
     history: Tensor | None = None
     history_sigmas: Tensor | None = None
@@ -78,9 +75,8 @@ class _Sample(NamedTuple):
 
     frames: ByteArray
     start_frame: ByteArray
-    trajectory: ByteArray | None
+    trajectory: ByteArray
     object_ids: ByteArray | None
-    actions: np.ndarray | None
     past: Past | None
 
 
@@ -93,7 +89,6 @@ class BatchSource:
         robot: of the recordings.
         segmenter: finds the objects of the first frames.
         seed: of choice and disturbances.
-        actions: encoding of positions as actions, where they are not drawn.
         numbers: the clips of a step that this process makes; None: all.
         workers: processes that make them; 0 = a thread of this one.
     """
@@ -106,7 +101,6 @@ class BatchSource:
         robot: RobotModel,
         segmenter: Segmenter,
         seed: int,
-        actions: ActionEncoding | None = None,
         numbers: Sequence[int] | None = None,
         workers: int = 0,
     ) -> None:
@@ -125,7 +119,6 @@ class BatchSource:
             segmenter=segmenter,
             rendering=config.rendering,
             object_mask=config.video.object_mask,
-            actions=actions,
         )
         self._spec, self._augment, self._seed = spec, config.augment, seed
         self._history = config.history
@@ -164,15 +157,13 @@ class BatchSource:
             samples = [self._clip(step, number) for number in self._numbers]
         else:
             samples = self._workers.clips(step, self._numbers)
-        encoded = [s.actions for s in samples if s.actions is not None]
         return ClipBatch(
             step=step,
             numbers=self._numbers,
             frames=torch.from_numpy(np.stack([s.frames for s in samples])),
             start_frame=torch.from_numpy(np.stack([s.start_frame for s in samples])),
-            trajectory=_stack([s.trajectory for s in samples]),
+            trajectory=torch.from_numpy(np.stack([s.trajectory for s in samples])),
             object_ids=_stack(_with_zeros([s.object_ids for s in samples])),
-            actions=torch.from_numpy(collate(encoded)) if encoded else None,
             **pasts([s.past for s in samples]),
         )
 
@@ -190,7 +181,7 @@ class BatchSource:
         names = recording.names
         if rng.random() < self._augment.name_dropout:
             names = tuple(name for name in names if rng.random() < 0.5)
-        trajectory, actions = self.controls.make(clip, names)
+        trajectory = self.controls.make(clip, names)
         frames = clip.frames
         if rng.random() < self._augment.colour_permutation:
             colours = rng.permutation(3)
@@ -200,7 +191,7 @@ class BatchSource:
         if rng.random() < self._augment.start_noise:
             start = _disturb(start, self._augment.start_noise_std, rng)
         whole = np.ascontiguousarray(frames)
-        return _Sample(whole, start.copy(), trajectory, clip.object_ids, actions, past)
+        return _Sample(whole, start.copy(), trajectory, clip.object_ids, past)
 
     def _past(self, recording: Recording, start: int, rng: np.random.Generator) -> Past | None:
         """Anchor and history of the clip, in models that take them."""

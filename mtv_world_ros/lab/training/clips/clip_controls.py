@@ -1,4 +1,4 @@
-"""Control input of a clip: its actions as a trajectory video, or encoded as numbers."""
+"""Control input of a clip: its trajectory video, and what came before it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.object_motion import cut_outs, moved_pictures, ObjectMotion
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.training_config import HistoryConfig
-from mtv_world_ros.model.actions import ActionEncoding
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
@@ -81,21 +80,19 @@ class ControlMaker:
         segmenter: finds the objects of the start frame.
         rendering: widths, colours and fading of trajectory videos.
         object_mask: whether they carry the objects' masks.
-        actions: how actions are encoded where they are not drawn; None = they are drawn.
     """
 
     robot: RobotModel
     segmenter: Segmenter
     rendering: TrajectoryVideoConfig
     object_mask: bool
-    actions: ActionEncoding | None = None
     # batches are prepared in one thread while the model's rollouts are drawn in another
     _lock: Lock = field(default_factory=Lock)
 
     def make(
         self, clip: Clip, names: tuple[str, ...], start_frame: ByteArray | None = None
-    ) -> tuple[ByteArray | None, np.ndarray | None]:
-        """Returns the trajectory video (V, 1 + T, H, W, 3), or else the encoded actions.
+    ) -> ByteArray:
+        """Returns the trajectory video (V, 1 + T, H, W, 3) uint8 RGB.
 
         Args:
             clip: one chunk; its cameras, times and positions count.
@@ -104,8 +101,6 @@ class ControlMaker:
                 searched in it. None = the clip's own; its masks are those stored with the
                 episode if this segmenter made them.
         """
-        if self.actions is not None:
-            return None, self.actions.encode(self.robot, clip.positions)
         masks = None
         if self.object_mask:
             masks = self._start_masks(clip, names, start_frame)
@@ -118,7 +113,7 @@ class ControlMaker:
             objects=self._objects(clip, names) if self.object_mask else None,
             config=self.rendering,
         )
-        return video.frames, None
+        return video.frames
 
     def _start_masks(
         self, clip: Clip, names: tuple[str, ...], start_frame: ByteArray | None
