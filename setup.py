@@ -72,7 +72,7 @@ setup(
     extras_require={
         'train': ['accelerate>=1.15', 'tensorboard>=2.21'],
         # Vision-language models that name objects: behind a server, or here.
-        'describe': ['httpx2>=2.16', 'openai>=3.52,<4', 'pillow>=11', 'transformers>=5.23,<6'],
+        'describe': ['httpx2>=2.16', 'openai>=3.52,<4'],
         # Segmenters with public weights: MM-Grounding-DINO with SAM 2, SAM 3.
         'vision': ['transformers>=5.23,<6'],
         # Intervals, fits and charts of evaluate, calibrate, rank and report; PSNR and SSIM.

@@ -81,7 +81,6 @@ def fingerprint(
         parts.append(f'task {task}')
     elif task is not None:
         files += [('task', Path(task))]
-        files += [('picture', picture.path) for _, picture in load_task(Path(task)).pictures]
     parts += [f'{what} {path} ({content_digest(path)[:8]})' for what, path in files]
     return ', '.join(parts)
 
@@ -378,7 +377,6 @@ def assemble_describer(config: DescriberConfig | str | Path | None = None) -> De
 
     Raises:
         ConfigError: the configuration is wrong, a key or a package is missing.
-        CheckpointError: the local model cannot be loaded.
     """
     from mtv_world_ros.vision.describers.describer_config import (
         DescriberConfig,
@@ -407,8 +405,4 @@ def _chat(config: DescriberConfig) -> Chat | None:
         from mtv_world_ros.vision.describers.openai_chat import OpenAIChat
 
         return OpenAIChat(config.openai)
-    if config.kind == 'local' and config.local:
-        from mtv_world_ros.vision.describers.local_vlm import LocalVlm
-
-        return LocalVlm(config.local)
     return None

@@ -14,7 +14,6 @@ from mtv_world_ros.success.calibration import Calibration, weighed
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
 from mtv_world_ros.success.fitted_to import Setting
 from mtv_world_ros.success.foreseen import foreseen_feature, ForeseenEnds, ForeseenMotions
-from mtv_world_ros.success.goal_pictures import PictureMasks
 from mtv_world_ros.success.relations import Margin
 from mtv_world_ros.success.rollout_memory import Footage, remember, RolloutMemory
 from mtv_world_ros.success.situation import grippers_open
@@ -94,7 +93,7 @@ class SuccessEstimator:
             task: name of the one to judge; default: the one the instruction matches. Where the
                 instruction names no objects for it, they take the task's placeholders in order.
             calibration: fitted weights, used where they hold.
-            segmenter: what finds the masks; finds objects in the pictures of tasks, too.
+            segmenter: what finds the masks.
             setting: where it judges; None = as where the calibration was fitted.
 
         Raises:
@@ -111,7 +110,6 @@ class SuccessEstimator:
         self.calibration = calibration
         self.setting = setting
         self.segmenter = '' if segmenter is None else segmenter.name
-        self._picture_masks = PictureMasks(segmenter)
 
     def estimate(
         self,
@@ -148,7 +146,7 @@ class SuccessEstimator:
         starts = memory.points[:, 0]
         ends = None if foreseen is None else foreseen.ends(task, bound, starts)
         try:
-            evidence = gather(views, task, bound, self._picture_masks)
+            evidence = gather(views, task, bound)
         except CannotTell as reason:
             if ends is None:
                 return Judged(_abstains(reason, views, subjects), memory)
@@ -272,8 +270,7 @@ def _released(task: TaskSpec, openings: FloatArray | None) -> float:
 def _check_views(task: TaskSpec, footage: Footage) -> None:
     """Refuses a task that needs views which do not exist."""
     known = [camera.view for camera in footage.cameras]
-    wanted = dict.fromkeys([*task.views, *(view for view, _ in task.pictures)])
-    missing = [view for view in wanted if view not in known]
+    missing = [view for view in task.views if view not in known]
     if missing:
         raise CannotTell(f'task {task.name} looks at the views {missing}; there are {known}')
 

@@ -16,10 +16,7 @@ from mtv_world_ros.geometry.mask_geometry import (
     Location,
     widest_swing,
 )
-from mtv_world_ros.success.goal_pictures import Picture, PictureMasks
 from mtv_world_ros.success.relations import (
-    AsPictured,
-    InRegion,
     Inside,
     Margin,
     Relation,
@@ -42,7 +39,6 @@ class ImaginedScene:
     Attributes:
         views: masks of the rollout.
         bound: placeholder -> name of its object.
-        picture_masks: finds objects in the task's pictures.
         sizes: placeholder -> usual extents (3,) of its object [m]; not there = taken as a cube
             and measured.
         notes: assumptions made on the way, in order.
@@ -51,7 +47,6 @@ class ImaginedScene:
 
     views: Views
     bound: Mapping[str, str]
-    picture_masks: PictureMasks
     sizes: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     notes: dict[str, None] = field(default_factory=dict)
     sigmas: dict[str, float] = field(default_factory=dict)
@@ -114,39 +109,6 @@ class ImaginedScene:
         counts = count_reversals(np.unwrap(np.arcsin(along), period=np.pi), swing)
         return np.concatenate([[0.0], counts])[np.cumsum(known)]
 
-    def pictured(self, role: str, pictures: Mapping[str, Picture]) -> BoolArray:
-        """Returns (V, H, W) masks of an object in pictures; empty where a view has none."""
-        cameras = self.views.footage.cameras
-        return self.picture_masks.masks(pictures, self.views.names, self.item(role), cameras)
-
-    def pictured_jaccard(self, role: str, pictures: Mapping[str, Picture]) -> float:
-        """See `Situation`."""
-        goals = self.pictured(role, pictures)
-        return self._known(role, self.views.goal_jaccard(self.item(role), goals)[0])
-
-    def share_inside(self, role: str, regions: Mapping[str, Picture]) -> float:
-        """See `Situation`."""
-        cameras = self.views.footage.cameras
-        painted = np.stack(
-            [
-                regions[c.view].region(c)
-                if c.view in regions
-                else np.zeros((c.height, c.width), bool)
-                for c in cameras
-            ]
-        )
-        has_region = np.array([camera.view in regions for camera in cameras])
-        inside = self.views.share_inside(self.item(role), painted)
-        shares = np.where(has_region, inside, np.nan)
-        self._known(role, shares)
-        return float(np.nanmin(shares))
-
-    def _known(self, role: str, scores: FloatArray) -> float:
-        """The mean over the views that know."""
-        if not np.isfinite(scores).any():
-            raise CannotTell(f"no view of the task's pictures knows '{self.bound[role]}'")
-        return float(mean_of_known(scores))
-
 
 #: margins are clipped to this many softness lengths
 MAX_MARGIN = 3.0
@@ -200,21 +162,18 @@ class Evidence:
         return cls(worst=None, features=features, sigma=nan, goal_jaccard={}, notes=notes)
 
 
-def gather(
-    views: Views, task: TaskSpec, bound: Mapping[str, str], picture_masks: PictureMasks
-) -> Evidence:
+def gather(views: Views, task: TaskSpec, bound: Mapping[str, str]) -> Evidence:
     """Measures how far a task's relations hold at the end of a rollout.
 
     Args:
         views: the rollout.
         task: its relations are evaluated.
         bound: placeholder -> name of its object.
-        picture_masks: finds objects in the task's pictures.
 
     Raises:
         CannotTell: objects lost, rays that miss each other, views that disagree.
     """
-    scene = ImaginedScene(views, bound, picture_masks, task.sizes_m)
+    scene = ImaginedScene(views, bound, task.sizes_m)
     for role in task.movers:
         views.check_visible(scene.item(role))
     margins = [margin for relation in task.relations for margin in relation.margins(scene)]
@@ -272,8 +231,6 @@ def _goals(scene: ImaginedScene, task: TaskSpec) -> tuple[dict[int, FloatArray],
 
 def _goal_masks(scene: ImaginedScene, relation: Relation) -> BoolArray | None:
     """Goal masks (V, H, W): the subject where it should be; None if that is not one place."""
-    if isinstance(relation, AsPictured):
-        return scene.pictured(relation.subject, relation.pictures)
     goal = relation.goal(scene)
     if goal is None:
         return None
@@ -289,11 +246,6 @@ def _contained(scene: ImaginedScene, task: TaskSpec) -> float:
         scene.views.containment(scene.item(relation.subject), scene.item(relation.target))
         for relation in task.relations
         if isinstance(relation, Within | Inside | ServedOn)
-    ]
-    shares += [
-        scene.share_inside(relation.subject, relation.regions)
-        for relation in task.relations
-        if isinstance(relation, InRegion)
     ]
     known = [share for share in shares if isfinite(share)]
     return 2 * min(known) - 1 if known else nan

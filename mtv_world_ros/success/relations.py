@@ -7,23 +7,19 @@ right, y away from the robot, z up. A distance in the plane is that of the centr
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
-from pydantic import BeforeValidator, Field, InstanceOf, Strict
+from pydantic import Field, Strict
 
 from mtv_world_ros.config import expected, Schema
 from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.success.goal_pictures import load_pictures, load_regions, Picture
 from mtv_world_ros.success.situation import Situation
 
 #: thickness of the floor of plates and containers [m]
 FLOOR_M = 0.005
 #: an object in a container may lean on its wall: its centre is at most this far over the wall [m]
 OVER_WALL_M = 0.03
-#: a J, or a share of an area, that counts as one in the margins
-_SOFT_SHARE = 0.1
 #: swings that are told apart, and what counts as one in their margin, in swings that are wanted
 _SWINGS = (0.25, 0.5, 0.625, 0.75, 0.875, 1.0, 1.125, 1.25, 1.5, 2.0, 3.0)
 _SOFT_SWING = 0.25
@@ -65,7 +61,6 @@ def plane_distance(a: FloatArray, b: FloatArray) -> FloatArray:
 EXPECTED = '; expected'
 _Positive = Annotated[float, Field(gt=0, lt=1e3)]
 _Signed = Annotated[float, Field(gt=-1e3, lt=1e3)]
-_Share = Annotated[float, Field(gt=0, le=1), expected('(0, 1]', '; it must be in')]
 _Angle = Annotated[_Positive, expected('a positive angle in radians', EXPECTED)]
 Length = Annotated[_Positive, expected('1 positive length(s) in metres', EXPECTED)]
 _Lengths2 = Annotated[
@@ -418,40 +413,6 @@ class Shaken(Relation):
         return np.asarray(np.cumsum(turns * is_lifted) >= self.num_reversals)
 
 
-class AsPictured(Relation):
-    """The subject lies as in pictures of the task done; its mask in them is the goal mask.
-
-    Attributes:
-        pictures: view -> picture of the task done, by the calibrated camera; one view will do.
-        min_jaccard: J of the subject's mask with that in the pictures, mean over the views.
-    """
-
-    pictures: Annotated[Mapping[str, InstanceOf[Picture]], BeforeValidator(load_pictures)]
-    min_jaccard: _Share = 0.5
-
-    def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much the condition holds."""
-        reached = at.pictured_jaccard(self.subject, self.pictures) - self.min_jaccard
-        return [Margin('as in the goal picture', np.array([reached]), 'J', _SOFT_SHARE)]
-
-
-class InRegion(Relation):
-    """The subject is seen within a region of the views that was painted.
-
-    Attributes:
-        regions: view -> picture, white where the subject belongs, black elsewhere.
-        min_share: of the subject's mask that is in the region, in every one of these views.
-    """
-
-    regions: Annotated[Mapping[str, InstanceOf[Picture]], BeforeValidator(load_regions)]
-    min_share: _Share = 0.8
-
-    def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much the condition holds."""
-        inside = at.share_inside(self.subject, self.regions) - self.min_share
-        return [Margin('in the painted region', np.array([inside]), 'of its area', _SOFT_SHARE)]
-
-
 KINDS: dict[str, type[Relation]] = {
     'left_of': Beside,
     'right_of': Beside,
@@ -465,6 +426,4 @@ KINDS: dict[str, type[Relation]] = {
     'at_goal': AtGoal,
     'shifted': Shifted,
     'shaken': Shaken,
-    'as_pictured': AsPictured,
-    'in_region': InRegion,
 }

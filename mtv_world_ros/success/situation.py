@@ -11,7 +11,6 @@ import numpy as np
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.geometry.mask_geometry import count_reversals, widest_swing
-from mtv_world_ros.success.goal_pictures import Picture
 
 #: a gripper counts as open above this share of its range
 OPEN_SHARE = 0.8
@@ -51,14 +50,6 @@ class Situation(Protocol):
 
     def reversals(self, role: str, swing: float) -> FloatArray:
         """Returns (T,) how often the object's lean has turned back by more than `swing` [rad]."""
-        ...
-
-    def pictured_jaccard(self, role: str, pictures: Mapping[str, Picture]) -> float:
-        """Returns J of the object's mask at the end with that in pictures; mean over views."""
-        ...
-
-    def share_inside(self, role: str, regions: Mapping[str, Picture]) -> float:
-        """Returns the share of the object's mask at the end in regions; the least of the views."""
         ...
 
 
@@ -115,14 +106,6 @@ class TruePoses:
         """See `Situation`; the lean is that of the object's z axis, where it swings most."""
         axis = self.rotations[role][:, :, 2]
         return count_reversals(np.arctan2(widest_swing(axis[:, :2]), axis[:, 2]), swing)
-
-    def pictured_jaccard(self, role: str, pictures: Mapping[str, Picture]) -> float:
-        """See `Situation`; there are no masks."""
-        raise CannotTell(f"'{role}' has a pose, but no mask to compare with pictures")
-
-    def share_inside(self, role: str, regions: Mapping[str, Picture]) -> float:
-        """See `Situation`; there are no masks."""
-        raise CannotTell(f"'{role}' has a pose, but no mask to compare with regions")
 
 
 def grippers_open(openings: FloatArray) -> BoolArray:

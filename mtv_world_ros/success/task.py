@@ -8,12 +8,11 @@ import re
 from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import BeforeValidator, model_validator, PlainValidator, ValidationInfo
+from pydantic import BeforeValidator, model_validator, PlainValidator
 
 from mtv_world_ros.config import expected, ListOf, read_yaml, Schema, validated, wrong
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import ConfigError, nearest
-from mtv_world_ros.success.goal_pictures import Picture
 from mtv_world_ros.success.relations import EXPECTED, KINDS, Length, Lengths3, Relation
 from mtv_world_ros.success.situation import grippers_open, Situation
 from mtv_world_ros.vision.describers.describer import ends_phrase
@@ -25,13 +24,13 @@ HELD_SAMPLES = 5
 _LONGEST_NAME = 64
 
 
-def _relation(data: Any, info: ValidationInfo) -> Relation:
+def _relation(data: Any) -> Relation:
     if isinstance(data, Relation):
         return data
     kind = data.get('kind') if isinstance(data, Mapping) else None
     if kind not in KINDS:
         raise ValueError(f"kind is '{kind}'{nearest(str(kind), KINDS)}; known are {sorted(KINDS)}")
-    return KINDS[kind].model_validate(data, context=info.context)
+    return KINDS[kind].model_validate(data)
 
 
 def _listed(data: Any) -> Any:
@@ -109,16 +108,6 @@ class TaskSpec(Schema):
         """Placeholders of the objects that the robot is to move."""
         return tuple(dict.fromkeys(relation.subject for relation in self.relations))
 
-    @property
-    def pictures(self) -> tuple[tuple[str, Picture], ...]:
-        """Views and their pictures, of all relations."""
-        named = [
-            getattr(relation, key, {})
-            for relation in self.relations
-            for key in ('pictures', 'regions')
-        ]
-        return tuple(item for by_view in named for item in by_view.items())
-
     def holds(self, at: Situation, openings: FloatArray) -> BoolArray:
         """Returns (T,) whether the task is done at each sample.
 
@@ -177,7 +166,7 @@ def load_task(path: Path) -> TaskSpec:
         ConfigError: the file is no YAML mapping, a key is unknown or missing, a value is wrong.
     """
     values = read_yaml(path, 'task file', 'task')
-    return validated(TaskSpec, values, str(path), context={'folder': Path(path).parent})
+    return validated(TaskSpec, values, str(path))
 
 
 def load_tasks(folder: Path) -> tuple[TaskSpec, ...]:

@@ -8,10 +8,8 @@ import pytest
 from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.success.relations import (
     Apart,
-    AsPictured,
     AtGoal,
     Beside,
-    InRegion,
     Inside,
     Moved,
     NestedOn,
@@ -170,10 +168,6 @@ def test_what_poses_do_not_tell_is_said():
     at = situation({'a': B})
     with pytest.raises(CannotTell, match="no goal for 'a'"):
         AtGoal(kind='at_goal', subject='a').margins(at)
-    with pytest.raises(CannotTell, match='no mask'):
-        AsPictured(kind='as_pictured', subject='a', pictures={}).margins(at)
-    with pytest.raises(CannotTell, match='no mask'):
-        InRegion(kind='in_region', subject='a', regions={}).margins(at)
 
 
 PLATE = {'p': (0.11, 0.11, 0.02)}

@@ -87,7 +87,7 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
         '--quality', type=names, default=(), metavar='LIST', help='of psnr,ssim,lpips'
     )
     parser.add_argument('--fid-weights', type=Path, help='Inception-v3 of 2015-12-05, state dict')
-    parser.add_argument('--fvd-weights', type=Path, help='I3D state dict, or a VideoMAE folder')
+    parser.add_argument('--fvd-weights', type=Path, help='I3D state dict')
     parser.add_argument('--no-report', dest='report', action='store_false', help='no report.html')
     add_options(parser, 'overwrite dtype model serving seeds describer segmenter source task')
     parser.set_defaults(handler=_evaluate)

@@ -54,9 +54,7 @@ class EvaluationConfig(Schema):
     fid_weights: Path | None = Field(
         default=None, description='Inception-v3 state dict; None = no FID'
     )
-    fvd_weights: Path | None = Field(
-        default=None, description='I3D state dict or VideoMAE folder; None = no FVD'
-    )
+    fvd_weights: Path | None = Field(default=None, description='I3D state dict; None = no FVD')
     source: EpisodeSource = Field(
         default=DEFAULT, description="how episodes are read that are not this package's own"
     )

@@ -12,7 +12,6 @@ from mtv_world_ros.config import read_yaml, Schema, validated
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, DescriptionError, nearest
 from mtv_world_ros.vision.describers.describer import check_objects, DescribedObject
-from mtv_world_ros.vision.describers.local_vlm import LocalVlmConfig
 from mtv_world_ros.vision.describers.openai_chat import OpenAIConfig
 
 
@@ -95,7 +94,7 @@ def _plain(instruction: str) -> str:
     return ' '.join(instruction.lower().split()).rstrip('.! ')
 
 
-KINDS = ('instruction', 'list', 'openai', 'local')
+KINDS = ('instruction', 'list', 'openai')
 
 
 def _known(kind: Any) -> str:
@@ -114,13 +113,12 @@ class DescriberConfig(Schema):
     kind: Annotated[str, BeforeValidator(_known)] = Field(
         default='instruction',
         description='`instruction` (the words of the instruction, no model), `list` (a YAML '
-        'file), `openai` (a server) or `local` (a model that runs here)',
+        'file) or `openai` (a server, also one on this machine)',
     )
     list: str = Field(
         default='', description='the YAML file of `list`; in a file, relative to that file'
     )
     openai: OpenAIConfig | None = Field(default=None, description='the server of `openai`')
-    local: LocalVlmConfig | None = Field(default=None, description='the model of `local`')
     cache: str = Field(
         default='',
         description="folder in which models' answers are kept; empty = they are not; in a file, "

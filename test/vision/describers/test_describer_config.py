@@ -41,7 +41,7 @@ def test_the_file_that_is_shipped_is_valid_with_each_of_its_variants():
     shipped = share_path('config', 'describer.yaml')
     assert load_describer_config(shipped).kind == 'instruction'
     paragraphs = shipped.read_text().split('\n\n')[1:]
-    for kind, paragraph in zip(('list', 'openai', 'local'), paragraphs, strict=False):
+    for kind, paragraph in zip(('list', 'openai'), paragraphs, strict=False):
         lines = [line.removeprefix('# ') for line in paragraph.splitlines()]
         config = DescriberConfig(**yaml.safe_load('\n'.join(lines)))
         assert config.kind == kind
@@ -104,8 +104,8 @@ def test_a_wrong_object_list_says_what_and_where(tmp_path, text, words):
         ('kind: openai\nopenai: {model: x, timeout_s: 0}', 'a positive number'),
         ('kind: openai\nopenai: {model: x, timeout_s: true}', 'a positive number'),
         ('kind: openai\nopenai: {model: x, timeout_s: .nan}', 'a positive number'),
-        ('kind: local\nlocal: {model: x, max_new_tokens: 1.5}', 'a positive whole number'),
-        ('kind: local\nlocal: [x]', 'local: expected keys and values'),
+        ('kind: local', "kind 'local' is none"),
+        ('kind: openai\nopenai: [x]', 'openai: expected keys and values'),
         ('- kind', 'expected keys and values'),
         ('kind: {', 'cannot be read'),
     ],

@@ -157,18 +157,13 @@ def clip_features(weights: Path, device: str = 'cpu') -> ClipFeatures:
     """Returns the features that FVD is measured with.
 
     Args:
-        weights: a file: the state dict of an I3D (400 logits, the usual FVD); a folder: a VideoMAE
-            as transformers saves it (mean over its tokens). The two give different numbers.
+        weights: the state dict of an I3D (400 logits).
         device: e.g. `cpu`, `cuda`.
 
     Raises:
-        ConfigError: there is no such file or folder.
+        ConfigError: there is no such file.
         CheckpointError: the file holds other tensors.
     """
-    return _video_mae(weights, device) if weights.is_dir() else _i3d(weights, device)
-
-
-def _i3d(weights: Path, device: str) -> ClipFeatures:
     _check_file(weights, 'fvd_weights')
     import torch
 
@@ -178,56 +173,13 @@ def _i3d(weights: Path, device: str) -> ClipFeatures:
         if len(clip) < MIN_FRAMES:
             raise EpisodeError(
                 f'FVD with I3D needs clips of at least {MIN_FRAMES} frames, this one has '
-                f"{len(clip)}; use a VideoMAE folder for 'fvd_weights', or leave it out"
+                f"{len(clip)}; leave 'fvd_weights' out"
             )
         with torch.inference_mode():
             video = torch.from_numpy(np.array(clip)).to(device).permute(3, 0, 1, 2)
             return network(video[None].float()).float().cpu().numpy()
 
     return features
-
-
-def _video_mae(folder: Path, device: str) -> ClipFeatures:
-    """Clips are brought to the network's number of frames by taking the nearest ones."""
-    import torch
-    import torch.nn.functional as F
-
-    network = _transformers_model(folder).to(device).eval()
-    side, num_frames = network.config.image_size, network.config.num_frames
-    mean, deviation = (
-        torch.tensor(values, device=device)[None, :, None, None]
-        for values in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
-    )
-
-    def features(clip: ByteArray) -> FloatArray:
-        places = np.linspace(0, len(clip) - 1, num_frames).round().astype(int)
-        with torch.inference_mode():
-            frames = torch.from_numpy(clip[places]).to(device).permute(0, 3, 1, 2) / 255
-            frames = F.interpolate(frames, (side, side), mode='bilinear', antialias=True)
-            video = ((frames - mean) / deviation)[None]
-            tokens = network(pixel_values=video).last_hidden_state
-            return tokens.mean(1).float().cpu().numpy()
-
-    return features
-
-
-def _transformers_model(folder: Path) -> Any:
-    try:
-        from transformers import VideoMAEModel
-    except ImportError as error:
-        raise ConfigError(
-            f"fvd_weights '{folder}' is a folder, which needs transformers: "
-            "pip install 'mtv_world_ros[describe]', or name an I3D state dict file"
-        ) from error
-    try:
-        model = VideoMAEModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise CheckpointError(
-            f"fvd_weights '{folder}' cannot be loaded as a VideoMAE ({error}); it needs "
-            'config.json and model.safetensors'
-        ) from error
-    check_weights(model, folder)
-    return model
 
 
 def _loaded(network: torch.nn.Module, path: Path, device: str, option: str) -> torch.nn.Module:
