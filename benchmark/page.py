@@ -40,11 +40,9 @@ DESCRIBES = {
     'foresight': ('mtv_world_ros/ros',),
     'interval_coverage': ('mtv_world_ros/lab/evaluation/metrics',),
     'learned_policies': ('mtv_world_ros/bench', 'mtv_world_ros/policies'),
-    'policy_in_the_loop': ('mtv_world_ros/ros',),
     'robustness': ('mtv_world_ros',),
     'segmenter': ('mtv_world_ros/vision/segmenters',),
     'serving': ('mtv_world_ros/model',),
-    'sim_tasks': ('mtv_world_ros/bench',),
     'training_speed': ('mtv_world_ros/lab/training',),
     'trajectory_video': ('mtv_world_ros/rendering',),
     'wan': ('mtv_world_ros/model',),
@@ -54,7 +52,6 @@ DESCRIBES = {
 OF_A_CHECKPOINT = (
     'foresight',
     'learned_policies',
-    'policy_in_the_loop',
     'serving',
 )
 _MADE = re.compile(
