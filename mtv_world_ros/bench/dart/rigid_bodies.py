@@ -98,8 +98,8 @@ class RigidBodies:
         solids: O, on the table.
         settings: of contact.
         step_s: of the engine.
-        pose: (J,) near which the arms work; None = the middle of their range [rad or m].
-        masses: (O,) of the solids [kg]; None = as their density has it.
+        pose: (J,) near which the arms work [rad or m].
+        masses: (O,) of the solids [kg].
 
     Raises:
         RobotError: the robot cannot be a tree of rigid bodies.
@@ -112,8 +112,8 @@ class RigidBodies:
         solids: Sequence[Solid],
         settings: ContactSettings,
         step_s: float,
-        pose: FloatArray | None = None,
-        masses: Sequence[float] | None = None,
+        pose: FloatArray,
+        masses: Sequence[float],
     ) -> None:
         self._world = dart.simulation.World()
         self._world.setTimeStep(step_s)
@@ -121,13 +121,11 @@ class RigidBodies:
         still.mEnabled = False  # what sleeps is not woken by fingers that close gently
         self._world.setDeactivationOptions(still)
         self._settings = settings
-        given = [None] * len(solids) if masses is None else masses
         self._solids = [
             _body(number, solid, settings, mass)
-            for number, (solid, mass) in enumerate(zip(solids, given, strict=True))
+            for number, (solid, mass) in enumerate(zip(solids, masses, strict=True))
         ]
-        middle = (robot.lower + robot.upper) / 2
-        self.arms = Arms(robot, response, settings, middle if pose is None else pose)
+        self.arms = Arms(robot, response, settings, pose)
         detector = _detector(self.arms.skeleton)
         solver = self._world.getConstraintSolver()
         solver.setCollisionDetector(detector)
@@ -271,7 +269,7 @@ class Arms:
         path = _urdf(robot)
         tree = _described(path)
         pads = _add_pads(tree, robot, grips) if settings.pad_stiffness else set[str]()
-        self.skeleton, described = _skeleton(robot, path, tree, swing=settings.fingers_swing)
+        self.skeleton, described = _skeleton(robot, path, tree)
         self.pads = [_pad(self.skeleton, name, settings) for name in sorted(pads)]
         self._ghost = self.skeleton.clone('expected')
         names = [self.skeleton.getDof(i).getName() for i in range(self.skeleton.getNumDofs())]
@@ -305,7 +303,7 @@ class Arms:
             self._stiffness[row], self._damping[row] = stiffness, damping
             self._armature[row] = armature
         self._means = np.asarray(np.linalg.pinv(self._follows), np.float64)
-        self._driven, self._swing = self._stiffness > 0, settings.fingers_swing
+        self._driven = self._stiffness > 0
         self._finger_joints = {names[row] for row in self.fingers} | pads
         for skeleton in (self.skeleton, self._ghost):
             _settle(skeleton, described, self._finger_joints, settings)
@@ -345,10 +343,6 @@ class Arms:
             upper=np.array([dof.getPositionUpperLimit() for dof in dofs]),
         )
 
-    def shares(self, columns: Sequence[int]) -> FloatArray:
-        """Returns (F, C) what fingers make of joints: the mean of those that follow it."""
-        return self._means[np.ix_(columns, self.fingers)].T
-
     @property
     def joints(self) -> FloatArray:
         """(J,) where the robot's joints are [rad or m]."""
@@ -383,8 +377,9 @@ class Arms:
             forces[row] = self._ghost.getForces()
         forces *= self._driven
         pulls, mass = -forces[:, self.fingers], self.finger_drives.mass
-        # a moving hand does not pull what a drive adds, nor fingers that are geared to each other
-        added = self._armature[self.fingers] / mass if self._swing else np.ones(len(mass))
+        added = (
+            self._armature[self.fingers] / mass
+        )  # a moving hand does not pull what a drive adds
         forces[:, self.fingers] = mass * own - added * pulls
         return forces, (1 - added) * pulls
 
@@ -531,17 +526,14 @@ def _pad(arms: Any, name: str, settings: ContactSettings) -> Any:
     return joint
 
 
-def _skeleton(
-    robot: RobotModel, path: Path, tree: ElementTree.Element, *, swing: bool
-) -> tuple[Any, set[str]]:
+def _skeleton(robot: RobotModel, path: Path, tree: ElementTree.Element) -> tuple[Any, set[str]]:
     """The robot's bodies, and the links that have an inertia in its description, of a file."""
     loader = dart.utils.DartLoader()
     options = loader.getOptions()
     options.mDefaultRootJointType = dart.utils.DartLoaderRootJointType.FIXED
     loader.setOptions(options)
-    if swing:
-        for joint in tree.iterfind('joint/mimic/..'):
-            joint.remove(joint.find('mimic'))  # type: ignore[arg-type]
+    for joint in tree.iterfind('joint/mimic/..'):  # each finger swings by itself
+        joint.remove(joint.find('mimic'))  # type: ignore[arg-type]
     text = ElementTree.tostring(tree, encoding='unicode')
     skeleton = loader.parseSkeletonString(text, dart.common.Uri(path.resolve().as_uri()))
     if skeleton is None:
@@ -616,8 +608,8 @@ def _table(settings: ContactSettings) -> Any:
     return skeleton
 
 
-def _body(number: int, solid: Solid, settings: ContactSettings, given: float | None) -> Any:
-    """A solid of a mass, as it stands; None = as its density has it."""
+def _body(number: int, solid: Solid, settings: ContactSettings, given: float) -> Any:
+    """A solid of a mass [kg], as it stands."""
     skeleton = dart.dynamics.Skeleton(f'object {number}')
     joint, body = skeleton.createFreeJointAndBodyNodePair()
     parts = _parts(solid, settings)
@@ -629,7 +621,7 @@ def _body(number: int, solid: Solid, settings: ContactSettings, given: float | N
         turn, arm = part.pose[:3, :3], part.pose[:3, 3] - middle
         inertia += turn @ part.inertia @ turn.T
         inertia += part.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    share = 1.0 if given is None else given / mass
+    share = given / mass
     body.setMass(share * mass)
     body.setLocalCOM(middle)
     _set_inertia(body, share * inertia)

@@ -10,13 +10,8 @@ import pytest
 
 pytest.importorskip('dartpy', reason='dartpy is not installed (pip install .[dart])')
 
-from mtv_world_ros.bench.dart import contact_motions
-from mtv_world_ros.bench.dart.contact_motions import (
-    check_robot,
-    ContactMotions,
-    course_of,
-)
 from mtv_world_ros.bench.dart.rigid_bodies import _FREE, RigidBodies
+from mtv_world_ros.bench.dart.stepped_world import course_of, STEP_S, SteppedWorld
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.foresight.contact_settings import ContactSettings
@@ -26,8 +21,6 @@ from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.lab.training.object_motion.contact_fit import _Trial, read_contact
 
-#: of commands between two rows that come back
-ROWS = 5
 SETTINGS = ContactSettings(
     finger_stiffness=190.0,
     finger_damping=7.0,
@@ -36,10 +29,7 @@ SETTINGS = ContactSettings(
     table_friction=0.5,
     density=300.0,
     tray_kg=0.4,
-    num_motions=1,
 )
-#: of the engine [s]
-STEP_S = contact_motions.STEP_S
 #: out of the arms' reach
 AWAY = Solid(centre=np.array([1.0, 1.0, 0.025]), size=np.full(3, 0.05), yaw=0.3)
 
@@ -50,9 +40,37 @@ def recording(robot):
     return _Trial.of(read, SETTINGS)
 
 
-def motions_of(response, *solids: Solid | None, **changed) -> ContactMotions:
+def masses_of(solids) -> list[float]:
+    return [max(300.0 * float(np.prod(solid.size)), 0.01) for solid in solids]
+
+
+def world_of(robot, response, pose, *solids: Solid, **changed) -> SteppedWorld:
     settings = SETTINGS.model_copy(update=changed)
-    return ContactMotions(settings=settings, response=response, solids=solids)
+    free = replace(response, floor=None)
+    return SteppedWorld(robot, free, settings, solids, masses_of(solids), pose)
+
+
+def bodies_of(robot, response, pose, *solids: Solid, **changed) -> RigidBodies:
+    settings = SETTINGS.model_copy(update=changed)
+    return RigidBodies(robot, response, solids, settings, STEP_S, pose, masses_of(solids))
+
+
+def commanded(world, positions) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (1 + T, O, 4, 4) and joints (1 + T, J) under commands (1 + T, J)."""
+    poses, joints = [world.poses], [world.joints]
+    for command in positions[1:]:
+        world.advance(command)
+        poses.append(world.poses)
+        joints.append(world.joints)
+    return np.stack(poses), np.stack(joints)
+
+
+def acted(robot, response, recording, positions=None, **changed) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (1 + T, O, 3) and joints in the recording's scene, under its or other commands."""
+    positions = recording.positions if positions is None else positions
+    world = world_of(robot, response, positions[0], *recording.solids, **changed)
+    poses, joints = commanded(world, positions)
+    return poses[..., :3, 3], joints
 
 
 def still(robot, seconds: float) -> np.ndarray:
@@ -61,38 +79,27 @@ def still(robot, seconds: float) -> np.ndarray:
 
 
 def test_a_block_is_carried_to_where_the_recorded_one_was(robot, response, recording):
-    motions = motions_of(response, *recording.solids)
-    moved, _ = motions.advance(robot, recording.positions, ROWS)
-    points, rotations = moved.points, moved.rotations
-    assert points.shape == (1, len(recording.positions[::ROWS]), 2, 3)
-    assert rotations.shape == (*points.shape, 3)
-    way = points[0, -1] - points[0, 0]
+    """And fingers are where it stops them, whatever they are commanded to."""
+    points, joints = acted(robot, response, recording)
+    way = points[-1] - points[0]
     assert np.linalg.norm(way[0] - recording.ways[-1, 0]) < 0.025 < 0.1 < np.linalg.norm(way[0])
     assert np.linalg.norm(way[1]) < 0.01
-
-
-def test_fingers_are_where_what_they_hold_stops_them(robot, response, recording):
-    """Whatever they are commanded to."""
-    motions = motions_of(response, *recording.solids)
-    joints = motions.advance(robot, recording.positions, ROWS)[0].joints[0]
-    widest = robot.gripper_openings(joints) - robot.gripper_openings(recording.positions[::ROWS])
+    widest = robot.gripper_openings(joints) - robot.gripper_openings(recording.positions)
     assert 0.3 < widest.max() < 0.8
-    opened = robot.gripper_openings(joints)[:, -1]
-    np.testing.assert_allclose(opened, 1, atol=0.02)
+    np.testing.assert_allclose(robot.gripper_openings(joints)[:, -1], 1, atol=0.02)
 
 
 def test_a_gripper_that_stays_open_carries_nothing(robot, response, recording):
     opened = recording.positions.copy()
     for tool in robot.tools:
         opened[:, robot.joint_names.index(tool.gripper_joint)] = tool.gripper_open
-    points = motions_of(response, *recording.solids).advance(robot, opened, ROWS)[0].points
-    assert np.ptp(points[0, ..., 2], axis=0).max() < 0.005
+    points, _ = acted(robot, response, recording, opened)
+    assert np.ptp(points[..., 2], axis=0).max() < 0.005
 
 
 def test_fingers_that_do_not_rub_lose_the_block(robot, response, recording):
-    slippery = motions_of(response, *recording.solids, grip_friction=0.02)
-    points = slippery.advance(robot, recording.positions, ROWS)[0].points
-    assert np.linalg.norm(points[0, -1, 0] - points[0, 0, 0] - recording.ways[-1, 0]) > 0.05
+    points, _ = acted(robot, response, recording, grip_friction=0.02)
+    assert np.linalg.norm(points[-1, 0] - points[0, 0] - recording.ways[-1, 0]) > 0.05
 
 
 def shaken(robot, seconds: float = 2.0) -> np.ndarray:
@@ -105,41 +112,23 @@ def shaken(robot, seconds: float = 2.0) -> np.ndarray:
     return positions
 
 
-def courses_of(robot, response, positions, **changed):
-    motions = motions_of(response, **changed)
-    arms = RigidBodies(robot, response, (), motions.settings, STEP_S, positions[0]).arms
-    return arms, course_of(arms, response.follow(robot, positions)[0])[0]
-
-
-def test_fingers_of_a_hand_that_gains_speed_stay_behind(robot, response):
-    arms, course = courses_of(robot, response, shaken(robot), fingers_swing=True)
+def test_fingers_of_a_hand_that_gains_speed_stay_behind_as_the_course_says(robot, response):
+    """So that arms may pass by without dynamics."""
+    positions = shaken(robot)
+    bodies = bodies_of(robot, response, positions[0])
+    arms = bodies.arms
+    course = course_of(arms, response.follow(robot, positions)[0])[0]
     off = (course.free - course.ways)[:, arms.fingers]
     assert 0.001 < np.abs(off).max() < 0.03
     # never outwards, where the stops are: left fingers open upwards, their mirrors downwards
     openness = off * np.sign(course.ways[0, arms.fingers])
     assert openness.max() < 1e-4
-    others = np.delete(course.free - course.ways, arms.fingers, axis=1)
-    assert (others == 0).all()
-
-
-def test_fingers_that_are_geared_do_not_swing(robot, response):
-    _, course = courses_of(robot, response, shaken(robot), fingers_swing=False)
-    np.testing.assert_array_equal(course.free, course.ways)
-
-
-@pytest.mark.parametrize('swing', [False, True])
-def test_in_free_air_dynamics_go_as_the_course_says(robot, response, swing):
-    """So that arms may pass by without them."""
-    positions = shaken(robot)
-    motions = motions_of(response, fingers_swing=swing)
-    bodies = RigidBodies(robot, response, (), motions.settings, STEP_S, positions[0])
-    course = course_of(bodies.arms, response.follow(robot, positions)[0])[0]
-    bodies.arms.skeleton.setPositions(course.free[0])
+    assert (np.delete(course.free - course.ways, arms.fingers, axis=1) == 0).all()
+    arms.skeleton.setPositions(course.free[0])
     worst = 0.0
     for step in range(len(course.forces)):
-        forces = course.forces[step], course.ways[step], course.velocities[step]
-        bodies.step(bodies.arms.forces(*forces))
-        off = np.abs(bodies.arms.skeleton.getPositions() - course.free[step + 1])
+        bodies.step(arms.forces(course.forces[step], course.ways[step], course.velocities[step]))
+        off = np.abs(arms.skeleton.getPositions() - course.free[step + 1])
         worst = max(worst, off.max())
     assert worst < 0.005
 
@@ -147,7 +136,7 @@ def test_in_free_air_dynamics_go_as_the_course_says(robot, response, swing):
 def test_an_arm_feels_its_own_rotors_alone(robot, response, recording):
     """The engine has none; its bodies come near to what joints feel."""
     pose = recording.positions[0]
-    arms = RigidBodies(robot, response, (), SETTINGS, STEP_S, pose).arms
+    arms = bodies_of(robot, response, pose).arms
     arms.skeleton.setPositions(arms.ways(pose[None])[0])
     names = [arms.skeleton.getDof(i).getName() for i in range(arms.skeleton.getNumDofs())]
     strong = [f'{arm}_joint{number}' for arm in ('left', 'right') for number in (1, 2, 3)]
@@ -172,60 +161,62 @@ def test_arms_hit_each_other(robot, response, recording):
     alone[:, len(rest) // 2 :] = rest[len(rest) // 2 :]
     reached = []
     for positions in (both, alone):
-        _, then = motions_of(response).advance(robot, positions, ROWS)
-        arms = RigidBodies(robot, response, (), SETTINGS, STEP_S, rest).arms
-        reached.append(np.abs(then.states[0].positions[-1] - arms.ways(positions[-1:])[0]).max())
+        _, joints = commanded(world_of(robot, response, rest), positions)
+        reached.append(np.abs(joints[-1] - positions[-1]).max())
     assert reached[0] > 0.05 > 0.01 > reached[1]
+
+
+def shut_over_the_table(robot, recording):
+    """Of the lowest tool that was recorded: its arm, joints with its gripper shut, its pose."""
+    lowest = robot.tool_poses(recording.positions)[..., 2, 3]
+    arm, row = np.unravel_index(lowest.argmin(), lowest.shape)
+    tool, joints = robot.tools[arm], recording.positions[row].copy()
+    joints[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_closed
+    return arm, joints, robot.tool_poses(joints[None])[arm, 0]
+
+
+def straight(robot, arm, joints, pose, places, shares) -> np.ndarray:
+    """Commands of an arm whose tool goes straight from one place to another, by shares."""
+    solver, ends = ArmSolver(robot, robot.tools[arm]), []
+    for place in places:
+        there = pose.copy()
+        there[:3, 3] = place
+        ends.append(joints.copy())
+        ends[-1][solver.indices] = solver.solve(there, joints[solver.indices])
+    return ends[0] + np.clip(shares, 0, 1)[:, None] * (ends[1] - ends[0])
 
 
 def test_both_shut_fingers_bear_on_what_they_press(robot, response, recording):
     """Where tips do not give way one bears it all, and slides away from the other."""
-    lowest = robot.tool_poses(recording.positions)[..., 2, 3]
-    arm, row = np.unravel_index(lowest.argmin(), lowest.shape)
-    tool, joints = robot.tools[arm], recording.positions[row].copy()
-    joints[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_closed
-    pose = robot.tool_poses(joints[None])[arm, 0]
+    arm, joints, pose = shut_over_the_table(robot, recording)
     block = Solid(centre=np.array([*pose[:2, 3], 0.025]), size=np.full(3, 0.05))
-    solver, ends = ArmSolver(robot, tool), []
-    for height in (0.11, 0.03):  # 2 cm too deep, 1 cm beside the middle
-        place = pose.copy()
-        place[:3, 3] = pose[0, 3] + 0.01, pose[1, 3], height
-        ends.append(joints.copy())
-        ends[-1][solver.indices] = solver.solve(place, joints[solver.indices])
-    share = np.clip(np.linspace(-0.5, 2, 50), 0, 1)[:, None]
-    positions = ends[0] + share * (ends[1] - ends[0])
-    motions = motions_of(
-        response, block, fingers_swing=True, grip_friction=1.6, pad_stiffness=1e4, num_motions=2
-    )
-    moved, _ = motions.advance(robot, positions, ROWS)
-    soft, hard = (robot.gripper_openings(joints)[arm].max() for joints in moved.joints)
-    assert soft <= 0.01 and hard >= 0.03
-    assert (np.linalg.norm(moved.points[:, -1] - moved.points[:, 0], axis=-1) < 0.005).all()
+    # 2 cm too deep, 1 cm beside the middle
+    places = [(pose[0, 3] + 0.01, pose[1, 3], height) for height in (0.11, 0.03)]
+    positions = straight(robot, arm, joints, pose, places, np.linspace(-0.5, 2, 50))
+    openings = []
+    for pads in (1e4, None):
+        given = {'grip_friction': 1.6, 'pad_stiffness': pads}
+        poses, found = commanded(
+            world_of(robot, response, positions[0], block, **given), positions
+        )
+        openings.append(robot.gripper_openings(found)[arm].max())
+        assert np.linalg.norm(poses[-1, 0, :3, 3] - poses[0, 0, :3, 3]) < 0.005
+    assert openings[0] <= 0.01 and openings[1] >= 0.03
 
 
 def test_what_is_pushed_off_its_middle_goes_along_with_the_fingers(robot, response, recording):
     """It rubs on them as much as what is held, and does not slide off to one side."""
-    lowest = robot.tool_poses(recording.positions)[..., 2, 3]
-    arm, row = np.unravel_index(lowest.argmin(), lowest.shape)
-    tool, joints = robot.tools[arm], recording.positions[row].copy()
-    joints[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_closed
-    pose = robot.tool_poses(joints[None])[arm, 0]
-    solver, ends = ArmSolver(robot, tool), []
-    for way in (np.zeros(2), np.array([0.02, 0.05])):
-        place = pose.copy()
-        place[:3, 3] = *(pose[:2, 3] + way), 0.03
-        ends.append(joints.copy())
-        ends[-1][solver.indices] = solver.solve(place, joints[solver.indices])
-    share = np.clip(np.linspace(-0.5, 1.5, 100), 0, 1)[:, None]
-    positions = ends[0] + share * (ends[1] - ends[0])
+    arm, joints, pose = shut_over_the_table(robot, recording)
+    places = [(pose[0, 3] + x, pose[1, 3] + y, 0.03) for x, y in ((0.0, 0.0), (0.02, 0.05))]
+    positions = straight(robot, arm, joints, pose, places, np.linspace(-0.5, 1.5, 100))
     middle = np.array([pose[0, 3] + 0.012, pose[1, 3] + 0.05, 0.025])
     block = Solid(centre=middle, size=np.full(3, 0.05))
-    motions = motions_of(response, block, grip_friction=1.6, table_friction=0.8)
-    moved, _ = motions.advance(robot, positions, ROWS)
-    way = moved.points[0, -1, 0] - moved.points[0, 0, 0]
+    given = {'grip_friction': 1.6, 'table_friction': 0.8}
+    poses, _ = commanded(world_of(robot, response, positions[0], block, **given), positions)
+    way = poses[-1, 0, :3, 3] - poses[0, 0, :3, 3]
     # bounded by forces that do without friction, it would go half as far aside, and turn
     np.testing.assert_allclose(way[:2], [0.0126, 0.0336], atol=0.002)
-    assert moved.rotations[0, -1, 0, 0, 0] > np.cos(np.radians(5))
+    assert (poses[-1, 0, :3, :3] @ poses[0, 0, :3, :3].T)[0, 0] > np.cos(np.radians(5))
 
 
 def test_where_cones_diverge_a_pyramid_goes_on(robot, response, recording, monkeypatch):
@@ -239,11 +230,9 @@ def test_where_cones_diverge_a_pyramid_goes_on(robot, response, recording, monke
 
     lost = []
     monkeypatch.setattr(RigidBodies, 'step', diverges)
-    motions = motions_of(response, *recording.solids)
-    moved, _ = motions.advance(robot, recording.positions, ROWS)
-    assert lost and np.isfinite(moved.points).all()
-    way = np.linalg.norm(moved.points[0, -1] - moved.points[0, 0], axis=-1)
-    assert way.max() > 0.05  # carried, as by cones
+    points, _ = acted(robot, response, recording)
+    assert lost and np.isfinite(points).all()
+    assert np.linalg.norm(points[-1] - points[0], axis=-1).max() > 0.05  # carried, as by cones
 
 
 def test_pads_give_way_on_objects_and_not_on_the_table(robot, response):
@@ -252,9 +241,8 @@ def test_pads_give_way_on_objects_and_not_on_the_table(robot, response):
         rest[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_closed
     tip = robot.tool_poses(rest[None])[0, 0, :3, 3]
     for table, given in ((tip[2] - 0.2, True), (tip[2], False)):
-        settings = SETTINGS.model_copy(update={'pad_stiffness': 1e4, 'table_m': table})
-        between = replace(AWAY, centre=tip)
-        bodies = RigidBodies(robot, response, (between,), settings, STEP_S, rest)
+        given = {'pad_stiffness': 1e4, 'table_m': table}
+        bodies = bodies_of(robot, response, rest, replace(AWAY, centre=tip), **given)
         assert len(bodies.arms.pads) == 2 * len(robot.tools)
         bodies.notice_touch()
         kinds = {pad.getActuatorType() for pad in bodies.arms.pads}
@@ -270,7 +258,7 @@ def test_what_falls_into_a_cup_lies_on_its_floor(robot, response, is_open, heigh
         is_open=is_open,
     )
     ball = Solid(centre=np.array([0.0, 0.3, 0.09]), size=np.full(3, 0.02))
-    bodies = RigidBodies(robot, response, (cup, ball), SETTINGS, STEP_S)
+    bodies = bodies_of(robot, response, still(robot, 0.0)[0], cup, ball)
     for _ in range(round(0.8 / STEP_S)):
         bodies.step(np.zeros(bodies.arms.skeleton.getNumDofs()))
     # the engine hardly lifts out what sinks in within the step of an impact
@@ -284,7 +272,7 @@ def test_what_fingers_touch_holds_to_them_and_slides_on_others(robot, response):
     for tool in robot.tools:
         rest[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_closed
     between = replace(AWAY, centre=robot.tool_poses(rest[None])[0, 0, :3, 3] - [0, 0, 0.024])
-    bodies = RigidBodies(robot, response, (AWAY, between), SETTINGS, STEP_S, rest)
+    bodies = bodies_of(robot, response, rest, AWAY, between)
 
     def frictions():
         bodies.notice_touch()
@@ -310,7 +298,7 @@ def test_what_fingers_touch_holds_to_them_and_slides_on_others(robot, response):
 
 @pytest.mark.parametrize('degrees', [0, 45])
 def test_friction_is_the_same_in_all_directions_where_fingers_touch(robot, response, degrees):
-    bodies = RigidBodies(robot, response, (replace(AWAY, yaw=0.0),), SETTINGS, STEP_S)
+    bodies = bodies_of(robot, response, still(robot, 0.0)[0], replace(AWAY, yaw=0.0))
     bodies._world.getConstraintSolver().setBoxedLcpSolver(bodies._cone)
     turn, speed = np.radians(degrees), 0.6
     velocity = [0, 0, 0, speed * np.cos(turn), speed * np.sin(turn), 0]
@@ -328,47 +316,22 @@ def test_arms_that_pass_by_save_the_dynamics_and_nothing_else(
     steps = []
     step = RigidBodies.step
     monkeypatch.setattr(RigidBodies, 'step', lambda self, f: (steps.append(0), step(self, f)))
-    motions = motions_of(response, *recording.solids)
-    points = motions.advance(robot, recording.positions, ROWS)[0].points
+    points, _ = acted(robot, response, recording)
     short = len(steps)
     monkeypatch.setattr(RigidBodies, 'passes', lambda *_: False)
     steps.clear()
-    whole = motions.advance(robot, recording.positions, ROWS)[0].points
+    whole, _ = acted(robot, response, recording)
     assert short < 0.75 * len(steps)
-    np.testing.assert_allclose(points[0, -1], whole[0, -1], atol=0.005)
-
-
-def test_chunks_go_on_where_the_last_one_ended(robot, response, recording):
-    motions, half = motions_of(response, *recording.solids), 34 * ROWS
-    whole = motions.advance(robot, recording.positions, ROWS)[0].points
-    first, then = motions.advance(robot, recording.positions[: half + 1], ROWS)
-    second, _ = then.advance(robot, recording.positions[half:], ROWS)
-    np.testing.assert_allclose(first.points[0], whole[0, :35], atol=1e-3)
-    np.testing.assert_allclose(second.points[0, 0], first.points[0, -1], atol=1e-9)
-    np.testing.assert_allclose(second.joints[0, 0], first.joints[0, -1], atol=1e-9)
-    assert np.linalg.norm(second.points[0, -1] - whole[0, -1], axis=-1).max() < 0.02
-    assert second.rotations.shape[:3] == second.points.shape[:3]
+    np.testing.assert_allclose(points[-1], whole[-1], atol=0.005)
 
 
 def test_arms_that_touch_nothing_go_as_they_are_expected_to(robot, response, recording):
     """Nor does the table stop them in these one and a half seconds."""
     commands = recording.positions[:76]
-    moved, then = motions_of(response, AWAY).advance(robot, commands, ROWS)
-    assert np.abs(moved.points[0] - AWAY.centre).max() < 0.001
+    poses, joints = commanded(world_of(robot, response, commands[0], AWAY), commands)
+    assert np.abs(poses[:, 0, :3, 3] - AWAY.centre).max() < 0.001
     expected = replace(response, floor=None).follow(robot, commands)[0]
-    np.testing.assert_allclose(moved.joints[0], expected[::ROWS], atol=0.002)
-    assert len(then.states[0].positions[-1]) == len(expected[0]) + 2  # fingers count each
-
-
-def test_motions_differ_within_the_errors_of_masks(robot, response):
-    motions = motions_of(response, AWAY, num_motions=4)
-    points = motions.advance(robot, still(robot, 0.2), ROWS)[0].points
-    starts = points[:, 0, 0]
-    np.testing.assert_allclose(starts[0], AWAY.centre, atol=1e-9)
-    assert 0 < np.abs(starts[1:, :2] - AWAY.centre[:2]).max() < 0.006
-    assert len({size.tobytes() for size in motions.sizes[:, 0]}) == 4
-    again = motions.advance(robot, still(robot, 0.2), ROWS)[0].points
-    np.testing.assert_array_equal(again, points)
+    np.testing.assert_allclose(joints, expected, atol=0.002)
 
 
 @pytest.mark.parametrize('is_round', [False, True])
@@ -381,34 +344,17 @@ def test_what_is_wide_and_low_is_hollow(robot, response, is_round):
         is_round=is_round,
     )
     block = replace(AWAY, centre=AWAY.centre + [0, 0, 0.005], size=np.full(3, 0.03))
-    points = motions_of(response, dish, block).advance(robot, still(robot, 1.0), ROWS)[0].points
-    assert points[0, -1, 1, 2] == pytest.approx(0.006 + 0.015, abs=0.003)
-    assert np.linalg.norm(points[0, -1, 1, :2] - AWAY.centre[:2]) < 0.01
+    commands = still(robot, 1.0)
+    poses, _ = commanded(world_of(robot, response, commands[0], dish, block), commands)
+    assert poses[-1, 1, 2, 3] == pytest.approx(0.006 + 0.015, abs=0.003)
+    assert np.linalg.norm(poses[-1, 1, :2, 3] - AWAY.centre[:2]) < 0.01
 
 
-def test_an_object_that_was_not_seen_is_not_known(robot, response):
-    motions = motions_of(response, None, AWAY)
-    moved, _ = motions.advance(robot, still(robot, 0.2), ROWS)
-    points, rotations = moved.points, moved.rotations
-    assert np.isnan(points[:, :, 0]).all() and np.isfinite(points[:, :, 1]).all()
-    assert np.isfinite(rotations).all()
-    assert np.isnan(motions.sizes[:, 0]).all() and np.isnan(motions.centres[0]).all()
-    motions = motions_of(response, None)
-    points = motions.advance(robot, still(robot, 0.2), ROWS)[0].points
-    assert points.shape == (1, 3, 1, 3) and motions.sizes.shape == (1, 1, 3)
-    nothing = motions_of(response)
-    points = nothing.advance(robot, still(robot, 0.2), ROWS)[0].points
-    assert points.shape == (1, 3, 0, 3) and nothing.centres.shape == (0, 3)
-
-
-def test_robots_of_which_contact_cannot_be_computed_are_named(robot, response):
-    light = replace(response, compliance=np.zeros_like(response.compliance))
-    with pytest.raises(RobotError, match="robot 'yam_bimanual' were found without inertias"):
-        check_robot(SETTINGS, robot, light)
+def test_a_robot_without_a_urdf_is_named(robot, response):
     bare = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
     bare.file = None
     with pytest.raises(RobotError, match='has no URDF'):
-        check_robot(SETTINGS, bare, response)
+        bodies_of(bare, response, still(robot, 0.0)[0])
 
 
 def test_meshes_are_found_or_named(response, tmp_path):
@@ -421,7 +367,7 @@ def test_meshes_are_found_or_named(response, tmp_path):
     urdf.write_text(f'{before}<collision>{shape}{rest.split("</collision>", 1)[1]}')
     robot = load_robot(tmp_path / 'yam_bimanual.yaml')
     with pytest.raises(RobotError, match="mesh 'base.stl' is missing"):
-        check_robot(SETTINGS, robot, response)
+        bodies_of(robot, response, still(robot, 0.0)[0])
     corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], np.float32)
     faces = [
         corners[list(face)].tobytes() for face in ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
@@ -429,4 +375,4 @@ def test_meshes_are_found_or_named(response, tmp_path):
     stl = bytes(80) + np.uint32(4).tobytes()
     stl += b''.join(bytes(12) + face + bytes(2) for face in faces)
     (tmp_path / 'base.stl').write_bytes(stl)
-    check_robot(SETTINGS, robot, response)
+    bodies_of(robot, response, still(robot, 0.0)[0])
