@@ -240,13 +240,13 @@ def test_pads_give_way_on_objects_and_not_on_the_table(robot, response):
     for tool in robot.tools:
         rest[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_closed
     tip = robot.tool_poses(rest[None])[0, 0, :3, 3]
-    for table, given in ((tip[2] - 0.2, True), (tip[2], False)):
-        given = {'pad_stiffness': 1e4, 'table_m': table}
-        bodies = bodies_of(robot, response, rest, replace(AWAY, centre=tip), **given)
+    for table, is_soft in ((tip[2] - 0.2, True), (tip[2], False)):
+        changed = {'pad_stiffness': 1e4, 'table_m': table}
+        bodies = bodies_of(robot, response, rest, replace(AWAY, centre=tip), **changed)
         assert len(bodies.arms.pads) == 2 * len(robot.tools)
         bodies.notice_touch()
         kinds = {pad.getActuatorType() for pad in bodies.arms.pads}
-        assert (_FREE in kinds) == given
+        assert (_FREE in kinds) == is_soft
 
 
 @pytest.mark.parametrize(('is_open', 'height'), [(True, 0.02), (False, 0.07)])
