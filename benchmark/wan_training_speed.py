@@ -127,7 +127,7 @@ def main() -> None:
             options.repeats,
         )
     step, peak = statistics.median(spent['step']), statistics.median(peaks[1:])
-    ideal = ideal_seconds(config, None, bench.dtype, peak)
+    ideal = ideal_seconds(config, bench.dtype, peak)
     memory = '–'
     if bench.device.type == 'cuda':
         memory = f'{torch.cuda.max_memory_allocated(bench.device) / 2**30:.1f} GiB'

@@ -85,7 +85,7 @@ def test_a_batch_is_what_encoding_the_recorded_clips_gives(
     clip = held._clip(0, 1)
     cut = cut_clip(recording, clip.start, config.spec)
     frames = torch.from_numpy(cut.frames)[None]
-    video, _ = source.controls.make(cut, cut.objects)
+    video = source.controls.make(cut, cut.objects)
     autoencoder = base.encoders.autoencoder
     with torch.no_grad():
         clean = encode_chunk(autoencoder, frames)
