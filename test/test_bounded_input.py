@@ -54,18 +54,18 @@ def clock():
 
 
 @pytest.mark.parametrize('name', YAML)
-def test_yaml_that_costs_too_much_is_refused(name) -> None:
+def test_yaml_that_costs_too_much_is_refused(name):
     with pytest.raises(yaml.YAMLError):
         parse_yaml(YAML[name])
 
 
-def test_yaml_with_aliases_and_merges_is_read_as_before() -> None:
+def test_yaml_with_aliases_and_merges_is_read_as_before():
     text = 'a: &a {k: [1, 2.5, yes, 2020-01-01]}\nb: {<<: *a, c: *a}\n'
     assert parse_yaml(text) == yaml.safe_load(text)
 
 
 @pytest.mark.parametrize('value', ['.inf', '-.inf', '.nan', '1e400', '[' * 5000, '"x"', '2**9'])
-def test_a_calibration_with_a_wild_size_is_a_clear_error(tmp_path, value) -> None:
+def test_a_calibration_with_a_wild_size_is_a_clear_error(tmp_path, value):
     file = tmp_path / 'calibration.yaml'
     file.write_text(
         f'views: {{low: {{width: {value}, height: 480, K: [90, 90, 47, 35], mount_link: base, '
@@ -87,7 +87,7 @@ def test_a_calibration_with_a_wild_size_is_a_clear_error(tmp_path, value) -> Non
         {'width': 10**9},
     ],
 )
-def test_a_calibration_that_no_camera_has_is_refused(tmp_path, change) -> None:
+def test_a_calibration_that_no_camera_has_is_refused(tmp_path, change):
     row = {
         'width': 96,
         'height': 72,
@@ -104,7 +104,7 @@ def test_a_calibration_that_no_camera_has_is_refused(tmp_path, change) -> None:
         load_calibration(file)
 
 
-def test_pipes_devices_and_folders_are_no_files(tmp_path) -> None:
+def test_pipes_devices_and_folders_are_no_files(tmp_path):
     os.mkfifo(tmp_path / 'pipe.yaml')
     for path in (tmp_path / 'pipe.yaml', '/dev/zero', tmp_path):
         with pytest.raises(OSError, match=r'regular file|directory'):
@@ -113,7 +113,7 @@ def test_pipes_devices_and_folders_are_no_files(tmp_path) -> None:
         load_calibration(tmp_path / 'pipe.yaml')
 
 
-def test_a_urdf_that_cannot_be_opened_is_a_clear_error(tmp_path) -> None:
+def test_a_urdf_that_cannot_be_opened_is_a_clear_error(tmp_path):
     """Found by the fuzz: `Path.is_file` raises for a name that is too long."""
     robot = bundled('robots', 'yam_bimanual', 'robot_file').read_text()
     values = yaml.safe_load(robot)
@@ -124,7 +124,7 @@ def test_a_urdf_that_cannot_be_opened_is_a_clear_error(tmp_path) -> None:
             load_robot(tmp_path / 'robot.yaml')
 
 
-def test_json_is_bounded(tmp_path, monkeypatch) -> None:
+def test_json_is_bounded(tmp_path, monkeypatch):
     file = tmp_path / 'deep.json'
     file.write_text('[' * 1_000_000)
     with pytest.raises(ValueError, match='nested'):
@@ -135,20 +135,20 @@ def test_json_is_bounded(tmp_path, monkeypatch) -> None:
         read_json(file)
 
 
-def test_every_limit_is_documented() -> None:
+def test_every_limit_is_documented():
     page = share_path('docs', 'troubleshooting.md').read_text()
     for field in fields(Limits):
         assert f'| `MTV_WORLD_MAX_{field.name.upper()}` | {field.default} |' in page
 
 
 @pytest.mark.parametrize('text', ['', '-1', '0', 'many', '1e6', '٣'])
-def test_a_limit_that_is_no_number_is_an_error(monkeypatch, text) -> None:
+def test_a_limit_that_is_no_number_is_an_error(monkeypatch, text):
     monkeypatch.setenv('MTV_WORLD_MAX_YAML_NODES', text)
     with pytest.raises(ConfigError, match='MTV_WORLD_MAX_YAML_NODES'):
         limits()
 
 
-def test_a_long_instruction_is_matched_in_bounded_time() -> None:
+def test_a_long_instruction_is_matched_in_bounded_time():
     tasks = load_tasks(share_path('config', 'tasks'))
     words = ('put the red block on the blue block and then ' * 400)[:15_000]
     for text in (words, 'put the ' + 'a ' * 7000, 'put the ' * 1900, 'stack the' + ' ' * 15_000):
@@ -157,7 +157,7 @@ def test_a_long_instruction_is_matched_in_bounded_time() -> None:
     assert match_task(tasks, 'stack the red block on the blue block') is not None
 
 
-def test_many_joint_names_are_refused_at_once() -> None:
+def test_many_joint_names_are_refused_at_once():
     robot = load_robot(bundled('robots', 'yam_bimanual', 'robot_file'))
     names = tuple(f'joint{n}' for n in range(20_000))
     plan = JointTrajectory(joint_names=names, times=[1.0], positions=np.zeros((1, 20_000)))
@@ -175,7 +175,7 @@ def read(data: bytes):
 
 
 @pytest.mark.parametrize('side', [20_000, 65_500])
-def test_the_header_of_a_jpeg_is_looked_at_before_it_is_decoded(side) -> None:
+def test_the_header_of_a_jpeg_is_looked_at_before_it_is_decoded(side):
     data = jpeg()
     at = data.index(b'\xff\xc0') + 5
     bomb = data[:at] + struct.pack('>HH', side, side) + data[at + 4 :]
@@ -186,7 +186,7 @@ def test_the_header_of_a_jpeg_is_looked_at_before_it_is_decoded(side) -> None:
     tracemalloc.stop()
 
 
-def test_the_header_of_a_png_is_looked_at_and_its_checksums() -> None:
+def test_the_header_of_a_png_is_looked_at_and_its_checksums():
     data = bytearray(cv2.imencode('.png', np.zeros((8, 8, 3), np.uint8))[1].tobytes())
     assert read(bytes(data)).shape == (8, 8, 3)
     for at in (20, len(data) // 2, len(data) - 20):
@@ -197,7 +197,7 @@ def test_the_header_of_a_png_is_looked_at_and_its_checksums() -> None:
 
 
 @pytest.mark.parametrize('share', [0.2, 0.5, 0.9])
-def test_a_jpeg_cut_short_is_refused_though_its_end_mark_is_there(share) -> None:
+def test_a_jpeg_cut_short_is_refused_though_its_end_mark_is_there(share):
     data = jpeg()
     assert read(data).shape == (48, 64, 3)
     body = data.index(b'\xff\xda')
@@ -206,19 +206,19 @@ def test_a_jpeg_cut_short_is_refused_though_its_end_mark_is_there(share) -> None
         read(cut)
 
 
-def test_jpegs_are_decoded_as_opencv_does() -> None:
+def test_jpegs_are_decoded_as_opencv_does():
     data = np.frombuffer(jpeg((97, 131)), np.uint8)
     np.testing.assert_array_equal(read(data.tobytes())[..., ::-1], cv2.imdecode(data, 1))
 
 
-def test_bytes_before_the_end_mark_are_what_some_cameras_write() -> None:
+def test_bytes_before_the_end_mark_are_what_some_cameras_write():
     data = jpeg()
     np.testing.assert_array_equal(read(data[:-2] + b'\x00\x01\xff\xd9'), read(data))
 
 
 @pytest.mark.parametrize('kind', [CompressionType.ZSTD, CompressionType.LZ4])
 @pytest.mark.parametrize('stated', ['small', 'huge', 'true'])
-def test_a_chunk_is_not_inflated_beyond_what_it_states(tmp_path, kind, stated) -> None:
+def test_a_chunk_is_not_inflated_beyond_what_it_states(tmp_path, kind, stated):
     stream = io.BytesIO()
     writer = Writer(stream, chunk_size=2**30, compression=kind)
     writer.start(profile='ros2')
@@ -251,7 +251,7 @@ def test_a_chunk_is_not_inflated_beyond_what_it_states(tmp_path, kind, stated) -
         'rosbag2_bagfile_information: {relative_file_paths: x}',
     ],
 )
-def test_wild_metadata_is_a_problem_not_an_error(tmp_path, text) -> None:
+def test_wild_metadata_is_a_problem_not_an_error(tmp_path, text):
     writer = Writer(str(tmp_path / 'a.mcap'))
     writer.start()
     writer.finish()

@@ -27,7 +27,7 @@ def run(*arguments: str, cwd: Path, timeout: float = 300) -> subprocess.Complete
     )
 
 
-def test_help_does_not_load_the_model(tmp_path: Path) -> None:
+def test_help_does_not_load_the_model(tmp_path):
     code = (
         'import sys\nfrom mtv_world_ros.cli import main\n'
         "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
@@ -39,7 +39,7 @@ def test_help_does_not_load_the_model(tmp_path: Path) -> None:
         assert command in done.stdout.decode()
 
 
-def test_a_command_that_left_says_where_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_that_left_says_where_it_is(capsys):
     with pytest.raises(SystemExit) as end:
         main(['distill', 'bundled', 'data/sim', '--out', 'x'])
     said = capsys.readouterr().err
@@ -60,13 +60,7 @@ def test_a_command_that_left_says_where_it_is(capsys: pytest.CaptureFixture[str]
          'stack_blocks_two'),
     ],
 )  # fmt: skip
-def test_errors_are_one_line_and_say_what_to_do(
-    arguments: list[str],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_errors_are_one_line_and_say_what_to_do(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 1
     said = capsys.readouterr().err
@@ -82,7 +76,7 @@ needs_checkpoint = pytest.mark.skipif(
 
 
 @needs_checkpoint
-def test_the_demo_runs_over_the_middleware_and_beats_the_held_frame(tmp_path: Path) -> None:
+def test_the_demo_runs_over_the_middleware_and_beats_the_held_frame(tmp_path):
     done = run('demo', '--out', 'out', '--threads', '1', cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / 'out' / 'report.json').read_text())
@@ -101,7 +95,7 @@ def test_the_demo_runs_over_the_middleware_and_beats_the_held_frame(tmp_path: Pa
 
 
 @needs_checkpoint
-def test_replays_offline_to_a_bag_with_all_frames(tmp_path: Path) -> None:
+def test_replays_offline_to_a_bag_with_all_frames(tmp_path):
     from mtv_world_ros.data.bag.reader import BagReader
 
     episode = share_path('resource', 'demo_episode')
@@ -117,7 +111,7 @@ def test_replays_offline_to_a_bag_with_all_frames(tmp_path: Path) -> None:
 
 
 @needs_checkpoint
-def test_evaluates_the_bundled_model(tmp_path: Path) -> None:
+def test_evaluates_the_bundled_model(tmp_path):
     words = ['--out', str(tmp_path / 'scores'), '--steps', '1', '--threads', '1']
     assert main(['evaluate', 'bundled', str(share_path('resource', 'demo_episode')), *words]) == 0
     metrics = json.loads((tmp_path / 'scores' / 'metrics.json').read_text())
@@ -131,7 +125,7 @@ def test_evaluates_the_bundled_model(tmp_path: Path) -> None:
     assert np.isfinite(metrics['num_episodes'])
 
 
-def test_the_shell_completes_commands_and_options() -> None:
+def test_the_shell_completes_commands_and_options():
     pytest.importorskip('argcomplete', reason='argcomplete is not installed')
     for line, wanted in (('mtv-world imag', 'imagine'), ('mtv-world imagine --pol', '--policy')):
         words = {'_ARGCOMPLETE': '1', 'COMP_LINE': line, 'COMP_POINT': str(len(line))}

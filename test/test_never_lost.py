@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 import json
@@ -50,9 +49,7 @@ def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return said
 
 
-def test_a_file_or_a_folder_that_holds_something_is_replaced_only_when_asked(
-    tmp_path: Path,
-) -> None:
+def test_a_file_or_a_folder_that_holds_something_is_replaced_only_when_asked(tmp_path):
     check_free(tmp_path / 'new', False)
     check_free(tmp_path, False)  # empty
     file = tmp_path / 'report.html'
@@ -63,7 +60,7 @@ def test_a_file_or_a_folder_that_holds_something_is_replaced_only_when_asked(
         check_free(path, True)
 
 
-def test_results_with_other_settings_are_replaced_only_when_asked(tmp_path: Path) -> None:
+def test_results_with_other_settings_are_replaced_only_when_asked(tmp_path):
     folder = tmp_path / 'episodes'
     settings = {'name': 'a (12)', 'steps': 4}
     check_same_settings(folder, settings, False)
@@ -78,9 +75,7 @@ def test_results_with_other_settings_are_replaced_only_when_asked(tmp_path: Path
     check_same_settings(folder, {'name': 'b'}, True)
 
 
-def test_calibrate_writes_neither_into_the_package_nor_over_a_calibration(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calibrate_writes_neither_into_the_package_nor_over_a_calibration(tmp_path, capsys):
     words = [str(EPISODE.parent), '--out', str(tmp_path / 'out')]
     said = refused(['calibrate', 'bundled', *words], capsys)
     assert 'part of the installed package' in said and '--no-store' in said
@@ -91,9 +86,7 @@ def test_calibrate_writes_neither_into_the_package_nor_over_a_calibration(
     assert "success_calibration.json' exists" in refused(['calibrate', str(mine), *words], capsys)
 
 
-def test_imagined_episodes_and_predictions_stay(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_imagined_episodes_and_predictions_stay(tmp_path, capsys):
     kept = tmp_path / 'episode_00000' / 'kept'
     kept.parent.mkdir()
     kept.write_text('')
@@ -107,9 +100,7 @@ def test_imagined_episodes_and_predictions_stay(
     assert kept.is_file()
 
 
-def test_a_report_of_several_evaluations_needs_a_place_of_its_own(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_report_of_several_evaluations_needs_a_place_of_its_own(tmp_path, capsys):
     half = tmp_path / 'half' / 'episodes'
     half.mkdir(parents=True)
     (half / 'one.json').write_text('{}')
@@ -165,12 +156,7 @@ def stopped_here(words: list[str], kind: int, log: Path) -> tuple[int, str]:
     ('kind', 'stopped'),
     [(signal.SIGINT, stopped_in_a_process), (signal.SIGTERM, stopped_here)],
 )
-def test_a_signal_saves_the_training_and_says_how_to_go_on(
-    kind: int,
-    stopped: Callable[[list[str], int, Path], tuple[int, str]],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_signal_saves_the_training_and_says_how_to_go_on(kind, stopped, tmp_path, capsys):
     out = tmp_path / 'run'
     words = train_words(out, '--set', 'optimizer.steps=100000', '--save-every', '1000000')
     status, errors = stopped(words, kind, out / 'log.jsonl')
@@ -190,7 +176,7 @@ def test_a_signal_saves_the_training_and_says_how_to_go_on(
 
 
 @pytest.fixture(scope='module')
-def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def trained(tmp_path_factory) -> tuple[Path, str]:
     """A training of two steps, and what it printed."""
     out, said = tmp_path_factory.mktemp('trained') / 'run', StringIO()
     with redirect_stdout(said):
@@ -198,7 +184,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return out, said.getvalue()
 
 
-def test_the_evaluation_that_train_prints_runs(trained: tuple[Path, str]) -> None:
+def test_the_evaluation_that_train_prints_runs(trained):
     out, said = trained
     words = shlex.split(said.partition('evaluate it with: ')[2])
     assert words[:2] == ['mtv-world', 'evaluate']
@@ -206,9 +192,7 @@ def test_the_evaluation_that_train_prints_runs(trained: tuple[Path, str]) -> Non
     assert (out / 'evaluation_2' / 'metrics.json').is_file()
 
 
-def test_resuming_another_architecture_is_refused_before_anything_is_touched(
-    trained: tuple[Path, str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_resuming_another_architecture_is_refused_before_anything_is_touched(trained, capsys):
     out, _ = trained
     before = {path: path.stat().st_mtime_ns for path in out.rglob('*')}
     more = ['--set', 'optimizer.steps=4']
@@ -233,14 +217,12 @@ def test_resuming_another_architecture_is_refused_before_anything_is_touched(
         ),
     ],
 )
-def test_wrong_values_get_one_line(
-    more: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_values_get_one_line(more, message, tmp_path, capsys):
     assert message in refused(train_words(tmp_path / 'run', *more), capsys)
     assert not (tmp_path / 'run' / 'state').exists()
 
 
-def test_states_are_saved_by_time_too(tmp_path: Path) -> None:
+def test_states_are_saved_by_time_too(tmp_path):
     words = train_words(tmp_path, '--set', 'optimizer.steps=3', '--save-minutes', '0')
     seen = []
     from mtv_world_ros.lab.training.trainer import Trainer
@@ -252,7 +234,7 @@ def test_states_are_saved_by_time_too(tmp_path: Path) -> None:
     assert seen == [1, 2, 3]
 
 
-def test_the_version_is_that_of_package_xml(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_version_is_that_of_package_xml(capsys):
     with pytest.raises(SystemExit) as end:
         main(['--version'])
     assert end.value.code == 0
@@ -267,9 +249,7 @@ def test_the_version_is_that_of_package_xml(capsys: pytest.CaptureFixture[str]) 
         (['evaluate', 'a', 'b', '--out', 'c', '--devise', 'cpu'], "(did you mean '--device'?)"),
     ],
 )
-def test_what_is_mistyped_gets_its_nearest(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_mistyped_gets_its_nearest(words, message, capsys):
     with pytest.raises(SystemExit):
         main(words)
     assert message in capsys.readouterr().err

@@ -74,7 +74,7 @@ def world_model() -> CountingWorldModel:
 
 
 @pytest.fixture
-def pipeline(world_model: CountingWorldModel) -> Pipeline:
+def pipeline(world_model) -> Pipeline:
     return assemble(CARD, world_model, robot=YAM)
 
 
@@ -109,18 +109,14 @@ def imagine(pipeline: Pipeline, recording: Recording, seconds: float, **options)
 @pytest.mark.parametrize(
     ('seconds', 'lengths'), [(1.6, [8]), (0.5, [3]), (3.2, [8, 8]), (2.0, [8, 2])]
 )
-def test_predicts_just_as_far_as_the_trajectory_goes(
-    pipeline: Pipeline, recording: Recording, seconds: float, lengths: list[int]
-) -> None:
+def test_predicts_just_as_far_as_the_trajectory_goes(pipeline, recording, seconds, lengths):
     chunks = imagine(pipeline, recording, seconds)
     assert [len(chunk.video.times) for chunk in chunks] == lengths
     times = np.concatenate([chunk.video.times for chunk in chunks])
     np.testing.assert_allclose(times, np.arange(1, sum(lengths) + 1) / SPEC.fps)
 
 
-def test_each_chunk_goes_on_from_the_last_frame_of_the_one_before(
-    pipeline: Pipeline, recording: Recording
-) -> None:
+def test_each_chunk_goes_on_from_the_last_frame_of_the_one_before(pipeline, recording):
     episode = pipeline.begin(observe(recording))
     stands_at = []
     for prediction in episode.extend(commands(recording, 3.2)):
@@ -136,8 +132,8 @@ def test_each_chunk_goes_on_from_the_last_frame_of_the_one_before(
 
 @pytest.mark.parametrize(('asked', 'made_for', 'expected'), [(0, 2, 2), (7, 2, 7), (0, 4, 4)])
 def test_denoises_in_the_steps_that_the_model_is_made_for_unless_told_otherwise(
-    recording: Recording, asked: int, made_for: int, expected: int
-) -> None:
+    recording, asked, made_for, expected
+):
     world_model = CountingWorldModel(replace(SPEC, num_inference_steps=made_for))
     options = {'num_inference_steps': asked} if asked else {}
     (chunk,) = imagine(assemble(CARD, world_model, robot=YAM), recording, 1.6, **options)
@@ -145,17 +141,15 @@ def test_denoises_in_the_steps_that_the_model_is_made_for_unless_told_otherwise(
     assert chunk.num_inference_steps == expected
 
 
-def test_chunks_of_one_rollout_have_seeds_of_their_own(
-    pipeline: Pipeline, world_model: CountingWorldModel, recording: Recording
-) -> None:
+def test_chunks_of_one_rollout_have_seeds_of_their_own(pipeline, world_model, recording):
     imagine(pipeline, recording, 3.2, seed=7)
     assert world_model.seeds == [7, 8]
 
 
 @pytest.mark.parametrize('num_history', [0, 5, 12])
 def test_history_is_the_frames_before_the_start_and_the_first_one_stays_the_anchor(
-    recording: Recording, num_history: int
-) -> None:
+    recording, num_history
+):
     model = CountingWorldModel(replace(SPEC, num_history=num_history))
     chunks = imagine(assemble(CARD, model, robot=YAM), recording, 4.8)
     first = recording.frames[:, 0]
@@ -177,7 +171,7 @@ def part_of(asked: JointTrajectory, begin_s: float, end_s: float) -> JointTrajec
 
 
 @pytest.mark.parametrize('num_seeds', [1, 2])
-def test_chained_extends_are_one_long_extend(recording: Recording, num_seeds: int) -> None:
+def test_chained_extends_are_one_long_extend(recording, num_seeds):
     """The clock, seeds, history, anchor and memory are those of an episode without stops."""
     model = CountingWorldModel(replace(SPEC, num_history=5))
     pipeline = assemble(CARD, model, robot=YAM)
@@ -202,9 +196,7 @@ def test_chained_extends_are_one_long_extend(recording: Recording, num_seeds: in
         assert np.array_equal(one.anchor, other.anchor)
 
 
-def test_what_has_changed_holds_from_the_next_extend_on(
-    pipeline: Pipeline, world_model: CountingWorldModel, recording: Recording
-) -> None:
+def test_what_has_changed_holds_from_the_next_extend_on(pipeline, world_model, recording):
     episode = pipeline.begin(observe(recording), instruction='pick the red block')
     list(episode.extend(commands(recording, 1.6)))
     episode.instruction, episode.seed = recording.instruction, 40
@@ -223,9 +215,7 @@ class StoppingWorldModel(CountingWorldModel):
 
 
 @pytest.mark.parametrize('num_seeds', [1, 2])
-def test_a_stop_in_mid_chunk_leaves_the_episode_where_it_was(
-    recording: Recording, num_seeds: int
-) -> None:
+def test_a_stop_in_mid_chunk_leaves_the_episode_where_it_was(recording, num_seeds):
     model = StoppingWorldModel(SPEC)
     episode = assemble(CARD, model, robot=YAM).begin(observe(recording), num_seeds=num_seeds)
     done = []
@@ -241,9 +231,7 @@ def test_a_stop_in_mid_chunk_leaves_the_episode_where_it_was(
     assert after.seed == last.seed + 1
 
 
-def test_a_stop_between_chunks_keeps_those_that_are_done(
-    pipeline: Pipeline, recording: Recording
-) -> None:
+def test_a_stop_between_chunks_keeps_those_that_are_done(pipeline, recording):
     done: list[int] = []
     episode = pipeline.begin(observe(recording), should_stop=lambda: len(done) == 2)
     with pytest.raises(RolloutPreempted):
@@ -260,7 +248,7 @@ class NoisyWorldModel(CountingWorldModel):
         return np.random.default_rng(seed).integers(0, 256, held.shape, np.uint8)
 
 
-def test_the_same_seed_twice_gives_the_same_frames(recording: Recording) -> None:
+def test_the_same_seed_twice_gives_the_same_frames(recording):
     pipeline = assemble(CARD, NoisyWorldModel(SPEC), robot=YAM)
     first, again, other = (
         np.concatenate([c.video.frames for c in imagine(pipeline, recording, 3.2, seed=seed)], 1)
@@ -270,9 +258,7 @@ def test_the_same_seed_twice_gives_the_same_frames(recording: Recording) -> None
     assert not np.array_equal(first, other)
 
 
-def test_real_frames_are_judged_as_imagined_ones_are(
-    pipeline: Pipeline, recording: Recording
-) -> None:
+def test_real_frames_are_judged_as_imagined_ones_are(pipeline, recording):
     """Observing what was imagined: masks and estimate are the same, chunk after chunk."""
     imagined = imagine(pipeline, recording, 3.2)
     episode = pipeline.begin(observe(recording), instruction=recording.instruction)
@@ -286,7 +272,7 @@ def test_real_frames_are_judged_as_imagined_ones_are(
     assert np.array_equal(episode.observation.frames, imagined[-1].video.frames[:, -1])
 
 
-def test_imagining_goes_on_from_what_was_observed(recording: Recording) -> None:
+def test_imagining_goes_on_from_what_was_observed(recording):
     model = CountingWorldModel(replace(SPEC, num_history=5))
     episode = assemble(CARD, model, robot=YAM).begin(
         observe(recording), instruction=recording.instruction
@@ -299,7 +285,7 @@ def test_imagining_goes_on_from_what_was_observed(recording: Recording) -> None:
     assert chunk.imagined_seconds == pytest.approx(1.6)  # since the last real frame
 
 
-def test_a_recorded_frame_is_seen_at_its_own_size(recording: Recording, tmp_path) -> None:
+def test_a_recorded_frame_is_seen_at_its_own_size(recording, tmp_path):
     frames, cameras = recording.seen_at(3)
     assert frames.shape[1] > SPEC.height
     assert {(c.height, c.width) for c in cameras} == {frames.shape[1:3]}
@@ -312,7 +298,7 @@ def test_a_recorded_frame_is_seen_at_its_own_size(recording: Recording, tmp_path
         assert np.array_equal(frames, recording.frames[:, 3]) and cameras == cached.cameras
 
 
-def test_a_recording_is_judged_by_its_own_frames(pipeline: Pipeline, recording: Recording) -> None:
+def test_a_recording_is_judged_by_its_own_frames(pipeline, recording):
     """A model that holds its frame shows no move; the recorded frames do."""
     (stretch,) = stretches(recording, SPEC, 'imagine')
     seen = observe_stretch(pipeline, recording, stretch)
@@ -321,9 +307,7 @@ def test_a_recording_is_judged_by_its_own_frames(pipeline: Pipeline, recording: 
     assert seen.probability > 0.5 > last.success.probability
 
 
-def test_the_last_chunk_alone_is_imagined_from_what_was_seen(
-    pipeline: Pipeline, world_model: CountingWorldModel, recording: Recording
-) -> None:
+def test_the_last_chunk_alone_is_imagined_from_what_was_seen(pipeline, world_model, recording):
     (stretch,) = stretches(recording, SPEC, 'imagine')
     first, *_ = stretches(recording, SPEC, 'observe')
     assert last_chunk(recording, first, SPEC) is None
@@ -371,7 +355,7 @@ class ThreeWays:
         return tuple(motions), self
 
 
-def test_pictures_show_what_most_of_the_motions_say(recording: Recording) -> None:
+def test_pictures_show_what_most_of_the_motions_say(recording):
     def shown(*ways: float) -> np.ndarray:
         world_model = CountingWorldModel(SPEC)
         imagine(with_motion(world_model, ThreeWays(*ways)), recording, 1.6)
@@ -383,9 +367,7 @@ def test_pictures_show_what_most_of_the_motions_say(recording: Recording) -> Non
     assert np.array_equal(shown(0.0, 0.06, 0.06), moved)
 
 
-def test_a_plan_is_foreseen_chunk_by_chunk(
-    recording: Recording, world_model: CountingWorldModel
-) -> None:
+def test_a_plan_is_foreseen_chunk_by_chunk(recording, world_model):
     """So that its first chunk does not wait for the others."""
     log: list[int] = []
     pipeline = with_motion(world_model, DriftingObjects(log))
@@ -434,8 +416,8 @@ class DriftingObjects:
 
 
 def test_objects_move_on_from_chunk_to_chunk_and_are_found_again_in_real_frames(
-    recording: Recording, world_model: CountingWorldModel
-) -> None:
+    recording, world_model
+):
     log: list[int] = []
     pipeline = with_motion(world_model, DriftingObjects(log))
     episode = pipeline.begin(observe(recording), instruction=recording.instruction)
@@ -450,8 +432,8 @@ def test_objects_move_on_from_chunk_to_chunk_and_are_found_again_in_real_frames(
 
 @pytest.mark.parametrize('found_again', [True, False])
 def test_what_is_hidden_by_now_is_shown_and_foreseen_as_it_was_when_it_was_whole(
-    recording: Recording, world_model: CountingWorldModel, found_again: bool
-) -> None:
+    recording, world_model, found_again
+):
     pipeline = with_motion(world_model, DriftingObjects([], same=(True, found_again)))
     begun = pipeline.begin(observe(recording), instruction=recording.instruction)
     begun.observe(recording.frames[:, 1:9], recording.positions[:9])
@@ -473,9 +455,7 @@ def test_what_is_hidden_by_now_is_shown_and_foreseen_as_it_was_when_it_was_whole
     assert np.isfinite(chunk.success.features['foreseen']) == found_again
 
 
-def test_an_episode_in_which_nobody_names_an_object_is_imagined(
-    recording: Recording, world_model: CountingWorldModel
-) -> None:
+def test_an_episode_in_which_nobody_names_an_object_is_imagined(recording, world_model):
     foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
     episode = with_motion(world_model, foresight).begin(observe(recording))
     chunks = list(episode.extend(commands(recording, 3.2)))
@@ -502,8 +482,8 @@ def misplaced(monkeypatch, change) -> None:
     ],
 )
 def test_objects_that_cannot_be_where_they_were_found_are_named_and_there_is_no_verdict(
-    recording: Recording, world_model: CountingWorldModel, monkeypatch, change, said: str
-) -> None:
+    recording, world_model, monkeypatch, change, said
+):
     foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
     pipeline = with_motion(world_model, foresight)
     with monkeypatch.context() as context:
@@ -515,8 +495,8 @@ def test_objects_that_cannot_be_where_they_were_found_are_named_and_there_is_no_
 
 
 def test_objects_that_one_view_alone_shows_are_named_and_there_is_no_verdict(
-    recording: Recording, world_model: CountingWorldModel
-) -> None:
+    recording, world_model
+):
     foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
     seen = observe(recording)
     frames = seen.frames.copy()
@@ -530,8 +510,8 @@ def test_objects_that_one_view_alone_shows_are_named_and_there_is_no_verdict(
 
 
 def test_an_engine_that_diverges_is_named_and_there_is_no_verdict(
-    recording: Recording, world_model: CountingWorldModel, monkeypatch
-) -> None:
+    recording, world_model, monkeypatch
+):
     foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
     monkeypatch.setattr(foresight.engine, 'run', lambda m, d, states, controls: np.full(
         (len(states), controls.shape[1], states.shape[1]), np.nan
@@ -542,9 +522,7 @@ def test_an_engine_that_diverges_is_named_and_there_is_no_verdict(
     assert any('the engine diverged' in reason for reason in last.reasons)
 
 
-def test_control_frame_zero_shows_the_observed_state(
-    pipeline: Pipeline, world_model: CountingWorldModel, recording: Recording
-) -> None:
+def test_control_frame_zero_shows_the_observed_state(pipeline, world_model, recording):
     """And frame k the state after command k: a later start shifts the frames, not the first."""
     (chunk,) = imagine(pipeline, recording, 1.6)
     drawn = pipeline.draw(
@@ -556,26 +534,20 @@ def test_control_frame_zero_shows_the_observed_state(
     assert np.array_equal(world_model.trajectories[0][:, :2], drawn.frames)
 
 
-def test_the_objects_are_those_of_the_instruction(
-    pipeline: Pipeline, recording: Recording
-) -> None:
+def test_the_objects_are_those_of_the_instruction(pipeline, recording):
     (chunk,) = imagine(pipeline, recording, 1.6)
     assert chunk.start_masks.names == recording.objects[:2]
     assert chunk.start_masks.masks.any(axis=(2, 3, 4)).all()
 
 
-def test_without_object_masks_the_control_is_dark_but_for_the_trails(
-    world_model: CountingWorldModel, recording: Recording
-) -> None:
+def test_without_object_masks_the_control_is_dark_but_for_the_trails(world_model, recording):
     imagine(assemble(CARD.replace(object_mask=False), world_model, robot=YAM), recording, 1.6)
     imagine(assemble(CARD, world_model, robot=YAM), recording, 1.6)
     without, with_masks = (np.count_nonzero(t) for t in world_model.trajectories)
     assert 0 < without < with_masks
 
 
-def test_a_larger_observation_is_brought_to_the_models_size(
-    pipeline: Pipeline, recording: Recording
-) -> None:
+def test_a_larger_observation_is_brought_to_the_models_size(pipeline, recording):
     robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
     large = load_recording(
         share_path('resource', 'demo_episode'), replace(SPEC, width=384, height=288), robot
@@ -586,7 +558,7 @@ def test_a_larger_observation_is_brought_to_the_models_size(
     assert difference.max() <= 1
 
 
-def test_views_in_another_order_are_refused(pipeline: Pipeline, recording: Recording) -> None:
+def test_views_in_another_order_are_refused(pipeline, recording):
     seen = observe(recording)
     turned = Observation(
         cameras=seen.cameras[::-1],
@@ -598,9 +570,7 @@ def test_views_in_another_order_are_refused(pipeline: Pipeline, recording: Recor
         pipeline.begin(turned)
 
 
-def test_positions_outside_the_limits_are_refused(
-    pipeline: Pipeline, recording: Recording
-) -> None:
+def test_positions_outside_the_limits_are_refused(pipeline, recording):
     good = commands(recording, 1.6)
     positions = good.positions.copy()
     positions[3, 1] = 9.0
@@ -649,8 +619,8 @@ class SlidingModel:
 
 
 def test_objects_are_shown_where_they_go_and_that_goes_on_from_chunk_to_chunk(
-    world_model: CountingWorldModel, recording: Recording
-) -> None:
+    world_model, recording
+):
     model = SlidingModel()
     pipeline = with_motion(world_model, model)
     episode = pipeline.begin(observe(recording), instruction=recording.instruction)
@@ -722,9 +692,7 @@ def live(observed: ObservedEpisode, recording: Recording, first: int, last: int)
         observed.see(seen_at(recording, frame))
 
 
-def test_a_grasp_seen_two_plans_ago_counts(
-    observed: ObservedEpisode, large_recording: Recording
-) -> None:
+def test_a_grasp_seen_two_plans_ago_counts(observed, large_recording):
     """At the recording's end the blocks are stacked: whether a grasp did it, only memory knows."""
     last = len(large_recording.times) - 1
     for first, then in ((0, 16), (16, 32), (32, last)):
@@ -738,9 +706,7 @@ def test_a_grasp_seen_two_plans_ago_counts(
     assert known.probability > 0.5 > unknown.probability
 
 
-def test_another_instruction_or_a_reset_begins_a_new_episode(
-    observed: ObservedEpisode, large_recording: Recording
-) -> None:
+def test_another_instruction_or_a_reset_begins_a_new_episode(observed, large_recording):
     def judged(instruction: str = '') -> float:
         return judge(observed, large_recording, 40, instruction).features['moved']
 
@@ -760,8 +726,8 @@ def test_another_instruction_or_a_reset_begins_a_new_episode(
 
 
 def test_frames_between_those_of_the_model_and_before_the_first_plan_are_not_kept(
-    observed: ObservedEpisode, large_recording: Recording
-) -> None:
+    observed, large_recording
+):
     start_ns = large_recording.stamp_ns
     assert not observed.is_due(start_ns)
     judge(observed, large_recording, 0)
@@ -775,9 +741,7 @@ def test_frames_between_those_of_the_model_and_before_the_first_plan_are_not_kep
     assert not observed.is_due(start_ns + LARGE.num_frames * 200_000_000 + 100_000_000)
 
 
-def test_a_motion_that_no_view_shows_is_said_and_counted(
-    pipeline: Pipeline, recording: Recording
-) -> None:
+def test_a_motion_that_no_view_shows_is_said_and_counted(pipeline, recording):
     (seen,) = imagine(pipeline, recording, 1.6)
     assert (seen.in_view > 0.5).all()
     assert not any('no view' in reason for reason in seen.success.reasons)
@@ -793,9 +757,7 @@ def test_a_motion_that_no_view_shows_is_said_and_counted(
     assert unseen.success.reasons[-1] == 'no view shows a tool at any time'
 
 
-def test_a_lens_that_moves_the_tools_out_of_the_image_is_refused(
-    pipeline: Pipeline, recording: Recording
-) -> None:
+def test_a_lens_that_moves_the_tools_out_of_the_image_is_refused(pipeline, recording):
     start = observe(recording)
     wrong = replace(
         start.cameras[0], distortion_model='plumb_bob', distortion=np.array([300.0, 0, 0, 0])
@@ -805,9 +767,7 @@ def test_a_lens_that_moves_the_tools_out_of_the_image_is_refused(
         list(episode.extend(commands(recording, 1.6)))
 
 
-def test_a_describer_is_asked_once_about_the_first_real_frame(
-    pipeline: Pipeline, recording: Recording
-) -> None:
+def test_a_describer_is_asked_once_about_the_first_real_frame(pipeline, recording):
     shown = []
 
     class Describer:

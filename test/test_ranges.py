@@ -60,13 +60,13 @@ def _without_range(kind: type[Schema]) -> list[str]:
     ]
 
 
-def test_every_number_of_every_schema_has_a_range() -> None:
+def test_every_number_of_every_schema_has_a_range():
     schemas = _schemas()
     assert len(schemas) > 50
     assert not [name for kind in schemas for name in _without_range(kind)]
 
 
-def test_a_number_without_a_range_is_noticed() -> None:
+def test_a_number_without_a_range_is_noticed():
     class Wrong(Schema):
         fine: Annotated[float, Field(ge=0, le=1)] | None = None
         high: float = Field(default=0.0, ge=0)
@@ -77,7 +77,7 @@ def test_a_number_without_a_range_is_noticed() -> None:
     assert [name.rsplit('.')[-1] for name in _without_range(Wrong)] == ['high', 'rows', 'union']
 
 
-def test_what_is_not_known_may_be_no_number_but_not_out_of_range() -> None:
+def test_what_is_not_known_may_be_no_number_but_not_out_of_range():
     curve = {'period_s': 0.2, 'segmenter': 'colour', 'num_episodes': 3, 'lower': [nan, 0.0]}
     assert HorizonCurve.model_validate({**curve, 'values': [nan, 0.5]}).values[1] == 0.5
     for wrong in (1.5, float('inf')):

@@ -48,14 +48,14 @@ def stopped(tmp_path: Path, slow: str, number: int, *words: str) -> tuple[int, l
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_command_that_still_imports_ends_with_one_line(number: int, tmp_path: Path) -> None:
+def test_a_command_that_still_imports_ends_with_one_line(number, tmp_path):
     status, said = stopped(tmp_path, 'yaml', number, 'mtv_world_ros.cli', 'replay', 'x')
     assert status == 128 + number
     assert said == [f'mtv-world: stopped while starting ({signal.Signals(number).name})']
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_command_that_runs_ends_with_one_line(number: int, tmp_path: Path) -> None:
+def test_a_command_that_runs_ends_with_one_line(number, tmp_path):
     words = ('mtv_world_ros.cli', 'replay', str(EPISODE), '--offline', '--out', 'out')
     status, said = stopped(tmp_path, 'torch', number, *words)
     assert status == 128 + number
@@ -65,9 +65,7 @@ def test_a_command_that_runs_ends_with_one_line(number: int, tmp_path: Path) -> 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('node', ['world_model.node', 'policy.node', 'bags.recorder'])
-def test_a_node_that_still_imports_ends_with_one_line(
-    node: str, number: int, tmp_path: Path
-) -> None:
+def test_a_node_that_still_imports_ends_with_one_line(node, number, tmp_path):
     pytest.importorskip('rclpy', reason='rclpy is not installed (pip install .[ros])')
     slow = 'yaml' if node == 'bags.recorder' else 'pydantic'
     status, said = stopped(tmp_path, slow, number, f'mtv_world_ros.ros.{node}')
@@ -76,7 +74,7 @@ def test_a_node_that_still_imports_ends_with_one_line(
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_node_that_loads_its_model_ends_with_one_line(number: int, tmp_path: Path) -> None:
+def test_a_node_that_loads_its_model_ends_with_one_line(number, tmp_path):
     pytest.importorskip('rclpy', reason='rclpy is not installed (pip install .[ros])')
     status, said = stopped(tmp_path, 'torch', number, 'mtv_world_ros.ros.world_model.node')
     assert status == 128 + number
@@ -84,9 +82,7 @@ def test_a_node_that_loads_its_model_ends_with_one_line(number: int, tmp_path: P
 
 
 @pytest.mark.parametrize('home', ['/proc/nowhere', 'file'])
-def test_a_node_whose_home_cannot_be_written_says_so_and_starts(
-    home: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_node_whose_home_cannot_be_written_says_so_and_starts(home, tmp_path, monkeypatch):
     pytest.importorskip('rclpy', reason='rclpy is not installed (pip install .[ros])')
     (tmp_path / 'file').write_text('a file where a folder should be')
     monkeypatch.setenv('HOME', str(tmp_path / home))
@@ -98,7 +94,7 @@ def test_a_node_whose_home_cannot_be_written_says_so_and_starts(
     assert len(said) == 2 and 'cannot be written' in said[0] and 'ROS logs into' in said[0]
 
 
-def test_sigterm_lets_a_block_tidy_up_and_handlers_come_back(tmp_path: Path) -> None:
+def test_sigterm_lets_a_block_tidy_up_and_handlers_come_back(tmp_path):
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     tidied = []
     with pytest.raises(Stopped) as stop, stopped_by_sigterm():

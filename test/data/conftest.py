@@ -81,7 +81,7 @@ def write_episode(
 
 
 @pytest.fixture
-def make_episode(tmp_path: Path) -> Callable[..., Path]:
+def make_episode(tmp_path) -> Callable[..., Path]:
     """Records an episode of 8 frames, 48 x 64, and returns its folder."""
 
     def make(name: str = 'episode', **options: object) -> Path:
@@ -91,6 +91,6 @@ def make_episode(tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture(scope='module')
-def episode_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def episode_path(tmp_path_factory) -> Path:
     """The same, recorded once for tests that only read it."""
     return write_episode(tmp_path_factory.mktemp('episodes') / 'episode')

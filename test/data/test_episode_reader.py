@@ -25,7 +25,7 @@ def read(path: Path, **options: Any):
     return read_episode(path, with_cameras=False, **options)
 
 
-def test_what_was_written_is_read_back(episode_path) -> None:
+def test_what_was_written_is_read_back(episode_path):
     episode = read_episode(episode_path)
     info = episode.info
     assert (info.task, info.outcome, info.seed) == ('stack_blocks_two', 'success', 7)
@@ -57,7 +57,7 @@ def test_what_was_written_is_read_back(episode_path) -> None:
     np.testing.assert_array_equal(trajectory.velocities, np.arange(9.0).reshape(3, 3) / 7 * 2)
 
 
-def test_raw_images_and_masks_come_back_exactly(make_episode) -> None:
+def test_raw_images_and_masks_come_back_exactly(make_episode):
     episode = read_episode(make_episode('raw', compressed=False))
     for index in range(FRAMES):
         np.testing.assert_array_equal(episode.images['low'].frames[index], expected_picture(index))
@@ -70,7 +70,7 @@ def test_raw_images_and_masks_come_back_exactly(make_episode) -> None:
     assert read_episode(episode.info.path, with_masks=False).masks is None
 
 
-def test_cameras_come_from_the_folder_and_from_camera_info(episode_path) -> None:
+def test_cameras_come_from_the_folder_and_from_camera_info(episode_path):
     cameras = read_episode(episode_path).cameras
     low = cameras['low']
     assert (low.view, low.width, low.height, low.mount_link) == ('low', 64, 48, 'base')
@@ -79,7 +79,7 @@ def test_cameras_come_from_the_folder_and_from_camera_info(episode_path) -> None
     assert low.distortion_model == 'none'
 
 
-def test_frames_are_decoded_one_by_one_or_in_slices(episode_path) -> None:
+def test_frames_are_decoded_one_by_one_or_in_slices(episode_path):
     frames = read_episode(episode_path).images['low'].frames
     everything = np.asarray(frames)
     assert len(frames) == FRAMES
@@ -91,13 +91,13 @@ def test_frames_are_decoded_one_by_one_or_in_slices(episode_path) -> None:
         frames[FRAMES]
 
 
-def test_views_are_given_in_the_order_asked_for(episode_path) -> None:
+def test_views_are_given_in_the_order_asked_for(episode_path):
     episode = read_episode(episode_path, views=('high', 'low'))
     assert episode.views == tuple(episode.images) == tuple(episode.cameras) == ('high', 'low')
     assert read_episode(episode_path, views=['high']).views == ('high',)
 
 
-def test_a_missing_view_is_named_with_those_that_are_there(make_episode) -> None:
+def test_a_missing_view_is_named_with_those_that_are_there(make_episode):
     path = make_episode('single', views=('high',))
     assert read_episode(path).views == ('high',)
     with pytest.raises(EpisodeError, match=r"no view 'low'.*its views are high.*`topics`"):
@@ -106,7 +106,7 @@ def test_a_missing_view_is_named_with_those_that_are_there(make_episode) -> None
         read_episode(path, views=('hihg',))
 
 
-def test_a_cut_episode_is_read_up_to_the_cut_and_says_so(make_episode, tmp_path) -> None:
+def test_a_cut_episode_is_read_up_to_the_cut_and_says_so(make_episode, tmp_path):
     path = make_episode('long')
     file = path / 'long_0.mcap'
     content = file.read_bytes()
@@ -126,7 +126,7 @@ def test_a_cut_episode_is_read_up_to_the_cut_and_says_so(make_episode, tmp_path)
     assert outcomes >= {'refused', 'whole'}
 
 
-def test_without_calibration_the_file_to_add_is_named(make_episode) -> None:
+def test_without_calibration_the_file_to_add_is_named(make_episode):
     path = make_episode('bare')
     (path / 'calibration.yaml').rename(path / 'elsewhere.yaml')
     with pytest.raises(CalibrationError, match=r'bare/calibration.yaml.*poses'):
@@ -137,7 +137,7 @@ def test_without_calibration_the_file_to_add_is_named(make_episode) -> None:
         read_episode(path, calibration=path / 'missing.yaml')
 
 
-def test_a_view_without_calibration_is_named(make_episode) -> None:
+def test_a_view_without_calibration_is_named(make_episode):
     path = make_episode('half')
     content = yaml.safe_load((path / 'calibration.yaml').read_text())
     del content['views']['high']
@@ -147,7 +147,7 @@ def test_a_view_without_calibration_is_named(make_episode) -> None:
     assert tuple(read_episode(path, views=['low']).cameras) == ('low',)
 
 
-def test_info_is_read_with_and_without_metadata_yaml(make_episode) -> None:
+def test_info_is_read_with_and_without_metadata_yaml(make_episode):
     path = make_episode('episode')
     expected = read_info(path)
     assert (expected.task, expected.outcome, expected.seed) == ('stack_blocks_two', 'success', 7)
@@ -156,7 +156,7 @@ def test_info_is_read_with_and_without_metadata_yaml(make_episode) -> None:
     assert read_info(path / 'episode_0.mcap').objects == ('red block', 'blue block')
 
 
-def test_unfinished_episodes_are_not_listed(make_episode, tmp_path) -> None:
+def test_unfinished_episodes_are_not_listed(make_episode, tmp_path):
     paths = [make_episode('b'), make_episode('a')]
     shutil.copytree(paths[0], tmp_path / '.c.1234.tmp')
     (tmp_path / 'notes').mkdir()
@@ -164,7 +164,7 @@ def test_unfinished_episodes_are_not_listed(make_episode, tmp_path) -> None:
 
 
 @pytest.mark.parametrize('seed', range(12))
-def test_a_damaged_file_never_ends_in_another_error(seed, episode_path, tmp_path) -> None:
+def test_a_damaged_file_never_ends_in_another_error(seed, episode_path, tmp_path):
     rng = np.random.default_rng(seed)
     content = bytearray((episode_path / 'episode_0.mcap').read_bytes())
     for position in rng.integers(0, len(content), 4):

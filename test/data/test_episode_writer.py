@@ -47,7 +47,7 @@ def profiles_of(reader: Reader) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize('read', [by_topic_with_rosbags, by_topic_with_mcap_ros2])
-def test_independent_readers_find_every_value_that_was_written(read, episode_path) -> None:
+def test_independent_readers_find_every_value_that_was_written(read, episode_path):
     found = read(episode_path)
     assert {topic: len(items) for topic, items in found.items()} == {
         '/instruction': 1,
@@ -78,7 +78,7 @@ def test_independent_readers_find_every_value_that_was_written(read, episode_pat
 
 
 @pytest.mark.parametrize('read', [by_topic_with_rosbags, by_topic_with_mcap_ros2])
-def test_masks_are_exact_and_jpegs_close(read, episode_path) -> None:
+def test_masks_are_exact_and_jpegs_close(read, episode_path):
     found = read(episode_path)
     mask = found['/high/mask/compressed'][3][1]
     ids = cv2.imdecode(np.frombuffer(mask.data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -91,7 +91,7 @@ def test_masks_are_exact_and_jpegs_close(read, episode_path) -> None:
     assert abs(bgr[24, 2] - np.array([60.0, 96.0, 36.0])).max() < 6
 
 
-def test_raw_images_are_exact(make_episode) -> None:
+def test_raw_images_are_exact(make_episode):
     path = make_episode('raw', compressed=False)
     message = by_topic_with_rosbags(path)['/low/image_raw'][2][1]
     assert (message.encoding, message.width, message.height, message.step) == ('rgb8', 64, 48, 192)
@@ -99,7 +99,7 @@ def test_raw_images_are_exact(make_episode) -> None:
 
 
 @pytest.mark.filterwarnings('ignore::DeprecationWarning')
-def test_ros_itself_reads_the_recorded_bytes(episode_path) -> None:
+def test_ros_itself_reads_the_recorded_bytes(episode_path):
     serialization = pytest.importorskip('rclpy.serialization')
     from sensor_msgs.msg import CameraInfo, CompressedImage, JointState
     from std_msgs.msg import String
@@ -118,7 +118,7 @@ def test_ros_itself_reads_the_recorded_bytes(episode_path) -> None:
     assert bytes(last['/low/mask/compressed'].data[:4]) == b'\x89PNG'
 
 
-def test_metadata_yaml_is_version_9_and_counts_what_is_there(episode_path) -> None:
+def test_metadata_yaml_is_version_9_and_counts_what_is_there(episode_path):
     content = yaml.safe_load((episode_path / 'metadata.yaml').read_text())
     information = content['rosbag2_bagfile_information']
     assert information['version'] == 9
@@ -138,7 +138,7 @@ def test_metadata_yaml_is_version_9_and_counts_what_is_there(episode_path) -> No
     assert '&' not in (episode_path / 'metadata.yaml').read_text()
 
 
-def test_the_instruction_is_offered_latched_in_yaml_and_channel(episode_path) -> None:
+def test_the_instruction_is_offered_latched_in_yaml_and_channel(episode_path):
     content = yaml.safe_load((episode_path / 'metadata.yaml').read_text())
     entries = content['rosbag2_bagfile_information']['topics_with_message_count']
     offered = {e['topic_metadata']['name']: e['topic_metadata'] for e in entries}
@@ -157,7 +157,7 @@ def test_the_instruction_is_offered_latched_in_yaml_and_channel(episode_path) ->
     assert in_channel == offered['/instruction']['offered_qos_profiles']
 
 
-def test_the_mcap_file_is_what_foxglove_and_rosbag2_expect(episode_path) -> None:
+def test_the_mcap_file_is_what_foxglove_and_rosbag2_expect(episode_path):
     with (episode_path / 'episode_0.mcap').open('rb') as stream:
         reader = make_reader(stream)
         header, summary = reader.get_header(), reader.get_summary()
@@ -189,27 +189,27 @@ def test_the_mcap_file_is_what_foxglove_and_rosbag2_expect(episode_path) -> None
     assert recorded['custom_data'] == records['mtv_world']
 
 
-def test_type_hashes_are_those_of_ros() -> None:
+def test_type_hashes_are_those_of_ros():
     # `ros2 topic info -v` of a std_msgs/String publisher prints this one
     assert messages.type_hash('std_msgs/msg/String') == (
         'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18'
     )
 
 
-def test_an_unknown_outcome_drops_the_episode(tmp_path) -> None:
+def test_an_unknown_outcome_drops_the_episode(tmp_path):
     with pytest.raises(EpisodeError, match=r"'sucess' is not one of .*did you mean 'success'"):
         _record_with_outcome(tmp_path / 'episode', 'sucess')
     assert list(tmp_path.iterdir()) == []
 
 
-def test_metadata_keys_of_the_episode_cannot_be_shadowed(tmp_path) -> None:
+def test_metadata_keys_of_the_episode_cannot_be_shadowed(tmp_path):
     writer = _writer(tmp_path / 'episode', metadata={'task': 'another'})
     with pytest.raises(EpisodeError, match=r"keys \['task'\]"):
         writer.close()
     assert list(tmp_path.iterdir()) == []
 
 
-def test_text_of_any_language_survives(tmp_path) -> None:
+def test_text_of_any_language_survives(tmp_path):
     text = 'lege den »roten« Würfel: links\n# 红色'
     with _writer(tmp_path / 'episode', metadata={'note': text}) as writer:
         writer.write_instruction(0, text)
@@ -218,7 +218,7 @@ def test_text_of_any_language_survives(tmp_path) -> None:
     assert by_topic_with_mcap_ros2(tmp_path / 'episode')['/instruction'][0][1].data == text
 
 
-def test_a_trajectory_without_velocities_has_none(tmp_path) -> None:
+def test_a_trajectory_without_velocities_has_none(tmp_path):
     plain = JointTrajectory(joint_names=['a'], times=[0.0, 1.5], positions=[[1.0], [2.0]])
     with _writer(tmp_path / 'episode') as writer:
         writer.write_trajectory(0, plain)

@@ -13,7 +13,7 @@ def joint_state(stamp_ns: int, **positions: float):
     return stamp_ns, messages.make_joint_state(stamp_ns, list(positions), values)
 
 
-def test_joint_states_of_two_arms_become_one_table() -> None:
+def test_joint_states_of_two_arms_become_one_table():
     recorded = [
         joint_state(1, left=1.0),
         joint_state(2, right=2.0),
@@ -27,14 +27,14 @@ def test_joint_states_of_two_arms_become_one_table() -> None:
     assert states.positions.tolist() == [[1, 2], [3, 2], [5, 4]]
 
 
-def test_two_arms_of_one_stamp_become_one_row() -> None:
+def test_two_arms_of_one_stamp_become_one_row():
     recorded = [joint_state(1, left=1.0), joint_state(1, right=2.0)]
     states = merge_joint_states('/joint_states', recorded, [])
     assert states is not None
     assert states.positions.tolist() == [[1, 2]]
 
 
-def test_joint_states_without_positions_are_left_out() -> None:
+def test_joint_states_without_positions_are_left_out():
     stamp, broken = joint_state(2, a=1.0)
     broken.position = np.empty(0)
     warnings: list[str] = []
@@ -42,7 +42,7 @@ def test_joint_states_without_positions_are_left_out() -> None:
     assert warnings == ["'/joint_states': 1 messages without a position per joint were left out"]
 
 
-def test_late_and_repeated_stamps_are_sorted_and_counted() -> None:
+def test_late_and_repeated_stamps_are_sorted_and_counted():
     warnings: list[str] = []
     items = [(30, 'a'), (10, 'b'), (20, 'c'), (30, 'd'), (5, 'e')]
     expected = [(5, 'e'), (10, 'b'), (20, 'c'), (30, 'd')]
@@ -53,13 +53,13 @@ def test_late_and_repeated_stamps_are_sorted_and_counted() -> None:
     ]
 
 
-def test_stamps_in_order_need_no_warning() -> None:
+def test_stamps_in_order_need_no_warning():
     warnings: list[str] = []
     assert in_order('/topic', [(1, 'a'), (2, 'b')], warnings) == [(1, 'a'), (2, 'b')]
     assert warnings == []
 
 
-def test_frames_of_several_sizes_do_not_become_one_array() -> None:
+def test_frames_of_several_sizes_do_not_become_one_array():
     sizes = [(2, 3, 3), (1, 6, 3)]
     frames = LazyFrames('/low/image_raw', sizes, lambda size: np.zeros(size, np.uint8))
     assert frames[1].shape == (1, 6, 3)
@@ -67,7 +67,7 @@ def test_frames_of_several_sizes_do_not_become_one_array() -> None:
         np.asarray(frames)
 
 
-def test_only_the_frames_asked_for_are_decoded() -> None:
+def test_only_the_frames_asked_for_are_decoded():
     decoded = []
 
     def decode(index: int) -> np.ndarray:

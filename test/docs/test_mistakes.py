@@ -28,7 +28,7 @@ def sessions() -> list[tuple[str, str]]:
 
 
 @pytest.fixture(scope='module')
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory) -> Path:
     """What the page's commands find: half an evaluation, predictions, a report, a checkpoint."""
     out = tmp_path_factory.mktemp('mistakes')
     shutil.copytree(share_path('resource', 'demo_episode'), out / 'data' / 'demo_episode')
@@ -49,7 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def port(folder: Path) -> Iterator[None]:
+def port(folder) -> Iterator[None]:
     """The viewer's port is in use."""
     with socket.socket() as taken:
         taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -63,13 +63,8 @@ def port(folder: Path) -> Iterator[None]:
 
 @pytest.mark.parametrize(('command', 'answer'), sessions())
 def test_a_mistake_is_answered_as_the_page_says(
-    command: str,
-    answer: str,
-    folder: Path,
-    port: None,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    command, answer, folder, port, monkeypatch, capsys
+):
     monkeypatch.chdir(folder)
     before = {path: path.stat().st_mtime_ns for path in folder.rglob('*') if path.is_file()}
     words = shlex.split(command)
@@ -94,7 +89,7 @@ def test_a_mistake_is_answered_as_the_page_says(
     assert {p: after.get(p) for p in before} == before
 
 
-def test_the_tests_that_the_page_names_are_there() -> None:
+def test_the_tests_that_the_page_names_are_there():
     named = set(re.findall(r'`(test_\w+)`', PAGE.read_text()))
     written = '\n'.join(path.read_text() for path in (ROOT / 'test').rglob('test_*.py'))
     assert len(named) > 8

@@ -6,5 +6,5 @@ import pytest
 
 
 @pytest.fixture(params=['conv', 'patch'])
-def kind(request: pytest.FixtureRequest) -> str:
+def kind(request) -> str:
     return request.param

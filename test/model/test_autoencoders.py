@@ -59,14 +59,14 @@ def weights() -> Weights:
 
 
 @pytest.fixture(scope='module')
-def file(weights: Weights, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(weights, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp('tiny') / 'taew2_1.safetensors'
     save_file(weights, path)
     return path
 
 
 @pytest.fixture(scope='module')
-def tiny(file: Path) -> TinyAutoencoder:
+def tiny(file) -> TinyAutoencoder:
     return TinyAutoencoder.load(file)
 
 
@@ -121,7 +121,7 @@ class Reference:
 
 @pytest.mark.parametrize('latent_frames', [1, 8])  # 8 are more than are decoded together
 @torch.inference_mode()
-def test_decodes_as_the_published_layout_does(tiny, weights: Weights, latent_frames: int) -> None:
+def test_decodes_as_the_published_layout_does(tiny, weights, latent_frames):
     latents = 2 * torch.randn(2, 16, latent_frames, 1, 2)
     reference = Reference(weights, 'decoder')
     for frame in latents.unbind(2):
@@ -135,7 +135,7 @@ def test_decodes_as_the_published_layout_does(tiny, weights: Weights, latent_fra
 
 @pytest.mark.parametrize('frames', [1, 29])
 @torch.inference_mode()
-def test_encodes_as_the_published_layout_does(tiny, weights: Weights, frames: int) -> None:
+def test_encodes_as_the_published_layout_does(tiny, weights, frames):
     video = torch.rand(2, 3, frames, 8, 16) * 2 - 1
     reference = Reference(weights, 'encoder')
     for frame in (video / 2 + 0.5).unbind(2):
@@ -147,7 +147,7 @@ def test_encodes_as_the_published_layout_does(tiny, weights: Weights, frames: in
     torch.testing.assert_close(latents, torch.stack(reference.out, 2), rtol=0, atol=1e-4)
 
 
-def test_a_layer_that_grew_more_frames_gives_its_last(weights: Weights, tmp_path: Path) -> None:
+def test_a_layer_that_grew_more_frames_gives_its_last(weights, tmp_path):
     name = 'decoder.7.conv.weight'
     save_file(
         {**weights, name: torch.cat([weights[name] + 1, weights[name]])},
@@ -169,9 +169,7 @@ def test_a_layer_that_grew_more_frames_gives_its_last(weights: Weights, tmp_path
         ),
     ],
 )
-def test_weights_of_another_model_are_refused(
-    weights: Weights, tmp_path: Path, change: dict, message: str
-) -> None:
+def test_weights_of_another_model_are_refused(weights, tmp_path, change, message):
     changed = {name: t for name, t in {**weights, **change}.items() if t is not None}
     save_file(changed, tmp_path / 'other.safetensors')
     with pytest.raises(CheckpointError, match=message):
@@ -182,14 +180,14 @@ def test_weights_of_another_model_are_refused(
     ('name', 'message'),
     [('taew2_1.pth', 'pickle'), ('missing.safetensors', 'missing.safetensors')],
 )
-def test_pickles_and_missing_files_are_refused(tmp_path: Path, name: str, message: str) -> None:
+def test_pickles_and_missing_files_are_refused(tmp_path, name, message):
     if name.endswith('.pth'):
         torch.save({}, tmp_path / name)
     with pytest.raises(CheckpointError, match=message):
         TinyAutoencoder.load(tmp_path / name)
 
 
-def test_bytes_come_back_as_they_went_in() -> None:
+def test_bytes_come_back_as_they_went_in():
     frames = torch.randint(0, 256, (2, 3, 5, 16, 24, 3), dtype=torch.uint8)
     autoencoder = SpaceToDepthAutoencoder(block_size=2)
     latents = encode_frames(autoencoder, frames)
@@ -197,7 +195,7 @@ def test_bytes_come_back_as_they_went_in() -> None:
     assert torch.equal(decode_frames(autoencoder, latents), frames)
 
 
-def test_control_frame_k_stands_at_predicted_frame_k() -> None:
+def test_control_frame_k_stands_at_predicted_frame_k():
     """Frame 0 of the trajectory video is the start, frames 1 .. T are the predicted ones."""
     trajectory = torch.zeros(1, 1, 5, 4, 4, 3, dtype=torch.uint8)
     trajectory[:, :, 3] = 255

@@ -19,7 +19,7 @@ from mtv_world_ros.model.world_model import DiffusionWorldModel
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path) -> Path:
     checkpoint = Checkpoint(
         transformer=build(SMALL),
         autoencoder=SpaceToDepthAutoencoder(),
@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / 'checkpoint'
 
 
-def test_loads_bit_for_bit_what_was_saved(folder: Path) -> None:
+def test_loads_bit_for_bit_what_was_saved(folder):
     loaded = load_checkpoint(folder)
     for name, value in build(SMALL).state_dict().items():
         assert torch.equal(loaded.transformer.state_dict()[name], value), name
@@ -39,7 +39,7 @@ def test_loads_bit_for_bit_what_was_saved(folder: Path) -> None:
     assert loaded.card.plain() == CARD
 
 
-def test_leaves_nothing_but_safetensors_and_json(folder: Path) -> None:
+def test_leaves_nothing_but_safetensors_and_json(folder):
     assert {path.suffix for path in folder.rglob('*') if path.is_file()} == {
         '.json',
         '.safetensors',
@@ -47,7 +47,7 @@ def test_leaves_nothing_but_safetensors_and_json(folder: Path) -> None:
     assert not list(folder.parent.glob('*.partial'))
 
 
-def test_predicts_frames_of_the_cards_size_from_a_seed(folder: Path) -> None:
+def test_predicts_frames_of_the_cards_size_from_a_seed(folder):
     model = DiffusionWorldModel(load_checkpoint(folder))
     first, again, other = (predict(model, seed) for seed in (1, 1, 2))
     assert first.shape == (2, 4, 32, 32, 3)
@@ -68,7 +68,7 @@ def predict(model: DiffusionWorldModel, seed: int = 0, should_stop=lambda: False
     )
 
 
-def test_a_preempted_prediction_is_given_up(folder: Path) -> None:
+def test_a_preempted_prediction_is_given_up(folder):
     model = DiffusionWorldModel(load_checkpoint(folder))
     with pytest.raises(RolloutPreempted):
         predict(model, should_stop=lambda: True)
@@ -81,9 +81,7 @@ def test_a_preempted_prediction_is_given_up(folder: Path) -> None:
         RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried 1 TB"),
     ],
 )
-def test_out_of_memory_is_a_clear_error_and_the_next_call_works(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
+def test_out_of_memory_is_a_clear_error_and_the_next_call_works(folder, monkeypatch, error):
     model = DiffusionWorldModel(load_checkpoint(folder))
 
     def fail(*_: object, **__: object) -> None:
@@ -96,24 +94,24 @@ def test_out_of_memory_is_a_clear_error_and_the_next_call_works(
     assert predict(model).shape == (2, 4, 32, 32, 3)
 
 
-def test_a_folder_without_a_card_is_no_checkpoint(tmp_path: Path) -> None:
+def test_a_folder_without_a_card_is_no_checkpoint(tmp_path):
     with pytest.raises(CheckpointError, match='is not a checkpoint: it has no world_model.json'):
         load_checkpoint(tmp_path)
 
 
-def test_a_missing_part_is_named(folder: Path) -> None:
+def test_a_missing_part_is_named(folder):
     (folder / 'scheduler').rename(folder / 'elsewhere')
     with pytest.raises(CheckpointError, match="has no folder 'scheduler/'"):
         load_checkpoint(folder)
 
 
-def test_pickles_are_refused(folder: Path) -> None:
+def test_pickles_are_refused(folder):
     (folder / 'transformer' / 'diffusion_pytorch_model.bin').write_bytes(b'x')
     with pytest.raises(CheckpointError, match='holds pickle files'):
         load_checkpoint(folder)
 
 
-def test_weights_of_another_shape_are_refused(folder: Path) -> None:
+def test_weights_of_another_shape_are_refused(folder):
     file = folder / 'transformer' / 'config.json'
     config = json.loads(file.read_text())
     config['ffn_dim'] = 48
@@ -122,7 +120,7 @@ def test_weights_of_another_shape_are_refused(folder: Path) -> None:
         load_checkpoint(folder)
 
 
-def test_a_model_of_another_class_is_refused(folder: Path) -> None:
+def test_a_model_of_another_class_is_refused(folder):
     file = folder / 'transformer' / 'config.json'
     config = json.loads(file.read_text())
     config['_class_name'] = 'UNet2DModel'
@@ -140,13 +138,13 @@ def test_a_model_of_another_class_is_refused(folder: Path) -> None:
         ({'views': None}, "'views' is None"),
     ],
 )
-def test_a_wrong_card_is_refused(folder: Path, change: dict, message: str) -> None:
+def test_a_wrong_card_is_refused(folder, change, message):
     (folder / 'world_model.json').write_text(json.dumps({**CARD, **change}))
     with pytest.raises(CheckpointError, match=message):
         load_checkpoint(folder)
 
 
-def test_a_damaged_weight_file_is_refused(folder: Path) -> None:
+def test_a_damaged_weight_file_is_refused(folder):
     file = folder / 'transformer' / 'diffusion_pytorch_model.safetensors'
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(CheckpointError, match='cannot be loaded'):

@@ -38,7 +38,7 @@ def given(kind: str, views: int = 2, **changes: object) -> tuple[Any, dict]:
 
 
 @pytest.mark.parametrize('views', [1, 2, 3])
-def test_returns_exactly_the_videos_frames_whatever_is_before(kind: str, views: int) -> None:
+def test_returns_exactly_the_videos_frames_whatever_is_before(kind, views):
     model, values = given(kind, views)
     for frames in (2, 4):
         out = model(**values, **past(views, frames), anchor=values['reference'])
@@ -47,7 +47,7 @@ def test_returns_exactly_the_videos_frames_whatever_is_before(kind: str, views: 
 
 
 @pytest.mark.parametrize('views', [1, 2, 3])
-def test_every_weight_learns_with_a_history_too(kind: str, views: int) -> None:
+def test_every_weight_learns_with_a_history_too(kind, views):
     model, values = given(kind, views, num_views=views)
     past_values = {n: v.requires_grad_() for n, v in past(views).items()}
     model(**values, **past_values).square().mean().backward()
@@ -56,7 +56,7 @@ def test_every_weight_learns_with_a_history_too(kind: str, views: int) -> None:
     assert past_values['history'].grad.abs().amax(dim=(0, 2, 4, 5)).min() > 0
 
 
-def test_history_reaches_the_video_only_through_self_attention(kind: str) -> None:
+def test_history_reaches_the_video_only_through_self_attention(kind):
     """It neither leaks into the output nor changes what the video's tokens are."""
     model, values = given(kind)
     seen = model(**values, **past())
@@ -71,7 +71,7 @@ def test_history_reaches_the_video_only_through_self_attention(kind: str) -> Non
 
 
 @pytest.mark.parametrize('k', [0, 3])
-def test_control_frame_k_drives_predicted_frame_k_behind_a_history(kind: str, k: int) -> None:
+def test_control_frame_k_drives_predicted_frame_k_behind_a_history(kind, k):
     """Without attention among tokens, it reaches its own token's frames and no others."""
     model, values = given(kind)
     with torch.no_grad():
@@ -87,7 +87,7 @@ def test_control_frame_k_drives_predicted_frame_k_behind_a_history(kind: str, k:
     assert reached == [*range(k - k % merged, k - k % merged + merged)]
 
 
-def test_the_historys_noise_level_is_its_own(kind: str) -> None:
+def test_the_historys_noise_level_is_its_own(kind):
     """Block 0 modulates tokens of the history by its level, all others by the video's."""
     model, values = given(kind)
     caught: list[Tensor] = []
@@ -106,7 +106,7 @@ def test_the_historys_noise_level_is_its_own(kind: str) -> None:
 
 
 @pytest.mark.parametrize('view_offset', ['width', 'time', 'none'])
-def test_the_videos_places_are_the_same_with_and_without_history(view_offset: str) -> None:
+def test_the_videos_places_are_the_same_with_and_without_history(view_offset):
     rope = MultiViewRotaryPosEmbed(12, (1, 2, 2), 64, view_offset)
     video = torch.zeros(1, 3, 5, 2, 2, 4)
     plain = [t.reshape(3, 5, 4, -1) for t in rope(video)]
@@ -121,7 +121,7 @@ def test_the_videos_places_are_the_same_with_and_without_history(view_offset: st
     assert view_offset != 'none' or same.sum() == 3 * 21
 
 
-def test_places_before_zero_turn_the_other_way() -> None:
+def test_places_before_zero_turn_the_other_way():
     """Attention sees differences of places alone: shifting all of them changes nothing."""
     rope = MultiViewRotaryPosEmbed(12, (1, 2, 2), 64)
     grid = torch.zeros(1, 1, 3, 1, 1, 4)
@@ -142,7 +142,7 @@ def test_places_before_zero_turn_the_other_way() -> None:
     assert not torch.allclose(scores((-2, -1, 0)), scores((2, 1, 0)), atol=1e-2)
 
 
-def test_swapping_the_views_swaps_the_output_with_history(kind: str) -> None:
+def test_swapping_the_views_swaps_the_output_with_history(kind):
     model, values = given(kind, view_offset='none')
     with torch.no_grad():
         model.view_embedding.zero_()
@@ -151,7 +151,7 @@ def test_swapping_the_views_swaps_the_output_with_history(kind: str) -> None:
     torch.testing.assert_close(model(**swapped), model(**values).flip(1), rtol=1e-4, atol=1e-5)
 
 
-def test_the_anchor_takes_the_place_of_the_start_image_in_the_reference_tokens(kind: str) -> None:
+def test_the_anchor_takes_the_place_of_the_start_image_in_the_reference_tokens(kind):
     model, values = given(kind)
     other = past(seed=3)['history'][:, :, :, 0]
     assert not torch.allclose(model(**values, anchor=other), model(**values), atol=1e-5)
@@ -161,7 +161,7 @@ def test_the_anchor_takes_the_place_of_the_start_image_in_the_reference_tokens(k
 
 
 @pytest.mark.parametrize('start_image', ['both', 'reference', 'channel'])
-def test_the_start_image_enters_where_it_is_told_to(start_image: str) -> None:
+def test_the_start_image_enters_where_it_is_told_to(start_image):
     model, values = given('patch', start_image=start_image)
     before = model(**values)
     for name, slot in (('start', 'channel'), ('reference', 'reference')):
@@ -170,7 +170,7 @@ def test_the_start_image_enters_where_it_is_told_to(start_image: str) -> None:
         assert heard == (start_image in ('both', slot)), name
 
 
-def test_an_unknown_start_image_is_refused() -> None:
+def test_an_unknown_start_image_is_refused():
     with pytest.raises(CheckpointError, match="start_image 'none' is not one of both, ei"):
         build(PATCH, start_image='none')
 
@@ -205,13 +205,13 @@ def predict(model: DiffusionWorldModel, history: History | None, seeds: list[int
     )
 
 
-def test_a_model_without_history_takes_no_notice_of_one() -> None:
+def test_a_model_without_history_takes_no_notice_of_one():
     model = world_model()
     history = History(anchor=frames(2, seed=5), frames=frames(2, 4, seed=6))
     assert np.array_equal(predict(model, history), predict(model, None))
 
 
-def test_the_first_chunk_is_one_of_a_rollout_that_just_began() -> None:
+def test_the_first_chunk_is_one_of_a_rollout_that_just_began():
     model = world_model(history=SETTINGS)
     assert model.spec.num_history == 4
     began = History.begin(frames(2))
@@ -220,7 +220,7 @@ def test_the_first_chunk_is_one_of_a_rollout_that_just_began() -> None:
     assert not np.array_equal(predict(model, None), predict(model, moved))
 
 
-def test_history_frames_are_seen_and_few_are_filled_up_with_the_oldest() -> None:
+def test_history_frames_are_seen_and_few_are_filled_up_with_the_oldest():
     model = world_model(history=SETTINGS)
     seen = frames(2, 4, seed=6)
 
@@ -231,7 +231,7 @@ def test_history_frames_are_seen_and_few_are_filled_up_with_the_oldest() -> None
     assert np.array_equal(after(seen[:, 2:]), after(seen[:, [2, 2, 2, 3]]))
 
 
-def test_a_seed_gives_the_same_chunk_in_every_company_with_history() -> None:
+def test_a_seed_gives_the_same_chunk_in_every_company_with_history():
     model = world_model(history=SETTINGS)
     history = History(anchor=frames(2), frames=frames(2, 4, seed=6))
     together = predict(model, history, [3, 4])
@@ -250,11 +250,11 @@ def test_a_seed_gives_the_same_chunk_in_every_company_with_history() -> None:
         ({'frames': 4}, "history: unknown key 'frames'"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(changes: dict, match: str) -> None:
+def test_settings_that_cannot_be_are_refused(changes, match):
     with pytest.raises((CheckpointError, ConfigError), match=match):
         world_model(history={**SETTINGS, **changes})
 
 
-def test_settings_are_off_where_the_card_has_none() -> None:
+def test_settings_are_off_where_the_card_has_none():
     history = CheckpointCard(**CARD).history
     assert not history.on and history.as_card() == {}

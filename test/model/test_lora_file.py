@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import json
 from pathlib import Path
 from typing import Any
@@ -84,9 +83,7 @@ def of_peft(folder: Path, **settings: Any) -> Tensor:
 @pytest.mark.parametrize('fuse', [False, True])
 @pytest.mark.parametrize('settings', SETTINGS)
 @pytest.mark.parametrize('save', [of_pipeline, of_model, of_peft])
-def test_a_saved_adapter_counts_as_much_as_it_was_trained_to(
-    tmp_path: Path, save: Callable[..., Tensor], settings: str, fuse: bool
-) -> None:
+def test_a_saved_adapter_counts_as_much_as_it_was_trained_to(tmp_path, save, settings, fuse):
     expected = save(tmp_path / 'lora', **SETTINGS[settings])
     model = build()
     assert not torch.allclose(run(model), expected, atol=0.1)
@@ -94,7 +91,7 @@ def test_a_saved_adapter_counts_as_much_as_it_was_trained_to(
     torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-4)
 
 
-def test_a_file_of_peft_is_read_with_the_settings_beside_it(tmp_path: Path) -> None:
+def test_a_file_of_peft_is_read_with_the_settings_beside_it(tmp_path):
     expected = of_peft(tmp_path / 'lora', lora_alpha=16)
     model = build()
     adapters = Adapters(model)
@@ -121,9 +118,7 @@ def test_a_file_of_peft_is_read_with_the_settings_beside_it(tmp_path: Path) -> N
         ('{', 'cannot be used'),
     ],
 )
-def test_settings_that_are_not_applied_are_refused(
-    tmp_path: Path, change: Any, message: str
-) -> None:
+def test_settings_that_are_not_applied_are_refused(tmp_path, change, message):
     of_pipeline(tmp_path, lora_alpha=8)
     config = adapted(lora_alpha=8).peft_config['default'].to_dict()
     if isinstance(change, dict):
@@ -195,9 +190,7 @@ STYLES: dict[str, tuple[str, tuple[str, str], bool, float]] = {
 
 
 @pytest.mark.parametrize('style', STYLES)
-def test_styles_that_people_share_add_their_product_to_the_weights(
-    tmp_path: Path, style: str
-) -> None:
+def test_styles_that_people_share_add_their_product_to_the_weights(tmp_path, style):
     start, (a, b), flat, alpha = STYLES[style]
     modules = {**MODULES, **HEAD}
     pairs = factors(modules)
@@ -216,9 +209,7 @@ def test_styles_that_people_share_add_their_product_to_the_weights(
 
 
 @pytest.mark.parametrize('style', ['ComfyUI', 'ComfyUI with alpha', 'Kohya'])
-def test_styles_that_diffusers_reads_are_applied_as_it_applies_them(
-    tmp_path: Path, style: str
-) -> None:
+def test_styles_that_diffusers_reads_are_applied_as_it_applies_them(tmp_path, style):
     start, (a, b), flat, alpha = STYLES[style]
     tensors = keys(factors(MODULES), start, a, b, flat=flat, alpha=alpha)
     save_file(tensors, tmp_path / 'lora.safetensors')
@@ -255,16 +246,14 @@ Q = 'blocks.0.self_attn.q'
         ('something', torch.zeros(4), "'something' is no factor"),
     ],
 )
-def test_a_file_with_a_tensor_that_finds_no_place_is_refused(
-    tmp_path: Path, key: str, value: Tensor, message: str
-) -> None:
+def test_a_file_with_a_tensor_that_finds_no_place_is_refused(tmp_path, key, value, message):
     tensors = keys(factors(MODULES), '', '.lora_A.default', '.lora_B.default')
     save_file({**tensors, key: value}, tmp_path / 'lora.safetensors')
     with pytest.raises(CheckpointError, match=message):
         Adapters(build()).use(tmp_path / 'lora.safetensors')
 
 
-def test_a_file_without_tensors_is_refused(tmp_path: Path) -> None:
+def test_a_file_without_tensors_is_refused(tmp_path):
     save_file({}, tmp_path / 'lora.safetensors')
     with pytest.raises(CheckpointError, match='has no tensors'):
         Adapters(build()).use(tmp_path / 'lora.safetensors')

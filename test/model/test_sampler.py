@@ -86,9 +86,7 @@ def sample(
 @pytest.mark.parametrize('prediction', ['sample', 'flow'])
 @pytest.mark.parametrize('steps', [1, 4, 13])
 @pytest.mark.parametrize('config', [EULER, UNIPC], ids=['euler', 'unipc'])
-def test_reaches_what_a_perfect_predictor_predicts(
-    prediction: str, steps: int, config: dict
-) -> None:
+def test_reaches_what_a_perfect_predictor_predicts(prediction, steps, config):
     reached = sample(prediction, steps, scheduler=build_scheduler(config))
     # UniPC tells the model whole time steps, so this oracle's flow is off by up to 1 / 1000
     tolerance = 5e-3 if (config, prediction) == (UNIPC, 'flow') else 1e-5
@@ -96,7 +94,7 @@ def test_reaches_what_a_perfect_predictor_predicts(
 
 
 @pytest.mark.parametrize('steps', [4, 50])
-def test_noise_levels_are_spread_and_shifted_as_wan_does(steps: int) -> None:
+def test_noise_levels_are_spread_and_shifted_as_wan_does(steps):
     """`s * sigma / (1 + (s - 1) * sigma)`; Euler's last one is 1 / n, UniPC's .999 / n."""
     levels = {
         'euler': (EULER, np.linspace(1, 1 / steps, steps), 1e-6),
@@ -113,7 +111,7 @@ def test_noise_levels_are_spread_and_shifted_as_wan_does(steps: int) -> None:
         np.testing.assert_allclose(timesteps, 1000 * expected, rtol=0, atol=1.0)
 
 
-def test_a_seed_gives_the_same_noise_alone_and_in_a_batch() -> None:
+def test_a_seed_gives_the_same_noise_alone_and_in_a_batch():
     still = {'model': ConstantFlow(), 'text': torch.zeros(1, 512, 1)}
     together = sample(seeds=(3, 8), **still)
     assert together.shape == (2, *CLEAN.shape[1:])
@@ -124,7 +122,7 @@ def test_a_seed_gives_the_same_noise_alone_and_in_a_batch() -> None:
 
 
 @pytest.mark.parametrize(('scale', 'flow'), [(1.0, 2.0), (3.0, 0.5 + 3.0 * (2.0 - 0.5))])
-def test_guidance_goes_beyond_the_prompt(scale: float, flow: float) -> None:
+def test_guidance_goes_beyond_the_prompt(scale, flow):
     """A constant flow moves the noise by itself: the levels go from 1 to 0."""
     moved = sample(
         model=ConstantFlow(),
@@ -136,7 +134,7 @@ def test_guidance_goes_beyond_the_prompt(scale: float, flow: float) -> None:
     torch.testing.assert_close(moved, noise - flow, rtol=0, atol=1e-5)
 
 
-def test_stops_between_steps() -> None:
+def test_stops_between_steps():
     asked = []
 
     def should_stop() -> bool:
@@ -155,13 +153,13 @@ def test_stops_between_steps() -> None:
         ({'_class_name': 'UniPCMultistepScheduler'}, 'use_flow_sigmas: true'),
     ],
 )
-def test_a_schedule_without_flow_matching_is_refused(config: dict, message: str) -> None:
+def test_a_schedule_without_flow_matching_is_refused(config, message):
     with pytest.raises(CheckpointError, match=message):
         build_scheduler(config)
 
 
 @pytest.mark.parametrize(('steps', 'shift'), [(4, 3.0), (50, 3.0), (50, 5.0)])
-def test_unipc_has_the_noise_levels_of_videox_fun(steps: int, shift: float) -> None:
+def test_unipc_has_the_noise_levels_of_videox_fun(steps, shift):
     """Its `FlowUniPCMultistepScheduler`: sigma_max .999 and sigma_min 0 of the unshifted table."""
     scheduler = build_scheduler({**UNIPC, 'flow_shift': shift})
     set_timesteps(scheduler, steps, torch.device('cpu'))

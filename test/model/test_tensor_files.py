@@ -12,7 +12,7 @@ from torch import Tensor
 from mtv_world_ros.model.tensor_files import open_tensors, StoredTensor, write_tensors
 
 
-def test_no_more_than_one_shard_is_in_memory(tmp_path: Path) -> None:
+def test_no_more_than_one_shard_is_in_memory(tmp_path):
     alive: weakref.WeakSet[Tensor] = weakref.WeakSet()
     most = []
 
@@ -28,7 +28,7 @@ def test_no_more_than_one_shard_is_in_memory(tmp_path: Path) -> None:
     assert max(most) == 2
 
 
-def test_what_was_read_of_a_file_does_not_stay_mapped(tmp_path: Path) -> None:
+def test_what_was_read_of_a_file_does_not_stay_mapped(tmp_path):
     values = {'a': torch.arange(1000.0), 'b': torch.ones(3)}
     file = tmp_path / 'model.safetensors'
     save_file(values, file)

@@ -30,7 +30,7 @@ def trained(folder: Path, alpha: float = 8.0, seed: int = 5) -> Tensor:
     return run(model)
 
 
-def test_the_papers_adapter_has_the_known_size() -> None:
+def test_the_papers_adapter_has_the_known_size():
     """Rank 32 on queries, keys, values, outputs and feed-forward layers: 43.75 M on the 1.3B."""
     with torch.device('meta'):
         model = MultiViewWanTransformer(**load_training_config('wan-1.3b').transformer)
@@ -47,14 +47,14 @@ def test_the_papers_adapter_has_the_known_size() -> None:
     }
 
 
-def test_a_new_adapter_changes_nothing() -> None:
+def test_a_new_adapter_changes_nothing():
     model = build()
     before = run(model)
     add_adapter(model, rank=RANK)
     torch.testing.assert_close(run(model), before, rtol=0, atol=1e-5)
 
 
-def test_saved_and_loaded_gives_the_same_output(tmp_path: Path) -> None:
+def test_saved_and_loaded_gives_the_same_output(tmp_path):
     expected = trained(tmp_path / 'adapter')
     model = build()
     before = run(model)
@@ -68,7 +68,7 @@ def test_saved_and_loaded_gives_the_same_output(tmp_path: Path) -> None:
     }
 
 
-def test_fused_gives_the_same_output_in_the_same_tensors(tmp_path: Path) -> None:
+def test_fused_gives_the_same_output_in_the_same_tensors(tmp_path):
     expected = trained(tmp_path / 'adapter')
     model = build()
     places = {name: value.data_ptr() for name, value in model.state_dict().items()}
@@ -78,7 +78,7 @@ def test_fused_gives_the_same_output_in_the_same_tensors(tmp_path: Path) -> None
     torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-4)
 
 
-def test_fused_in_bfloat16_is_the_sum_rounded_once(tmp_path: Path) -> None:
+def test_fused_in_bfloat16_is_the_sum_rounded_once(tmp_path):
     trained(tmp_path / 'adapter')
     model = torch.nn.Module.to(build(), torch.bfloat16)
     name = 'blocks.1.attn1.to_k'
@@ -93,7 +93,7 @@ def test_fused_in_bfloat16_is_the_sum_rounded_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('fuse', [False, True])
-def test_adapters_are_exchanged_in_a_loaded_model(tmp_path: Path, fuse: bool) -> None:
+def test_adapters_are_exchanged_in_a_loaded_model(tmp_path, fuse):
     first, second = trained(tmp_path / 'a'), trained(tmp_path / 'b', seed=6)
     model = build()
     before = run(model)
@@ -107,7 +107,7 @@ def test_adapters_are_exchanged_in_a_loaded_model(tmp_path: Path, fuse: bool) ->
         assert torch.equal(model.state_dict()[name], value), name
 
 
-def test_a_failed_exchange_leaves_the_adapter_before(tmp_path: Path) -> None:
+def test_a_failed_exchange_leaves_the_adapter_before(tmp_path):
     expected = trained(tmp_path / 'a')
     model = build()
     adapters = Adapters(model)
@@ -119,7 +119,7 @@ def test_a_failed_exchange_leaves_the_adapter_before(tmp_path: Path) -> None:
     assert adapters.current == tmp_path / 'a'
 
 
-def test_the_number_format_of_the_model_stays(tmp_path: Path) -> None:
+def test_the_number_format_of_the_model_stays(tmp_path):
     trained(tmp_path / 'a')
     model = torch.nn.Module.to(build(), torch.bfloat16)
     Adapters(model).use(tmp_path / 'a')
@@ -127,7 +127,7 @@ def test_the_number_format_of_the_model_stays(tmp_path: Path) -> None:
     assert torch.isfinite(run(model)).all()
 
 
-def test_adapters_of_another_transformer_and_pickles_are_refused(tmp_path: Path) -> None:
+def test_adapters_of_another_transformer_and_pickles_are_refused(tmp_path):
     trained(tmp_path / 'a')
     with pytest.raises(CheckpointError, match='of num_layers 2, this one has 3'):
         Adapters(build(num_layers=3)).use(tmp_path / 'a')

@@ -1,7 +1,5 @@
 """The presets of the paper's size: the published architectures, counted without memory."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -16,7 +14,7 @@ PUBLISHED = {'wan-1.3b': (1536, 8960, 30, 12), 'wan-14b': (5120, 13824, 40, 40)}
 
 
 @pytest.mark.parametrize('preset', PUBLISHED)
-def test_a_preset_has_the_published_number_of_parameters(preset: str) -> None:
+def test_a_preset_has_the_published_number_of_parameters(preset):
     dim, ffn, layers, heads = PUBLISHED[preset]
     config = load_training_config(preset)
     with torch.device('meta'):
@@ -32,7 +30,7 @@ def test_a_preset_has_the_published_number_of_parameters(preset: str) -> None:
 
 
 @pytest.mark.parametrize('preset', PUBLISHED)
-def test_a_preset_predicts_the_papers_chunk(preset: str) -> None:
+def test_a_preset_predicts_the_papers_chunk(preset):
     """Two views of 81 frames at 288x384; 4k + 1 frames and multiples of 16, as the VAE needs."""
     video = load_training_config(preset).video
     assert (video.views, 1 + video.num_frames) == (('low', 'high'), 81)

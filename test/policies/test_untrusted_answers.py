@@ -52,7 +52,7 @@ def as_lerobot(monkeypatch):
 
 @pytest.mark.parametrize('dtype', [torch.float32, torch.float64, torch.float16, torch.bfloat16])
 @pytest.mark.parametrize('protocol', [3, 4, 5])
-def test_tensors_of_all_kinds_are_read(as_lerobot, dtype, protocol) -> None:
+def test_tensors_of_all_kinds_are_read(as_lerobot, dtype, protocol):
     table = torch.arange(12, dtype=dtype).reshape(3, 4)
     actions = [TimedAction(0.5 * n, n, row) for n, row in enumerate(table)]  # share a storage
     read = read_timed_actions(pickle.dumps(actions, protocol=protocol))
@@ -104,18 +104,18 @@ WILD = {
 
 
 @pytest.mark.parametrize('name', WILD)
-def test_pickles_that_are_no_actions_are_refused(name) -> None:
+def test_pickles_that_are_no_actions_are_refused(name):
     with pytest.raises(PolicyError):
         read_timed_actions(WILD[name])
 
 
-def test_the_hash_bomb_is_one() -> None:
+def test_the_hash_bomb_is_one():
     """The same instructions with few levels are a pickle that Python reads."""
     assert pickle.loads(nested_hash(2)) == {((1, 1), (1, 1)): 1}  # noqa: S301
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_mutated_answers_end_in_an_answer_or_a_refusal(as_lerobot, seed) -> None:
+def test_mutated_answers_end_in_an_answer_or_a_refusal(as_lerobot, seed):
     rng = np.random.default_rng(seed)
     actions = [TimedAction(0.0, n, torch.full((3,), float(n))) for n in range(3)]
     data = pickle.dumps(actions)
@@ -153,13 +153,13 @@ def deep(levels: int) -> bytes:
         msgpack.packb({b'__npgeneric__': True, b'data': [[1]], b'dtype': 'O'}),
     ],
 )
-def test_msgpack_that_is_no_answer_is_refused(data) -> None:
+def test_msgpack_that_is_no_answer_is_refused(data):
     with pytest.raises(PolicyError):
         unpack(data)
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_mutated_msgpack_ends_in_an_answer_or_a_refusal(seed) -> None:
+def test_mutated_msgpack_ends_in_an_answer_or_a_refusal(seed):
     rng = np.random.default_rng(seed)
     whole = pack({'actions': np.ones((4, 7)), 'policy_timing': {'infer_ms': 1.5}})
     for _ in range(200):

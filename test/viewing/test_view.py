@@ -60,7 +60,7 @@ def write_predictions(path: Path, start_ns: int = START_NS) -> Path:
     return path
 
 
-def test_an_episode_and_its_predictions_are_of_one_time(tmp_path: Path) -> None:
+def test_an_episode_and_its_predictions_are_of_one_time(tmp_path):
     streams = read_streams([EPISODE, write_predictions(tmp_path / 'predictions')])
     assert streams.views == ('low', 'high')
     assert streams.kinds == ('real', 'trajectory', 'imagined')
@@ -75,9 +75,7 @@ def test_an_episode_and_its_predictions_are_of_one_time(tmp_path: Path) -> None:
     assert {kind for kind, *_ in streams.joints} == {'real'}
 
 
-def test_a_long_video_is_shorter_in_frames_and_bytes_not_in_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_video_is_shorter_in_frames_and_bytes_not_in_time(tmp_path, monkeypatch):
     bag = write_predictions(tmp_path / 'predictions')
     monkeypatch.setattr(sheets, 'MAX_VIDEO_FRAMES', 2)
     sheet, video = sheets.write_pictures([bag], tmp_path)
@@ -93,14 +91,14 @@ def test_a_long_video_is_shorter_in_frames_and_bytes_not_in_time(
     assert sheet.is_file() and not video.exists()
 
 
-def test_bags_of_different_times_are_refused(tmp_path: Path) -> None:
+def test_bags_of_different_times_are_refused(tmp_path):
     later = write_predictions(tmp_path / 'later', START_NS + 10**15)
     with pytest.raises(EpisodeError, match='of different times, 1000000 s .*; give one of them'):
         read_streams([EPISODE, later])
     assert read_streams([later]).views == ('low',)
 
 
-def test_a_bag_without_images_is_refused(tmp_path: Path) -> None:
+def test_a_bag_without_images_is_refused(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
         value = messages.serialize(
             'std_msgs/msg/Float64', messages.make('std_msgs/msg/Float64', data=1.0)
@@ -110,9 +108,7 @@ def test_a_bag_without_images_is_refused(tmp_path: Path) -> None:
         read_streams([tmp_path / 'bag'])
 
 
-def test_the_command_writes_a_file_for_the_viewer(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_a_file_for_the_viewer(tmp_path, capsys):
     rerun = pytest.importorskip('rerun')
     del rerun
     predictions = write_predictions(tmp_path / 'predictions')
@@ -125,7 +121,7 @@ def test_the_command_writes_a_file_for_the_viewer(
     assert "view.rrd' exists; give another --save FILE" in capsys.readouterr().err
 
 
-def test_browsers_get_the_viewer_and_a_port_in_use_is_told(tmp_path: Path) -> None:
+def test_browsers_get_the_viewer_and_a_port_in_use_is_told(tmp_path):
     pytest.importorskip('rerun')
     from mtv_world_ros.viewing import rerun_log
 
@@ -143,9 +139,7 @@ def test_browsers_get_the_viewer_and_a_port_in_use_is_told(tmp_path: Path) -> No
     assert b're_viewer' in page
 
 
-def test_without_the_extra_one_line_says_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_extra_one_line_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(__import__('sys').modules, 'rerun', None)
     assert main(['view', str(EPISODE), '--save', str(tmp_path / 'x.rrd')]) == 1
     assert "pip install 'mtv_world_ros[view]'" in capsys.readouterr().err
@@ -153,7 +147,7 @@ def test_without_the_extra_one_line_says_so(
     assert "there is no 'nowhere'" in capsys.readouterr().err
 
 
-def test_pictures_show_what_there_is_and_grey_where_there_is_nothing(tmp_path: Path) -> None:
+def test_pictures_show_what_there_is_and_grey_where_there_is_nothing(tmp_path):
     from mtv_world_ros.rendering.video import decode_video
     from mtv_world_ros.viewing.sheets import compared, write_pictures
 

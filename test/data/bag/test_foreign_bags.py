@@ -66,7 +66,7 @@ def _camera() -> Any:
 
 
 @pytest.fixture
-def foreign_bag(tmp_path: Path) -> Callable[..., Path]:
+def foreign_bag(tmp_path) -> Callable[..., Path]:
     """Records (topic, type, log stamp, message) with rosbags, as a robot would."""
 
     def make(*entries: tuple[str, str, int, Any], name: str = 'bag') -> Path:
@@ -88,7 +88,7 @@ def read(path: Path, **options: Any):
 IMAGE, STATE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/JointState'
 
 
-def test_the_frames_before_a_cut_are_all_there(tmp_path) -> None:
+def test_the_frames_before_a_cut_are_all_there(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (30, 48, 64, 3), np.uint8)
     with BagWriter(tmp_path / 'bag') as writer:
         for index, frame in enumerate(noise):
@@ -109,13 +109,13 @@ def test_the_frames_before_a_cut_are_all_there(tmp_path) -> None:
     assert len(set(counts)) >= 5
 
 
-def test_an_unknown_encoding_is_named_with_its_topic(foreign_bag) -> None:
+def test_an_unknown_encoding_is_named_with_its_topic(foreign_bag):
     path = foreign_bag(('/low/image_raw', IMAGE, 5, image(5, encoding='32FC1')))
     with pytest.raises(EpisodeError, match=r"view 'low'.*/low/image_raw.*32FC1.*rgb8"):
         read(path)
 
 
-def test_an_unknown_compression_is_named_with_its_topic(foreign_bag) -> None:
+def test_an_unknown_compression_is_named_with_its_topic(foreign_bag):
     kind = 'sensor_msgs/msg/CompressedImage'
     message = STORE.types[kind](header=header(5), format='h264', data=np.zeros(9, np.uint8))
     path = foreign_bag(('/low/image_raw/compressed', kind, 5, message))
@@ -123,14 +123,14 @@ def test_an_unknown_compression_is_named_with_its_topic(foreign_bag) -> None:
         read(path)
 
 
-def test_padded_rows_are_read(foreign_bag) -> None:
+def test_padded_rows_are_read(foreign_bag):
     data = np.array([1, 2, 3, 99, 99, 4, 5, 6, 99, 99], np.uint8)
     path = foreign_bag(('/low/image_raw', IMAGE, 5, image(5, step=5, data=data)))
     frames = read(path).images['low'].frames
     assert frames[0][..., 0].tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
-def test_bad_frames_are_left_out_and_counted(foreign_bag) -> None:
+def test_bad_frames_are_left_out_and_counted(foreign_bag):
     path = foreign_bag(
         ('/low/image_raw', IMAGE, 1, image(1, step=2)),
         ('/low/image_raw', IMAGE, 2, image(2)),
@@ -143,7 +143,7 @@ def test_bad_frames_are_left_out_and_counted(foreign_bag) -> None:
     assert '2 messages were left out, the first: image of 3x2 mono8' in episode.warnings[0]
 
 
-def test_stamps_of_the_headers_count_and_are_sorted(foreign_bag) -> None:
+def test_stamps_of_the_headers_count_and_are_sorted(foreign_bag):
     path = foreign_bag(
         ('/low/image_raw', IMAGE, 100, image(30, 3)),
         ('/low/image_raw', IMAGE, 101, image(10, 1)),
@@ -157,7 +157,7 @@ def test_stamps_of_the_headers_count_and_are_sorted(foreign_bag) -> None:
     assert [text for text in episode.warnings if '1 stamps came twice' in text]
 
 
-def test_log_times_stand_in_for_missing_stamps(foreign_bag) -> None:
+def test_log_times_stand_in_for_missing_stamps(foreign_bag):
     path = foreign_bag(
         ('/low/image_raw', IMAGE, 100, image(0)), ('/low/image_raw', IMAGE, 150, image(0))
     )
@@ -166,7 +166,7 @@ def test_log_times_stand_in_for_missing_stamps(foreign_bag) -> None:
     assert episode.warnings == ("'/low/image_raw': headers without stamp; log times are used",)
 
 
-def test_topics_of_other_robots_are_mapped(foreign_bag) -> None:
+def test_topics_of_other_robots_are_mapped(foreign_bag):
     path = foreign_bag(
         ('/camera_low/color/image_raw', IMAGE, 1, image(1, 1)),
         ('/camera_low/color/camera_info', 'sensor_msgs/msg/CameraInfo', 1, camera_info(1)),
@@ -187,7 +187,7 @@ def test_topics_of_other_robots_are_mapped(foreign_bag) -> None:
 
 
 @pytest.mark.parametrize('named', ['/cam/image', '/cam/image/compressed'])
-def test_a_mapped_topic_may_be_compressed(foreign_bag, named) -> None:
+def test_a_mapped_topic_may_be_compressed(foreign_bag, named):
     kind = 'sensor_msgs/msg/CompressedImage'
     data = cv2.imencode('.png', np.full((2, 3, 3), 9, np.uint8))[1].ravel()
     message = STORE.types[kind](header=header(5), format='png', data=data)
@@ -195,7 +195,7 @@ def test_a_mapped_topic_may_be_compressed(foreign_bag, named) -> None:
     assert read(path, topics={'low': named}).images['low'].frames[0][0, 0, 0] == 9
 
 
-def test_raw_images_are_preferred_to_compressed_ones(foreign_bag) -> None:
+def test_raw_images_are_preferred_to_compressed_ones(foreign_bag):
     kind = 'sensor_msgs/msg/CompressedImage'
     data = cv2.imencode('.png', np.full((2, 3, 3), 9, np.uint8))[1].ravel()
     message = STORE.types[kind](header=header(5), format='png', data=data)
@@ -206,13 +206,13 @@ def test_raw_images_are_preferred_to_compressed_ones(foreign_bag) -> None:
     assert read(path).images['low'].frames[0][0, 0, 0] == 7
 
 
-def test_a_bag_without_states_commands_and_masks_is_read(foreign_bag) -> None:
+def test_a_bag_without_states_commands_and_masks_is_read(foreign_bag):
     episode = read(foreign_bag(('/low/image_raw', IMAGE, 1, image(1))))
     assert (episode.joint_states, episode.trajectories, episode.masks) == (None, [], None)
     assert (episode.info.task, episode.info.outcome, episode.info.seed) == ('', 'unknown', None)
 
 
-def test_the_instruction_topic_stands_in_for_metadata(foreign_bag) -> None:
+def test_the_instruction_topic_stands_in_for_metadata(foreign_bag):
     text = STORE.types['std_msgs/msg/String'](data='stack them')
     path = foreign_bag(
         ('/low/image_raw', IMAGE, 1, image(1)), ('/instruction', 'std_msgs/msg/String', 3, text)
@@ -221,7 +221,7 @@ def test_the_instruction_topic_stands_in_for_metadata(foreign_bag) -> None:
     assert read_info(path).instruction == 'stack them'
 
 
-def test_bad_trajectories_are_left_out_with_the_reason(tmp_path) -> None:
+def test_bad_trajectories_are_left_out_with_the_reason(tmp_path):
     kind = 'trajectory_msgs/msg/JointTrajectory'
     point = STORE.types['trajectory_msgs/msg/JointTrajectoryPoint']
     duration = STORE.types['builtin_interfaces/msg/Duration']
@@ -251,7 +251,7 @@ def test_bad_trajectories_are_left_out_with_the_reason(tmp_path) -> None:
     assert '5 messages were left out' in episode.warnings[0]
 
 
-def test_surplus_bytes_after_a_message_are_tolerated(tmp_path) -> None:
+def test_surplus_bytes_after_a_message_are_tolerated(tmp_path):
     # rclpy's serialize_message gives 76 bytes for a JointState of 68
     data = messages.serialize(STATE, joint_state(1, a=0.5)) + bytes(8)
     with BagWriter(tmp_path / 'bag') as writer:
@@ -262,7 +262,7 @@ def test_surplus_bytes_after_a_message_are_tolerated(tmp_path) -> None:
     assert states.positions.tolist() == [[0.5]]
 
 
-def test_a_topic_of_another_type_is_not_taken(foreign_bag) -> None:
+def test_a_topic_of_another_type_is_not_taken(foreign_bag):
     path = foreign_bag(
         ('/low/image_raw', IMAGE, 1, image(1)), ('/joint_trajectory', IMAGE, 1, image(1))
     )
@@ -271,7 +271,7 @@ def test_a_topic_of_another_type_is_not_taken(foreign_bag) -> None:
     assert 'expected trajectory_msgs/msg/JointTrajectory' in episode.warnings[0]
 
 
-def test_camera_info_that_changes_within_an_episode_is_refused(foreign_bag, make_episode) -> None:
+def test_camera_info_that_changes_within_an_episode_is_refused(foreign_bag, make_episode):
     kind = 'sensor_msgs/msg/CameraInfo'
     entries = [
         ('/low/camera_info', kind, n, camera_info(n, f)) for n, f in enumerate([50.0, 50.0])
@@ -289,7 +289,7 @@ def test_camera_info_that_changes_within_an_episode_is_refused(foreign_bag, make
         read_episode(path, calibration=calibration)
 
 
-def test_labels_that_ros2_bag_record_was_given_count(foreign_bag) -> None:
+def test_labels_that_ros2_bag_record_was_given_count(foreign_bag):
     path = foreign_bag(('/low/image_raw', IMAGE, 1, image(1)))
     content = yaml.safe_load((path / 'metadata.yaml').read_text())
     labels = {'task': 'stack', 'outcome': 'failure', 'operator': 'kim'}

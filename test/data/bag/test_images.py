@@ -19,7 +19,7 @@ ROWS = {
 
 @pytest.mark.parametrize('padding', [0, 1, 5])
 @pytest.mark.parametrize('encoding', ROWS)
-def test_every_encoding_becomes_rgb_whatever_the_padding(encoding, padding) -> None:
+def test_every_encoding_becomes_rgb_whatever_the_padding(encoding, padding):
     row = ROWS[encoding] + [99] * padding
     data = np.array(row * 3, np.uint8)
     image = raw_to_rgb(data, encoding=encoding, height=3, width=2, step=len(row))
@@ -27,7 +27,7 @@ def test_every_encoding_becomes_rgb_whatever_the_padding(encoding, padding) -> N
     assert image.tolist() == [[list(RED), list(GREEN)]] * 3
 
 
-def test_grey_becomes_rgb() -> None:
+def test_grey_becomes_rgb():
     data = np.array([1, 2, 0, 3, 4, 0], np.uint8)
     image = raw_to_rgb(data, encoding='mono8', height=2, width=2, step=3)
     assert image.tolist() == [[[1, 1, 1], [2, 2, 2]], [[3, 3, 3], [4, 4, 4]]]
@@ -51,7 +51,7 @@ def agrees(image: np.ndarray, tolerance: int) -> bool:
 
 
 @pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
-def test_bayer_patterns_become_rgb(pattern) -> None:
+def test_bayer_patterns_become_rgb(pattern):
     rgb = picture()
     mosaic = np.zeros(rgb.shape[:2], np.uint8)
     for place, letter in enumerate(pattern):
@@ -66,7 +66,7 @@ def test_bayer_patterns_become_rgb(pattern) -> None:
     ('encoding', 'order'), [('uyvy', 'uyvy'), ('yuv422', 'uyvy'), ('yuyv', 'yuyv'),
                             ('yuv422_yuy2', 'yuyv')]
 )  # fmt: skip
-def test_packed_yuv_becomes_rgb(encoding, order) -> None:
+def test_packed_yuv_becomes_rgb(encoding, order):
     y, u, v = luma_and_colours()
     packed = np.zeros((24, 16, 4), np.uint8)
     lumas = iter((y[:, ::2], y[:, 1::2]))
@@ -77,7 +77,7 @@ def test_packed_yuv_becomes_rgb(encoding, order) -> None:
 
 
 @pytest.mark.parametrize(('encoding', 'order'), [('nv12', 'uv'), ('nv21', 'vu')])
-def test_planar_yuv_becomes_rgb(encoding, order) -> None:
+def test_planar_yuv_becomes_rgb(encoding, order):
     y, u, v = luma_and_colours()
     colours = [{'u': u, 'v': v}[letter][::2, ::2] for letter in order]
     data = np.concatenate([y, np.stack(colours, -1).reshape(12, 32)])
@@ -94,13 +94,13 @@ def luma_and_colours() -> list[np.ndarray]:
     return [plane.round().astype(np.uint8) for plane in (y, u, v)]
 
 
-def test_the_last_row_needs_no_padding() -> None:
+def test_the_last_row_needs_no_padding():
     data = np.array([1, 2, 0, 3, 4], np.uint8)
     image = raw_to_rgb(data, encoding='mono8', height=2, width=2, step=3)
     assert image[1, 1, 0] == 4
 
 
-def test_the_image_does_not_hang_on_the_message() -> None:
+def test_the_image_does_not_hang_on_the_message():
     data = np.array(ROWS['rgb8'], np.uint8)
     image = raw_to_rgb(data, encoding='rgb8', height=1, width=2, step=6)
     data[:] = 0
@@ -120,13 +120,13 @@ def test_the_image_does_not_hang_on_the_message() -> None:
         ({'width': 0}, '0x3'),
     ],
 )
-def test_what_cannot_be_an_image_is_refused_with_numbers(fields, reason) -> None:
+def test_what_cannot_be_an_image_is_refused_with_numbers(fields, reason):
     layout = {'encoding': 'rgb8', 'height': 3, 'width': 2, 'step': 6, **fields}
     with pytest.raises(ObservationError, match=reason):
         raw_to_rgb(np.zeros(18, np.uint8), **layout)
 
 
-def test_png_is_exact_and_jpeg_has_its_colours_in_order() -> None:
+def test_png_is_exact_and_jpeg_has_its_colours_in_order():
     rgb = np.zeros((16, 16, 3), np.uint8)
     rgb[:] = RED
     png = cv2.imencode('.png', rgb[..., ::-1])[1].ravel()
@@ -135,13 +135,13 @@ def test_png_is_exact_and_jpeg_has_its_colours_in_order() -> None:
     assert abs(compressed_to_rgb('bgr8; jpeg compressed bgr8', jpeg) - rgb.astype(int)).max() < 6
 
 
-def test_a_padded_jpeg_is_read() -> None:
+def test_a_padded_jpeg_is_read():
     jpeg = cv2.imencode('.jpg', np.zeros((16, 16, 3), np.uint8))[1].tobytes() + bytes(1000)
     assert compressed_to_rgb('jpeg', np.frombuffer(jpeg, np.uint8)).shape == (16, 16, 3)
 
 
 @pytest.mark.parametrize('extension', ['.jpg', '.png'])
-def test_a_cut_file_is_refused_rather_than_filled_with_grey(extension) -> None:
+def test_a_cut_file_is_refused_rather_than_filled_with_grey(extension):
     noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
     data = cv2.imencode(extension, noise)[1].ravel()
     for length in (5, 100, len(data) // 2, len(data) - 30):
@@ -159,12 +159,12 @@ def test_a_cut_file_is_refused_rather_than_filled_with_grey(extension) -> None:
         ('16UC1; png compressed 16UC1', b'\x89PNG....IEND', 'holds depth'),
     ],
 )
-def test_other_formats_are_refused_by_name(layout, data, reason) -> None:
+def test_other_formats_are_refused_by_name(layout, data, reason):
     with pytest.raises(ObservationError, match=reason):
         compressed_to_rgb(layout, np.frombuffer(data, np.uint8))
 
 
-def test_masks_have_one_channel() -> None:
+def test_masks_have_one_channel():
     ids = np.arange(64, dtype=np.uint8).reshape(8, 8)
     png = cv2.imencode('.png', ids)[1].ravel()
     np.testing.assert_array_equal(compressed_to_ids('mono8; png compressed mono8', png), ids)
@@ -175,7 +175,7 @@ def test_masks_have_one_channel() -> None:
 
 @pytest.mark.parametrize('is_bigendian', [0, 1])
 @pytest.mark.parametrize('encoding', ['rgb16', 'bgr16', 'mono16', 'bayer_rggb16'])
-def test_sixteen_bits_become_eight(encoding, is_bigendian) -> None:
+def test_sixteen_bits_become_eight(encoding, is_bigendian):
     eight = {'rgb16': 'rgb8', 'bgr16': 'bgr8', 'mono16': 'mono8', 'bayer_rggb16': 'bayer_rggb8'}
     channels = 3 if 'b16' in encoding[1:5] or encoding == 'bgr16' else 1
     values = np.random.default_rng(0).integers(0, 2**16, (4, 6 * channels), np.uint16)

@@ -43,7 +43,7 @@ def write_with_mcap(path: Path, *, count: int = 5, encoding: str = 'cdr', **opti
 
 
 @pytest.fixture(scope='module')
-def noise(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def noise(tmp_path_factory) -> Path:
     return write_noise(tmp_path_factory.mktemp('bags') / 'noise')
 
 
@@ -54,7 +54,7 @@ def chunks(path: Path) -> list:
     return summary.chunk_indexes
 
 
-def test_messages_come_as_recorded(noise) -> None:
+def test_messages_come_as_recorded(noise):
     found = list(iter_messages(noise))
     assert [m.stamp_ns for m in found] == list(range(1000, 1040))
     assert all(m.data == payload(i) for i, m in enumerate(found))
@@ -63,7 +63,7 @@ def test_messages_come_as_recorded(noise) -> None:
 
 
 @pytest.mark.parametrize('in_folder', [True, False])
-def test_wherever_a_bag_is_cut_it_is_read_up_to_there(noise, tmp_path, in_folder) -> None:
+def test_wherever_a_bag_is_cut_it_is_read_up_to_there(noise, tmp_path, in_folder):
     content = (noise / 'noise_0.mcap').read_bytes()
     (tmp_path / 'cut').mkdir()
     cut_file = tmp_path / 'cut' / 'noise_0.mcap'
@@ -85,7 +85,7 @@ def test_wherever_a_bag_is_cut_it_is_read_up_to_there(noise, tmp_path, in_folder
     assert len(set(counts)) > len(chunks(noise / 'noise_0.mcap')) + 1
 
 
-def test_a_cut_index_loses_no_message_and_is_mentioned(noise, tmp_path) -> None:
+def test_a_cut_index_loses_no_message_and_is_mentioned(noise, tmp_path):
     content = (noise / 'noise_0.mcap').read_bytes()
     for missing in (1, 8, 20, 36, 60, 100):
         (tmp_path / 'a.mcap').write_bytes(content[:-missing])
@@ -96,7 +96,7 @@ def test_a_cut_index_loses_no_message_and_is_mentioned(noise, tmp_path) -> None:
             assert 'lost its index' in reader.problems[0]
 
 
-def test_a_cut_bag_raises_at_its_end_unless_problems_are_asked_for(noise, tmp_path) -> None:
+def test_a_cut_bag_raises_at_its_end_unless_problems_are_asked_for(noise, tmp_path):
     content = (noise / 'noise_0.mcap').read_bytes()
     (tmp_path / 'a.mcap').write_bytes(content[:500_000])
     iterator = iter_messages(tmp_path / 'a.mcap')
@@ -108,7 +108,7 @@ def test_a_cut_bag_raises_at_its_end_unless_problems_are_asked_for(noise, tmp_pa
     assert 'cut off' in problems[0]
 
 
-def test_a_damaged_chunk_ends_the_record(noise, tmp_path) -> None:
+def test_a_damaged_chunk_ends_the_record(noise, tmp_path):
     content = bytearray((noise / 'noise_0.mcap').read_bytes())
     second = chunks(noise / 'noise_0.mcap')[1]
     content[second.chunk_start_offset + 100_000] ^= 0xFF
@@ -120,7 +120,7 @@ def test_a_damaged_chunk_ends_the_record(noise, tmp_path) -> None:
     assert all(m.data == payload(i) for i, m in enumerate(found))
 
 
-def test_a_damaged_length_ends_the_record(noise, tmp_path) -> None:
+def test_a_damaged_length_ends_the_record(noise, tmp_path):
     content = bytearray((noise / 'noise_0.mcap').read_bytes())
     second = chunks(noise / 'noise_0.mcap')[1]
     content[second.chunk_start_offset + 1 : second.chunk_start_offset + 9] = b'\xff' * 8
@@ -140,14 +140,14 @@ def test_a_damaged_length_ends_the_record(noise, tmp_path) -> None:
         {'enable_crcs': False},
     ],
 )
-def test_every_layout_of_mcap_is_read(options, tmp_path) -> None:
+def test_every_layout_of_mcap_is_read(options, tmp_path):
     path = write_with_mcap(tmp_path / 'a.mcap', **options)
     found = list(iter_messages(path))
     assert [m.data for m in found] == [payload(i, 100) for i in range(5)]
 
 
 @pytest.mark.parametrize('compression', [CompressionType.NONE, CompressionType.LZ4])
-def test_cut_chunks_of_every_compression_give_what_they_have(compression, tmp_path) -> None:
+def test_cut_chunks_of_every_compression_give_what_they_have(compression, tmp_path):
     path = write_with_mcap(tmp_path / 'a.mcap', count=3000, compression=compression)
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 3])
@@ -157,21 +157,21 @@ def test_cut_chunks_of_every_compression_give_what_they_have(compression, tmp_pa
     assert 'cut off' in problems[0]
 
 
-def test_messages_that_are_not_cdr_are_left_out_and_named(tmp_path) -> None:
+def test_messages_that_are_not_cdr_are_left_out_and_named(tmp_path):
     path = write_with_mcap(tmp_path / 'a.mcap', encoding='json')
     problems: list[str] = []
     assert list(iter_messages(path, problems=problems)) == []
     assert problems == ["'/noise' was left out: it is encoded as 'json', not as cdr with a schema"]
 
 
-def test_only_the_topics_asked_for_come(tmp_path) -> None:
+def test_only_the_topics_asked_for_come(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
         for topic in ('/a', '/b', '/c'):
             writer.write_raw(topic, TYPE, 0, payload(0, 10))
     assert [m.topic for m in iter_messages(tmp_path / 'bag', {'/b', '/c', '/d'})] == ['/b', '/c']
 
 
-def test_files_of_a_split_bag_are_read_in_order(tmp_path) -> None:
+def test_files_of_a_split_bag_are_read_in_order(tmp_path):
     folder = tmp_path / 'bag'
     folder.mkdir()
     for name in ('bag_0.mcap', 'bag_1.mcap', 'bag_10.mcap'):
@@ -186,7 +186,7 @@ def test_files_of_a_split_bag_are_read_in_order(tmp_path) -> None:
 
 
 @pytest.mark.parametrize('content', [None, '', '- 1', 'a: {', 'rosbag2_bagfile_information: 3'])
-def test_a_folder_is_read_without_usable_metadata_yaml(content, noise, tmp_path) -> None:
+def test_a_folder_is_read_without_usable_metadata_yaml(content, noise, tmp_path):
     shutil.copytree(noise, tmp_path / 'noise')
     (tmp_path / 'noise' / 'metadata.yaml').unlink()
     if content is not None:
@@ -208,21 +208,21 @@ def test_a_folder_is_read_without_usable_metadata_yaml(content, noise, tmp_path)
     ],
 )
 @pytest.mark.parametrize('in_folder', [True, False])
-def test_other_files_are_refused_by_name(name, content, reason, in_folder, tmp_path) -> None:
+def test_other_files_are_refused_by_name(name, content, reason, in_folder, tmp_path):
     file = tmp_path / name
     file.write_bytes(content)
     with pytest.raises(EpisodeError, match=reason):
         list(iter_messages(tmp_path if in_folder else file))
 
 
-def test_what_is_no_bag_is_refused(tmp_path) -> None:
+def test_what_is_no_bag_is_refused(tmp_path):
     with pytest.raises(EpisodeError, match='there is no episode'):
         BagReader(tmp_path / 'missing')
     with pytest.raises(EpisodeError, match='holds no .mcap or .db3 file'):
         BagReader(tmp_path)
 
 
-def test_an_unknown_compression_is_named(tmp_path) -> None:
+def test_an_unknown_compression_is_named(tmp_path):
     path = write_with_mcap(tmp_path / 'a.mcap', compression=CompressionType.ZSTD)
     path.write_bytes(path.read_bytes().replace(b'\x04\0\0\0zstd', b'\x04\0\0\0zmtv'))
     with pytest.raises(EpisodeError, match="compressed with 'zmtv'; known are zstd and lz4"):
@@ -236,7 +236,7 @@ def test_an_unknown_compression_is_named(tmp_path) -> None:
         (b'\x04\0\0\0note', 'damaged metadata record'),
     ],
 )
-def test_damaged_declarations_and_metadata_are_mentioned(damaged, expected, tmp_path) -> None:
+def test_damaged_declarations_and_metadata_are_mentioned(damaged, expected, tmp_path):
     path = tmp_path / 'a.mcap'
     with path.open('wb') as stream:
         writer = Writer(stream, use_chunking=False)

@@ -23,13 +23,13 @@ def profiles_of(reader: Reader) -> dict[str, Any]:
     return {c.topic: cast('Any', c.ext).offered_qos_profiles[0] for c in reader.connections}
 
 
-def test_an_exception_leaves_nothing(tmp_path) -> None:
+def test_an_exception_leaves_nothing(tmp_path):
     with pytest.raises(RuntimeError, match='simulator fell over'):
         _record_and_fail(tmp_path / 'episode')
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_killed_recorder_leaves_nothing_under_the_name(tmp_path) -> None:
+def test_a_killed_recorder_leaves_nothing_under_the_name(tmp_path):
     code = (
         'import os, signal\n'
         'from mtv_world_ros.data.episode_writer import EpisodeWriter\n'
@@ -45,7 +45,7 @@ def test_a_killed_recorder_leaves_nothing_under_the_name(tmp_path) -> None:
     assert all(left.name.startswith('.episode.') for left in tmp_path.iterdir())
 
 
-def test_an_existing_episode_is_kept_unless_overwritten(make_episode, tmp_path) -> None:
+def test_an_existing_episode_is_kept_unless_overwritten(make_episode, tmp_path):
     path = make_episode('kept')
     before = (path / 'metadata.yaml').read_bytes()
     with pytest.raises(EpisodeError, match='exists already'):
@@ -60,7 +60,7 @@ def test_an_existing_episode_is_kept_unless_overwritten(make_episode, tmp_path) 
     assert [left.name for left in tmp_path.iterdir()] == ['kept']
 
 
-def test_a_folder_that_is_no_bag_is_never_overwritten(tmp_path) -> None:
+def test_a_folder_that_is_no_bag_is_never_overwritten(tmp_path):
     (tmp_path / 'photos').mkdir()
     (tmp_path / 'photos' / 'cat.jpg').write_bytes(b'x')
     with pytest.raises(EpisodeError, match='not a bag folder'):
@@ -68,7 +68,7 @@ def test_a_folder_that_is_no_bag_is_never_overwritten(tmp_path) -> None:
     assert (tmp_path / 'photos' / 'cat.jpg').exists()
 
 
-def test_a_name_that_was_taken_meanwhile_is_respected(tmp_path) -> None:
+def test_a_name_that_was_taken_meanwhile_is_respected(tmp_path):
     writer = _writer(tmp_path / 'episode')
     (tmp_path / 'episode').mkdir()
     with pytest.raises(EpisodeError, match='exists already'):
@@ -77,7 +77,7 @@ def test_a_name_that_was_taken_meanwhile_is_respected(tmp_path) -> None:
     assert [left.name for left in tmp_path.iterdir()] == ['episode']
 
 
-def test_a_parent_that_cannot_be_written_is_named(tmp_path) -> None:
+def test_a_parent_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / 'file').write_bytes(b'')
     with pytest.raises(EpisodeError, match='cannot write .*file/episode'):
         _writer(tmp_path / 'file' / 'episode')
@@ -97,7 +97,7 @@ def test_a_parent_that_cannot_be_written_is_named(tmp_path) -> None:
         (lambda w: w.write_raw('/instruction', 'std_msgs/msg/Bool', 0, b''), 'recorded as'),
     ],
 )
-def test_what_cannot_be_recorded_is_refused_with_a_reason(write, reason, tmp_path) -> None:
+def test_what_cannot_be_recorded_is_refused_with_a_reason(write, reason, tmp_path):
     with _writer(tmp_path / 'episode') as writer:
         writer.write_instruction(0)
         with pytest.raises(EpisodeError, match=reason):
@@ -105,7 +105,7 @@ def test_what_cannot_be_recorded_is_refused_with_a_reason(write, reason, tmp_pat
     assert [m.topic for m in iter_messages(tmp_path / 'episode')] == ['/instruction']
 
 
-def test_any_standard_topic_can_be_recorded_as_raw_bytes(tmp_path) -> None:
+def test_any_standard_topic_can_be_recorded_as_raw_bytes(tmp_path):
     types = [
         'sensor_msgs/msg/Image',
         'std_msgs/msg/Float64',
@@ -129,7 +129,7 @@ def test_any_standard_topic_can_be_recorded_as_raw_bytes(tmp_path) -> None:
         assert [c.msgtype for c in reader.connections] == types
 
 
-def test_a_declared_profile_is_recorded_and_kept(tmp_path) -> None:
+def test_a_declared_profile_is_recorded_and_kept(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
         writer.declare('/a', 'std_msgs/msg/String', Qos(reliability='best_effort', depth=3))
         writer.declare('/b', 'std_msgs/msg/String', LATCHED)
@@ -140,7 +140,7 @@ def test_a_declared_profile_is_recorded_and_kept(tmp_path) -> None:
     assert offered['/b'].durability.name == 'TRANSIENT_LOCAL'
 
 
-def test_an_empty_bag_is_a_valid_bag(tmp_path) -> None:
+def test_an_empty_bag_is_a_valid_bag(tmp_path):
     with BagWriter(tmp_path / 'bag'):
         pass
     with Reader(tmp_path / 'bag') as reader:
@@ -148,7 +148,7 @@ def test_an_empty_bag_is_a_valid_bag(tmp_path) -> None:
     assert list(iter_messages(tmp_path / 'bag')) == []
 
 
-def test_threads_may_record_at_once(tmp_path) -> None:
+def test_threads_may_record_at_once(tmp_path):
     def record(topic: str) -> None:
         for index in range(200):
             writer.write_raw(topic, 'std_msgs/msg/String', index, b'\0\1\0\0\1\0\0\0\0')
@@ -165,7 +165,7 @@ def test_threads_may_record_at_once(tmp_path) -> None:
         }
 
 
-def test_nothing_can_be_recorded_after_close(tmp_path) -> None:
+def test_nothing_can_be_recorded_after_close(tmp_path):
     writer = BagWriter(tmp_path / 'bag')
     writer.close()
     writer.close()

@@ -15,7 +15,6 @@ from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import ByteArray, CameraModel, JointTrajectory, WorldModelSpec
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.pipeline import Pipeline, WorldModel
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
@@ -68,7 +67,7 @@ def scene(shift: float, view: str, grey: int) -> tuple[ByteArray, ByteArray]:
 
 
 @pytest.fixture(scope='session')
-def make_episode(robot: RobotModel) -> Callable[..., Path]:
+def make_episode(robot) -> Callable[..., Path]:
     """Records an episode of 19 frames at 10 Hz; the red block moves `speed` px a frame."""
     middle = (robot.lower + robot.upper) / 2
     first = np.arange(len(middle)) == 0
@@ -121,7 +120,7 @@ def make_episode(robot: RobotModel) -> Callable[..., Path]:
 
 
 @pytest.fixture(scope='session')
-def episodes(tmp_path_factory: pytest.TempPathFactory, make_episode: Callable) -> list[Path]:
+def episodes(tmp_path_factory, make_episode) -> list[Path]:
     """Three episodes with different speeds and reaches."""
     folder = tmp_path_factory.mktemp('episodes')
     return [
@@ -139,13 +138,13 @@ def episodes(tmp_path_factory: pytest.TempPathFactory, make_episode: Callable) -
 
 
 @pytest.fixture(scope='session')
-def recordings(episodes: list[Path], robot: RobotModel) -> list[Recording]:
+def recordings(episodes, robot) -> list[Recording]:
     """The same, read."""
     return [load_recording(path, SPEC, robot) for path in episodes]
 
 
 @pytest.fixture(scope='session')
-def make_pipeline(robot: RobotModel) -> Callable[..., Pipeline]:
+def make_pipeline(robot) -> Callable[..., Pipeline]:
     """A pipeline around a world model; by default the one that repeats the start frame."""
 
     def make(world_model: WorldModel | None = None, **options: object) -> Pipeline:
@@ -195,13 +194,13 @@ class OracleWorldModel:
 
 
 @pytest.fixture
-def oracle(recordings: list[Recording]) -> OracleWorldModel:
+def oracle(recordings) -> OracleWorldModel:
     """Knows the recorded future."""
     return OracleWorldModel(recordings)
 
 
 @pytest.fixture
-def blurred_oracle(recordings: list[Recording]) -> OracleWorldModel:
+def blurred_oracle(recordings) -> OracleWorldModel:
     """Knows the recorded future but draws it out of focus."""
     return OracleWorldModel(recordings, blur=1.0)
 

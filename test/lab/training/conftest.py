@@ -9,7 +9,6 @@ from sources import make_source
 
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
 
 TINY = {
@@ -41,12 +40,12 @@ def tiny() -> TrainingConfig:
 
 
 @pytest.fixture(scope='session')
-def recording(episode: Path, tiny: TrainingConfig, robot: RobotModel) -> Recording:
+def recording(episode, tiny, robot) -> Recording:
     return load_recording(episode, tiny.spec, robot)
 
 
 @pytest.fixture
-def source(recording: Recording, tiny: TrainingConfig, robot: RobotModel):
+def source(recording, tiny, robot):
     batches = make_source([recording], tiny, robot)
     yield batches
     batches.close()

@@ -1,7 +1,5 @@
 """The paper's rate by commands alone: episodes of 16 fps, a preset of 81 frames, its scores."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -29,7 +27,7 @@ MINIATURE = {
 
 
 @pytest.mark.skipif(bool(missing_opengl()), reason='the simulator cannot render here')
-def test_episodes_of_16_fps_are_collected_trained_on_and_scored(tmp_path: Path) -> None:
+def test_episodes_of_16_fps_are_collected_trained_on_and_scored(tmp_path):
     data, run, scores = (str(tmp_path / name) for name in ('data', 'run', 'scores'))
     collect = ['collect', '--task', 'place_block_a2b_left', '--episodes', '1', '--fps', '16']
     assert main([*collect, '--width', '64', '--height', '48', '--out', data]) == 0

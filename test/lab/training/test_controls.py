@@ -12,7 +12,6 @@ import torch
 
 from mtv_world_ros.assembly import checkpoint_path
 from mtv_world_ros.cli import main
-from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.objective import pooled_weights
@@ -36,9 +35,7 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     return load_file(folder / 'transformer' / 'diffusion_pytorch_model.safetensors')
 
 
-def test_a_run_cut_in_two_ends_as_the_whole_one(
-    episode: Path, tiny: TrainingConfig, robot: RobotModel, tmp_path: Path
-) -> None:
+def test_a_run_cut_in_two_ends_as_the_whole_one(episode, tiny, robot, tmp_path):
     config = tiny.replace(optimizer=tiny.optimizer.replace(decay_share=0.0))
     whole = run(config, episode, tmp_path / 'whole', robot)
     half = config.replace(optimizer=config.optimizer.replace(steps=2))
@@ -50,9 +47,7 @@ def test_a_run_cut_in_two_ends_as_the_whole_one(
     assert card == (whole / 'world_model.json').read_bytes()
 
 
-def test_object_masks_off_leaves_them_out_of_the_trajectory_video(
-    recording: Recording, tiny: TrainingConfig, robot: RobotModel
-) -> None:
+def test_object_masks_off_leaves_them_out_of_the_trajectory_video(recording, tiny, robot):
     def drawn_pixels(object_mask: bool) -> int:
         drawn = tiny.replace(video=tiny.video.replace(object_mask=object_mask))
         source = make_source([recording], drawn, robot)
@@ -64,9 +59,7 @@ def test_object_masks_off_leaves_them_out_of_the_trajectory_video(
     assert drawn_pixels(True) > drawn_pixels(False)
 
 
-def test_one_view_from_the_command_line_trains_and_evaluates(
-    episode: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_one_view_from_the_command_line_trains_and_evaluates(episode, tmp_path, capsys):
     out = tmp_path / 'run'
     command = ['train', str(episode.parent), '--out', str(out), '--threads', '1', *ONE_STEP]
     options = ['--views', 'low', '--object-mask', 'off']
@@ -85,12 +78,12 @@ def test_one_view_from_the_command_line_trains_and_evaluates(
     assert 'give --preset and --set as before, or another --out' in capsys.readouterr().err
 
 
-def test_training_needs_a_dataset_and_a_folder(capsys: pytest.CaptureFixture) -> None:
+def test_training_needs_a_dataset_and_a_folder(capsys):
     assert main(['train']) == 1
     assert 'mtv-world train DATASET --out DIR' in capsys.readouterr().err
 
 
-def test_a_checkpoint_of_another_control_is_refused(tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_control_is_refused(tmp_path):
     shutil.copytree(checkpoint_path('bundled'), tmp_path / 'old')
     card = tmp_path / 'old' / 'world_model.json'
     card.write_text(card.read_text().replace('trajectory_video', 'ee_mlp'))
@@ -98,7 +91,7 @@ def test_a_checkpoint_of_another_control_is_refused(tmp_path: Path) -> None:
         load_checkpoint(tmp_path / 'old')
 
 
-def test_latents_of_four_frames_weigh_their_pixels_mean() -> None:
+def test_latents_of_four_frames_weigh_their_pixels_mean():
     weights = torch.rand(1, 2, 8, 16, 24, generator=torch.Generator().manual_seed(0))
     found = pooled_weights(weights, (1, 2, 16, 3, 2, 3))
     assert found.shape == (1, 2, 16, 3, 2, 3)

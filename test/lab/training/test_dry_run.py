@@ -1,7 +1,5 @@
 """What a step takes: counted on shapes, against a step that is really computed."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -11,7 +9,7 @@ from mtv_world_ros.lab.training.training_config import load_training_config
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 
-def test_counts_what_a_real_step_does() -> None:
+def test_counts_what_a_real_step_does():
     config = load_training_config(
         'small',
         {
@@ -33,7 +31,7 @@ def test_counts_what_a_real_step_does() -> None:
 
 
 @pytest.mark.parametrize('rank', [0, 8])
-def test_operations_are_those_of_the_products(rank: int) -> None:
+def test_operations_are_those_of_the_products(rank):
     """Of a patch model: every product of matrices in the published block, counted by hand."""
     config = load_training_config(
         'wan-1.3b',
@@ -74,7 +72,7 @@ def test_operations_are_those_of_the_products(rank: int) -> None:
         assert cost.training_bytes == (4 * 4 + 2) * trained
 
 
-def test_the_command_prints_it_and_trains_nothing(capsys: pytest.CaptureFixture) -> None:
+def test_the_command_prints_it_and_trains_nothing(capsys):
     smaller = ['--set', 'transformer.num_layers=1', '--set', 'video.num_frames=4']
     assert main(['train', '--dry-run', *smaller]) == 0
     printed = capsys.readouterr().out

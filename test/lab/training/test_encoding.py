@@ -28,7 +28,7 @@ def conditions() -> Conditioning:
     )
 
 
-def test_control_start_image_and_its_tokens_are_dropped_by_themselves() -> None:
+def test_control_start_image_and_its_tokens_are_dropped_by_themselves():
     augment = AugmentConfig(
         control_dropout=0.1, reference_dropout=0.2, image_dropout=0.3, start_dropout=0.15
     )
@@ -49,7 +49,7 @@ def test_control_start_image_and_its_tokens_are_dropped_by_themselves() -> None:
     assert (out.text == 1).all()
 
 
-def test_the_start_image_is_in_one_place() -> None:
+def test_the_start_image_is_in_one_place():
     """As `clip_idx` of VideoX-Fun decides: 0 leaves the slot, any other frame the tokens."""
     frames = torch.rand(3, 2, 3, 1, 1)
     other = torch.rand(3, 2, 3, 1, 1) + 1
@@ -67,7 +67,7 @@ def test_the_start_image_is_in_one_place() -> None:
     assert torch.equal(mixed.anchor[1], other[1])
 
 
-def test_without_dropout_nothing_is_drawn() -> None:
+def test_without_dropout_nothing_is_drawn():
     draws = NoiseDraws(0, 0, range(COUNT))
     drop_conditions(conditions(), AugmentConfig(), draws)
     assert torch.equal(draws.uniform(), NoiseDraws(0, 0, range(COUNT)).uniform())
@@ -81,7 +81,7 @@ def test_without_dropout_nothing_is_drawn() -> None:
         (lambda: ObjectiveConfig(huber_delta=0.0), 'huber_delta is 0.0; it must be positive'),
     ],
 )
-def test_settings_out_of_range_are_refused(make, message: str) -> None:
+def test_settings_out_of_range_are_refused(make, message):
     with pytest.raises(ConfigError, match=message):
         make()
     assert AugmentConfig().replace(image_dropout=1.0).image_dropout == 1.0

@@ -11,17 +11,14 @@ from sources import ONE_STEP
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.lab.training.training_config import TrainingConfig, TrainingRun
+from mtv_world_ros.lab.training.training_config import TrainingRun
 from mtv_world_ros.lab.training.training_run import HeldOut, HeldOutScores, train
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.rendering.video import decode_video
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
-def test_the_best_checkpoint_by_the_judge_is_kept(
-    episode: Path, tiny: TrainingConfig, robot: RobotModel, tmp_path: Path
-) -> None:
+def test_the_best_checkpoint_by_the_judge_is_kept(episode, tiny, robot, tmp_path):
     scores = {1: float('nan'), 2: 0.3, 3: 0.5, 4: 0.4}
 
     def judge(checkpoint: Path, step: int) -> HeldOutScores:
@@ -41,9 +38,7 @@ def test_the_best_checkpoint_by_the_judge_is_kept(
     assert [row['j_moving'] for row in rows if 'j_moving' in row][1:] == [0.3, 0.5, 0.4]
 
 
-def test_the_command_scores_held_out_episodes_as_evaluate_does(
-    episode: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_the_command_scores_held_out_episodes_as_evaluate_does(episode, tmp_path, capsys):
     data = tmp_path / 'data'
     for name in ('seen', 'unseen'):
         shutil.copytree(episode, data / name)
@@ -69,14 +64,12 @@ def test_the_command_scores_held_out_episodes_as_evaluate_does(
     assert row['j_moving_low'] == pytest.approx(expected['views']['low']['j_moving'], abs=1e-4)
 
 
-def test_without_held_out_episodes_the_command_says_what_to_give(
-    episode: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_without_held_out_episodes_the_command_says_what_to_give(episode, tmp_path, capsys):
     command = ['train', str(episode.parent), '--out', str(tmp_path), '--sample-every', '5']
     assert main(command) == 1
     assert 'no split val or test; give --held-out DIR' in capsys.readouterr().err
 
 
-def test_a_negative_interval_is_refused() -> None:
+def test_a_negative_interval_is_refused():
     with pytest.raises(ConfigError, match='--sample-every is -1'):
         HeldOut(lambda folder, step: HeldOutScores(score=0.0, numbers={}), -1)

@@ -13,15 +13,12 @@ import torch
 import yaml
 
 from mtv_world_ros.lab.training.trainer import Trainer
-from mtv_world_ros.lab.training.training_config import TrainingConfig
 
 SCRIPT = Path(__file__).with_name('train_killed.py')
 ROOT = Path(__file__).parents[3]
 
 
-def test_kill_9_changes_neither_curve_nor_weights(
-    tiny: TrainingConfig, episode: Path, tmp_path: Path
-) -> None:
+def test_kill_9_changes_neither_curve_nor_weights(tiny, episode, tmp_path):
     config = tiny.replace(optimizer=tiny.optimizer.replace(steps=40))
     preset = tmp_path / 'preset.yaml'
     preset.write_text(yaml.safe_dump(json.loads(json.dumps(config.model_dump()))))
@@ -47,9 +44,7 @@ def test_kill_9_changes_neither_curve_nor_weights(
     assert all(torch.equal(tensors[0][name], tensors[1][name]) for name in tensors[0])
 
 
-def test_a_kill_between_the_two_renames_leaves_the_old_state(
-    tiny: TrainingConfig, tmp_path: Path
-) -> None:
+def test_a_kill_between_the_two_renames_leaves_the_old_state(tiny, tmp_path):
     def trainer() -> Trainer:
         return Trainer(tiny, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})
 

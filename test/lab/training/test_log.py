@@ -28,7 +28,7 @@ def rows(folder: Path) -> list[dict]:
     return [json.loads(line) for line in (folder / 'log.jsonl').open()]
 
 
-def test_a_row_has_rate_wait_share_and_utilisation(tmp_path: Path) -> None:
+def test_a_row_has_rate_wait_share_and_utilisation(tmp_path):
     with TrainingLog(tmp_path, step=0, total=25, ideal_seconds=0.2) as log:
         for step in range(1, 26):
             log.add(report(step))
@@ -41,7 +41,7 @@ def test_a_row_has_rate_wait_share_and_utilisation(tmp_path: Path) -> None:
     assert list((tmp_path / 'tensorboard').iterdir())
 
 
-def test_rows_after_the_saved_state_and_torn_ones_are_made_again(tmp_path: Path) -> None:
+def test_rows_after_the_saved_state_and_torn_ones_are_made_again(tmp_path):
     with TrainingLog(tmp_path, step=0, total=100) as log:
         for step in range(1, 41):
             log.add(report(step))
@@ -54,7 +54,7 @@ def test_rows_after_the_saved_state_and_torn_ones_are_made_again(tmp_path: Path)
     assert 'mfu' not in rows(tmp_path)[0]
 
 
-def test_processes_but_the_main_one_write_nothing(tmp_path: Path) -> None:
+def test_processes_but_the_main_one_write_nothing(tmp_path):
     with TrainingLog(tmp_path, step=0, total=10, active=False) as log:
         for step in range(1, 11):
             log.add(report(step))

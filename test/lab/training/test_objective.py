@@ -1,7 +1,5 @@
 """The loss: noise levels, what weighs more, and the latent layout of the weights."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -22,7 +20,7 @@ from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 CONFIG = ObjectiveConfig()
 
 
-def test_noise_levels_follow_wans_shift() -> None:
+def test_noise_levels_follow_wans_shift():
     """Without the share at full noise, the median of sigma' is s * .5 / (1 + (s - 1) * .5)."""
     config = ObjectiveConfig(full_noise_share=0.0, sigma_shift=5.0)
     sigmas = draw_sigmas(NoiseDraws(0, 0, range(20_000)), config)
@@ -31,12 +29,12 @@ def test_noise_levels_follow_wans_shift() -> None:
     assert abs(sigmas.median().item() - 5 * 0.5 / 3) < 0.01
 
 
-def test_noise_is_mixed_in_by_sigma() -> None:
+def test_noise_is_mixed_in_by_sigma():
     clean, noise = torch.tensor([[2.0], [2.0]]), torch.tensor([[10.0], [10.0]])
     assert add_noise(clean, noise, torch.tensor([0.0, 0.25])).tolist() == [[2.0], [4.0]]
 
 
-def test_changed_pixels_and_objects_weigh_more() -> None:
+def test_changed_pixels_and_objects_weigh_more():
     frames = torch.zeros(1, 1, 2, 1, 4, 3, dtype=torch.uint8)
     frames[0, 0, 1, 0, 1] = 200  # changes
     ids = torch.zeros(1, 1, 2, 1, 4, dtype=torch.uint8)
@@ -52,7 +50,7 @@ def test_changed_pixels_and_objects_weigh_more() -> None:
     ]
 
 
-def test_latent_weights_lie_where_the_autoencoder_puts_the_pixels() -> None:
+def test_latent_weights_lie_where_the_autoencoder_puts_the_pixels():
     """Encoding an image of weights with three equal colours gives the weights of the latents."""
     weights = torch.rand(1, 2, 3, 8, 6)
     autoencoder = SpaceToDepthAutoencoder(block_size=2)
@@ -61,7 +59,7 @@ def test_latent_weights_lie_where_the_autoencoder_puts_the_pixels() -> None:
     assert torch.equal(latent_weights(weights, 2), expected)
 
 
-def test_loss_is_zero_for_the_truth_and_counts_by_weight() -> None:
+def test_loss_is_zero_for_the_truth_and_counts_by_weight():
     clean = torch.zeros(1, 1, 1, 1, 1, 2)
     wrong = torch.tensor([1.0, 0.0]).reshape(clean.shape)
     light, heavy = torch.tensor([1.0, 3.0]), torch.tensor([3.0, 1.0])
@@ -71,7 +69,7 @@ def test_loss_is_zero_for_the_truth_and_counts_by_weight() -> None:
     torch.testing.assert_close(high, 3 * low)
 
 
-def test_middle_noise_levels_count_as_in_diffsynth() -> None:
+def test_middle_noise_levels_count_as_in_diffsynth():
     """exp(-2 ((t - 500) / 1000)^2) of t = 1000, 995.02 .. 4.98, less the least, mean 1."""
     config = ObjectiveConfig(sigma_weighting='middle', sigma_shift=5.0)
     steps = [k / 1000 for k in range(1000, 0, -1)]
@@ -84,7 +82,7 @@ def test_middle_noise_levels_count_as_in_diffsynth() -> None:
     assert sigma_weights(torch.tensor([0.1, 1.0]), CONFIG).tolist() == [1, 1]
 
 
-def test_without_delta_the_error_is_squared_and_samples_count_by_noise_level() -> None:
+def test_without_delta_the_error_is_squared_and_samples_count_by_noise_level():
     clean = torch.zeros(2, 1, 1, 1, 1, 2)
     wrong = torch.tensor([[1.0, 2.0], [3.0, 0.0]]).reshape(clean.shape)
     loss = sample_loss(wrong, clean, torch.ones_like(clean), None, torch.tensor([1.0, 0.5]))

@@ -28,7 +28,7 @@ def printed(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 @pytest.fixture(scope='module')
-def recipe(tmp_path_factory: pytest.TempPathFactory, episode: Path) -> dict[str, Path]:
+def recipe(tmp_path_factory, episode) -> dict[str, Path]:
     """Folders of the imported checkpoint and of the adapter, and what the commands printed."""
     from contextlib import redirect_stdout
     from io import StringIO
@@ -48,9 +48,7 @@ def recipe(tmp_path_factory: pytest.TempPathFactory, episode: Path) -> dict[str,
     return {name: folder / name for name in ('base', 'lora', 'said.txt', 'tiny.yaml')}
 
 
-def test_the_history_of_the_preset_goes_through_import_and_training(
-    recipe: dict[str, Path],
-) -> None:
+def test_the_history_of_the_preset_goes_through_import_and_training(recipe):
     config = load_training_config(recipe['tiny.yaml'])
     assert config.history == load_training_config('wan-1.3b').history.replace()
     assert config.history.num_frames == 5
@@ -59,7 +57,7 @@ def test_the_history_of_the_preset_goes_through_import_and_training(
         assert read_card(folder).guidance_scale == config.sampling.guidance_scale
 
 
-def test_the_printed_evaluation_of_the_adapter_runs(recipe: dict[str, Path]) -> None:
+def test_the_printed_evaluation_of_the_adapter_runs(recipe):
     words = shlex.split(recipe['said.txt'].read_text().partition('evaluate it with: ')[2])
     more = ['--steps', '1', '--no-report', '--no-ceiling', '--actions', 'true', *SMALL]
     assert main([*words[1:], *more]) == 0
@@ -68,9 +66,7 @@ def test_the_printed_evaluation_of_the_adapter_runs(recipe: dict[str, Path]) -> 
     assert metrics['num_episodes'] == 1 and 'adapter' in metrics['name']
 
 
-def test_the_node_imagines_with_the_adapter(
-    recipe: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_node_imagines_with_the_adapter(recipe, tmp_path, capsys):
     pytest.importorskip('rclpy')
     served = tmp_path / 'served'
     shutil.copytree(recipe['base'], served)
@@ -83,9 +79,7 @@ def test_the_node_imagines_with_the_adapter(
 
 
 @pytest.mark.parametrize('base', [True, False])
-def test_an_adapter_of_another_history_is_refused(
-    recipe: dict[str, Path], tmp_path: Path, base: bool
-) -> None:
+def test_an_adapter_of_another_history_is_refused(recipe, tmp_path, base):
     card = read_card(recipe['base'])
     other = card.replace(history=HistorySettings())
     held, theirs = (card, other) if base else (other, card)

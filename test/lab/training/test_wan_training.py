@@ -16,7 +16,6 @@ from wan_base import make_base, tiny_preset
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.errors import CheckpointError, TrainingError
-from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.base import load_base
 from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.trainer import Trainer
@@ -34,27 +33,27 @@ CPU = torch.device('cpu')
 
 
 @pytest.fixture(scope='module')
-def preset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def preset(tmp_path_factory) -> Path:
     return tiny_preset(tmp_path_factory.mktemp('preset'))
 
 
 @pytest.fixture(scope='module')
-def config(preset: Path) -> TrainingConfig:
+def config(preset) -> TrainingConfig:
     return load_training_config(preset)
 
 
 @pytest.fixture(scope='module')
-def base(tmp_path_factory: pytest.TempPathFactory, config: TrainingConfig) -> Path:
+def base(tmp_path_factory, config) -> Path:
     return make_base(tmp_path_factory.mktemp('wan'), config)
 
 
 @pytest.fixture(scope='module')
-def clips(episode: Path, config: TrainingConfig, robot: RobotModel) -> Recording:
+def clips(episode, config, robot) -> Recording:
     return load_recording(episode, config.spec, robot)
 
 
 @pytest.fixture
-def batches(clips: Recording, config: TrainingConfig, robot: RobotModel):
+def batches(clips, config, robot):
     source = make_source([clips], config, robot)
     yield source
     source.close()
@@ -90,9 +89,8 @@ def predict(model: DiffusionWorldModel, clip: np.ndarray) -> np.ndarray:
 
 
 def test_the_command_trains_an_adapter_that_changes_the_prediction(
-    preset: Path, base: Path, episode: Path, clips: Recording, tmp_path: Path,
-    capsys: pytest.CaptureFixture,
-) -> None:  # fmt: skip
+    preset, base, episode, clips, tmp_path, capsys
+):
     command = ['train', str(episode.parent), '--preset', str(preset), '--init', str(base)]
     options = [
         '--out',
@@ -118,9 +116,7 @@ def test_the_command_trains_an_adapter_that_changes_the_prediction(
     np.testing.assert_array_equal(predict(model, clips.frames[:, :5]), plain)
 
 
-def test_the_loss_falls_and_the_frozen_weights_stay(
-    config: TrainingConfig, base: Path, batches: BatchSource, tmp_path: Path
-) -> None:
+def test_the_loss_falls_and_the_frozen_weights_stay(config, base, batches, tmp_path):
     """On one batch with the same noise; the base's weights are those of its files."""
     still = config.augment.replace(control_dropout=0, reference_dropout=0, image_dropout=0)
     steady = config.objective.replace(sigma_weighting='uniform')
@@ -143,9 +139,7 @@ def test_the_loss_falls_and_the_frozen_weights_stay(
         assert not torch.equal(named[name], held[name]), name
 
 
-def test_only_what_is_trained_takes_memory_for_training(
-    config: TrainingConfig, base: Path, tmp_path: Path
-) -> None:
+def test_only_what_is_trained_takes_memory_for_training(config, base, tmp_path):
     trainer = make(config, tmp_path, base)
     trained = [p for p in trainer.weights.worker.parameters() if p.requires_grad]
     shapes = [p.shape for p in trained]
@@ -155,8 +149,8 @@ def test_only_what_is_trained_takes_memory_for_training(
 
 
 def test_a_killed_run_continues_to_the_bit_and_exports_the_averages(
-    config: TrainingConfig, base: Path, batches: BatchSource, tmp_path: Path
-) -> None:
+    config, base, batches, tmp_path
+):
     whole = make(config, tmp_path / 'whole', base)
     losses = run(whole, batches)
     cut = make(config, tmp_path / 'cut', base)
@@ -181,9 +175,7 @@ def test_a_killed_run_continues_to_the_bit_and_exports_the_averages(
 
 
 @pytest.mark.gpu
-def test_an_adapter_trains_and_continues_on_a_gpu(
-    config: TrainingConfig, base: Path, batches: BatchSource, tmp_path: Path
-) -> None:
+def test_an_adapter_trains_and_continues_on_a_gpu(config, base, batches, tmp_path):
     reports = make(config, tmp_path, base, 'cuda').run(
         batches, save_every=2, on_save=lambda _: None
     )
@@ -196,9 +188,7 @@ def test_an_adapter_trains_and_continues_on_a_gpu(
     assert load_file(resumed.result / 'pytorch_lora_weights.safetensors')
 
 
-def test_a_state_on_top_of_other_weights_is_refused(
-    config: TrainingConfig, base: Path, tmp_path: Path
-) -> None:
+def test_a_state_on_top_of_other_weights_is_refused(config, base, tmp_path):
     make(config, tmp_path, base).save_state()
     other = load_base(config, base, CPU, torch.float32, seed=0)
     changed = replace(other, digest='of other weights')
@@ -208,9 +198,7 @@ def test_a_state_on_top_of_other_weights_is_refused(
         trainer.load_state()
 
 
-def test_an_adapter_of_another_clock_is_refused_when_it_is_loaded(
-    config: TrainingConfig, base: Path, tmp_path: Path
-) -> None:
+def test_an_adapter_of_another_clock_is_refused_when_it_is_loaded(config, base, tmp_path):
     trainer = make(config, tmp_path, base)
     trainer.export(trainer.result)
     checkpoint = load_checkpoint(base)
@@ -232,18 +220,14 @@ def test_an_adapter_of_another_clock_is_refused_when_it_is_loaded(
         ('transformer', {'num_layers': 3}, 'has num_layers 2, the preset 3; give --preset'),
     ],
 )
-def test_a_base_of_another_kind_is_refused(
-    config: TrainingConfig, base: Path, section: str, changes: dict, message: str
-) -> None:
+def test_a_base_of_another_kind_is_refused(config, base, section, changes, message):
     held = getattr(config, section)
     other = {**held, **changes} if isinstance(held, dict) else held.replace(**changes)
     with pytest.raises(TrainingError, match=message):
         load_base(config.replace(**{section: other}), base, CPU, torch.float32, seed=0)
 
 
-def test_without_a_base_the_command_to_make_one_is_named(
-    config: TrainingConfig, episode: Path, robot: RobotModel, tmp_path: Path
-) -> None:
+def test_without_a_base_the_command_to_make_one_is_named(config, episode, robot, tmp_path):
     with pytest.raises(TrainingError, match=r'--init FOLDER.*import-weights'):
         train(
             TrainingRun(config=config, dataset=episode.parent, out=tmp_path),
@@ -252,7 +236,7 @@ def test_without_a_base_the_command_to_make_one_is_named(
         )
 
 
-def test_the_presets_are_the_papers_setting() -> None:
+def test_the_presets_are_the_papers_setting():
     """Implementation Details: rank 32, 1e-4, batch 8, 8 epochs, 2 views, 81 frames, 288 x 384."""
     for name in ('wan-1.3b', 'wan-14b'):
         config = load_training_config(name)

@@ -39,9 +39,7 @@ def inputs(dtype: torch.dtype) -> tuple[Tensor, Tensor, Any]:
 
 @pytest.mark.parametrize('runs', [1, RUNS])
 @pytest.mark.parametrize(('dtype', 'atol'), [(torch.float32, 1e-5), (torch.bfloat16, 0.1)])
-def test_values_and_gradients_are_those_of_the_stock_block(
-    runs: int, dtype: torch.dtype, atol: float
-) -> None:
+def test_values_and_gradients_are_those_of_the_stock_block(runs, dtype, atol):
     theirs, ours = (block.to(dtype) for block in both())
     levels = torch.randn(2, runs, 6, DIM, generator=torch.Generator().manual_seed(2))
     of_tokens = levels[:, 0] if runs == 1 else levels.repeat_interleave(EACH, dim=1)
@@ -57,6 +55,6 @@ def test_values_and_gradients_are_those_of_the_stock_block(
         torch.testing.assert_close(value, expected, rtol=0, atol=atol)
 
 
-def test_names_of_weights_stay() -> None:
+def test_names_of_weights_stay():
     theirs, ours = both()
     assert list(ours.state_dict()) == list(theirs.state_dict())

@@ -1,7 +1,5 @@
 """The transformer: shapes, view symmetry, and no leak of reference tokens."""
 
-from __future__ import annotations
-
 import pytest
 from small_transformer import build, inputs, PATCH, SMALL
 import torch
@@ -13,7 +11,7 @@ CONFIGS = {'conv': (SMALL, 0), 'patch': (PATCH, 16)}
 
 
 @pytest.mark.parametrize('views', [1, 2, 3])
-def test_returns_every_frame_of_every_view_and_no_reference(kind: str, views: int) -> None:
+def test_returns_every_frame_of_every_view_and_no_reference(kind, views):
     config, text_dim = CONFIGS[kind]
     values = inputs(views=views, text_dim=text_dim)
     out = build(config)(**values)
@@ -22,7 +20,7 @@ def test_returns_every_frame_of_every_view_and_no_reference(kind: str, views: in
 
 
 @pytest.mark.parametrize('views', [1, 3])
-def test_every_used_weight_gets_a_gradient(kind: str, views: int) -> None:
+def test_every_used_weight_gets_a_gradient(kind, views):
     config, text_dim = CONFIGS[kind]
     model = build(config, num_views=views)
     model(**inputs(views=views, text_dim=text_dim)).square().mean().backward()
@@ -35,7 +33,7 @@ def test_every_used_weight_gets_a_gradient(kind: str, views: int) -> None:
     assert [name for name in without if not name.endswith(('to_k.bias', 'copy.to_k.bias'))] == []
 
 
-def test_swapping_the_views_swaps_the_output(kind: str) -> None:
+def test_swapping_the_views_swaps_the_output(kind):
     """Where views differ neither by embedding nor by position."""
     config, text_dim = CONFIGS[kind]
     model = build(config, view_offset='none')
@@ -46,7 +44,7 @@ def test_swapping_the_views_swaps_the_output(kind: str) -> None:
     torch.testing.assert_close(model(**swapped), model(**values).flip(1), rtol=1e-4, atol=1e-5)
 
 
-def test_views_are_told_apart_by_their_place_in_width(kind: str) -> None:
+def test_views_are_told_apart_by_their_place_in_width(kind):
     config, text_dim = CONFIGS[kind]
     model = build(config, view_offset='width')
     with torch.no_grad():
@@ -56,7 +54,7 @@ def test_views_are_told_apart_by_their_place_in_width(kind: str) -> None:
     assert not torch.allclose(model(**swapped), model(**values).flip(1), atol=1e-4)
 
 
-def test_each_view_sees_the_other_one(kind: str) -> None:
+def test_each_view_sees_the_other_one(kind):
     config, text_dim = CONFIGS[kind]
     model = build(config)
     values = inputs(text_dim=text_dim)
@@ -66,12 +64,12 @@ def test_each_view_sees_the_other_one(kind: str) -> None:
     assert not torch.allclose(model(**values)[:, 0], before[:, 0], atol=1e-6)
 
 
-def test_more_views_than_trained_are_refused() -> None:
+def test_more_views_than_trained_are_refused():
     with pytest.raises(CheckpointError, match='4 views given, the model was built for 3'):
         build(SMALL)(**inputs(views=4))
 
 
-def test_copied_patches_come_from_the_views_own_reference() -> None:
+def test_copied_patches_come_from_the_views_own_reference():
     """The copy attention of view 0 returns pixels of reference 0 alone."""
     decoder = build(SMALL).proj_out
     keys = torch.randn(2, 16, 8, 8)
@@ -82,7 +80,7 @@ def test_copied_patches_come_from_the_views_own_reference() -> None:
 
 
 @pytest.mark.parametrize('width', [12, 32, 48])
-def test_the_attention_of_copies_is_that_of_the_formula(width: int) -> None:
+def test_the_attention_of_copies_is_that_of_the_formula(width):
     torch.manual_seed(0)
     q, k = torch.randn(2, 2, 30, 32), torch.randn(2, 2, 20, 32)
     v = torch.randn(2, 1, 20, width).expand(-1, 2, -1, -1)

@@ -52,7 +52,7 @@ def inputs(views: int, batch: int = 1, seed: int = 0) -> dict[str, Tensor]:
     }
 
 
-def test_forward_equals_the_published_tensor_flow(tmp_path: Path) -> None:
+def test_forward_equals_the_published_tensor_flow(tmp_path):
     values = inputs(views=1, batch=2)
     expected = wan_forward(
         transformer_weights(),
@@ -74,9 +74,7 @@ def test_forward_equals_the_published_tensor_flow(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('views', [1, 2, 3])
 @pytest.mark.parametrize('view_offset', ['width', 'time', 'none'])
-def test_forward_and_backward_with_any_number_of_views(
-    tmp_path: Path, views: int, view_offset: str
-) -> None:
+def test_forward_and_backward_with_any_number_of_views(tmp_path, views, view_offset):
     model = build(tmp_path, view_offset=view_offset)
     values = inputs(views)
     out = model(**values)
@@ -95,7 +93,7 @@ def swapped(values: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 @torch.inference_mode()
-def test_swapping_views_swaps_their_outputs_where_positions_are_equal(tmp_path: Path) -> None:
+def test_swapping_views_swaps_their_outputs_where_positions_are_equal(tmp_path):
     values = inputs(views=2)
     model = build(tmp_path, view_offset='none')
     torch.testing.assert_close(
@@ -107,14 +105,14 @@ def test_swapping_views_swaps_their_outputs_where_positions_are_equal(tmp_path: 
 
 @pytest.mark.parametrize('view_offset', ['width', 'time'])
 @torch.inference_mode()
-def test_positions_tell_views_apart(tmp_path: Path, view_offset: str) -> None:
+def test_positions_tell_views_apart(tmp_path, view_offset):
     values = inputs(views=2)
     model = build(tmp_path, view_offset=view_offset)
     assert not torch.allclose(model(**swapped(values)), model(**values).flip(1), atol=1e-3)
 
 
 @torch.inference_mode()
-def test_the_first_view_stands_where_wans_only_one_does(tmp_path: Path) -> None:
+def test_the_first_view_stands_where_wans_only_one_does(tmp_path):
     """What public weights learnt of positions holds for view 0, whatever the other views."""
     for offset in ('width', 'time', 'none'):
         rope = build(tmp_path, view_offset=offset).rope
@@ -126,7 +124,7 @@ def test_the_first_view_stands_where_wans_only_one_does(tmp_path: Path) -> None:
 
 
 @torch.inference_mode()
-def test_output_of_a_latent_frame_comes_from_its_own_tokens(tmp_path: Path) -> None:
+def test_output_of_a_latent_frame_comes_from_its_own_tokens(tmp_path):
     """Without self-attention: control latent k reaches output latent k alone, the reference none.
 
     So neither the reference's tokens nor a shift by one frame can hide in the output.
@@ -157,14 +155,12 @@ def test_output_of_a_latent_frame_comes_from_its_own_tokens(tmp_path: Path) -> N
         ({'encoder_hidden_states_image': torch.zeros(1, 257, CLIP_DIM)}, '257 image tokens'),
     ],
 )
-def test_tokens_that_attention_would_split_wrongly_are_refused(
-    tmp_path: Path, change: dict, message: str
-) -> None:
+def test_tokens_that_attention_would_split_wrongly_are_refused(tmp_path, change, message):
     with pytest.raises(CheckpointError, match=message):
         build(tmp_path)(**{**inputs(views=2), **change})
 
 
-def test_more_than_the_positions_hold_is_refused(tmp_path: Path) -> None:
+def test_more_than_the_positions_hold_is_refused(tmp_path):
     with pytest.raises(CheckpointError, match=r'reach position 8, the model has 7'):
         build(tmp_path, rope_max_seq_len=7)(**inputs(views=2))
     with pytest.raises(CheckpointError, match="view_offset 'height' is not one of width"):

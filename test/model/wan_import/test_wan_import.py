@@ -33,12 +33,12 @@ WEIGHTS = 'diffusion_pytorch_model.safetensors'
 
 
 @pytest.fixture(scope='session')
-def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def published(tmp_path_factory) -> Path:
     return write_videox(tmp_path_factory.mktemp('public') / 'Wan2.1-Fun-V1.1-tiny-Control')
 
 
 @pytest.fixture
-def videox(published: Path, tmp_path: Path) -> Path:
+def videox(published, tmp_path) -> Path:
     """A copy that a test may damage."""
     return Path(shutil.copytree(published, tmp_path / 'videox'))
 
@@ -53,7 +53,7 @@ def bring_in(path: Path, out: Path, **changes: object) -> list[PartReport]:
     return import_weights(path, out, **{**arguments, **changes})
 
 
-def test_every_tensor_is_accounted_for(videox: Path, tmp_path: Path) -> None:
+def test_every_tensor_is_accounted_for(videox, tmp_path):
     reports = {report.part: report for report in bring_in(videox, tmp_path / 'out')}
     counts = {'transformer': transformer_weights(), 'text_encoder': umt5_weights()}
     for part, weights in counts.items():
@@ -70,7 +70,7 @@ def test_every_tensor_is_accounted_for(videox: Path, tmp_path: Path) -> None:
     assert [part['part'] for part in written] == list(reports)
 
 
-def test_number_formats_and_values_are_kept(videox: Path, tmp_path: Path) -> None:
+def test_number_formats_and_values_are_kept(videox, tmp_path):
     bring_in(videox, tmp_path / 'out')
     stored = load_file(tmp_path / 'out' / 'transformer' / WEIGHTS)
     public = {k: v.bfloat16() for k, v in transformer_weights().items()}
@@ -87,14 +87,14 @@ def test_number_formats_and_values_are_kept(videox: Path, tmp_path: Path) -> Non
     assert stored['view_embedding'].shape == (3, 24) and not stored['view_embedding'].any()
 
 
-def test_the_autoencoder_is_the_published_one(videox: Path, tmp_path: Path) -> None:
+def test_the_autoencoder_is_the_published_one(videox, tmp_path):
     bring_in(videox, tmp_path / 'out')
     loaded = load_checkpoint(tmp_path / 'out').autoencoder
     for name, value in vae_model().state_dict().items():
         assert torch.equal(loaded.vae.state_dict()[name], value), name
 
 
-def test_loads_and_saves_bit_for_bit(videox: Path, tmp_path: Path) -> None:
+def test_loads_and_saves_bit_for_bit(videox, tmp_path):
     bring_in(videox, tmp_path / 'out')
     first = load_checkpoint(tmp_path / 'out', dtype=torch.bfloat16)
     save_checkpoint(first, tmp_path / 'again', dtype=torch.bfloat16)
@@ -106,7 +106,7 @@ def test_loads_and_saves_bit_for_bit(videox: Path, tmp_path: Path) -> None:
     assert type(second.scheduler).__name__ == 'UniPCMultistepScheduler'
 
 
-def test_shards_and_one_file_are_the_same(videox: Path, tmp_path: Path) -> None:
+def test_shards_and_one_file_are_the_same(videox, tmp_path):
     bring_in(videox, tmp_path / 'whole')
     (videox / WEIGHTS).unlink()
     write_shards(videox, {k: v.bfloat16() for k, v in transformer_weights().items()})
@@ -119,7 +119,7 @@ def test_shards_and_one_file_are_the_same(videox: Path, tmp_path: Path) -> None:
     bring_in(videox, tmp_path / 'without_index')
 
 
-def test_a_diffusers_folder_is_read(videox: Path, tmp_path: Path) -> None:
+def test_a_diffusers_folder_is_read(videox, tmp_path):
     """Our own checkpoint folder is in diffusers' layout, and in transformers' names."""
     bring_in(videox, tmp_path / 'first')
     (tmp_path / 'first' / 'autoencoder').rename(tmp_path / 'first' / 'vae')
@@ -131,7 +131,7 @@ def test_a_diffusers_folder_is_read(videox: Path, tmp_path: Path) -> None:
         assert load_file(file).keys() == load_file(old).keys()
 
 
-def test_parts_may_lie_elsewhere(videox: Path, tmp_path: Path) -> None:
+def test_parts_may_lie_elsewhere(videox, tmp_path):
     other = tmp_path / 'other'
     other.mkdir()
     save_file(clip_weights(), other / 'clip.safetensors')
@@ -164,29 +164,27 @@ def change(videox: Path, drop: str = '', **put: torch.Tensor) -> None:
         ('patch_embedding.weight', {}, r'holds no Wan transformer'),
     ],
 )
-def test_weights_of_another_model_are_refused(
-    videox: Path, tmp_path: Path, drop: str, put: dict, message: str
-) -> None:
+def test_weights_of_another_model_are_refused(videox, tmp_path, drop, put, message):
     change(videox, drop, **{name: torch.zeros(shape) for name, shape in put.items()})
     with pytest.raises(CheckpointError, match=message):
         bring_in(videox, tmp_path / 'out')
     assert not list(tmp_path.glob('out*'))
 
 
-def test_another_number_of_heads_is_refused(videox: Path, tmp_path: Path) -> None:
+def test_another_number_of_heads_is_refused(videox, tmp_path):
     (videox / 'config.json').write_text(json.dumps({'num_heads': 12}))
     with pytest.raises(CheckpointError, match='says 12 attention heads, the preset 2'):
         bring_in(videox, tmp_path / 'out')
 
 
-def test_encoders_of_another_width_are_refused(videox: Path, tmp_path: Path) -> None:
+def test_encoders_of_another_width_are_refused(videox, tmp_path):
     narrow = {k: v[..., :16].contiguous() for k, v in umt5_weights().items()}
     save_file(narrow, videox / 'models_t5_umt5-xxl-enc-bf16.safetensors')
     with pytest.raises(CheckpointError, match='tokens of width 16, the transformer takes 32'):
         bring_in(videox, tmp_path / 'out')
 
 
-def test_a_missing_shard_is_named(videox: Path, tmp_path: Path) -> None:
+def test_a_missing_shard_is_named(videox, tmp_path):
     (videox / WEIGHTS).unlink()
     write_shards(videox, transformer_weights())
     gone = 'diffusion_pytorch_model-00002-of-00003.safetensors'
@@ -199,27 +197,25 @@ def test_a_missing_shard_is_named(videox: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('name', ['Wan2.1_VAE', 'models_t5_umt5-xxl-enc-bf16'])
-def test_a_pickle_is_refused_unread(videox: Path, tmp_path: Path, name: str) -> None:
+def test_a_pickle_is_refused_unread(videox, tmp_path, name):
     (videox / f'{name}.safetensors').rename(videox / f'{name}.pth')
     with pytest.raises(CheckpointError, match=rf'{name}.pth.*never read; expected .safetensors'):
         bring_in(videox, tmp_path / 'out')
 
 
-def test_a_damaged_file_is_named(videox: Path, tmp_path: Path) -> None:
+def test_a_damaged_file_is_named(videox, tmp_path):
     (videox / WEIGHTS).write_bytes((videox / WEIGHTS).read_bytes()[:500])
     with pytest.raises(CheckpointError, match='diffusion_pytorch_model.safetensors. cannot be'):
         bring_in(videox, tmp_path / 'out')
 
 
-def test_an_existing_checkpoint_is_not_overwritten(videox: Path, tmp_path: Path) -> None:
+def test_an_existing_checkpoint_is_not_overwritten(videox, tmp_path):
     write_tokenizer(tmp_path / 'out')
     with pytest.raises(CheckpointError, match='exists; give --out'):
         bring_in(videox, tmp_path / 'out')
 
 
-def test_the_command_prints_what_became_of_every_part(
-    videox: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_prints_what_became_of_every_part(videox, tmp_path, capsys):
     preset = tmp_path / 'tiny.yaml'
     video = {'num_frames': 4, 'width': 32, 'height': 32}
     sections = {'transformer': TRANSFORMER, 'autoencoder': AUTOENCODER, 'scheduler': SCHEDULER}

@@ -59,7 +59,7 @@ CLIP = clip_shapes(1280, layers=32, side=16, patch=14, out=1024) | clip_text_sha
         pytest.param(CLIP, '5941c53e207d62f20f9025686193c40b', id='CLIP'),
     ],
 )
-def test_a_layout_is_the_published_one(shapes: Shapes, published: str) -> None:
+def test_a_layout_is_the_published_one(shapes, published):
     assert hash_of(shapes) == published
 
 
@@ -73,7 +73,7 @@ def mapped(shapes: Shapes, keys: KeyMap) -> Shapes:
 @pytest.mark.parametrize(
     ('preset', 'size'), [('wan-1.3b', (1536, 8960, 30)), ('wan-14b', (5120, 13824, 40))]
 )
-def test_every_published_tensor_finds_its_place(preset: str, size: tuple[int, int, int]) -> None:
+def test_every_published_tensor_finds_its_place(preset, size):
     with torch.device('meta'):
         model = MultiViewWanTransformer(**load_training_config(preset).transformer)
     ours = {name: tuple(t.shape) for name, t in model.state_dict().items() if name not in NEW}
@@ -83,7 +83,7 @@ def test_every_published_tensor_finds_its_place(preset: str, size: tuple[int, in
     assert mapped(repackaged, transformer_keys(repackaged)) == ours
 
 
-def test_every_tensor_of_the_other_parts_is_settled() -> None:
+def test_every_tensor_of_the_other_parts_is_settled():
     expected = {name: tuple(t.shape) for name, t in vae_state().items()}
     assert mapped(vae(), autoencoder_keys(vae())) == expected
     assert len(mapped(UMT5, text_encoder_keys(UMT5))) == 242

@@ -1,24 +1,18 @@
 """Clips whose objects are cut out of their own first frame."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.training_config import load_training_config
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
 @pytest.mark.parametrize('share', [0.0, 1.0])
-def test_objects_are_cut_out_of_the_frame_where_a_rollout_begins(
-    episode: Path, robot: RobotModel, share: float
-) -> None:
+def test_objects_are_cut_out_of_the_frame_where_a_rollout_begins(episode, robot, share):
     config = load_training_config(
         'small',
         {

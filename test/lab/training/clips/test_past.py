@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from sources import make_source, with_batch_size
@@ -36,9 +34,7 @@ def position(recording: Recording, frame: np.ndarray) -> int:
     return int(same[-1])
 
 
-def test_a_clip_is_shown_what_a_rollout_that_began_earlier_would_show(
-    recording: Recording, tiny: TrainingConfig
-) -> None:
+def test_a_clip_is_shown_what_a_rollout_that_began_earlier_would_show(recording, tiny):
     """Every number of frames up to N comes, the anchor is never younger than the history."""
     spec, start = tiny.spec, 40
     clock = frame_indices(recording, 0, spec, int(recording.times[-1] * 5) - 1)
@@ -59,18 +55,14 @@ def test_a_clip_is_shown_what_a_rollout_that_began_earlier_would_show(
     assert counts == {0, 1, 2, 3, 4}
 
 
-def test_the_recordings_first_frame_has_nothing_before_it(
-    recording: Recording, tiny: TrainingConfig
-) -> None:
+def test_the_recordings_first_frame_has_nothing_before_it(recording, tiny):
     rng = np.random.default_rng(0)
     history = history_before(recording, 0, tiny.spec, HISTORY.replace(first_share=0.0), rng)
     assert history.frames.shape[1] == 0
     assert np.array_equal(history.anchor, recording.frames[:, 0])
 
 
-def test_noise_levels_are_drawn_up_to_the_largest_and_one_means_nothing(
-    recording: Recording, tiny: TrainingConfig
-) -> None:
+def test_noise_levels_are_drawn_up_to_the_largest_and_one_means_nothing(recording, tiny):
     config = HISTORY.replace(first_share=0.0, dropout=0.25, max_noise=0.2)
     rng = np.random.default_rng(0)
     history = history_before(recording, 40, tiny.spec, config, rng)
@@ -83,16 +75,14 @@ def test_noise_levels_are_drawn_up_to_the_largest_and_one_means_nothing(
 
 
 def test_switched_off_the_clips_are_those_of_before_and_carry_nothing(
-    recording: Recording, tiny: TrainingConfig, robot: RobotModel, source: BatchSource
-) -> None:
+    recording, tiny, robot, source
+):
     off = source_of(tiny, recording, robot).batch(0)
     assert off.anchor is None and off.history is None
     assert torch.equal(off.frames[:1], source.batch(0).frames)
 
 
-def test_a_batch_shows_colours_of_clip_and_past_alike(
-    recording: Recording, tiny: TrainingConfig, robot: RobotModel
-) -> None:
+def test_a_batch_shows_colours_of_clip_and_past_alike(recording, tiny, robot):
     augment = tiny.augment.replace(colour_permutation=1.0, start_noise=0.0)
     config = tiny.replace(history=HISTORY.replace(first_share=1.0), augment=augment)
     made = source_of(config, recording, robot)
@@ -104,9 +94,7 @@ def test_a_batch_shows_colours_of_clip_and_past_alike(
         assert batch.history.shape[2] == 4
 
 
-def test_a_model_trained_with_history_serves_with_it(
-    recording: Recording, tiny: TrainingConfig, robot: RobotModel, tmp_path: Path
-) -> None:
+def test_a_model_trained_with_history_serves_with_it(recording, tiny, robot, tmp_path):
     config = tiny.replace(history=HISTORY)
     trainer = Trainer(config, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})
     made = source_of(config, recording, robot)
@@ -131,14 +119,12 @@ def test_a_model_trained_with_history_serves_with_it(
         ('history.reference', 'first', "'first' is not one of chunk_start, first_frame"),
     ],
 )
-def test_wrong_settings_are_refused_by_name(key: str, value: object, match: str) -> None:
+def test_wrong_settings_are_refused_by_name(key, value, match):
     with pytest.raises(ConfigError, match=match):
         load_training_config('small', {key: value})
 
 
-def test_frames_that_do_not_divide_into_tokens_are_refused_before_the_first_step(
-    tiny: TrainingConfig, tmp_path: Path
-) -> None:
+def test_frames_that_do_not_divide_into_tokens_are_refused_before_the_first_step(tiny, tmp_path):
     config = tiny.replace(history=HISTORY.replace(num_frames=3))
     with pytest.raises(CheckpointError, match='num_frames to a multiple of 2'):
         Trainer(config, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})

@@ -27,24 +27,24 @@ CPU = torch.device('cpu')
 
 
 @pytest.fixture(scope='module')
-def config(tmp_path_factory: pytest.TempPathFactory) -> TrainingConfig:
+def config(tmp_path_factory) -> TrainingConfig:
     config = load_training_config(tiny_preset(tmp_path_factory.mktemp('preset')))
     objective = config.objective.replace(change_weight=4.0, moved_weight=10.0)
     return config.replace(objective=objective)
 
 
 @pytest.fixture(scope='module')
-def folder(tmp_path_factory: pytest.TempPathFactory, config: TrainingConfig) -> Path:
+def folder(tmp_path_factory, config) -> Path:
     return make_base(tmp_path_factory.mktemp('wan'), config)
 
 
 @pytest.fixture(scope='module')
-def base(folder: Path, config: TrainingConfig) -> Base:
+def base(folder, config) -> Base:
     return load_base(config, folder, CPU, torch.float32, seed=0)
 
 
 @pytest.fixture(scope='module')
-def copied(tmp_path_factory: pytest.TempPathFactory, episode: Path) -> Path:
+def copied(tmp_path_factory, episode) -> Path:
     """An episode that tests may change."""
     return Path(shutil.copytree(episode, tmp_path_factory.mktemp('data') / 'episode'))
 
@@ -56,12 +56,12 @@ def source_of(path: Path, config: TrainingConfig, robot: RobotModel) -> BatchSou
 
 
 @pytest.fixture
-def source(copied: Path, config: TrainingConfig, robot: RobotModel) -> BatchSource:
+def source(copied, config, robot) -> BatchSource:
     return source_of(copied, config, robot)
 
 
 @pytest.fixture(scope='module')
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp('latents')
 
 
@@ -70,10 +70,7 @@ def fill(source: BatchSource, root: Path, config: TrainingConfig, base: Base) ->
     return cached(source, root, config, base, seed=0, dtype=torch.float32, processes=processes)
 
 
-def test_a_batch_is_what_encoding_the_recorded_clips_gives(
-    source: BatchSource, root: Path, config: TrainingConfig, base: Base,
-    capsys: pytest.CaptureFixture,
-) -> None:  # fmt: skip
+def test_a_batch_is_what_encoding_the_recorded_clips_gives(source, root, config, base, capsys):
     held = fill(source, root, config, base)
     said = capsys.readouterr().out
     assert f'0 of {source.num_clips} clips were there, {source.num_clips} encoded in' in said
@@ -104,9 +101,7 @@ def test_a_batch_is_what_encoding_the_recorded_clips_gives(
     torch.testing.assert_close(batch.weights[1:], weights, rtol=0, atol=14 * 0.5 / 255 + 1e-6)
 
 
-def test_clips_are_shown_what_came_before_them(
-    source: BatchSource, root: Path, config: TrainingConfig, base: Base
-) -> None:
+def test_clips_are_shown_what_came_before_them(source, root, config, base):
     """At the beginning of an episode that is nothing: the anchor is the start image itself."""
     held = fill(source, root, config, base)
     steps = -(-held.num_clips // 2)
@@ -121,19 +116,14 @@ def test_clips_are_shown_what_came_before_them(
     assert first.history.shape[3] == 2  # five frames: the first alone, then four
 
 
-def test_a_second_run_encodes_nothing(
-    source: BatchSource, root: Path, config: TrainingConfig, base: Base,
-    capsys: pytest.CaptureFixture,
-) -> None:  # fmt: skip
+def test_a_second_run_encodes_nothing(source, root, config, base, capsys):
     fill(source, root, config, base)
     assert f'{source.num_clips} of {source.num_clips} clips were there, none to encode' in (
         capsys.readouterr().out
     )
 
 
-def test_an_epoch_takes_every_clip_once_and_the_next_in_another_order(
-    source: BatchSource, root: Path, config: TrainingConfig, base: Base
-) -> None:
+def test_an_epoch_takes_every_clip_once_and_the_next_in_another_order(source, root, config, base):
     held = fill(source, root, config, base)
     count = held.num_clips
     order = [held._clip(*divmod(index, 2)).start for index in range(2 * count)]
@@ -141,10 +131,7 @@ def test_an_epoch_takes_every_clip_once_and_the_next_in_another_order(
     assert order[:count] != order[count:]
 
 
-def test_other_encoder_weights_are_noticed(
-    source: BatchSource, root: Path, config: TrainingConfig, folder: Path, tmp_path: Path,
-    capsys: pytest.CaptureFixture,
-) -> None:  # fmt: skip
+def test_other_encoder_weights_are_noticed(source, root, config, folder, tmp_path, capsys):
     other = Path(shutil.copytree(folder, tmp_path / 'other'))
     file = other / 'autoencoder' / 'diffusion_pytorch_model.safetensors'
     tensors = load_file(file)
@@ -166,18 +153,14 @@ def test_other_encoder_weights_are_noticed(
     ],
 )
 def test_other_settings_are_noticed(
-    copied: Path, root: Path, config: TrainingConfig, base: Base, robot: RobotModel,
-    capsys: pytest.CaptureFixture, section: str, changes: dict, said: str,
-) -> None:  # fmt: skip
+    copied, root, config, base, robot, capsys, section, changes, said
+):
     other = config.replace(**{section: getattr(config, section).replace(**changes)})
     fill(source_of(copied, other, robot), root, other, base)
     assert said in capsys.readouterr().out
 
 
-def test_a_changed_episode_is_noticed(
-    copied: Path, root: Path, config: TrainingConfig, base: Base, robot: RobotModel,
-    capsys: pytest.CaptureFixture,
-) -> None:  # fmt: skip
+def test_a_changed_episode_is_noticed(copied, root, config, base, robot, capsys):
     (copied / 'notes.txt').write_text('one more file is another content')
     source = source_of(copied, config, robot)
     fill(source, root, config, base)
@@ -187,9 +170,8 @@ def test_a_changed_episode_is_noticed(
 
 
 def test_too_little_space_is_said_before_anything_is_encoded(
-    source: BatchSource, config: TrainingConfig, base: Base, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    source, config, base, tmp_path, monkeypatch
+):
     free = shutil.disk_usage(tmp_path)._replace(free=1000)
     monkeypatch.setattr(shutil, 'disk_usage', lambda _: free)
     with pytest.raises(TrainingError, match=r'take 0\.0 GB .* free there; give --latent-cache'):
@@ -204,10 +186,7 @@ def test_too_little_space_is_said_before_anything_is_encoded(
         ({'augment.failure_share': 0.3}, r'augment.failure_share is 0.3'),
     ],
 )
-def test_what_a_cache_cannot_hold_is_refused(
-    source: BatchSource, config: TrainingConfig, base: Base, tmp_path: Path, changes: dict,
-    message: str,
-) -> None:  # fmt: skip
+def test_what_a_cache_cannot_hold_is_refused(source, config, base, tmp_path, changes, message):
     ((dotted, value),) = changes.items()
     section, key = dotted.split('.')
     held = getattr(config, section).replace(**{key: value})
@@ -215,6 +194,6 @@ def test_what_a_cache_cannot_hold_is_refused(
         fill(source, tmp_path, config.replace(**{section: held}), base)
 
 
-def test_the_small_preset_needs_no_cache(source: BatchSource, base: Base, tmp_path: Path) -> None:
+def test_the_small_preset_needs_no_cache(source, base, tmp_path):
     with pytest.raises(ConfigError, match='only rearranges pixels'):
         fill(source, tmp_path, load_training_config('small'), base)

@@ -35,7 +35,7 @@ def filled(root: Path, count: int = 5, **settings: object) -> LatentCache:
     return cache
 
 
-def test_tensors_come_back_as_they_were_from_several_shards(tmp_path: Path) -> None:
+def test_tensors_come_back_as_they_were_from_several_shards(tmp_path):
     filled(tmp_path)
     cache = LatentCache(tmp_path, SETTINGS)
     assert len(cache) == 5 and cache.notes == []
@@ -48,7 +48,7 @@ def test_tensors_come_back_as_they_were_from_several_shards(tmp_path: Path) -> N
     ]
 
 
-def test_a_killed_build_goes_on_where_the_last_shard_ended(tmp_path: Path) -> None:
+def test_a_killed_build_goes_on_where_the_last_shard_ended(tmp_path):
     killed = LatentCache(tmp_path, SETTINGS, shard_bytes=1200)
     for seed, key in enumerate(list(KEYS)[:3]):  # the third one waits for its shard
         killed.add(key, KEYS[key], tensors(seed))
@@ -58,7 +58,7 @@ def test_a_killed_build_goes_on_where_the_last_shard_ended(tmp_path: Path) -> No
     assert len(LatentCache(tmp_path, SETTINGS)) == 5
 
 
-def test_other_settings_are_not_used_and_named(tmp_path: Path) -> None:
+def test_other_settings_are_not_used_and_named(tmp_path):
     filled(tmp_path)
     cache = LatentCache(tmp_path, {**SETTINGS, 'autoencoder': 'b2', 'fps': 8.0})
     assert len(cache) == 0
@@ -68,7 +68,7 @@ def test_other_settings_are_not_used_and_named(tmp_path: Path) -> None:
     assert LatentCache(tmp_path, SETTINGS).notes == []  # both are kept, each for its own
 
 
-def test_a_changed_episode_is_told_from_a_new_one(tmp_path: Path) -> None:
+def test_a_changed_episode_is_told_from_a_new_one(tmp_path):
     filled(tmp_path, count=2)
     cache = LatentCache(tmp_path, SETTINGS)
     again = {digest_of('edited', start): f'episode from frame {start}' for start in range(3)}
@@ -76,7 +76,7 @@ def test_a_changed_episode_is_told_from_a_new_one(tmp_path: Path) -> None:
     assert cache.changed(KEYS) == []
 
 
-def test_a_damaged_shard_is_said_and_its_clips_are_encoded_again(tmp_path: Path) -> None:
+def test_a_damaged_shard_is_said_and_its_clips_are_encoded_again(tmp_path):
     folder = filled(tmp_path).folder
     whole = sorted(folder.glob('*.safetensors'))[0]
     whole.write_bytes(whole.read_bytes()[:500])
@@ -86,7 +86,7 @@ def test_a_damaged_shard_is_said_and_its_clips_are_encoded_again(tmp_path: Path)
     assert len(filled(tmp_path)) == 5
 
 
-def test_a_full_disk_is_said_and_what_was_written_is_kept(tmp_path: Path) -> None:
+def test_a_full_disk_is_said_and_what_was_written_is_kept(tmp_path):
     """Files may not grow beyond a limit here, which fails the same way as a full disk."""
     cache = filled(tmp_path, count=2)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -100,6 +100,6 @@ def test_a_full_disk_is_said_and_what_was_written_is_kept(tmp_path: Path) -> Non
     assert len(LatentCache(tmp_path, SETTINGS)) == 2
 
 
-def test_a_clip_that_is_not_there_is_an_error(tmp_path: Path) -> None:
+def test_a_clip_that_is_not_there_is_an_error(tmp_path):
     with pytest.raises(TrainingError, match='has no clip missing'):
         LatentCache(tmp_path, SETTINGS).read('missing')
