@@ -7,7 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 import subprocess
 import time
+from typing import Any
 
+from tqdm import tqdm
+
+from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import check_room
 from mtv_world_ros.processes import (
@@ -75,7 +79,9 @@ def record_through_node(
         )
         command += ['--wait-timeout', str(_NODE_START_S), '--answer-timeout', '300']
         player = start_process('player', command, logs, environment)
-        _wait(player, {'node': node, 'recorder': recorder}, logs)
+        plans = sum(1 for _ in BagReader(episode).messages(('/joint_trajectory',)))
+        with tqdm(total=plans, desc='imagining', unit='plan', disable=None) as bar:
+            _wait(player, {'node': node, 'recorder': recorder}, logs, bar)
     finally:
         stop_process(recorder)
         stop_process(node)
@@ -102,10 +108,15 @@ def _node_command(options: DemoOptions) -> list[str]:
 
 
 def _wait(
-    player: subprocess.Popen[bytes], others: Mapping[str, subprocess.Popen[bytes]], logs: Path
+    player: subprocess.Popen[bytes],
+    others: Mapping[str, subprocess.Popen[bytes]],
+    logs: Path,
+    bar: Any,
 ) -> None:
     still = StandStill()
     while player.poll() is None:
+        bar.n = (logs / 'player.log').read_bytes().count(b'trajectory is answered: ')
+        bar.refresh()
         for name, process in others.items():
             if process.poll() is not None:
                 stop_process(player)
@@ -113,6 +124,6 @@ def _wait(
         if said := still.said({'player': player, **others}):
             stop_process(player)
             raise EpisodeError(f"{said} (logs are in '{logs}')")
-        time.sleep(0.1)
+        time.sleep(0.2)
     if player.returncode != 0:
         raise EpisodeError(how_it_ended('player', player, logs))

@@ -269,6 +269,7 @@ class Player(Node):
         timeline.pause(time.time_ns() - begin_ns)
         state = 'unanswered' if answer is None else answer['state']
         self._counts[state] += 1
+        self.get_logger().info(f'trajectory is answered: {state}')
         if state != 'done':
             text = '' if answer is None else answer.get('text', '')
             self.get_logger().warning(f'trajectory at {stamp_ns} ns: {state} {text}')
