@@ -176,9 +176,14 @@ def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_kno
     lines = [f"view '{view}': {focal}; {count} places in {len(episodes)} recordings"]
     if len(estimate.apart_px):
         lines.append(
-            f'seen points: {np.median(estimate.apart_px):.1f} px beside where they are drawn in '
-            f'the median of {len(estimate.apart_px)}; 95 % of tool points are expected within '
-            f'{estimate.within_px:.1f} px'
+            f'{len(estimate.apart_px)} seen points that were left out: '
+            f'{np.median(estimate.apart_px):.1f} px beside where they are drawn in the median; '
+            f'95 % of tool points are expected within {estimate.within_px:.1f} px'
+        )
+    else:
+        lines.append(
+            'no error is stated: of three or more --points of a recording each third is left out '
+            'of the fit, and tells it'
         )
     if estimate.kept_guess:
         lines.append("the guess fits better by the doctor's measure and is kept")

@@ -27,7 +27,7 @@ from mtv_world_ros.lab.inspection.fixed_camera import (
 from mtv_world_ros.lab.inspection.places import CameraPlaces, turn_between
 
 #: widths of the images and blurs [px], from coarse to fine
-_COARSE, _FIRST, STAGES = (64, 1.5), (64, 3.0), ((80, 3.0), (120, 2.0), (160, 1.2))
+_COARSE, _FIRST, _STAGES = (64, 1.5), (64, 3.0), ((80, 3.0), (120, 2.0), (160, 1.2))
 #: recordings whose background is shifted by less look alike to the search [share of the width]
 _NEAR = 0.06
 #: difference of drawn and seen change from which on a pixel counts less
@@ -166,11 +166,11 @@ class JointCamera:
             found.sort(key=lambda state: -float(self.fits(state, _FIRST, near).mean()))
             starts = found[:_NUM_REFINED]
             starts = [self._respread(near[0], state, places) for state in starts]
-        ends = [self.refined(start, STAGES[:1], 14) for start in starts]
-        best = max(ends, key=lambda state: float(self.fits(state, STAGES[0]).mean()))
+        ends = [self.refined(start, _STAGES[:1], 14) for start in starts]
+        best = max(ends, key=lambda state: float(self.fits(state, _STAGES[0]).mean()))
         if guess is None:
             best = self._respread(places.near(_NEAR)[0], best, places)
-        return best if rough else self.refined(best, STAGES[1:], 9)
+        return best if rough else self.refined(best, _STAGES[1:], 9)
 
     def together(
         self, starts: Sequence[JointState], points: Sequence[SeenPoint] = ()
@@ -183,11 +183,11 @@ class JointCamera:
             points: seen tool points, of any of the recordings.
         """
         self._points = points
-        ends = [self.refined(start, STAGES[:1], 14) for start in starts]
-        return self.refined(min(ends, key=self._cost_of), STAGES[1:], 14)
+        ends = [self.refined(start, _STAGES[:1], 14) for start in starts]
+        return self.refined(min(ends, key=self._cost_of), _STAGES[1:], 14)
 
     def _cost_of(self, state: JointState) -> float:
-        stage, numbers = STAGES[0], range(len(self._recordings))
+        stage, numbers = _STAGES[0], range(len(self._recordings))
         return self._cost(state, {n: self._read(n, state, stage) for n in numbers})
 
     def from_points(
@@ -315,7 +315,7 @@ class JointCamera:
     def fits(
         self,
         state: JointState,
-        stage: tuple[int, float] = STAGES[1],
+        stage: tuple[int, float] = _STAGES[1],
         members: Sequence[int] | None = None,
     ) -> FloatArray:
         """(R,) correlation of drawn and seen changes of recordings; None = of all."""
@@ -329,7 +329,7 @@ class JointCamera:
     def refined(
         self,
         state: JointState,
-        stages: Sequence[tuple[int, float]] = STAGES,
+        stages: Sequence[tuple[int, float]] = _STAGES,
         iterations: int = 8,
         members: Sequence[int] | None = None,
     ) -> JointState:

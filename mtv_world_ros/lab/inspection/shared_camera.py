@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import f as f_distribution
 
 from mtv_world_ros.config import read_yaml
 from mtv_world_ros.data.episode import Episode
@@ -22,7 +23,6 @@ from mtv_world_ros.lab.inspection.joint_camera import (
     JointCamera,
     JointState,
     SeenPoint,
-    STAGES,
     zoomed,
 )
 from mtv_world_ros.lab.inspection.motion_residual import (
@@ -42,11 +42,9 @@ _DOUBTED = 0.02
 #: real recordings a view with the right focal length had .35 to .47, and .23 to .32 with one a
 #: third too long; another view had .37 to .56 with any of three focal lengths
 _LEAST_MATCH = 0.335
-#: standard deviations of x and y within which 95 % of distances lie
-_WITHIN = 2.45
-#: points that were left out are this much farther away than those that poses were fitted to: 1.0
-#: and 2.1 times in two views of ten real recordings
-_WIDENED = 2.0
+#: of the points of a recording each third is left out of the fit, and tells how good it is: on ten
+#: real recordings points that poses were fitted to are .5 and .9 px away, others 1.3 and 3.2
+_LEFT_OUT = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +59,7 @@ class SharedEstimate:
         kept_guess: whether the guess fits better and is what `cameras` has.
         focal_px: estimated, or the one given.
         fits: (R,) correlation of drawn and seen changes of each recording.
-        apart_px: (N,) how far the tool points that somebody saw are drawn from there.
+        apart_px: (N,) how far the seen tool points that were left out are drawn from there.
     """
 
     cameras: tuple[CameraModel, ...]
@@ -77,13 +75,12 @@ class SharedEstimate:
     def within_px(self) -> float:
         """Distance from where it is within which 95 % of tool points are drawn; NaN = not known.
 
-        From the seen points, as of errors that are normal in x and y, widened for points that
-        the poses were fitted to; at least a pixel of the images that are compared.
+        From the seen points that were left out, as of errors that are normal in x and y.
         """
-        if not len(self.apart_px):
+        count = len(self.apart_px)
+        if not count:
             return np.nan
-        found = _WIDENED * _WITHIN * float(np.sqrt(np.mean(self.apart_px**2) / 2))
-        return max(found, self.cameras[0].width / STAGES[-1][0])
+        return float(np.sqrt(np.mean(self.apart_px**2) * f_distribution.ppf(0.95, 2, 2 * count)))
 
     def doubts(self, number: int) -> str:
         """Why the pose of a recording may be wrong; empty where nothing says so."""
@@ -110,6 +107,7 @@ class _View:
     recordings: list[FixedCamera]
     places: CameraPlaces
     points: list[SeenPoint]
+    left_out: list[SeenPoint]
     joint: JointCamera
 
     @property
@@ -187,12 +185,14 @@ def _view(
     ]  # fmt: skip
     places = find_places([background(episode.images[view]) for episode in episodes])
     numbers = [int(n) for n in places.place]
+    fitted, left_out = (_seen_points(p, episodes, tracks, robot) for p in _parted(points))
     return _View(
         name=view,
         cameras=cameras,
         recordings=recordings,
         places=places,
-        points=_seen_points(points, episodes, tracks, robot),
+        points=fitted,
+        left_out=left_out,
         joint=JointCamera(recordings, numbers, intrinsics_known=focal_known),
     )
 
@@ -288,7 +288,7 @@ def _judged(
         kept_guess=kept,
         focal_px=focal if kept else focal * float(state.zoom[0]),
         fits=view.joint.fits(view.given if kept else state),
-        apart_px=np.array([_apart(point, best[point.recording]) for point in view.points]),
+        apart_px=np.array([_apart(point, best[point.recording]) for point in view.left_out]),
     )
 
 
@@ -317,6 +317,17 @@ def _on_base(camera: CameraModel, robot: RobotModel) -> CameraModel:
         )
     rest = robot.link_poses(camera.mount_link, np.zeros((1, len(robot.joint_names))))[0]
     return replace(camera, mount_link=robot.base_link, T_mount_camera=rest @ camera.T_mount_camera)
+
+
+def _parted(
+    points: Mapping[str, Sequence[Any]],
+) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
+    """Rows that poses are fitted to, and those that are left out."""
+    parts: tuple[dict[str, list[Any]], dict[str, list[Any]]] = ({}, {})
+    for name, rows in points.items():
+        for number, row in enumerate(rows, start=1):
+            parts[number % _LEFT_OUT == 0].setdefault(name, []).append(row)
+    return parts
 
 
 def _seen_points(
