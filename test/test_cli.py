@@ -136,6 +136,6 @@ def test_the_shell_completes_commands_and_options():
         words |= {'_ARGCOMPLETE_IFS': ' ', '_ARGCOMPLETE_STDOUT_FILENAME': '/dev/stdout'}
         done = subprocess.run(
             [sys.executable, '-m', 'mtv_world_ros.cli'],
-            env={**os.environ, **words}, capture_output=True, text=True, timeout=60,
+            env={**os.environ, **words}, capture_output=True, text=True, timeout=180,
         )  # fmt: skip
         assert wanted in done.stdout.split(), done

@@ -35,7 +35,7 @@ def test_one_that_stands_still_is_named_and_one_at_work_is_not(child):
     child.send_signal(signal.SIGSTOP)
     begin_s = time.monotonic()
     while not (said := still.said({'child': child, 'self': child})):
-        assert time.monotonic() - begin_s < 4 * STILL_S
+        assert time.monotonic() - begin_s < 12 * STILL_S
         time.sleep(0.1)
     assert "'child' was stopped" in said and time.monotonic() - begin_s >= STILL_S
     child.send_signal(signal.SIGCONT)
@@ -48,7 +48,8 @@ def test_one_that_stands_still_hears_that_it_is_to_end(child):
     child.send_signal(signal.SIGSTOP)
     begin_s = time.monotonic()
     stop_process(child)
-    assert child.poll() is not None and time.monotonic() - begin_s < 10.0
+    # it is killed after 30 s where it hears nothing
+    assert child.poll() is not None and time.monotonic() - begin_s < 25.0
 
 
 def test_a_stopped_worker_is_an_error_within_seconds():
@@ -75,7 +76,7 @@ def test_forked_workers_that_note_sigterm_as_training_does_end_with_a_broken_poo
         begin_s = time.monotonic()
         workers.close()
         signal.signal(signal.SIGTERM, before)
-    assert time.monotonic() - begin_s < 4 * STILL_S
+    assert time.monotonic() - begin_s < 12 * STILL_S
 
 
 #: the pool of OpenCV's threads has been used before clips are made
@@ -96,7 +97,7 @@ workers.close()
 
 def test_forked_workers_begin_after_opencv_had_threads():
     """Its pool does not survive the fork: whoever waits for its threads waits for ever."""
-    subprocess.run([sys.executable, '-c', AFTER_OPENCV], check=True, timeout=60)
+    subprocess.run([sys.executable, '-c', AFTER_OPENCV], check=True, timeout=180)
 
 
 def test_an_interrupted_command_does_not_wait_for_the_jobs_of_its_workers(tmp_path):

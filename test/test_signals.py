@@ -41,7 +41,7 @@ def stopped(tmp_path: Path, slow: str, number: int, *words: str) -> tuple[int, l
     try:
         assert process.stdout.readline() == 'importing\n'
         process.send_signal(number)
-        _, said = process.communicate(timeout=30)
+        _, said = process.communicate(timeout=120)
     finally:
         process.kill()
     return process.returncode, said.splitlines()

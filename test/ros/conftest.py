@@ -370,7 +370,7 @@ class NodeProcess:
     def stop(self, number=signal.SIGTERM):
         if self.process.poll() is None:
             self.process.send_signal(number)
-        self.process.wait(timeout=20)
+        self.process.wait(timeout=120)
         return self.process.returncode
 
     def output(self):

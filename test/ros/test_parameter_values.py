@@ -30,7 +30,7 @@ sys.exit(run(make, sys.argv[1:], spin=lambda node: None))
 def ask(ros, node, *arguments):
     return subprocess.run(
         [sys.executable, '-c', NODE, node, '--ros-args', *arguments],
-        env=ros.ENVIRONMENT, capture_output=True, text=True, timeout=60,
+        env=ros.ENVIRONMENT, capture_output=True, text=True, timeout=180,
     )  # fmt: skip
 
 

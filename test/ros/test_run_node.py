@@ -22,7 +22,7 @@ def test_the_middleware_repeats_soon_unless_it_is_told_otherwise(own, ros):
     if own:
         environment[VARIABLE] = own
     done = subprocess.run(
-        [sys.executable, '-c', NODE], env=environment, capture_output=True, text=True, timeout=60
+        [sys.executable, '-c', NODE], env=environment, capture_output=True, text=True, timeout=180
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == (own or str(share_path('config', 'fastdds_heartbeat.xml')))

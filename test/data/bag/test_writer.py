@@ -39,7 +39,7 @@ def test_a_killed_recorder_leaves_nothing_under_the_name(tmp_path):
         'os.kill(os.getpid(), signal.SIGKILL)\n'
     )
     root = Path(__file__).parents[3]
-    done = subprocess.run([sys.executable, '-c', code], cwd=root, timeout=60, check=False)
+    done = subprocess.run([sys.executable, '-c', code], cwd=root, timeout=180, check=False)
     assert done.returncode == -signal.SIGKILL
     assert not (tmp_path / 'episode').exists()
     assert all(left.name.startswith('.episode.') for left in tmp_path.iterdir())

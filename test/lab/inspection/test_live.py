@@ -35,7 +35,7 @@ def player(private_domain):
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     yield
     process.send_signal(signal.SIGINT)
-    process.wait(timeout=20)
+    process.wait(timeout=120)
 
 
 def test_running_topics_become_a_bag_that_can_be_checked(player, tmp_path):

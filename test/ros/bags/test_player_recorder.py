@@ -79,7 +79,7 @@ def launch(ros):
     for process in started:
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
-        process.wait(timeout=20)
+        process.wait(timeout=120)
 
 
 @pytest.fixture

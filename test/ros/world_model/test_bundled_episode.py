@@ -75,7 +75,7 @@ def test_bundled_episode_is_imagined_over_the_middleware(bundled, ros, tmp_path)
     finally:
         if player is not None and player.poll() is None:
             player.send_signal(signal.SIGINT)
-            player.wait(timeout=20)
+            player.wait(timeout=120)
         client.close()
         assert process.stop(signal.SIGINT) == 0, process.output()
 

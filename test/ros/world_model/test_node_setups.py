@@ -168,7 +168,7 @@ def test_qos_overrides_and_latched_instruction(start, new_client, ros):
 )
 def test_wrong_parameter_at_start_is_one_clear_line(start, parameter, said):
     process = start(parameter)
-    assert process.process.wait(timeout=30) == 1
+    assert process.process.wait(timeout=120) == 1
     output = process.output()
     assert said in output
     assert 'Traceback' not in output
