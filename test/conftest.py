@@ -89,6 +89,27 @@ def nothing_left_behind() -> Iterator[None]:
         warnings.warn(said, stacklevel=1)
 
 
+@pytest.fixture
+def failing_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """`MODULE:NAME` of a policy whose answers have a wrong shape; child processes find it, too."""
+    module = f'failing_{tmp_path.name}'
+    (tmp_path / f'{module}.py').write_text(
+        """
+class Failing:
+    name = 'failing'
+
+    def reset(self, *, seed):
+        pass
+
+    def act(self, observation, instruction):
+        raise ValueError('actions have shape (7,), expected (50, 14)')
+"""
+    )
+    monkeypatch.setenv('PYTHONPATH', str(tmp_path), prepend=':')
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return f'{module}:Failing'
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for marker, obstacle in OBSTACLES.items():
         marked = [item for item in items if item.get_closest_marker(marker)]

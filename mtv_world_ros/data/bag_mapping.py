@@ -45,7 +45,20 @@ def _view(value: Any) -> Any:
     return {'image': value} if isinstance(value, str) else value
 
 
-class BagMapping(Schema):
+class Written(Schema):
+    """What is said of the episodes that an import writes, and how they are written."""
+
+    task: str = Field(default='', description='name of the task; empty = none')
+    outcome: Annotated[str, AfterValidator(check_outcome)] = 'unknown'
+    objects: ListOf[str] = Field(default=(), description='names of the objects')
+    chunk_s: Seconds = Field(default=3.2, description='length of a joint trajectory message [s]')
+    limit_tolerance: Length = Field(
+        default=0.05, description='positions further outside the joint limits fail [rad or m]'
+    )
+    jpeg_quality: int = Field(default=95, ge=1, le=100)
+
+
+class BagMapping(Written):
     """A mapping file of bags; topics without a leading slash are in the namespace."""
 
     robot: str = Field(
@@ -75,14 +88,6 @@ class BagMapping(Schema):
     tf_prefix: str = Field(default='', description='of frame names in TF, removed')
     instruction_topic: str = 'instruction'
     instruction: str = Field(default='', description='of the robot; empty = the topic')
-    task: str = ''
-    outcome: Annotated[str, AfterValidator(check_outcome)] = 'unknown'
-    objects: ListOf[str] = ()
-    chunk_s: Seconds = Field(default=3.2, description='length of a joint trajectory message [s]')
-    limit_tolerance: Length = Field(
-        default=0.05, description='positions further outside the limits fail [rad or m]'
-    )
-    jpeg_quality: int = Field(default=95, ge=1, le=100)
 
     def topic(self, name: str) -> str:
         """The absolute name of a topic."""

@@ -45,23 +45,9 @@ def test_the_expert_succeeds_as_the_page_says(tmp_path, capsys):
 
 
 def test_a_policy_that_fails_ends_with_1_and_its_reason_on_the_screen(
-    tmp_path, capsys, monkeypatch
+    tmp_path, capsys, failing_policy
 ):
-    (tmp_path / 'failing_policy.py').write_text(
-        """
-class Failing:
-    name = 'failing'
-
-    def reset(self, *, seed):
-        pass
-
-    def act(self, observation, instruction):
-        raise ValueError('actions have shape (7,), expected (50, 14)')
-"""
-    )
-    (tmp_path / 'failing.yaml').write_text('kind: python\nfactory: failing_policy:Failing\n')
-    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
-    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / 'failing.yaml').write_text(f'kind: python\nfactory: {failing_policy}\n')
     assert run(tmp_path / 'out', tmp_path / 'failing.yaml') == 1
     printed = capsys.readouterr()
     assert 'episode 0 failed: policy_failed: ' in printed.err

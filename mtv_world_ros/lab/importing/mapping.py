@@ -16,7 +16,8 @@ from pydantic import (
     ValidationInfo,
 )
 
-from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, Seconds, validated, wrong
+from mtv_world_ros.config import ListOf, read_yaml, validated, wrong
+from mtv_world_ros.data.bag_mapping import Written
 from mtv_world_ros.data.episode import check_outcome
 from mtv_world_ros.data.tool_targets import add_tool_poses, led_joints
 from mtv_world_ros.data_types import FloatArray
@@ -116,7 +117,7 @@ def _named(views: dict[str, CameraSource]) -> dict[str, CameraSource]:
     return {view: source.model_copy(update={'view': view}) for view, source in views.items()}
 
 
-class DatasetMapping(Schema):
+class DatasetMapping(Written):
     """A mapping file."""
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -131,7 +132,6 @@ class DatasetMapping(Schema):
     action: Annotated[ActionStream | None, BeforeValidator(_not_from_state)] = Field(
         description='commands; `state` = the measured positions of the frames that follow'
     )
-    task: str = Field(default='', description='name of the task; empty = none')
     instruction: str = Field(
         default='', description="what the robot is told; empty = the dataset's text"
     )
@@ -140,11 +140,6 @@ class DatasetMapping(Schema):
     )
     outcome_feature: str = Field(
         default='', description='feature that is true in a frame of an episode that succeeds'
-    )
-    objects: ListOf[str] = Field(default=(), description='names of the objects')
-    chunk_s: Seconds = Field(default=3.2, description='length of a joint trajectory message [s]')
-    limit_tolerance: Length = Field(
-        default=0.05, description='positions further outside the limits fail [rad or m]'
     )
     jpeg_quality: int = Field(default=90, ge=1, le=100)
     _key: str = PrivateAttr(default='')

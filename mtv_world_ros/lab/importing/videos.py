@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PrivateAttr
 
 from mtv_world_ros.bounded_input import check_limit, parse_json, read_text
-from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, Seconds, validated, wrong
-from mtv_world_ros.data.bag_mapping import BagMapping, ViewTopics
-from mtv_world_ros.data.episode import check_outcome, Episode, EpisodeInfo, JointStates, Track
+from mtv_world_ros.config import read_yaml, validated, wrong
+from mtv_world_ros.data.bag_mapping import BagMapping, ViewTopics, Written
+from mtv_world_ros.data.episode import Episode, EpisodeInfo, JointStates, Track
 from mtv_world_ros.data.joint_plans import following
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import ConfigError, EpisodeError
@@ -42,7 +42,7 @@ def _inside(pattern: str) -> str:
     return pattern
 
 
-class VideoMapping(Schema):
+class VideoMapping(Written):
     """A mapping file of videos and tables; `{name}` in a path is the recording's name."""
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -60,14 +60,6 @@ class VideoMapping(Schema):
     )
     time: str = Field(default='', description='column or key of the time of each row [s]')
     instruction: str = Field(default='', description='text, or `key: NAME` of the JSON file')
-    task: str = ''
-    outcome: Annotated[str, AfterValidator(check_outcome)] = 'unknown'
-    objects: ListOf[str] = ()
-    chunk_s: Seconds = Field(default=3.2, description='length of a joint trajectory message [s]')
-    limit_tolerance: Length = Field(
-        default=0.05, description='positions further outside the joint limits fail [rad or m]'
-    )
-    jpeg_quality: int = Field(default=95, ge=1, le=100)
     _robot_file: Path = PrivateAttr(default=Path())
 
     @property
@@ -77,8 +69,7 @@ class VideoMapping(Schema):
 
     def written(self) -> BagMapping:
         """What is said of the episodes that are written."""
-        names = ('task', 'outcome', 'objects', 'chunk_s', 'limit_tolerance', 'jpeg_quality')
-        given = {name: getattr(self, name) for name in names}
+        given = {name: getattr(self, name) for name in Written.model_fields}
         return BagMapping(**given, views={view: ViewTopics(image=view) for view in self.views})
 
 

@@ -75,27 +75,14 @@ def test_a_watched_port_that_is_taken_is_told_before_anything_runs(tmp_path, cap
 
 
 def test_a_rollout_that_fails_ends_with_1_and_its_reason_and_the_others_count(
-    tmp_path, capsys, monkeypatch
+    tmp_path, capsys, failing_policy
 ):
     if reason := missing_opengl():
         pytest.skip(reason)
-    (tmp_path / 'failing_in_rank.py').write_text(
-        """
-class Failing:
-    name = 'failing'
-
-    def reset(self, *, seed):
-        pass
-
-    def act(self, observation, instruction):
-        raise ValueError('actions have shape (7,), expected (50, 14)')
-"""
-    )
-    monkeypatch.syspath_prepend(str(tmp_path))
     file = tmp_path / 'policies.yaml'
     file.write_text(
         'policies:\n- {name: expert, policy: expert}\n'
-        "- {name: broken, policy: {kind: python, factory: 'failing_in_rank:Failing'}}\n"
+        f"- {{name: broken, policy: {{kind: python, factory: '{failing_policy}'}}}}\n"
     )
     command = ['rank', '--policies', str(file), '--tasks', 'stack_blocks_two', '--episodes', '1']
     command += ['--max-chunks', '1', '--segmenter', 'colour', '--no-video']
