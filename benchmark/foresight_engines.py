@@ -14,7 +14,8 @@ processor for finding and foreseeing a plan, medians; the ratio is of each episo
 median. What is chosen by this must not be measured by it: kinds of the split `test` are refused.
 
 `--robot` and `--contact` judge another robot's episodes with what fit-contact found, this version
-alone.
+alone. The no-picture rule (commands and first masks alone: an object sticks to a gripper that closes
+near it) stands beside it.
 
 With `--chunks N` both versions imagine N plans of 3.2 s of the bundled episode in turns, each whole
 with its pictures; seconds are those of the processor again, one thread each, so that other work on
@@ -42,6 +43,7 @@ from mtv_world_ros.assembly import (
     fingerprint,
     robot_path,
 )
+from mtv_world_ros.bench.ranking.no_picture_rule import is_done, things_in
 from mtv_world_ros.cli.shared_options import names
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.splits import refuse_test_kinds
@@ -59,7 +61,7 @@ from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.success.foreseen import foreseen_of
 from mtv_world_ros.success.task import load_tasks, match_task
 
-OLD = '0.1.0: networks and DART'
+OLD, RULE = '0.1.0: networks and DART', 'no-picture rule'
 #: plans begin so many frames apart, among the first frames of the bundled episode
 _STRIDE, _FRAMES = 7, 60
 #: a share from here on is a verdict of success
@@ -258,7 +260,12 @@ class New:
             if ends is None:
                 return success, {}
             answers[row] = ends.share, time.process_time() - begin
-        return success, answers
+        begin = time.process_time()
+        things = things_in(named, frame.masks, frame.cameras, frame.poses)
+        if not set(bound.values()) <= set(things):
+            return success, {}
+        done = is_done(task, bound, things, self.robot, positions)
+        return success, {**answers, RULE: (float(done), time.process_time() - begin)}
 
 
 #: row of the table -> share of futures that succeed, and seconds

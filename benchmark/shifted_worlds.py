@@ -615,8 +615,8 @@ def main() -> None:
     if not found:
         raise MtvWorldError('no rollout was done; give more time (--until)')
     rows = rows_of(options, pipelines, found)
-    asked = ('faults', 'size', 'physics', 'pictures', 'real', 'contact', 'scenes', 'policies',
-             'seed', 'checkpoints')  # fmt: skip
+    asked = ('faults', 'size', 'physics', 'pictures', 'real', 'contact', 'tasks', 'scenes',
+             'policies', 'seed', 'checkpoints')  # fmt: skip
     command = ' '.join(
         f'--{key} {getattr(options, key)}' for key in asked if getattr(options, key)
     )

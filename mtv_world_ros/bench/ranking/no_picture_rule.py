@@ -130,6 +130,23 @@ def find_things(episode: ImaginedEpisode) -> dict[str, Thing]:
     masks = pipeline.segmenter.segment(start.frames[:, None], names).masks[:, :, 0]
     cameras = start.cameras
     poses = [camera_poses(camera, pipeline.robot, start.positions[None])[0] for camera in cameras]
+    return things_in(names, masks, cameras, poses)
+
+
+def things_in(
+    names: Sequence[str],
+    masks: BoolArray,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray],
+) -> dict[str, Thing]:
+    """Returns the objects of masks by name, those that two views see.
+
+    Args:
+        names: O of them.
+        masks: (V, O, H, W) of one frame.
+        cameras: V cameras at the masks' size.
+        poses: V of T_base_camera (4, 4).
+    """
     things = {}
     for name, seen in zip(names, masks.swapaxes(0, 1), strict=True):
         location = locate(cameras, poses, centroids(seen))
