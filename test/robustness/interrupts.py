@@ -48,6 +48,8 @@ MARK = 'MTV_WORLD_INTERRUPTED'
 #: names of logs and locks
 LOGS, LOG_FOLDERS = ('.lock', 'log.jsonl'), {'logs', 'tensorboard'}
 TASK = 'stack_blocks_two'
+#: of each episode: a calibration wants eight with an outcome
+COPIES = 4
 TINY = (
     'transformer.num_attention_heads=2 transformer.attention_head_dim=12 transformer.ffn_dim=32 '
     'transformer.num_layers=1 transformer.stem_widths=[8,16,16] transformer.frames_per_token=2 '
@@ -74,7 +76,7 @@ COMMANDS: dict[str, Callable[[Path, Path], list[str]]] = {
         'evaluate', 'bundled', str(given / 'set'), '--split', 'all', '--actions', 'true',
         '--no-ceiling', '--out', str(out / 'evaluation'), *ONE_STEP],
     'calibrate': lambda given, out: [
-        'calibrate', str(out / 'checkpoint'), str(given / 'set'), '--split', 'all',
+        'calibrate', str(out / 'checkpoint'), str(given / 'copies'), '--split', 'all',
         '--out', str(out / 'calibration'), *ONE_STEP],
     'rank': lambda given, out: [
         'rank', '--policies', 'expert,expert-miss-0.5', '--tasks', TASK, '--episodes', '1',
@@ -100,6 +102,8 @@ def prepare(given: Path) -> Path:
         words = ['collect', '--task', TASK, '--episodes', '2', '--failures-of-ten', '5', *SIZE]
         with start([*words, '--out', str(given / 'set')], given.parent) as process:
             assert process.wait(PATIENCE_S) == 0, (given.parent / 'log').read_text()
+        for number, episode in enumerate(sorted((given / 'set').glob(f'{TASK}_*')) * COPIES):
+            shutil.copytree(episode, given / 'copies' / f'{TASK}_{number:05d}')
         (given / 'ready').touch()
     return given
 
