@@ -120,10 +120,22 @@ def cycles_table(folders: list[Path]) -> str:
                  for key in ('memory_mb', 'descriptors', 'threads')]  # fmt: skip
         grown = found['growth_a_cycle']['memory_mb']
         most, failed = found['most_processes'], len(found['problems'])
-        rows.append([found['commit'], found['cycles'], *spans, f'{grown:.2f}', most, failed])
+        half = _cell(_growth_of_last_half(folder / 'cycles.csv'))
+        rows.append([found['commit'], found['cycles'], *spans, f'{grown:.2f}', half, most, failed])
     head = ('commit', 'cycles', 'memory [MB]', 'descriptors', 'threads',
-            'growth, warm [MB a cycle]', 'most processes', 'problems')  # fmt: skip
+            'growth, warm [MB a cycle]', 'of the last half', 'most processes',
+            'problems')  # fmt: skip
     return table(head, [[str(cell) for cell in row] for row in rows])
+
+
+def _growth_of_last_half(file: Path) -> float:
+    """Of the memory [MB a cycle]."""
+    with file.open() as table_of_cycles:
+        rows = [
+            (float(r['cycle']), float(r['memory_mb'])) for r in csv.DictReader(table_of_cycles)
+        ]
+    cycle, megabytes = np.array(rows[len(rows) // 2 :]).T
+    return float(np.polyfit(cycle, megabytes, 1)[0])
 
 
 def worlds_table(folder: Path) -> str:
