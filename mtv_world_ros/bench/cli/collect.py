@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from pathlib import Path
 
 from mtv_world_ros.bench.cli.physics_option import add_physics
@@ -90,7 +91,7 @@ def _collect(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.bench.world.randomize import RandomizationConfig
 
     size = RandomizationConfig(width=arguments.width, height=arguments.height)
-    collect(
+    made = collect(
         [name.strip() for name in arguments.task.split(',')],
         arguments.episodes,
         arguments.seed,
@@ -111,6 +112,9 @@ def _collect(arguments: argparse.Namespace) -> int:
         ),
         sheets=arguments.sheets,
     )
+    outcomes = Counter(entry.outcome for entry in made)
+    counted = ', '.join(f'{outcome} {number}' for outcome, number in sorted(outcomes.items()))
+    print(f'{len(made)} episodes ({counted}): {arguments.out}')
     return 0
 
 

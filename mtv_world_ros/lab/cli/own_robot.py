@@ -212,6 +212,10 @@ def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
 
 
 def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
+    from functools import partial
+
+    from tqdm import tqdm
+
     from mtv_world_ros.lab.inspection.inspect import load_inspector
     from mtv_world_ros.lab.inspection.inspection_report import to_text
 
@@ -219,7 +223,8 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     inspector = load_inspector(file)
     robot = inspector.robot
     episode = read_for_checks(path, arguments.views, source, robot, robot.base_link)
-    inspection = inspector.inspect(episode)
+    bar = partial(tqdm, desc='comparing', unit='view', disable=None)
+    inspection = inspector.inspect(episode, bar)
     out = arguments.out or Path('out/doctor') / name
     _write_inspection(inspector, episode, inspection, out)
     print(to_text(inspection))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -109,8 +109,14 @@ class Inspector:
         factor = 1.0 if shape.is_known else _RODS_FACTOR
         self._suspicious, self._broken = factor * _SUSPICIOUS, factor * _BROKEN
 
-    def inspect(self, episode: Episode) -> Inspection:
+    def inspect(
+        self, episode: Episode, progress: Callable[[Sequence[str]], Iterable[str]] = iter
+    ) -> Inspection:
         """Checks an episode that was read with its cameras.
+
+        Args:
+            episode: the recording.
+            progress: wraps the views, e.g. in a progress bar.
 
         Raises:
             EpisodeError: the episode has no joint states.
@@ -125,7 +131,7 @@ class Inspector:
         joints = JointTrack(states, self.robot)
         residuals = {
             view: self._residual(episode, view, joints)
-            for view in episode.views
+            for view in progress(episode.views)
             if view not in (*episode.camera_tracks, *episode.unknown)
         }
         late = delays(

@@ -422,7 +422,9 @@ def cached(
     )
     held = sum(clip.key in cache for clip in clips)
     made = 'none to encode'
-    for build in tqdm(steps, total=len(clips) - held, desc='encoding clips', unit='clip'):
+    for build in tqdm(
+        steps, total=len(clips) - held, desc='encoding clips', unit='clip', disable=None
+    ):
         made = (
             f'{build.num_encoded} encoded in {build.seconds:.1f} s ({build.clips_per_s:.2f} '
             f'clips/s, {build.clip_bytes / 1e6:.2f} MB each)'

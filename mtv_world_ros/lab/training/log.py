@@ -40,7 +40,11 @@ class TrainingLog:
     ) -> None:
         self._total, self._active, self._ideal = total, active, ideal_seconds
         self._bar = tqdm(
-            total=total, initial=step, desc='training', unit='step', disable=not active
+            total=total,
+            initial=step,
+            desc='training',
+            unit='step',
+            disable=None if active else True,  # None: on a terminal only
         )
         self._started = time.time()
         self._steps, self._seconds, self._waited = 0, 0.0, 0.0

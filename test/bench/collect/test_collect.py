@@ -106,6 +106,17 @@ def test_a_policy_that_no_scene_allows_is_named(tmp_path, opengl):
         collect('collect_toy', 1, SEED, tmp_path, config=config, progress=False)
 
 
+def test_the_command_says_what_was_made_and_draws_no_bar_into_a_file(data_set, tmp_path, capsys):
+    out = shutil.copytree(data_set, tmp_path / 'set')
+    words = list(COMMAND[COMMAND.index('collect') :])
+    assert main([*words, '--episodes', '2', '--out', str(out)]) == 0
+    card = json.loads((out / 'dataset.json').read_text())
+    good = sum(entry['outcome'] == 'success' for entry in card['episodes'])
+    counted = ', '.join(f'{w} {n}' for w, n in (('failure', 4 - good), ('success', good)) if n)
+    said = capsys.readouterr()
+    assert said.out == f'4 episodes ({counted}): {out}\n' and '%|' not in said.err
+
+
 def test_unknown_policy_is_refused_before_anything_is_made(tmp_path, capsys):
     command = ['collect', '--task', TASKS, '--episodes', '1', '--out', str(tmp_path / 'set')]
     assert main([*command, '--policies', 'expert,expert-lat-0.6']) == 1
