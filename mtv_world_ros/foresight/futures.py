@@ -104,7 +104,7 @@ def _disturbed(
     noise, spread = share * rng.normal(size=5), settings.spread
     wide, long, high = solid.size * np.exp(spread.size * noise[[0, 0, 1]])
     x, y = solid.centre[:2] + spread.place_m * noise[2:4] + moved
-    bottom = solid.centre[2] - solid.size[2] / 2
+    bottom = solid.bottom
     if abs(bottom - settings.table_m) < STANDS_M:
         bottom = settings.table_m
     return replace(

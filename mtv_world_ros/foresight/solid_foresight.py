@@ -316,13 +316,9 @@ def _upright(solid: Solid) -> FloatArray:
     return replace(solid, yaw=0.0).turn_to(solid)
 
 
-def _bottom(solid: Solid) -> float:
-    return float(solid.centre[2] - solid.size[2] / 2)
-
-
 def _table_under(solids: Sequence[Solid | None]) -> float:
     """Height of the table that the lowest solids stand on [m]; NaN = one alone does not tell."""
-    bottoms = np.array([_bottom(solid) for solid in solids if solid is not None])
+    bottoms = np.array([solid.bottom for solid in solids if solid is not None])
     level = bottoms[bottoms < bottoms.min(initial=np.inf) + _LEVEL_M]
     return float(level.mean()) if len(level) > 1 else float('nan')
 
@@ -338,8 +334,8 @@ def _doubts(
             doubts[number] = f"'{name}' is seen by one view alone: where it is is not known"
         elif solid is not None and np.abs(solid.centre[:2]).max() > _TABLE_REACH_M:
             doubts[number] = f"'{name}' seems to lie off the table"
-        elif solid is not None and _bottom(solid) < table - _NEAR_TABLE_M:
-            depth = 1e3 * (table - _bottom(solid))
+        elif solid is not None and solid.bottom < table - _NEAR_TABLE_M:
+            depth = 1e3 * (table - solid.bottom)
             doubts[number] = f"'{name}' seems to lie {depth:.0f} mm below the table"
     known = [(n, s) for n, s in enumerate(solids) if s is not None]
     for count, (one, solid) in enumerate(known):
@@ -352,7 +348,7 @@ def _doubts(
 
 def _floats(solid: Solid, others: Sequence[Solid], table: float) -> float:
     """How far above the table a solid is on which nothing holds it [m]; 0 = it stands."""
-    height = _bottom(solid) - table
+    height = solid.bottom - table
     if height < 3 * STANDS_M or any(_apart(solid, other) < 0 for other in others):
         return 0.0
     return height
@@ -362,7 +358,7 @@ def _overlap(one: Solid, other: Solid) -> bool:
     """Whether solids reach into each other, and neither stands in or on the other."""
     depth = -_apart(one, other)
     tops = [solid.centre[2] + solid.size[2] / 2 for solid in (one, other)]
-    bottoms = [_bottom(solid) for solid in (one, other)]
+    bottoms = [solid.bottom for solid in (one, other)]
     over = min(tops) - max(bottoms)
     return depth > _OVERLAP_M and over > _OVERLAP_M and not (one.is_open or other.is_open)
 

@@ -76,6 +76,11 @@ class Solid:
     fills: FloatArray = field(default_factory=lambda: np.zeros(0))
     error_px: float = 0.0
 
+    @property
+    def bottom(self) -> float:
+        """Height of its lower face [m]."""
+        return float(self.centre[2] - self.size[2] / 2)
+
     def turn_to(self, now: Solid) -> FloatArray:
         """Returns (3, 3) how it has turned."""
         return about_z(now.yaw - self.yaw)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import multivariate_normal, qmc
@@ -168,9 +169,10 @@ _NEAR_M, _LOST_M = 0.008, 0.1
 _WIDER, _LEAST = 1.3, 0.08
 #: an episode says something of a number whose low and high values differ by this likelihood
 _SAYS = 0.5
-#: delays and heights of a table that are tried [s], [m]
+#: delays that are tried [s]
 _DELAYS = np.arange(0.0, 0.31, PERIOD_S)
-_HEIGHTS = np.arange(-0.03, 0.0301, 0.0075)
+#: outlines of masks are no more exact than this, however many there are [m]
+_EXACT_M = 0.0005
 #: recordings whose table is looked for
 _MOST_TABLES = 8
 #: objects of which less is shown than this share of the first frame's are hidden in part
@@ -574,7 +576,10 @@ class _Trial:
 def find_delay(recordings: Sequence[ContactRecording], arms: Arms) -> Finding:
     """Returns how much later joints move than commands of now would have them move."""
     errors = np.stack([_delay_errors(one, arms) for one in recordings])
-    return _least('delay_s', errors, _DELAYS)
+    known = errors[np.isfinite(errors).all(-1)]
+    return _resampled(
+        'delay_s', known, len(errors), 'recordings', lambda rows: _lowest(rows.mean(0), _DELAYS)
+    )
 
 
 def _delay_errors(recording: ContactRecording, arms: Arms) -> FloatArray:
@@ -594,43 +599,60 @@ def _delay_errors(recording: ContactRecording, arms: Arms) -> FloatArray:
 
 
 def find_table(recordings: Sequence[ContactRecording]) -> Finding:
-    """Returns the height at which the outlines of what stands on a table fit best."""
-    errors = []
+    """Returns the height at which what stands on a table ends below."""
+    bottoms = []
     for recording in recordings[:: max(1, len(recordings) // _MOST_TABLES)]:
-        frame, points = recording.frame, recording.frame.points()
+        points = recording.frame.points()
         for item, name in enumerate(recording.names):
-            row = [
-                fit_solid(
-                    frame.masks[:, item], points[item], frame.cameras, frame.poses, height,
-                    is_vessel(name),
-                )
-                for height in _HEIGHTS
-            ]  # fmt: skip
-            # logarithms: what is no box or cylinder fits badly at any height
-            errors.append([np.nan if s is None else np.log(s.error_px + 0.05) for s in row])
-    return _least('table_m', np.array(errors), _HEIGHTS, 'objects')
+            bottoms.append(_bottom_in(recording.frame, item, points[item], is_vessel(name)))
+    known = np.array(bottoms)[np.isfinite(bottoms)]
+    # the middle one: some stand in others
+    found = _resampled('table_m', known, len(bottoms), 'objects', np.median)
+    return replace(found, low=found.low - _EXACT_M, high=found.high + _EXACT_M)
 
 
-def _least(
-    name: str, errors: FloatArray, values: FloatArray, counted: str = 'recordings'
+def _bottom_in(frame: FirstFrame, item: int, point: FloatArray, is_open: bool) -> float:
+    """Where an object ends below [m]; NaN = two views do not see it."""
+    floor = 0.0
+    for _ in range(2):  # a fit is drawn to the height that is told
+        solid = fit_solid(frame.masks[:, item], point, frame.cameras, frame.poses, floor, is_open)
+        if solid is None:
+            return float('nan')
+        floor = solid.bottom
+    return floor
+
+
+def _resampled(
+    name: str,
+    known: FloatArray,
+    of: int,
+    counted: str,
+    middle: Callable[..., Any],
 ) -> Finding:
-    """The value with the least errors (E, N), with an interval from resampled ones."""
-    known = errors[np.isfinite(errors).all(-1)]
+    """What rows say of a number, with an interval from resampled ones.
+
+    Args:
+        name: of the number.
+        known: (E, ...) rows of those that say something.
+        of: that were looked at.
+        counted: what they are.
+        middle: gives the number of rows.
+    """
     if not len(known):
         nothing = dict.fromkeys(('value', 'low', 'high', 'spread'), 0.0)
-        return Finding(name=name, count=0, of=len(errors), counted=counted, **nothing)
+        return Finding(name=name, count=0, of=of, counted=counted, **nothing)
     rng = np.random.default_rng(_SEED)
     rows = rng.integers(0, len(known), (_RESAMPLED, len(known)))
-    found = np.array([_lowest(known[row].mean(0), values) for row in rows])
+    found = np.array([middle(known[row]) for row in rows])
     low, high = np.quantile(found, (0.05, 0.95))
     return Finding(
         name=name,
-        value=float(_lowest(known.mean(0), values)),
+        value=float(middle(known)),
         low=float(low),
         high=float(high),
         spread=float(found.std()),
         count=len(known),
-        of=len(errors),
+        of=of,
         counted=counted,
     )
 
