@@ -284,6 +284,10 @@ class ExampleSegmenter:
         )
         masks, status = np.array(worded.masks), [list(row) for row in worded.status]
         known = [i for i, name in enumerate(names) if name in self._looks]
+        if not frames.shape[1]:
+            return ObjectMasks(
+                names=names, masks=masks, status=(('absent',) * len(names),) * len(frames)
+            )
         # what stands out lies before what does not, where both might be
         known.sort(key=lambda i: not self._looks[names[i]].stands_out)
         for v, view in enumerate(frames):

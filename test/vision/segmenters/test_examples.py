@@ -127,6 +127,11 @@ def test_a_scene_without_them_has_neither(segmenter):
     assert not found.masks.any()
 
 
+def test_no_frames_have_no_masks(segmenter):
+    frames = np.zeros((2, 0, HEIGHT, WIDTH, 3), np.uint8)
+    assert segmenter.segment(frames, ('plate',)).masks.shape == (2, 1, 0, HEIGHT, WIDTH)
+
+
 def test_two_that_look_alike_are_ambiguous(segmenter):
     frame, _ = scene(mug=(30, 70))
     frame[60:78, 175:199] = frame[70:88, 30:54]
