@@ -157,15 +157,6 @@ class Clip:
     origin: Origin | None = None
     masks_by: str = ''
 
-    @property
-    def begun(self) -> Clip:
-        """The same with its own first frame as its origin."""
-        if self.object_poses is None:
-            return self
-        return replace(
-            self, origin=Origin(self.frames[:, 0], self.positions[0], self.object_poses[0])
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class Origin:

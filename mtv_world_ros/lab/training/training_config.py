@@ -101,12 +101,6 @@ class AugmentConfig(Schema):
         description='probability of a clip of which only some objects, or none, are named, so '
         'that what an instruction does not name stays in the picture',
     )
-    begun_share: Share = Field(
-        default=0.0,
-        description='probability of a clip whose objects are cut out of its own first frame, '
-        'where a gripper may hide half of them, as where a rollout begins in mid-episode; else '
-        "out of the recording's first frame",
-    )
     control_dropout: Share = Field(
         default=0.0, description='probability of a sample without its trajectory video'
     )

@@ -174,9 +174,6 @@ class BatchSource:
         recording, starts = self._choose(rng)
         start = int(starts[rng.integers(len(starts))])
         clip = cut_clip(recording, start, self._spec)
-        begun = self._augment.begun_share
-        if begun and rng.random() < begun:
-            clip = clip.begun
         past = self._past(recording, start, rng)
         names = recording.names
         if rng.random() < self._augment.name_dropout:

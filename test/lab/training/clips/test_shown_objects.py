@@ -1,9 +1,8 @@
-"""Clips whose objects are cut out of their own first frame."""
+"""Where the objects that a clip's trajectory video shows are cut out."""
 
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.lab.training.clips.batches import BatchSource
@@ -11,13 +10,11 @@ from mtv_world_ros.lab.training.training_config import load_training_config
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
-@pytest.mark.parametrize('share', [0.0, 1.0])
-def test_objects_are_cut_out_of_the_frame_where_a_rollout_begins(episode, robot, share):
+def test_objects_are_cut_out_of_the_recordings_first_frame(episode, robot):
     config = load_training_config(
         'small',
         {
             'rendering.object_motion': True,
-            'augment.begun_share': share,
             'augment.start_noise': 0.0,
             'augment.colour_permutation': 0.0,
             'optimizer.batch_size': 6,
@@ -35,4 +32,4 @@ def test_objects_are_cut_out_of_the_frame_where_a_rollout_begins(episode, robot,
     for frames, drawn in zip(batch.frames.numpy(), batch.trajectory.numpy(), strict=True):
         seen = segmenter.segment(frames[:, :1], recording.names).masks[:, :, 0].any(1)
         same.append(bool((drawn[:, 0][seen] == frames[:, 0][seen]).all()))
-    assert all(same) if share else not any(same)
+    assert not any(same)
