@@ -175,7 +175,7 @@ def make_evaluation(folder: Path) -> None:
     from mtv_world_ros.lab.evaluation.results import EpisodeResult
 
     numbers = dict.fromkeys(
-        ('j', 'j_visible', 'j_copy', 'j_shuffled', 'j_zero', 'j_mirrored', 'j_ceiling', 'j_self'),
+        ('j', 'j_visible', 'j_copy', 'j_shuffled', 'j_zero', 'j_ceiling', 'j_self'),
         0.5,
     )
     row = ScoreRow(

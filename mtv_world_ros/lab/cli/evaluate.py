@@ -68,7 +68,7 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
         type=names,
         default=('true', 'shuffled'),
         metavar='LIST',
-        help='what is imagined, of true,shuffled,zero,mirrored; default: true,shuffled',
+        help='what is imagined, of true,shuffled,zero; default: true,shuffled',
     )
     parser.add_argument(
         '--no-ceiling',

@@ -277,7 +277,7 @@ class EpisodeScorer:
         moves = truth.moving.any()
         for name in self.config.actions if moves else {SHUFFLED} & {*self.config.actions}:
             try:
-                actions = with_actions(name, recording, stretch, donor, self.pipeline.robot)
+                actions = with_actions(name, recording, stretch, donor)
                 if name == 'true' or actions is None:
                     continue
                 chunks = self._imagine(recording, stretch, actions, truth.names, found)

@@ -4,7 +4,8 @@ import json
 import numpy as np
 import pytest
 
-from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.errors import ConfigError, EpisodeError, TrajectoryError
+from mtv_world_ros.lab.evaluation import episode_scorer
 from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
 from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
@@ -200,31 +201,32 @@ def test_j_by_frame_falls_as_the_held_frame_ages_and_has_a_band(make_pipeline, e
     assert 'J of objects that move, chunk' in table
 
 
-def test_held_and_mirrored_actions_are_scored_beside_the_true_ones(
-    make_pipeline, episodes, oracle, tmp_path
-):
-    actions = ('true', 'shuffled', 'zero', 'mirrored')
+def test_held_actions_are_scored_beside_the_true_ones(make_pipeline, episodes, oracle, tmp_path):
+    actions = ('true', 'shuffled', 'zero')
     metrics, table = run(make_pipeline(oracle), episodes, tmp_path, actions=actions)
     for view in metrics['views'].values():
         # under any other actions the oracle holds the first frame
-        for name in ('zero', 'mirrored', 'shuffled'):
+        for name in ('zero', 'shuffled'):
             assert view[f'j_{name}_moving'] == view['j_copy_moving']
         assert view['margin_of_shuffled'] == 0.0 and view['j_self'] == 1.0
-    assert 'imagined, mirrored actions' in table and 'imagined, joints held' in table
+    assert 'imagined, joints held' in table
     assert metrics['actions'] == list(actions)
 
 
-def test_actions_that_the_robot_cannot_do_are_noted_and_not_scored(
-    make_pipeline, make_episode, tmp_path
+def test_actions_that_cannot_be_imagined_are_noted_and_not_scored(
+    make_pipeline, episodes, tmp_path, monkeypatch
 ):
-    reaching = make_episode(tmp_path / 'reaching', offset=2.7, reach=0.0)
-    metrics, table = run(
-        make_pipeline(), [reaching], tmp_path / 'out', actions=('true', 'mirrored')
-    )
-    assert metrics['views']['low']['j_mirrored_moving'] is None
+    def out_of_reach(name, recording, *_):
+        if name == 'zero':
+            raise TrajectoryError('out of reach')
+        return recording
+
+    monkeypatch.setattr(episode_scorer, 'with_actions', out_of_reach)
+    metrics, table = run(make_pipeline(), episodes[:1], tmp_path / 'out', actions=('true', 'zero'))
+    assert metrics['views']['low']['j_zero_moving'] is None
     assert metrics['views']['low']['j_moving'] is not None
-    (note,) = metrics['notes']['reaching']
-    assert 'mirrored actions were not imagined' in note and note in table
+    (notes,) = metrics['notes'].values()
+    assert notes == ['zero actions were not imagined: out of reach'] and notes[0] in table
 
 
 def test_true_frames_score_the_segmenters_own_ceiling_against_the_simulators_masks(

@@ -45,7 +45,6 @@ class ScoreRow:
         j_copy: of the first frame held.
         j_shuffled: with the actions of another episode.
         j_zero: with the joints held where they were.
-        j_mirrored: with the arms' actions mirrored.
         j_ceiling: of recorded frames that went through the autoencoder.
         j_self: of the recorded frames themselves, through the same path.
         j_frames: (T,) J per frame.
@@ -68,7 +67,6 @@ class ScoreRow:
     j_copy: float
     j_shuffled: float
     j_zero: float
-    j_mirrored: float
     j_ceiling: float
     j_self: float
     j_frames: tuple[float, ...]
@@ -95,6 +93,7 @@ class ScoreRow:
         read: dict[str, Any] = {
             key: np.nan if value is None else value for key, value in values.items()
         }
+        read.pop('j_mirrored', None)  # of version 0.1.0
         for field in FRAME_FIELDS:
             read[field] = tuple(np.nan if v is None else v for v in values[field])
         return ScoreRow(**read)
@@ -178,7 +177,7 @@ def score_frames(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> Objec
 
 
 #: videos beside the prediction that are scored like it; each is `j_<name>` of a row
-OTHERS = ('shuffled', 'zero', 'mirrored', 'ceiling', 'self')
+OTHERS = ('shuffled', 'zero', 'ceiling', 'self')
 
 
 def score_rows(
@@ -277,7 +276,6 @@ MEANS = {
     'j_copy_moving': ('j_copy', 'moving'),
     'j_shuffled_moving': ('j_shuffled', 'moving'),
     'j_zero_moving': ('j_zero', 'moving'),
-    'j_mirrored_moving': ('j_mirrored', 'moving'),
     'j_ceiling_moving': ('j_ceiling', 'moving'),
     'j_self_moving': ('j_self', 'moving'),
     'f_moving': ('f', 'moving'),

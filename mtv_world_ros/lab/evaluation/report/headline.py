@@ -24,13 +24,11 @@ _KEYS = (
 #: shown where they were measured
 _MORE = {
     'j_zero_moving': 'joints held',
-    'j_mirrored_moving': 'mirrored',
     'j_ceiling_moving': 'round trip',
     'j_self_moving': 'recorded',
 }
 _MEANINGS = {
     'j_zero_moving': 'Joints held: imagined with joints that stay where they are.',
-    'j_mirrored_moving': "Mirrored: imagined with the arms' actions mirrored.",
     'j_ceiling_moving': 'Round trip: recorded frames through the autoencoder.',
     'j_self_moving': 'Recorded: the recorded frames themselves, the ceiling of the segmenter.',
 }

@@ -35,7 +35,6 @@ CONTROLS = {
     'jf_moving': 'the same, J&F',
     'j_shuffled_moving': "imagined, another episode's actions",
     'j_zero_moving': 'imagined, joints held',
-    'j_mirrored_moving': 'imagined, mirrored actions',
     'j_copy_moving': 'first frame held (persistence)',
     'jf_copy_moving': 'the same, J&F',
     'margin_of_shuffled': 'shuffled actions - persistence',

@@ -13,7 +13,7 @@ from mtv_world_ros.lab.evaluation.metrics.scores import ScoreRow
 
 def row(frames: list[float], view: str = 'low', moving: bool = True) -> ScoreRow:
     numbers = dict.fromkeys(
-        ('j', 'j_visible', 'j_copy', 'j_shuffled', 'j_zero', 'j_mirrored', 'j_ceiling', 'j_self'),
+        ('j', 'j_visible', 'j_copy', 'j_shuffled', 'j_zero', 'j_ceiling', 'j_self'),
         nan,
     )
     return ScoreRow(

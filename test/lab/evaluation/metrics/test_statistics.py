@@ -28,7 +28,6 @@ def row(j, copy, *, name='red block', view='low', moving=True, frames=4, shuffle
         j_copy=copy,
         j_shuffled=shuffled,
         j_zero=zero,
-        j_mirrored=NAN,
         j_ceiling=NAN,
         j_self=1.0,
         j_frames=(j,) * frames,

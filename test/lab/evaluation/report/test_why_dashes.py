@@ -14,7 +14,7 @@ from mtv_world_ros.lab.evaluation.results import EpisodeResult
 NAN = float('nan')
 ROW = ScoreRow(
     stretch=0, num_frames=2, view='low', name='red block', status='ok', moving=True, j=0.7,
-    j_visible=0.7, j_copy=0.5, j_shuffled=0.4, j_zero=NAN, j_mirrored=NAN, j_ceiling=0.9,
+    j_visible=0.7, j_copy=0.5, j_shuffled=0.4, j_zero=NAN, j_ceiling=0.9,
     j_self=1.0, j_frames=(0.7, 0.7), j_copy_frames=(0.5, 0.5), j_shuffled_frames=(0.4, 0.4),
 )  # fmt: skip
 NOT_SCORED = replace(
