@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from functools import partial
+from math import isfinite
 from pathlib import Path
 import re
 import sys
@@ -206,7 +207,7 @@ def in_short(metrics: Mapping[str, Any]) -> str:
     said = [
         f'{words} {cell(numbers, key)} (first frame held: {cell(numbers, held)})'
         for key, words, held in _J
-        if numbers.get(key) is not None
+        if numbers.get(key) is not None and isfinite(numbers[key])
     ][:1]
     pictures = metrics.get('pictures', {}).get('overall', {})
     if 'psnr' in pictures:

@@ -58,6 +58,15 @@ def test_checkpoints_are_compared_in_one_set_of_tables(episodes, tmp_path, capsy
     assert (out / 'report.html').stat().st_size > 10_000
 
 
+def test_without_named_objects_the_line_is_of_pictures(make_episode, tmp_path, capsys):
+    make_episode(tmp_path / 'data' / 'one', objects=(), instruction='wave')
+    options = ['--steps', '1', '--no-ceiling', '--actions', 'true', '--threads', '1']
+    command = ['evaluate', 'bundled', str(tmp_path / 'data'), '--no-report', *options]
+    assert main([*command, '--out', str(tmp_path / 'out')]) == 0
+    line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith('bundled: '))
+    assert 'give at least 3); PSNR ' in line and '–' not in line and 'J of' not in line
+
+
 def test_an_episode_without_a_result_is_told_and_is_in_the_exit_status(
     make_episode, tmp_path, capsys
 ):
