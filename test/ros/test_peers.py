@@ -1,5 +1,6 @@
 """Services of other nodes whose answers get lost."""
 
+import signal
 import time
 
 import pytest
@@ -76,7 +77,17 @@ def test_nobody_answers(soon):
         ask()
 
 
-def test_a_bag_that_has_begun_is_named_again(tmp_path):
+@pytest.fixture
+def handlers_come_back():
+    """A recorder, which is a process of its own otherwise, has handlers of its own."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in numbers}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_a_bag_that_has_begun_is_named_again(tmp_path, handlers_come_back):
     """Whoever lost the answer asks again; no empty bag stays."""
     rclpy.init()
     try:
