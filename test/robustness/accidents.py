@@ -6,7 +6,6 @@ from array import array
 from collections.abc import Callable
 from contextlib import closing
 import io
-import json
 from pathlib import Path
 import re
 import sqlite3
@@ -87,14 +86,6 @@ def chunk_bomb() -> bytes:
     body = struct.pack('<QQQI', 0, 1, 100, 0) + struct.pack('<I', 4) + b'zstd'
     body += struct.pack('<Q', len(packed)) + packed
     return stream.getvalue() + b'\x06' + struct.pack('<Q', len(body)) + body
-
-
-def foreign_token() -> bytes:
-    """A tokenizer that merges a token which it does not have."""
-    name, _, content = KINDS['action statistics'].samples()[-1].partition(b'\n')
-    values = json.loads(content)
-    values['tokenizer']['model']['merges'][0] = ['?', '?']
-    return name + b'\n' + json.dumps(values).encode()
 
 
 def sqlite_bag(statement: str = '') -> bytes:
@@ -211,7 +202,6 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
         lambda: sqlite_bag("UPDATE messages SET timestamp = 'x'"),
     ),
     'SQLite messages without end': ('bag, sqlite3', endless_view),
-    'token that is not in the vocabulary': ('action statistics', foreign_token),
     'split that is a number': (
         'data set card',
         lambda: b'dataset.json\n{"splits": {"test": 1.5}, "episodes": []}',
@@ -239,10 +229,6 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
     'Jaccard index of 400 digits': (
         'ranking',
         lambda: altered('ranking', rb'"jaccard": \[\s*\[\s*[\d.]+', b'"jaccard": [[' + b'9' * 400),
-    ),
-    'clip of 400 digits': (
-        'action statistics',
-        lambda: altered('action statistics', rb'"clip": [\d.]+', b'"clip": ' + b'9' * 400),
     ),
     'focal length of 400 digits': (
         'camera parameters',
