@@ -136,6 +136,24 @@ class ObjectExamples:
             around.append(rest[:: max(1, len(rest) // _KEPT)])
         return ObjectExamples(examples=tuple(found), elsewhere=np.concatenate(around))
 
+    def checked(self) -> ObjectExamples:
+        """Returns itself.
+
+        Raises:
+            ValueError: shapes or kinds do not fit each other, or there is nothing.
+        """
+        pictures = [self.elsewhere[None], *(example.frame for example in self.examples)]
+        if any(p.dtype != np.uint8 or p.ndim != 3 or p.shape[-1] != 3 for p in pictures):
+            raise ValueError('pictures must be (height, width, 3) uint8')
+        for one in self.examples:
+            if one.mask.shape != one.frame.shape[:2] or not one.mask.any():
+                raise ValueError(f"the mask of '{one.name}' is {one.mask.shape} or empty")
+            if one.size.shape != (2,) or (one.size < 1).any():
+                raise ValueError(f"the size of '{one.name}' is {one.size}")
+        if not self.examples or not len(self.elsewhere):
+            raise ValueError('it is empty')
+        return self
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the objects."""
@@ -177,7 +195,7 @@ class ObjectExamples:
                 )
                 for number, name in sorted(names.items(), key=lambda item: int(item[0]))
             )
-            return ObjectExamples(examples=examples, elsewhere=tensors['elsewhere'])
+            return ObjectExamples(examples=examples, elsewhere=tensors['elsewhere']).checked()
         except (SafetensorError, OSError, KeyError, ValueError) as error:
             raise ConfigError(
                 f"segmenter: '{path}' has no examples of objects ({error}); import with "

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.vision.jaccard import jaccard
@@ -154,6 +155,27 @@ def test_examples_are_the_same_after_they_were_stored(examples, segmenter, tmp_p
     want, have = segmenter.segment(frames, names), again.segment(frames, names)
     assert again.name == 'examples'
     assert have.status == want.status and (have.masks == want.masks).all()
+
+
+@pytest.mark.parametrize(
+    ('name', 'change', 'says'),
+    [
+        ('0.frame', lambda a: a[..., 0], 'uint8'),
+        ('0.frame', lambda a: a.astype(np.float32), 'uint8'),
+        ('0.mask', lambda a: a[1:], 'the mask of'),
+        ('0.mask', np.zeros_like, 'the mask of'),
+        ('0.size', lambda a: -a, 'the size of'),
+        ('elsewhere', lambda a: a[:0], 'empty'),
+    ],
+)
+def test_examples_that_do_not_fit_each_other_are_named(examples, tmp_path, name, change, says):
+    file = tmp_path / 'objects.safetensors'
+    examples.save(file)
+    tensors = load_file(file)
+    tensors[name] = np.ascontiguousarray(change(tensors[name]))
+    save_file(tensors, file, metadata={'0': 'brown mug', '1': 'plate'})
+    with pytest.raises(ConfigError, match=says):
+        choose_segmenter(str(file))
 
 
 @pytest.mark.parametrize('content', [None, b'', b'{"a": 1}', b'\x00' * 64])
