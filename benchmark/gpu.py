@@ -27,12 +27,12 @@ import tempfile
 import time
 
 ROOT = Path(__file__).resolve().parents[1]
-#: packages that a machine with PyTorch lacks, or has in other versions than the tested ones
+#: packages that a machine with PyTorch and transformers lacks; versions: the tested ones
 PACKAGES = (
-    'annotated-types', 'coal', 'diffusers', 'eigenpy', 'huggingface_hub', 'importlib_metadata',
-    'libcoal', 'libpinocchio', 'lz4', 'mcap', 'mcap-ros2-support', 'peft', 'accelerate', 'pin',
-    'pydantic', 'pydantic_core', 'rosbags', 'ruamel.yaml', 'simplejpeg', 'tokenizers',
-    'transformers', 'typing-inspection', 'zipp', 'zstandard',
+    'annotated-types', 'coal', 'diffusers', 'eigenpy', 'importlib_metadata', 'libcoal',
+    'libpinocchio', 'lz4', 'mcap', 'mcap-ros2-support', 'peft', 'accelerate', 'pin', 'pydantic',
+    'pydantic_core', 'rosbags', 'ruamel.yaml', 'simplejpeg', 'typing-inspection', 'zipp',
+    'zstandard',
 )  # fmt: skip
 #: what the measured code imports and never calls
 _STAND_INS = ('av', 'dartpy', 'mujoco')
