@@ -3,6 +3,9 @@
 import json
 import shutil
 
+import pytest
+import torch
+
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.files import share_path
@@ -22,6 +25,15 @@ def copy(path, outcome):
     assert read_episode(path).info.outcome == outcome
 
 
+@pytest.fixture
+def same_threads():
+    """torch has as many afterwards."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures('same_threads')
 def test_an_episode_that_fails_is_named_and_in_the_exit_status(tmp_path, capsys):
     """First where too few others are left for a fit, then, as the run goes on, beside a fit."""
     data, out = tmp_path / 'data', tmp_path / 'out'
