@@ -47,6 +47,15 @@ def stopped(tmp_path: Path, slow: str, number: int, *words: str) -> tuple[int, l
     return process.returncode, said.splitlines()
 
 
+def test_ctrl_c_while_python_starts_ends_without_a_traceback(tmp_path: Path) -> None:
+    status, said = stopped(tmp_path, 'argparse', signal.SIGINT, 'mtv_world_ros.cli', 'replay', 'x')
+    assert (status, said) == (-signal.SIGINT, [])
+    handler = 'signal.getsignal(signal.SIGINT) is signal.default_int_handler'
+    code = f'import signal, mtv_world_ros.cli; raise SystemExit(0 if {handler} else 3)'
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
+    assert subprocess.run([sys.executable, '-c', code], env=environment).returncode == 0
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_command_that_still_imports_ends_with_one_line(number, tmp_path):
     status, said = stopped(tmp_path, 'yaml', number, 'mtv_world_ros.cli', 'replay', 'x')

@@ -3,22 +3,33 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterable, Sequence
 from contextlib import suppress
-import errno
-from importlib import import_module, metadata
-import os
-from pathlib import Path
-import shlex
 import signal
-import sys
-from types import ModuleType
-from typing import Any
 
-from mtv_world_ros.entry_points import broken, COMMANDS, load, registered
-from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest, TrainingInterrupted
-from mtv_world_ros.processes import ended_by_signals, stopped_by_sigterm
+# Ctrl-C while the rest is imported ends the process, without a traceback; see `main` for later
+_interrupt = signal.getsignal(signal.SIGINT)
+if _interrupt is signal.default_int_handler:
+    with suppress(ValueError):  # another thread imports this
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+import argparse  # noqa: E402
+from collections.abc import Iterable, Sequence  # noqa: E402
+import errno  # noqa: E402
+from importlib import import_module, metadata  # noqa: E402
+import os  # noqa: E402
+from pathlib import Path  # noqa: E402
+import shlex  # noqa: E402
+import sys  # noqa: E402
+from types import ModuleType  # noqa: E402
+from typing import Any  # noqa: E402
+
+from mtv_world_ros.entry_points import broken, COMMANDS, load, registered  # noqa: E402
+from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest, TrainingInterrupted  # noqa: E402
+from mtv_world_ros.processes import ended_by_signals, stopped_by_sigterm  # noqa: E402
+
+if _interrupt is signal.default_int_handler:
+    with suppress(ValueError):
+        signal.signal(signal.SIGINT, _interrupt)
 
 #: of the extra `evaluate`, which several commands need
 _EVALUATE_PACKAGES = ('matplotlib', 'scipy')
