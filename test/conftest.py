@@ -11,7 +11,7 @@ import shutil
 import sys
 import warnings
 
-from left_behind import left, state
+from left_behind import left, restore, state
 import pytest
 
 from mtv_world_ros.assembly import checkpoint_path
@@ -80,6 +80,7 @@ def nothing_left_behind() -> Iterator[None]:
     """
     before = state()
     yield
+    restore(before)
     found = left(before)
     rclpy = sys.modules.get('rclpy')
     assert rclpy is None or not rclpy.ok(), 'rclpy.shutdown() is missing'

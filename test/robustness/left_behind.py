@@ -24,6 +24,7 @@ _SET_BY_IMPORTS = (
 )
 #: who is about to end is waited for [s]
 _PATIENCE_S = 10.0
+_TORCH = "torch's threads"
 _THREADS, _CHILDREN = 'threads that keep the process alive', 'child processes'
 
 
@@ -42,6 +43,12 @@ def state() -> dict[str, Any]:
         "ROS's default context": 'rclpy' in sys.modules and sys.modules['rclpy'].ok(),
         **_torch(),
     }
+
+
+def restore(before: Mapping[str, Any]) -> None:
+    """Gives torch the threads back that it had: commands that run in this process set them."""
+    if _TORCH in before:
+        sys.modules['torch'].set_num_threads(before[_TORCH])
 
 
 def left(before: Mapping[str, Any]) -> list[str]:
@@ -116,7 +123,7 @@ def _torch() -> dict[str, Any]:
     if torch is None or not hasattr(torch, 'get_num_threads'):
         return {}
     return {
-        "torch's threads": torch.get_num_threads(),
+        _TORCH: torch.get_num_threads(),
         "torch's type": torch.get_default_dtype(),
         "torch's gradients": torch.is_grad_enabled(),
     }
