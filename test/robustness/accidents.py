@@ -168,8 +168,22 @@ def cut_compressed() -> Any:
 
 
 Make = Callable[[], Any]
+
+
 #: name -> (kind, what makes it)
+def found(kind: str, case: int) -> Make:
+    """A case of `fuzz.py --seed 20261127`."""
+
+    def make() -> Any:
+        of = KINDS[kind]
+        return of.damage(of.samples(), np.random.default_rng([20261127, case]))
+
+    return make
+
+
 ACCIDENTS: dict[str, tuple[str, Make]] = {
+    **{f'mesh {case}': ('mesh', found('mesh', case)) for case in (267, 1157, 1889)},
+    'image path of no text': ('LeRobot v2.1', found('LeRobot v2.1', 1496)),
     'instruction of 15 kB': ('instruction', lambda: b'put the red block ' * 5_000),
     'width .inf': ('calibration', lambda: calibrated(width=float('inf'))),
     'nesting': ('calibration', lambda: b'[' * 100_000),

@@ -44,7 +44,14 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
         candidates += [folder / inside for folder in above if folder.name == package]
         installed = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
         candidates += [Path(prefix) / 'share' / package / inside for prefix in installed]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    return next((candidate for candidate in candidates if _is_file(candidate)), None)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that no system has
+        return False
 
 
 def load_mesh(path: Path) -> Any:

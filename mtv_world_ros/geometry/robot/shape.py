@@ -34,6 +34,8 @@ _CORNERS = 16
 ROD_RADIUS_M = 0.03
 #: parts of shapes nearer to the camera's plane are cut off [m]
 _NEAR_M = 0.04
+#: no vertex of a robot's mesh is further from its link than this [m]
+_MOST_M = 1e4
 #: links closer together than this get no rod between them [m]
 _SHORTEST_ROD_M = 0.01
 #: pixels are drawn with this many fractional bits
@@ -257,6 +259,11 @@ def _pieces(
         raise FileNotFoundError(f"'{shape.attrib['filename']}'")
     mesh = load_mesh(file)
     vertices = np.asarray(mesh.vertices(), np.float64) * scale
+    if not (np.abs(vertices) < _MOST_M).all():
+        raise RobotError(
+            f"'{file}': a vertex is further than {_MOST_M:g} m away or no number; is the file "
+            "damaged, or the 'scale' of the mesh in the URDF wrong?"
+        )
     return [outermost(vertices)] if cut is None else cut(vertices, edges_of(mesh))
 
 

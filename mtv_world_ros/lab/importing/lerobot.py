@@ -319,7 +319,13 @@ class LeRobotDataset:
         order = np.argsort(table.column('frame_index').to_pylist(), kind='stable')
         column = table.column(feature)
         for number in order:
-            yield self._decoded(column[int(number)].as_py(), entry, feature)
+            try:
+                cell = column[int(number)].as_py()
+            except UnicodeDecodeError as error:  # the path beside the bytes
+                raise EpisodeError(
+                    f"'{entry.data_file}': an image of '{feature}' is damaged: {error}"
+                ) from error
+            yield self._decoded(cell, entry, feature)
 
     def _decoded(self, cell: Any, entry: EpisodeEntry, feature: str) -> ByteArray:
         data = cell.get('bytes') if isinstance(cell, Mapping) else None
