@@ -43,7 +43,12 @@ def _freeze(
     error: type[MtvWorldError] = MtvWorldError,
 ) -> None:
     """Casts, checks the shape of, and sets read-only one array field (None = any length)."""
-    array = np.asarray(getattr(owner, field), dtype=dtype)
+    given = getattr(owner, field)
+    try:
+        array = np.asarray(given, dtype=dtype)
+    except (TypeError, ValueError) as why:
+        name = f'{type(owner).__name__}.{field}'
+        raise error(f'{name} is {str(given)[:100]}, expected numbers: {why}') from why
     fits = array.ndim == len(shape) and all(
         want is None or have == want for have, want in zip(array.shape, shape, strict=True)
     )

@@ -183,6 +183,7 @@ def found(kind: str, case: int) -> Make:
 
 ACCIDENTS: dict[str, tuple[str, Make]] = {
     **{f'mesh {case}': ('mesh', found('mesh', case)) for case in (267, 1157, 1889)},
+    'distortion of letters': ('camera parameters', found('camera parameters', 778)),
     'image path of no text': ('LeRobot v2.1', found('LeRobot v2.1', 1496)),
     'instruction of 15 kB': ('instruction', lambda: b'put the red block ' * 5_000),
     'width .inf': ('calibration', lambda: calibrated(width=float('inf'))),
