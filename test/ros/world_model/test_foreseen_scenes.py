@@ -1,5 +1,6 @@
 """The bundled model's foresight over the running node: doubt that comes of what really happens."""
 
+from contextlib import suppress
 import re
 
 import numpy as np
@@ -89,7 +90,10 @@ def execute(client, recording, at):
         stamp_ns = start_ns + round(number / FPS * NANO)
         client.spin_for(max((stamp_ns - client.now_ns()) / NANO, 0.1))
         show(client, recording, int(frame), stamp_ns)
-    client.wait(lambda: len(client.report_values('fidelity')) >= compared + 2, 'the comparison')
+    # a chunk of which a busy machine lost a frame is not compared
+    with suppress(AssertionError):
+        client.wait(lambda: len(client.report_values('fidelity')) >= compared + 2, 'both', 20)
+    client.spin_for(2.5)  # `/diagnostics` comes once a second
     client.reset()
 
 
@@ -99,8 +103,8 @@ def test_the_node_says_that_its_physics_is_another_one_and_estimates_widen(node,
     execute(node, recording, truly)
     node.wait(lambda: said(node).startswith('as it was fitted, by '), 'it')
     sure = node.report_values('chunk')[-1]
-    # the blocks stay where they are, whatever the arm does; a chunk of which a frame was lost, as
-    # on a busy machine, does not count, so that three plans are enough but more may be needed
+    # the blocks stay where they are, whatever the arm does; three plans are enough where no frame
+    # is lost
     for _ in range(6):
         execute(node, recording, 0 * truly)
         if parted(node):
