@@ -183,7 +183,7 @@ def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_kno
     else:
         lines.append(
             'no error is stated: of three or more --points of a recording each third is left out '
-            'of the fit, and tells it'
+            'of a first fit, and tells it'
         )
     if estimate.kept_guess:
         lines.append("the guess fits better by the doctor's measure and is kept")

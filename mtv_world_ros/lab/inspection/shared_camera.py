@@ -42,8 +42,8 @@ _DOUBTED = 0.02
 #: real recordings a view with the right focal length had .35 to .47, and .23 to .32 with one a
 #: third too long; another view had .37 to .56 with any of three focal lengths
 _LEAST_MATCH = 0.335
-#: of the points of a recording each third is left out of the fit, and tells how good it is: on ten
-#: real recordings points that poses were fitted to are .5 and .9 px away, others 1.3 and 3.2
+#: of the points of a recording each third is left out of a first fit, and tells how good it is: on
+#: ten real recordings points that poses were fitted to are .5 and .9 px away, others 1.3 and 3.2
 _LEFT_OUT = 3
 
 
@@ -59,7 +59,8 @@ class SharedEstimate:
         kept_guess: whether the guess fits better and is what `cameras` has.
         focal_px: estimated, or the one given.
         fits: (R,) correlation of drawn and seen changes of each recording.
-        apart_px: (N,) how far the seen tool points that were left out are drawn from there.
+        apart_px: (N,) how far the seen tool points that were left out of a first fit are drawn
+            from there; the last one is to all points.
     """
 
     cameras: tuple[CameraModel, ...]
@@ -157,10 +158,13 @@ def estimate_shared(
         _view(episodes, view, robot, shapes, tracks, (points or {}).get(view, {}), focal_known)
         for view in views
     ]
-    states = _together(each, guess, focal_known, seed)
+    tested = _together(each, guess, focal_known, seed)
+    states = tested
+    if any(view.left_out for view in each):
+        states = _joined(each, [tested], focal_known, [[*v.points, *v.left_out] for v in each])
     return tuple(
-        _judged(view, state, episodes, robot, shapes, tracks, guess=guess)
-        for view, state in zip(each, states, strict=True)
+        _judged(view, state, without, episodes, robot, shapes, tracks, guess=guess)
+        for view, state, without in zip(each, states, tested, strict=True)
     )
 
 
@@ -217,6 +221,16 @@ def _together(
         ]
         for zoom in zooms[: 1 if focal_known else None]
     ]
+    return _joined(each, candidates, focal_known, [view.points for view in each])
+
+
+def _joined(
+    each: Sequence[_View],
+    candidates: Sequence[Sequence[JointState]],
+    focal_known: bool,
+    points: Sequence[Sequence[SeenPoint]],
+) -> list[JointState]:
+    """The state of each view, fitted together from the best of some starts, to its points."""
     firsts = np.cumsum([0, *(1 + max(view.numbers) for view in each)])
     recordings = [one for view in each for one in view.recordings]
     numbers = [int(first) + n for view, first in zip(each, firsts, strict=False)
@@ -224,10 +238,10 @@ def _together(
     of_view = [number for number, view in enumerate(each) for _ in view.numbers]
     joint = JointCamera(recordings, numbers, intrinsics_known=focal_known, views=of_view)
     rows = np.cumsum([0, *(len(view.numbers) for view in each)])
-    points = [
+    seen = [
         replace(point, recording=point.recording + int(row))
-        for view, row in zip(each, rows, strict=False)
-        for point in view.points
+        for of_one, row in zip(points, rows, strict=False)
+        for point in of_one
     ]
     starts = [
         JointState(
@@ -240,7 +254,7 @@ def _together(
         )
         for states in candidates
     ]
-    found = joint.together(starts, points)
+    found = joint.together(starts, seen)
     return [
         JointState(poses={n: found.poses[int(first) + n] for n in view.numbers}, zoom=found.zoom)
         for view, first in zip(each, firsts, strict=False)
@@ -256,6 +270,7 @@ def _start(view: _View, guess: bool, seed: int) -> JointState:
 def _judged(
     view: _View,
     state: JointState,
+    without: JointState,
     episodes: Sequence[Episode],
     robot: RobotModel,
     shapes: Sequence[LinkShape],
@@ -263,7 +278,10 @@ def _judged(
     *,
     guess: bool,
 ) -> SharedEstimate:
-    """The better of guess and result by the doctor's measure."""
+    """The better of guess and result by the doctor's measure.
+
+    Its error is that of the state that was fitted without the points that were left out.
+    """
 
     def measured(found: Sequence[CameraModel]) -> tuple[MotionResidual, ...]:
         rows = zip(episodes, found, tracks, strict=True)
@@ -272,13 +290,17 @@ def _judged(
             for episode, camera, joints in rows
         )
 
-    ends = [
-        replace(zoomed(camera, state.zoom), T_mount_camera=state.poses[place])
-        for camera, place in zip(view.cameras, view.numbers, strict=True)
-    ]
+    def placed(found: JointState) -> list[CameraModel]:
+        return [
+            replace(zoomed(camera, found.zoom), T_mount_camera=found.poses[place])
+            for camera, place in zip(view.cameras, view.numbers, strict=True)
+        ]
+
+    ends = placed(state)
     measures, before = measured(ends), measured(view.cameras) if guess else ()
     kept = bool(before) and _mean_match(before) > _mean_match(measures)
     focal = float(view.cameras[0].K[0, 0])
+    tested = view.cameras if kept else placed(without)
     best = view.cameras if kept else ends
     return SharedEstimate(
         cameras=tuple(best),
@@ -288,7 +310,7 @@ def _judged(
         kept_guess=kept,
         focal_px=focal if kept else focal * float(state.zoom[0]),
         fits=view.joint.fits(view.given if kept else state),
-        apart_px=np.array([_apart(point, best[point.recording]) for point in view.left_out]),
+        apart_px=np.array([_apart(point, tested[point.recording]) for point in view.left_out]),
     )
 
 
