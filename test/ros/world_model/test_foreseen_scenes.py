@@ -77,6 +77,7 @@ def send_plan(client, recording, start_ns, hidden=()):
         positions=commands.positions[kept],
     )
     show(client, recording, 0, start_ns, hidden)
+    client.spin_for(0.3)  # topics keep no order among them: the pictures of before would do, too
     client.publish('/joint_trajectory', to_trajectory_message(plan, make_header(start_ns)))
     return client.next_end(since)
 
