@@ -46,7 +46,6 @@ from mtv_world_ros.assembly import (
 from mtv_world_ros.bench.ranking.no_picture_rule import is_done, things_in
 from mtv_world_ros.cli.shared_options import names
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
-from mtv_world_ros.data.splits import refuse_test_kinds
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.files import share_path
@@ -56,6 +55,7 @@ from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.lab.evaluation.metrics.statistics import wilson
 from mtv_world_ros.lab.evaluation.metrics.success_agreement import area_under_roc
+from mtv_world_ros.lab.splits import refuse_test_kinds
 from mtv_world_ros.lab.training.object_motion.tracks import fine_commands, first_frame
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.success.foreseen import foreseen_of

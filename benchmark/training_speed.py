@@ -29,9 +29,9 @@ from page import in_turns, parse_arguments, publish, ratio, table
 import torch
 
 from mtv_world_ros.assembly import assemble_segmenter, robot_path
-from mtv_world_ros.data.splits import select
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.lab.cli.train import set_overrides
+from mtv_world_ros.lab.splits import select
 from mtv_world_ros.lab.training.clips.batches import BatchSource, ClipBatch
 from mtv_world_ros.lab.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.lab.training.objective import NoiseDraws

@@ -17,7 +17,7 @@ import yaml
 
 from mtv_world_ros.files import check_free, share_path
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.guess import guess_robot
+from mtv_world_ros.lab.importing.robot_guess import guess_robot
 
 parser = argparse.ArgumentParser()
 parser.add_argument(

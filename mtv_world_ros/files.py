@@ -14,7 +14,6 @@ import shutil
 import sys
 from typing import Any
 
-from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import ConfigError, nearest
 
 PACKAGE = 'mtv_world_ros'
@@ -118,37 +117,6 @@ def check_room(folder: Path, num_bytes: int) -> None:
     if free < num_bytes:
         text = f'{os.strerror(errno.ENOSPC)}: {free} bytes are free, {num_bytes} are needed'
         raise OSError(errno.ENOSPC, text, str(folder))
-
-
-def check_same_settings(results: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
-    """Refuses a folder of results that were made with other settings.
-
-    Args:
-        results: folder of JSON files, each with the `settings` it was made with.
-        settings: of this run; stored ones may have more keys.
-        overwrite: the user asked to replace such results.
-
-    Raises:
-        ConfigError: a file was made with other settings, or by another version.
-    """
-    wanted = plain(settings)
-    for file in () if overwrite else sorted(results.glob('*.json')):
-        try:
-            stored = read_json(file)['settings']
-            other = [key for key in wanted if stored[key] != wanted[key]]
-        except (OSError, ValueError):
-            continue  # not readable, thus nothing is lost
-        except (KeyError, TypeError):
-            raise ConfigError(
-                f"'{file}' was written by another version; give another --out, or --overwrite to "
-                'replace it'
-            ) from None
-        if other:
-            differing = '; '.join(f'{k} {stored[k]!r}, now {wanted[k]!r}' for k in other)
-            raise ConfigError(
-                f"'{results.parent}' holds results with other settings ({differing}); give "
-                'another --out, or --overwrite to replace them'
-            )
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:

@@ -20,7 +20,8 @@ import torch
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.files import check_free, check_same_settings, share_path, write_json
+from mtv_world_ros.files import check_free, share_path, write_json
+from mtv_world_ros.lab.jobs import check_same_settings
 
 ROOT = Path(__file__).parents[1]
 EPISODE = share_path('resource', 'demo_episode')

@@ -9,7 +9,7 @@ import pytest
 from small_episodes import PersistenceWorldModel
 
 from mtv_world_ros.assembly import assemble
-from mtv_world_ros.data.recording import cached_recording, load_recording, Recording
+from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import History, JointTrajectory, Observation, WorldModelSpec
 from mtv_world_ros.errors import (
     CalibrationError,
@@ -30,6 +30,7 @@ from mtv_world_ros.lab.evaluation.imagined_stretches import (
     observe_stretch,
     stretches,
 )
+from mtv_world_ros.lab.recordings import cached_recording
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline

@@ -12,15 +12,9 @@ import pytest
 from worker_jobs import LongJobs, make_held_back, make_stopping
 
 from mtv_world_ros.errors import MtvWorldError, TrainingError
+from mtv_world_ros.lab.jobs import run_all, run_job, WorkerPool
 from mtv_world_ros.lab.training.clips.batches import ClipWorkers
-from mtv_world_ros.processes import (
-    run_all,
-    run_job,
-    StandStill,
-    STILL_S,
-    stop_process,
-    WorkerPool,
-)
+from mtv_world_ros.processes import StandStill, STILL_S, stop_process
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,11 +13,6 @@ from mtv_world_ros.data.episode import check_outcome
 from mtv_world_ros.data.tool_targets import ToolTargets
 
 STATE = 'state'
-#: parts of an image topic's name that say nothing of the view
-_NOT_A_VIEW = {'image', 'image_raw', 'image_rect', 'image_color', 'image_rect_color', 'color',
-               'rgb', 'compressed', 'ffmpeg', 'camera', 'image_rect_raw'}  # fmt: skip
-#: no pictures of the scene
-_NO_COLOURS = ('depth', 'infra', 'mask', 'confidence', 'disparity')
 
 
 class ViewTopics(Schema):
@@ -140,19 +134,3 @@ def load_bag_mapping(path: Path) -> BagMapping:
     if Path(mapping.robot).suffix in ('.yaml', '.yml'):
         mapping = mapping.replace(robot=str(path.parent / mapping.robot))
     return mapping
-
-
-def guess_views(topics: Collection[str]) -> dict[str, str]:
-    """Returns image topics by a view's name: the last part of the topic that says which it is.
-
-    Depth, infrared and masks are left out; of raw and compressed images of a view the raw ones
-    are taken.
-    """
-    found: dict[str, str] = {}
-    for topic in sorted(topics):
-        plain = topic.removesuffix('/compressed').removesuffix('/ffmpeg')
-        if any(word in plain for word in _NO_COLOURS):
-            continue
-        parts = [part for part in plain.split('/') if part and part not in _NOT_A_VIEW]
-        found.setdefault(parts[-1] if parts else 'camera', plain)
-    return found

@@ -1,1 +1,1 @@
-"""Nodes, recorder and player as processes."""
+"""World model, policy and episode runner as processes."""

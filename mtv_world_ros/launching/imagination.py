@@ -23,7 +23,6 @@ from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.files import check_free, check_room
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.launching.node_processes import ROOM_BYTES
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.policies.policy import RecordedPolicySettings, ScriptedPolicySettings
 from mtv_world_ros.processes import (
@@ -36,6 +35,8 @@ from mtv_world_ros.processes import (
     stop_process,
 )
 
+#: of logs and bags, before anything is started
+ROOM_BYTES = 8 * 2**20
 #: what an episode starts from stays valid for as long as the policy thinks [s]
 _NO_AGE = 3600.0
 #: the address of its page, or its file

@@ -101,7 +101,7 @@ def _job(number: int) -> int:
 
 def worker(folder: Path, one: Signal) -> None:
     """Two workers do eight jobs."""
-    from mtv_world_ros.processes import run_all
+    from mtv_world_ros.lab.jobs import run_all
 
     assert len(list(run_all(list(range(8)), _make_job, 2))) == 8
 
@@ -231,7 +231,7 @@ def make_episode(folder: Path, *, compressed: bool = True) -> Path:
 
 def through_node(folder: Path, one: Signal) -> None:
     """An episode is played into a node and recorded while one of the three is hit."""
-    from mtv_world_ros.launching.node_processes import DemoOptions, record_through_node
+    from mtv_world_ros.lab.demo.node_processes import DemoOptions, record_through_node
 
     path = make_episode(folder)
     options = DemoOptions(

@@ -31,13 +31,13 @@ import yaml
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data.bag.messages import deserialize, typestore
 from mtv_world_ros.data.bag.reader import BagReader
-from mtv_world_ros.data.bag.recover import recover
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.joint_plans import read_plan
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.lab.importing.recover import recover
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 

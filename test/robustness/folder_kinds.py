@@ -130,7 +130,7 @@ def make_card(folder: Path) -> None:
 
 
 def _read_card(folder: Path) -> Any:
-    from mtv_world_ros.data.splits import select
+    from mtv_world_ros.lab.splits import select
 
     return select(folder, 'train')
 

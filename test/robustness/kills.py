@@ -30,8 +30,8 @@ from node_messages import commit, ROOT, ros
 import numpy as np
 from rosbags.highlevel import AnyReader
 
-from mtv_world_ros.data.bag.recover import find_damaged, recover
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.lab.importing.recover import find_damaged, recover
 from mtv_world_ros.ros.messages.conversions import read_stamp
 
 sys.path.insert(0, str(ROOT / 'test' / 'ros'))

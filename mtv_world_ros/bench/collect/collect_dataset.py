@@ -40,7 +40,7 @@ from mtv_world_ros.bench.tasks.tasks import tasks_named
 from mtv_world_ros.bench.world.opengl import load_mujoco
 from mtv_world_ros.bench.world.zero_shot import kinds_named
 from mtv_world_ros.errors import SimulatorError
-from mtv_world_ros.processes import run_all
+from mtv_world_ros.lab.jobs import run_all
 from mtv_world_ros.rendering.images import encode_png
 
 #: episodes between two writings of the card

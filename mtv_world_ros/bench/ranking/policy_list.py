@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 from mtv_world_ros.bench.expert.expert import Expert
 from mtv_world_ros.bench.expert.faults.catalogue import parse_variant
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
+from mtv_world_ros.bench.ranking.server_process import PORT, ServerProcess
 from mtv_world_ros.bench.tasks.tasks import tasks_named
 from mtv_world_ros.config import expected, ListOf, read_yaml, Schema, Seconds, validated
 from mtv_world_ros.data_types import JointTrajectory, Observation
@@ -31,7 +32,6 @@ from mtv_world_ros.policies.policy import (
     RecordedPolicySettings,
     ScriptedPolicySettings,
 )
-from mtv_world_ros.policies.server_process import PORT, ServerProcess
 
 #: names are parts of file names
 _NAME = r'^[A-Za-z0-9][A-Za-z0-9._-]*$'

@@ -15,9 +15,10 @@ from mtv_world_ros.bench.ranking.rollout_jobs import Job, Result
 from mtv_world_ros.bench.ranking.rollout_runner import make_runner, RolloutConfig, WantedJob
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.files import check_same_settings, plain, write_json, write_whole
+from mtv_world_ros.files import plain, write_json, write_whole
+from mtv_world_ros.lab.jobs import check_same_settings, Outcome, score_all
 from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.processes import Outcome, score_all, threads_each
+from mtv_world_ros.processes import threads_each
 
 FOLDER = 'rollouts'
 
@@ -135,7 +136,7 @@ def _scored(
     jobs: Sequence[WantedJob], make: Callable[[], Any], workers: int, ray_address: str | None
 ) -> Iterator[tuple[WantedJob, Outcome]]:
     if ray_address is not None:
-        from mtv_world_ros.processes import score_with_ray
+        from mtv_world_ros.lab.jobs import score_with_ray
 
         return score_with_ray(jobs, make, workers, ray_address)
     return score_all(jobs, make, workers, threads_each(workers))

@@ -22,9 +22,9 @@ from mtv_world_ros.files import check_free
 from mtv_world_ros.lab.cli.evaluate import say_failed
 
 if TYPE_CHECKING:
-    from mtv_world_ros.data.splits import Selection
     from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
     from mtv_world_ros.lab.evaluation.results import EpisodeResult
+    from mtv_world_ros.lab.splits import Selection
     from mtv_world_ros.success.calibration import HorizonCurve
     from mtv_world_ros.success.fitted_to import FittedTo
 
@@ -69,18 +69,18 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _calibrate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import checkpoint_path
-    from mtv_world_ros.data.splits import select
+    from mtv_world_ros.lab.splits import select
     from mtv_world_ros.success.calibration import save_calibration, save_horizon
 
     check_model(arguments.device, arguments.checkpoint)
     folder = checkpoint_path(arguments.checkpoint)
     _check_places(arguments, folder)
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
-    from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.lab.evaluation.calibration.calibration_report import (
         write_calibration_report,
     )
     from mtv_world_ros.lab.evaluation.calibration.fit import calibrate, samples_of
+    from mtv_world_ros.lab.splits import refuse_test_kinds
 
     print(f'{arguments.dataset}: {selection}')
     refuse_test_kinds(selection.paths, 'calibration')
@@ -128,8 +128,8 @@ def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
         EpisodeError: the metadata of an episode cannot be used.
         PolicyError: a policy has an unknown fault.
     """
-    from mtv_world_ros.data.splits import recorded_kinds
     from mtv_world_ros.lab.evaluation.evaluate_episodes import result_names
+    from mtv_world_ros.lab.splits import recorded_kinds
 
     names = result_names(paths)
     return {names[path]: kinds for path, kinds in recorded_kinds(paths).items()}

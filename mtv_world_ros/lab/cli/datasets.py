@@ -12,10 +12,10 @@ from mtv_world_ros.cli.shared_options import add_options
 from mtv_world_ros.errors import ConfigError, EpisodeError
 
 if TYPE_CHECKING:
-    from mtv_world_ros.data.bag.recover import Recovered
     from mtv_world_ros.data.bag_mapping import BagMapping
     from mtv_world_ros.data.episode import Episode
     from mtv_world_ros.lab.importing.convert import ImportSummary
+    from mtv_world_ros.lab.importing.recover import Recovered
     from mtv_world_ros.lab.importing.stored_objects import ObjectStage
 
 
@@ -45,7 +45,7 @@ def _add_recover(commands: argparse._SubParsersAction) -> None:
 
 
 def _recover(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.data.bag.recover import find_damaged, recover
+    from mtv_world_ros.lab.importing.recover import find_damaged, recover
 
     damaged, lost = find_damaged(arguments.bag), []
     for source in damaged:

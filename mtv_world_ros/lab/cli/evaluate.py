@@ -23,8 +23,8 @@ from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import check_free
 
 if TYPE_CHECKING:
-    from mtv_world_ros.data.splits import Selection
     from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
+    from mtv_world_ros.lab.splits import Selection
     from mtv_world_ros.pipeline import Pipeline
 
 
@@ -149,7 +149,7 @@ def _row(entry: Entry, pipeline: Pipeline) -> str:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.data.splits import of_physics, select
+    from mtv_world_ros.lab.splits import of_physics, select
 
     entries = parse_entries(arguments.checkpoints)
     check_model(arguments.device, *(entry.path for entry in entries))

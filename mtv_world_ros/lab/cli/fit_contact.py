@@ -48,7 +48,6 @@ def _fit(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from mtv_world_ros.assembly import robot_path
-    from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.foresight.arms import Arms
     from mtv_world_ros.foresight.loading import (
         CONTACT_FILE,
@@ -58,6 +57,7 @@ def _fit(arguments: argparse.Namespace) -> int:
         save_response,
     )
     from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.lab.splits import refuse_test_kinds
     from mtv_world_ros.lab.training.object_motion.contact_fit import (
         first_settings,
         fit_contact,

@@ -86,7 +86,7 @@ def _write_guess(urdf: Path, out: Path) -> Path:
     import yaml
 
     from mtv_world_ros.files import write_whole
-    from mtv_world_ros.geometry.robot.guess import guess_robot
+    from mtv_world_ros.lab.importing.robot_guess import guess_robot
 
     if out.exists():
         raise ConfigError(f"'{out}' exists; look at it with: mtv-world robot {out}")

@@ -115,8 +115,8 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.data.splits import select
     from mtv_world_ros.errors import ConfigError
+    from mtv_world_ros.lab.splits import select
     from mtv_world_ros.lab.training.training_config import load_training_config
 
     config = load_training_config(arguments.preset, _overrides(arguments))
@@ -144,8 +144,8 @@ def _train(arguments: argparse.Namespace) -> int:
 
     check_device(arguments.device)
     from mtv_world_ros.data.bag_mapping import load_source
-    from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.lab.splits import refuse_test_kinds
     from mtv_world_ros.lab.training.training_run import train
 
     source = load_source(arguments.topics, arguments.calibration)
@@ -320,7 +320,7 @@ def held_out(
 
 
 def _paths(arguments: argparse.Namespace) -> Sequence[Path]:
-    from mtv_world_ros.data.splits import select
+    from mtv_world_ros.lab.splits import select
 
     dataset = arguments.held_out or arguments.dataset
     for split in _SPLITS:

@@ -18,6 +18,7 @@ from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import write_whole
+from mtv_world_ros.lab.demo.node_processes import DemoOptions, NODE, record_through_node
 from mtv_world_ros.lab.evaluation.imagined_stretches import Stretch
 from mtv_world_ros.lab.evaluation.metrics.scores import (
     episode_means,
@@ -26,7 +27,6 @@ from mtv_world_ros.lab.evaluation.metrics.scores import (
     ScoreRow,
     true_masks,
 )
-from mtv_world_ros.launching.node_processes import DemoOptions, NODE, record_through_node
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.rendering.images import write_png
 from mtv_world_ros.rendering.video import (

@@ -14,9 +14,8 @@ import numpy as np
 from tqdm import tqdm
 
 from mtv_world_ros.bounded_input import read_json
-from mtv_world_ros.data.recording import described_objects
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
-from mtv_world_ros.files import check_same_settings, plain, write_json
+from mtv_world_ros.files import plain, write_json
 from mtv_world_ros.lab.evaluation.episode_scorer import EpisodeScorer, EvaluationJob, Instruments
 from mtv_world_ros.lab.evaluation.metrics.frechet.feature_store import (
     distances,
@@ -31,8 +30,10 @@ from mtv_world_ros.lab.evaluation.references import round_trip
 from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary, Group
 from mtv_world_ros.lab.evaluation.results import EpisodeResult
 from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
+from mtv_world_ros.lab.jobs import check_same_settings, score_all
+from mtv_world_ros.lab.recordings import described_objects
 from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.processes import score_all, threads_each
+from mtv_world_ros.processes import threads_each
 from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.jaccard import mean_of_known
 

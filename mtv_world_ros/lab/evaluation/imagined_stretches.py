@@ -7,7 +7,7 @@ from math import floor
 
 import numpy as np
 
-from mtv_world_ros.data.recording import commands_until, frame_indices, Recording
+from mtv_world_ros.data.recording import frame_indices, Recording
 from mtv_world_ros.data_types import (
     ByteArray,
     FloatArray,
@@ -16,6 +16,7 @@ from mtv_world_ros.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.lab.recordings import commands_until
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 import tempfile
@@ -13,7 +13,7 @@ import yaml
 
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
-from mtv_world_ros.data.bag_mapping import BagMapping, guess_views
+from mtv_world_ros.data.bag_mapping import BagMapping
 from mtv_world_ros.data.episode import Episode, MASKS_BY, UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
@@ -27,11 +27,17 @@ from mtv_world_ros.errors import (
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot.file import load_robot, ROBOT_YAML, save_robot
-from mtv_world_ros.geometry.robot.guess import guess_robot
 from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
 from mtv_world_ros.lab.importing.convert import import_each, ImportSummary, jumps, MAPPING_KEY
 from mtv_world_ros.lab.importing.mapping import digest_of
+from mtv_world_ros.lab.importing.robot_guess import guess_robot
 from mtv_world_ros.lab.importing.stored_objects import AS_RECORDED, MaskWriter, ObjectStage
+
+#: parts of an image topic's name that say nothing of the view
+_NOT_A_VIEW = {'image', 'image_raw', 'image_rect', 'image_color', 'image_rect_color', 'color',
+               'rgb', 'compressed', 'ffmpeg', 'camera', 'image_rect_raw'}  # fmt: skip
+#: no pictures of the scene
+_NO_COLOURS = ('depth', 'infra', 'mask', 'confidence', 'disparity')
 
 
 def find_bags(paths: Sequence[Path]) -> list[Path]:
@@ -68,6 +74,22 @@ def with_guessed_views(mapping: BagMapping, bag: Path) -> BagMapping:
             f"'{bag}' has no images (topics of Image, CompressedImage or FFMPEGPacket)"
         )
     return mapping.replace(views={view: {'image': topic} for view, topic in views.items()})
+
+
+def guess_views(topics: Collection[str]) -> dict[str, str]:
+    """Returns image topics by a view's name: the last part of the topic that says which it is.
+
+    Depth, infrared and masks are left out; of raw and compressed images of a view the raw ones
+    are taken.
+    """
+    found: dict[str, str] = {}
+    for topic in sorted(topics):
+        plain = topic.removesuffix('/compressed').removesuffix('/ffmpeg')
+        if any(word in plain for word in _NO_COLOURS):
+            continue
+        parts = [part for part in plain.split('/') if part and part not in _NOT_A_VIEW]
+        found.setdefault(parts[-1] if parts else 'camera', plain)
+    return found
 
 
 def described_robot(bag: Path, mapping: BagMapping, folder: Path) -> tuple[Path, tuple[str, ...]]:

@@ -18,7 +18,6 @@ from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import (
-    draw_silhouettes,
     gripper_links,
     LinkShape,
     load_shape,
@@ -51,6 +50,7 @@ from mtv_world_ros.lab.inspection.motion_residual import (
 from mtv_world_ros.lab.inspection.pictures import check_frozen, check_lengths, mirrored
 from mtv_world_ros.lab.inspection.places import keeps_place
 from mtv_world_ros.lab.inspection.stored_masks import check_masks
+from mtv_world_ros.lab.silhouettes import draw_silhouettes
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,
     render_trajectory_video,

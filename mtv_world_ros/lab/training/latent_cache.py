@@ -22,11 +22,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mtv_world_ros.bounded_input import parse_json, read_json
-from mtv_world_ros.data.recording import cut_clip, Recording
+from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.files import content_digest, write_whole
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.recordings import cut_clip
 from mtv_world_ros.lab.training.base import Base
 from mtv_world_ros.lab.training.clips.batches import BatchSource, ClipBatch, pasts
 from mtv_world_ros.lab.training.clips.clip_controls import ControlMaker, draw_past, history_before

@@ -19,13 +19,7 @@ from tqdm import tqdm
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode_reader import list_episodes, read_info
-from mtv_world_ros.data.recording import (
-    cached_recording,
-    clip_starts,
-    DEFAULT,
-    described_objects,
-    Recording,
-)
+from mtv_world_ros.data.recording import DEFAULT, Recording
 from mtv_world_ros.data_types import CameraModel, WorldModelSpec
 from mtv_world_ros.errors import (
     ConfigError,
@@ -38,6 +32,7 @@ from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.calibration_file import save_calibration
 from mtv_world_ros.geometry.robot.file import save_robot
 from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
+from mtv_world_ros.lab.recordings import cached_recording, clip_starts, described_objects
 from mtv_world_ros.lab.training.base import load_base, needs_base
 from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.distributed import Processes

@@ -360,9 +360,10 @@ def test_an_episode_whose_scene_is_not_known_is_refused(data_set, robot):
 
 def test_81_frames_at_16_fps_and_288x384_can_be_cut(tmp_path, data_set):
     """Clips of the paper's model; stamps are those of the control periods, at most 10 ms off."""
-    from mtv_world_ros.data.recording import clip_starts, load_recording
+    from mtv_world_ros.data.recording import load_recording
     from mtv_world_ros.files import share_path
     from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.lab.recordings import clip_starts
     from mtv_world_ros.lab.training.training_config import load_training_config
 
     del data_set  # skips without OpenGL

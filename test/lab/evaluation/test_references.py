@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mtv_world_ros.data.recording import commands_until
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.lab.evaluation.imagined_stretches import imagine_stretch, stretches
 from mtv_world_ros.lab.evaluation.references import check_actions, with_actions
+from mtv_world_ros.lab.recordings import commands_until
 from mtv_world_ros.pipeline import ImaginedEpisode
 
 

@@ -112,9 +112,10 @@ def test_a_calibration_file_is_scaled_to_the_video(datasets, make_mapping, tmp_p
 
 
 def test_training_reads_what_was_imported(datasets, make_mapping, tmp_path):
-    from mtv_world_ros.data.recording import clip_starts, cut_clip, load_recording
+    from mtv_world_ros.data.recording import load_recording
     from mtv_world_ros.data_types import WorldModelSpec
     from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.lab.recordings import clip_starts, cut_clip
 
     mapping = make_mapping()
     import_dataset(datasets('v3.0'), mapping, tmp_path / 'out')

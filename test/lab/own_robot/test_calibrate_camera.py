@@ -12,11 +12,12 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot.shape import draw_silhouettes, load_shape
+from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.lab.inspection.camera_pose import difference, moved, spread
 from mtv_world_ros.lab.inspection.clocks import JointTrack
 from mtv_world_ros.lab.inspection.fixed_camera import FixedCamera
 from mtv_world_ros.lab.inspection.wrist_camera import follow_scene, WristCamera
+from mtv_world_ros.lab.silhouettes import draw_silhouettes
 
 
 def test_a_fixed_camera_is_found_from_a_guess_in_a_part_of_the_recording(tmp_path, capsys):

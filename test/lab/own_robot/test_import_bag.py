@@ -12,9 +12,10 @@ import yaml
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.bag import messages
-from mtv_world_ros.data.bag_mapping import guess_views, load_bag_mapping
+from mtv_world_ros.data.bag_mapping import load_bag_mapping
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.lab.importing.bags import guess_views
 
 MAPPING = {
     'namespace': 'cell',

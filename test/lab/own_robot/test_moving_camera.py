@@ -11,13 +11,14 @@ import yaml
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.bag_mapping import load_source
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.data.recording import cached_recording, cut_clip, load_recording
+from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.geometry.transforms import inverse
 from mtv_world_ros.lab.inspection.inspect import Inspector
 from mtv_world_ros.lab.inspection.motion_residual import ResidualSearch
+from mtv_world_ros.lab.recordings import cached_recording, cut_clip
 from mtv_world_ros.replay.offline import observe, ReplayLimits
 
 NUM = 30

@@ -12,7 +12,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.guess import guess_robot
+from mtv_world_ros.lab.importing.robot_guess import guess_robot
 
 
 @pytest.fixture

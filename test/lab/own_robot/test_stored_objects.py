@@ -13,9 +13,10 @@ import yaml
 from mtv_world_ros.assembly import assemble_describer
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.data.recording import cut_clip, described_objects, load_recording
+from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.lab.recordings import cut_clip, described_objects
 from mtv_world_ros.lab.training.clips.clip_controls import ControlMaker
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter

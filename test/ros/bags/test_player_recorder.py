@@ -17,10 +17,10 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from mtv_world_ros.data.bag.reader import BagReader
-from mtv_world_ros.data.bag.recover import find_damaged, recover
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import JointTrajectory as Trajectory
 from mtv_world_ros.geometry.calibration_file import load_calibration
+from mtv_world_ros.lab.importing.recover import find_damaged, recover
 from mtv_world_ros.ros.messages.conversions import NANO, to_ns
 
 START_NS = 1_700_000_000 * NANO

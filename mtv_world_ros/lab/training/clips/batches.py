@@ -17,10 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mtv_world_ros.data.recording import clip_starts, cut_clip, Recording
+from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.jobs import run_job, WorkerPool
+from mtv_world_ros.lab.recordings import clip_starts, cut_clip
 from mtv_world_ros.lab.training.clips.clip_controls import (
     ControlMaker,
     draw_past,
@@ -28,7 +30,6 @@ from mtv_world_ros.lab.training.clips.clip_controls import (
     Past,
 )
 from mtv_world_ros.lab.training.training_config import TrainingConfig
-from mtv_world_ros.processes import run_job, WorkerPool
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 

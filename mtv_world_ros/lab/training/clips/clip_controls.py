@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mtv_world_ros.data.recording import Clip, frame_indices, Recording
+from mtv_world_ros.data.recording import frame_indices, Recording
 from mtv_world_ros.data_types import BoolArray, ByteArray, History, WorldModelSpec
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.object_motion import cut_outs, moved_pictures, ObjectMotion
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.recordings import Clip
 from mtv_world_ros.lab.training.training_config import HistoryConfig
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,

@@ -12,9 +12,10 @@ from sources import make_source, with_batch_size
 import torch
 from wan_base import make_base, tiny_preset
 
-from mtv_world_ros.data.recording import cut_clip, load_recording
+from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.lab.recordings import cut_clip
 from mtv_world_ros.lab.training.base import Base, load_base
 from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.distributed import Processes

@@ -3,7 +3,7 @@ import sys
 import pytest
 
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.processes import score_all, score_with_ray
+from mtv_world_ros.lab.jobs import score_all, score_with_ray
 
 
 @pytest.fixture

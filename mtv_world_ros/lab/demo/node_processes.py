@@ -14,6 +14,7 @@ from tqdm import tqdm
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import check_room
+from mtv_world_ros.launching.imagination import ROOM_BYTES
 from mtv_world_ros.processes import (
     how_it_ended,
     module_command,
@@ -28,8 +29,6 @@ STREAMS = ('predicted/image_raw', 'predicted/camera_info', 'trajectory/image_raw
 TOPICS = ('predicted/joint_states', 'success', 'jaccard', 'report')
 NODE = '/world_model'
 _NODE_START_S = 120.0
-#: of logs and bag, before anything is started
-ROOM_BYTES = 8 * 2**20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

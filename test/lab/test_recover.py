@@ -16,9 +16,9 @@ from rosbags.rosbag2 import Reader
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.bag.reader import BagReader, iter_messages
-from mtv_world_ros.data.bag.recover import find_damaged, recover
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.lab.importing.recover import find_damaged, recover
 
 TYPE = 'std_msgs/msg/UInt8MultiArray'
 JOINTS = 'sensor_msgs/msg/JointState'
