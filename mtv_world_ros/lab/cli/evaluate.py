@@ -9,7 +9,7 @@ from math import isfinite
 from pathlib import Path
 import re
 import sys
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import (
     add_options,
@@ -166,7 +166,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     ]
     write_comparison(summaries, arguments.out)
     for entry, summary in zip(entries, summaries, strict=True):
-        print(f'{entry.label}: {summary.following.line}; {in_short(summary.metrics())}')
+        print(f'{entry.label}: {summary.following.line}; {in_short(summary)}')
     print(f'tables: {" ".join(str(folder / "tables.md") for folder in folders)}')
     if arguments.report:
         from mtv_world_ros.lab.evaluation.report.html import write_report
@@ -176,11 +176,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 
 def say_failed(failed: Sequence[Mapping[str, str]]) -> bool:
-    """Writes which episodes have no result, and why, to standard error; returns if any.
-
-    Args:
-        failed: reason by episode, of every run; what runs have in common is said once.
-    """
+    """Writes which episodes have no result and why, once each, to standard error."""
     lines = dict.fromkeys(
         f'mtv-world: {episode} was not scored: {reason}\n'
         for run in failed
@@ -197,25 +193,25 @@ _J = (
 )
 
 
-def in_short(metrics: Mapping[str, Any]) -> str:
+def in_short(summary: EvaluationSummary) -> str:
     """Returns the one line of an evaluation that is printed; all else is in its report."""
     from mtv_world_ros.lab.documents import number
     from mtv_world_ros.lab.evaluation.metrics.statistics import MIN_EPISODES
-    from mtv_world_ros.lab.evaluation.report.headline import cell
+    from mtv_world_ros.lab.evaluation.report.tables import cell
 
-    numbers, count = metrics['overall'], int(metrics['num_episodes'])
+    numbers, count = summary.estimates(None), len(summary.results)
     said = [
-        f'{words} {cell(numbers, key)} (first frame held: {cell(numbers, held)})'
+        f'{words} {cell(numbers[key])} (first frame held: {cell(numbers[held])})'
         for key, words, held in _J
-        if numbers.get(key) is not None and isfinite(numbers[key])
+        if isfinite(numbers[key].value)
     ][:1]
-    pictures = metrics.get('pictures', {}).get('overall', {})
+    pictures = summary.pictures[None]
     if 'psnr' in pictures:
-        psnr, held = (number(pictures[key]['value'], 1) for key in ('psnr', 'psnr_held'))
+        psnr, held = (number(pictures[key].value, 1) for key in ('psnr', 'psnr_held'))
         said.append(f'PSNR {psnr} dB (first frame held: {held} dB)')
     said = said or ['no object was found and no picture compared']
     few = f'; no intervals below {MIN_EPISODES} episodes' if count < MIN_EPISODES else ''
-    failed = metrics['num_episodes_failed']
+    failed = len(summary.failed)
     lost = f'; {failed} episodes failed, see the report' if failed else ''
     return f'{", ".join(said)}, {count} episode{"s" * (count > 1)}{few}{lost}'
 

@@ -73,13 +73,13 @@ class EvaluationJob:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Instruments:
-    """What episodes are measured with.
+    """What episodes are measured with; None = not measured.
 
     Attributes:
         pipeline: imagines and segments.
-        reconstruct: the autoencoder's round trip, for the ceiling; None = not measured.
-        quality: PSNR and the like; None = not measured.
-        features: for FID and FVD; None = not measured.
+        reconstruct: the autoencoder's round trip, for the ceiling.
+        quality: PSNR, SSIM, LPIPS.
+        features: for FID and FVD.
     """
 
     pipeline: Pipeline
@@ -111,12 +111,9 @@ class _Found:
 
 
 class EpisodeScorer:
-    """Scores episodes with the same instruments; keeps the last episodes that it read.
+    """Scores episodes with the same instruments, and keeps the last two recordings that it read.
 
-    Args:
-        instruments: pipeline, image quality and features of Fréchet distances.
-        config: stretches to imagine and scores to compute.
-        out: folder of the evaluation; rollouts and features go into `episodes/`.
+    Rollouts and features go into `out/episodes`.
     """
 
     def __init__(self, instruments: Instruments, config: EvaluationConfig, out: Path) -> None:

@@ -28,6 +28,7 @@ from mtv_world_ros.lab.evaluation.metrics.image_quality import image_quality
 from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate
 from mtv_world_ros.lab.evaluation.references import round_trip
 from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary, Group
+from mtv_world_ros.lab.evaluation.report.tables import write_summary
 from mtv_world_ros.lab.evaluation.results import EpisodeResult
 from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
 from mtv_world_ros.lab.jobs import check_same_settings, score_all
@@ -79,25 +80,21 @@ def evaluate(
 
     Args:
         pipeline: imagines and segments.
-        episode_paths: recorded episodes.
-        out: folder for the results.
+        episode_paths: folders of recorded episodes.
+        out: folder of the results.
         config: stretches to imagine and scores to compute.
-        name: identifies the checkpoint; only results of the same name are taken over, and none
+        name: fingerprint of the checkpoint; only results of the same name are taken over, and none
             without a name.
-        label: of its rows in tables that compare checkpoints.
+        label: name of its rows in tables that compare checkpoints.
         zero_shot: by path what the model was not trained for: `view`, `task` or `object`.
-        provenance: what the results were made with, by heading; goes into metrics.json.
+        provenance: command, date and versions, by heading; goes into metrics.json.
         parallel: processes to score with; None = this one.
-        describer: names the objects from each episode's first frame; None = see `Job.objects`.
+        describer: names the objects from each episode's first frame; None = see `EvaluationJob`.
         overwrite: replace results of other settings; only asked where there is a name.
         show_progress: draw a progress bar, on a terminal.
 
-    Returns:
-        What was found.
-
     Raises:
-        ConfigError: weights that are not there, or `out` holds results of
-            other settings.
+        ConfigError: weights are missing, or `out` holds results of other settings.
         EpisodeError: no episode can be used.
     """
     if not config.num_inference_steps:  # results say the number
@@ -120,6 +117,7 @@ def evaluate(
         raise EpisodeError(f'no episode could be scored; {reason[0]}: {reason[1]}')
     results.sort(key=lambda result: result.episode)
     summary = EvaluationSummary(
+        folder=out,
         name=name,
         label=label,
         spec=pipeline.spec,
@@ -128,8 +126,8 @@ def evaluate(
         results=results,
         failed=dict(sorted(failed.items())),
     )
-    summary = summary.with_distances(_distances(summary, out, config))
-    summary.write(out)
+    summary = replace(summary, distances=_distances(summary, config))
+    write_summary(summary)
     return summary
 
 
@@ -195,7 +193,7 @@ def _progress(results: Sequence[EpisodeResult]) -> str:
 
 
 def _distances(
-    summary: EvaluationSummary, out: Path, config: EvaluationConfig
+    summary: EvaluationSummary, config: EvaluationConfig
 ) -> dict[tuple[str | None, str], dict[str, Estimate]]:
     """FID and FVD by (zero-shot set, view), the set None for all episodes."""
     if config.fid_weights is None and config.fvd_weights is None:
@@ -203,7 +201,7 @@ def _distances(
     return {
         (group, view): distances(
             [
-                load_features(feature_path(out, result.episode))
+                load_features(feature_path(summary.folder, result.episode))
                 for result in summary.chosen(Group(zero_shot=group))
             ],
             view,

@@ -125,7 +125,7 @@ def imagine_stretch(
     """Imagines a stretch from the recorded frames until its start; returns its chunks.
 
     Args:
-        pipeline: imagines.
+        pipeline: the world model and all around it.
         recording: the episode that the stretch was cut from.
         stretch: recorded frames to imagine.
         actions: the episode whose commands are executed: the same one, or another for a control.

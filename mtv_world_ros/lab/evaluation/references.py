@@ -44,13 +44,9 @@ def with_actions(
     stretch: Stretch,
     donor: Recording | None,
 ) -> Recording | None:
-    """Returns the episode whose commands are executed; None without an episode to lend them.
+    """Returns the episode whose commands of a kind (of `ACTIONS`) are executed for a stretch.
 
-    Args:
-        name: of `ACTIONS`.
-        recording: the episode that is imagined.
-        stretch: the part of it that is imagined.
-        donor: lends its commands for `shuffled`.
+    None = `shuffled`, but there is no episode, the donor, to lend its commands.
     """
     commands = recording.commands
     if name == 'shuffled':

@@ -77,12 +77,12 @@ class EpisodeResult:
         read['reasons'], read['notes'] = tuple(values['reasons']), tuple(values['notes'])
         read['probability'] = np.nan if values['probability'] is None else values['probability']
         for name in ('features', 'observed', 'resumed'):
-            read[name] = _with_nan(values.get(name, {}))
-        read['pictures'] = {k: _with_nan(v) for k, v in values.get('pictures', {}).items()}
+            read[name] = _nan_for_none(values.get(name, {}))
+        read['pictures'] = {k: _nan_for_none(v) for k, v in values.get('pictures', {}).items()}
         return EpisodeResult(**read)
 
 
-def _with_nan(values: Mapping[str, float | None]) -> dict[str, float]:
+def _nan_for_none(values: Mapping[str, float | None]) -> dict[str, float]:
     return {k: np.nan if v is None else v for k, v in values.items()}
 
 
@@ -114,13 +114,13 @@ def stored_stretch(
     masks: ObjectMasks,
     j: FloatArray,
 ) -> StoredRollout:
-    """Returns what is kept of one stretch.
+    """Returns what is kept of a stretch for later reports.
 
     Args:
         chunks: imagined from the stretch's first frame.
         stretch: the recorded frames.
-        start_seconds: of the stretch since the episode's first frame [s].
-        fps: of the model.
+        start_seconds: from the episode's first frame to the stretch's [s].
+        fps: frames a second.
         true_masks: of the recorded frames 1..T.
         masks: of the predicted frames.
         j: (V, O, T) J per frame.

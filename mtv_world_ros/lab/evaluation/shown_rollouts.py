@@ -23,11 +23,11 @@ def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
         EpisodeError: frames cannot be read.
     """
     for evaluated in read_evaluations(folder):
-        label = evaluated.metrics.get('label') or folder.name
-        for name in sorted(evaluated.results)[:count]:
-            rollout = evaluated.rollout(name)
+        label = evaluated.label or folder.name
+        for result in sorted(evaluated.results, key=lambda result: result.episode)[:count]:
+            rollout = evaluated.rollout(result.episode)
             if rollout is not None:
-                yield _evaluated(f'{label}/{name}', rollout, evaluated.results[name])
+                yield _evaluated(f'{label}/{result.episode}', rollout, result)
 
 
 def _evaluated(name: str, rollout: StoredRollout, result: EpisodeResult) -> ScoredRollout:

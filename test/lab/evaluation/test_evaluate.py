@@ -12,7 +12,7 @@ from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 
 
 def run(pipeline, episodes, out, *, name='', zero_shot=None, overwrite=False, **config):
-    summary = evaluate(
+    evaluate(
         pipeline,
         episodes,
         out,
@@ -22,7 +22,7 @@ def run(pipeline, episodes, out, *, name='', zero_shot=None, overwrite=False, **
         overwrite=overwrite,
         show_progress=False,
     )
-    return json.loads((out / 'metrics.json').read_text()), summary.markdown()
+    return json.loads((out / 'metrics.json').read_text()), (out / 'tables.md').read_text()
 
 
 @pytest.mark.parametrize('mode', ['observe', 'imagine'])

@@ -78,15 +78,13 @@ class Calibrated:
     """A calibration and what it was judged by.
 
     Attributes:
-        calibration: fitted on all samples.
-        samples: with known outcome.
-        judgements: `BEFORE`, `AFTER` (each task left out of the fit that judges it),
-            `AFTER_KINDS` (each fault kind left out; of episodes without a fault their task;
-            only where there are faults), `OBSERVED` (the same of the recorded frames, by a fit to
-            them), `UNFORESEEN` (with all but the last chunk seen and nothing foreseen, by a fit to
-            them), `RESUMED` (with all but the last chunk seen, by the fit for where something is
-            foreseen or by that for where nothing is), `FITTED` (on what it was fitted on: too
-            good) -> one per sample.
+        calibration: fitted to all samples.
+        samples: episodes of known outcome.
+        judgements: a judgement of each sample, by the names above. `AFTER` leaves each task out
+            of the fit that judges it, `AFTER_KINDS` each fault kind (of episodes without a fault
+            their task). `OBSERVED` is that of the recorded frames and `UNFORESEEN` that with all
+            but the last chunk seen and nothing foreseen, each by a fit of its own. `RESUMED`: with
+            all but the last chunk seen. `FITTED`: on what it was fitted to, thus too good.
     """
 
     calibration: Calibration
@@ -132,13 +130,13 @@ def calibrate(
     l2: float = 1.0,
     made: Mapping[str, str] | None = None,
 ) -> Calibrated:
-    """Fits the calibration and judges it.
+    """Fits the calibration to imagined episodes of known outcome, and judges it.
 
     Args:
         samples: imagined episodes of known outcome.
-        segmenter: name of the segmenter of the masks.
+        segmenter: name of what found the masks.
         l2: strength of the penalty.
-        made: command, date, machine.
+        made: command, date and machine, by heading.
 
     Raises:
         ConfigError: too few episodes, or all of one outcome.
@@ -283,12 +281,7 @@ def _judged(sample: Sample, probability: float) -> Judgement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Logistic:
-    """P(true) = 1 / (1 + exp(-(weights x + bias))).
-
-    Attributes:
-        weights: (F,).
-        bias: is not penalised; within +-`MAX_BIAS`.
-    """
+    """P(true) = 1 / (1 + exp(-(weights x + bias))): weights (F,), bias within +-`MAX_BIAS`."""
 
     weights: FloatArray
     bias: float
@@ -308,9 +301,11 @@ def fit_logistic(
 ) -> Logistic:
     """Minimises -log likelihood + l2 / 2 * |weights - prior|^2 (scikit-learn's with C = 1 / l2).
 
+    The bias is not penalised.
+
     Args:
         features: (N, F).
-        labels: (N,).
+        labels: (N,) outcomes.
         l2: strength of the penalty; positive, so that there is one minimum.
         prior: (F,) weights that hold where the rows say nothing; None = zero.
         non_negative: no weight below 0, for features that grow with the probability.

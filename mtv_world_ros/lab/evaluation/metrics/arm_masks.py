@@ -59,10 +59,10 @@ class ArmScene:
 
     Attributes:
         picture: (H, W, 3) uint8 RGB, the median of a recording.
-        known: (H, W) where the arm stands in less than half of it.
-        camera: that sees it.
-        robot: gives the links' poses.
-        parts: of its links.
+        known: (H, W) where the arm stands in less than half of the recording.
+        camera: the still camera.
+        robot: kinematics of the arm.
+        parts: shapes of the arm's links.
     """
 
     picture: ByteArray

@@ -26,6 +26,11 @@ class Curve:
     values: tuple[float, ...]
     band: tuple[tuple[float, float], ...]
 
+    def at(self, index: int) -> tuple[float | None, tuple[float, float] | None]:
+        """Returns a value and its interval; None where the curve does not reach."""
+        reached = index < len(self.values)
+        return (self.values[index], self.band[index]) if reached else (None, None)
+
 
 def curve(
     episodes: Sequence[Sequence[ScoreRow]],
@@ -38,7 +43,7 @@ def curve(
 
     Args:
         episodes: rows of each episode.
-        view: its name; None = all.
+        view: name of the view; None = all.
         field: one of `scores.FRAME_FIELDS`.
         min_share: frames that fewer than this share of the rollouts reach are left out.
     """
@@ -56,13 +61,7 @@ def by_chunk(
 ) -> Curve:
     """Returns J of the moving objects of a view for each chunk of its rollouts: how it drifts.
 
-    All frames of a chunk weigh equally; the other arguments are those of `curve`.
-
-    Args:
-        episodes: rows of each episode.
-        view: its name; None = all.
-        field: one of `scores.FRAME_FIELDS`.
-        num_frames: T, frames of a chunk.
+    All frames of a chunk, `num_frames`, weigh equally; the other arguments are those of `curve`.
     """
     sums, counts = _sums(_moving(episodes, view, field))
     missing = -sums.shape[1] % num_frames

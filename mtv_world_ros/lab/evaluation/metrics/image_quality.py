@@ -21,12 +21,8 @@ ImageQuality = Callable[[ByteArray, ByteArray], dict[str, float]]
 def image_quality(names: Sequence[str], device: str = 'cpu') -> ImageQuality | None:
     """Returns what measures the named numbers, each the mean over frames; None without names.
 
-    PSNR [dB] of frames that are equal is that of an error of 1/2 of a grey level in one of them,
-    so that means stay finite.
-
-    Args:
-        names: of `MEASURES`.
-        device: for LPIPS.
+    PSNR [dB] of equal frames is that of an error of 1/2 of a grey level in one value, so that
+    means stay finite.
 
     Raises:
         ConfigError: an unknown name, or a package that it needs is missing.

@@ -142,10 +142,7 @@ def _arcsine_variance(rates: FloatArray, trials: IntArray) -> FloatArray:
 
 
 def _groupings(observed: FloatArray) -> BoolArray:
-    """(Q, P) which policies are the second group: first none, then each cut along either rate.
-
-    Along their sum as well.
-    """
+    """(Q, P) which policies are the second group: none, or a cut along a rate or their sum."""
     num = observed.shape[1]
     cuts = np.arange(num)[None] >= np.arange(1, num)[:, None]
     found = [np.zeros((1, num), np.bool_)]
@@ -207,11 +204,9 @@ def pearson(judged: Sequence[float] | FloatArray, true: Sequence[float] | FloatA
     are equal.
     """
     a, b = _known(judged, true)
-    if len(a) < 2:
+    if len(a) < 2 or min(np.ptp(a), np.ptp(b)) < 1e-12:
         return np.nan
-    a, b = a - a.mean(), b - b.mean()
-    scale = float(np.sqrt((a**2).sum() * (b**2).sum()))
-    return float((a * b).sum()) / scale if scale > 1e-12 else np.nan
+    return float(_pearson_of(a[None], b[None])[0])
 
 
 def mean_maximum_rank_violation(
@@ -227,8 +222,7 @@ def mean_maximum_rank_violation(
     a, b = _known(judged, true)
     if len(a) < 2:
         return np.nan
-    is_violated = (a[:, None] > a) != (b[:, None] > b)
-    return float(np.where(is_violated, np.abs(b[:, None] - b), 0.0).max(axis=1).mean())
+    return float(_violation_of(a[None], b[None])[0])
 
 
 def _known(

@@ -63,15 +63,15 @@ class ScoreRow:
     status: str
     moving: bool
     j: float
-    j_visible: float
-    j_copy: float
-    j_shuffled: float
-    j_zero: float
-    j_ceiling: float
-    j_self: float
-    j_frames: tuple[float, ...]
-    j_copy_frames: tuple[float, ...]
-    j_shuffled_frames: tuple[float, ...]
+    j_visible: float = np.nan
+    j_copy: float = np.nan
+    j_shuffled: float = np.nan
+    j_zero: float = np.nan
+    j_ceiling: float = np.nan
+    j_self: float = np.nan
+    j_frames: tuple[float, ...] = ()
+    j_copy_frames: tuple[float, ...] = ()
+    j_shuffled_frames: tuple[float, ...] = ()
     moving_imagined: bool = False
     f: float = np.nan
     f_copy: float = np.nan
@@ -110,7 +110,7 @@ class Truth:
     Attributes:
         first: (V, O, H, W) masks of frame 0.
         first_frames: (V, H, W, 3) uint8 RGB, frame 0.
-        masks: of the frames 1..T.
+        masks: (V, O, T, H, W) masks of the frames 1..T.
         moving: (V, O) whether each object really moves.
     """
 
@@ -139,7 +139,7 @@ def true_masks(
         stretch: recorded frames.
         segmenter: finds the masks, as it will in the predicted frames.
         names: O objects to score.
-        objects: names; the recorded identities number them from 1.
+        objects: names that the recorded identities number, from 1.
         use_ids: score against the recorded identities instead, where there are any. Which
             objects move is read from them in any case.
     """
@@ -196,7 +196,7 @@ def score_rows(
         truth: masks of the recorded frames.
         predicted: scores of the prediction.
         others: scores by name, of `OTHERS`; those that are missing were not measured.
-        masks: in the predicted frames; they tell what is imagined to move.
+        masks: in the predicted frames; None = what is imagined to move is not known.
     """
     first = truth.first.masks[:, :, 0]
     imagined = np.zeros_like(truth.moving) if masks is None else moves(masks.masks, first)
@@ -252,12 +252,7 @@ def _union_row(
         name='',
         status='ok' if np.isfinite(j) else 'no object is scored',
         moving=False,
-        moving_imagined=False,
         j=float(j),
-        j_visible=np.nan,
-        j_frames=(),
-        j_copy_frames=(),
-        j_shuffled_frames=(),
         **_values(scores, lambda found: found.union[v]),
     )
 
@@ -292,6 +287,8 @@ BOTH = {
 }
 #: means over frames of one episode that are not of objects
 QUALITY = ('psnr', 'ssim', 'lpips')
+#: Fréchet distances of frames and of clips, over all episodes
+DISTANCES = ('fid', 'fvd')
 #: functions of the means: name -> (minuend, subtrahend); paired within each episode
 MARGINS = {
     'margin_moving': ('j_moving', 'j_copy_moving'),
@@ -301,13 +298,9 @@ MARGINS = {
 
 
 def episode_means(rows: Sequence[ScoreRow], view: str | None) -> dict[str, float]:
-    """Returns the `MEANS` and `MARGINS` of one episode; frames weigh equally.
+    """Returns `MEANS` and `MARGINS` of an episode in a view (None = all); frames weigh equally.
 
     Only rows with a J count, also in the baselines, so that the differences are paired.
-
-    Args:
-        rows: of the episode.
-        view: name, or None for all views together.
     """
     kept = [row for row in rows if view in (None, row.view) and np.isfinite(row.j)]
     chosen = {

@@ -42,13 +42,7 @@ _RANGES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """A number and its 95 % interval; NaN = not measured, or no interval.
-
-    Attributes:
-        value: mean over the episodes that have it.
-        interval: (low, high).
-        num_episodes: number of episodes that have the value.
-    """
+    """A mean over the episodes that have the value, and its 95 % interval; NaN = not known."""
 
     value: float
     interval: Interval
@@ -94,10 +88,8 @@ def mean_interval(
 def summarise(episodes: Sequence[dict[str, float]]) -> dict[str, Estimate]:
     """Returns the mean over episodes of every number, and the skills, with 95 % intervals.
 
-    The interval of a margin is that of differences paired within each episode.
-
-    Args:
-        episodes: `episode_means` of each episode, and its `QUALITY` where measured.
+    The interval of a margin is that of differences paired within each episode. Episodes are given
+    by their `episode_means`, and `QUALITY` where it was measured.
     """
     names = [*MEANS, *BOTH, *MARGINS, *QUALITY]
     rows = [[means.get(name, nan) for name in names] for means in episodes]
@@ -130,12 +122,9 @@ def _estimate(values: FloatArray, weights: FloatArray, limits: Interval) -> Esti
 
 
 def wilson(hits: float, count: float, quantile: float = float(ndtri(0.975))) -> Interval:
-    """Returns the 95 % Wilson score interval of a share; NaN where nothing was counted.
+    """Returns the 95 % Wilson score interval of a share of independent trials; NaN without any.
 
-    Args:
-        hits: successes.
-        count: trials, all independent of each other.
-        quantile: factor of the standard error.
+    `quantile` is the factor of the standard error.
     """
     if count <= 0:
         return UNKNOWN
@@ -151,14 +140,12 @@ def clustered_wilson(hits: FloatArray, counts: FloatArray) -> Interval:
     """Returns the 95 % interval of a share of trials that come in clusters.
 
     Wilson's interval of the effective number of trials, with the t quantile of the clusters
-    (Korn and Graubard, 1998). Rollouts that share a scene are a cluster.
+    (Korn and Graubard, 1998). Rollouts that share a scene are a cluster. NaN for fewer than
+    `MIN_EPISODES` clusters.
 
     Args:
         hits: (C,) successes of each cluster.
         counts: (C,) trials of each.
-
-    Returns:
-        (low, high); NaN for fewer than `MIN_EPISODES` clusters.
     """
     hits, counts = (np.asarray(part, np.float64)[counts > 0] for part in (hits, counts))
     num, total = len(counts), counts.sum()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.stats import mannwhitneyu
 
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.lab.evaluation.metrics.statistics import wilson
@@ -15,12 +16,7 @@ from mtv_world_ros.success.estimator import verdict
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """The estimate at the end of an episode.
-
-    Attributes:
-        probability: NaN = abstained.
-        outcome: `success`, `failure` or `unknown`.
-    """
+    """The estimate at the end of an episode (NaN = abstained), and the outcome or `unknown`."""
 
     probability: float
     outcome: str
@@ -61,21 +57,20 @@ def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
     }
 
 
-def expected_calibration_error(
-    probability: FloatArray, real: BoolArray, num_bins: int = NUM_BINS
-) -> float:
+def expected_calibration_error(probability: FloatArray, real: BoolArray) -> float:
     """Returns how far what was said is from what came true, over bins of what was said.
 
     Bins weigh by how many (N,) estimates lie in them (Guo et al., 2017); what was said is the
     probability of success, not of the likelier outcome.
     """
+    bins = _binned(probability, NUM_BINS)
+    return float(sum(at.mean() * abs(probability[at].mean() - real[at].mean()) for _, at in bins))
+
+
+def _binned(probability: FloatArray, num_bins: int) -> list[tuple[float, BoolArray]]:
+    """Middle of each of equally wide bins that hold an estimate, and which (N,) it holds."""
     place = np.minimum((probability * num_bins).astype(int), num_bins - 1)
-    gaps = [
-        (place == k).mean() * abs(probability[place == k].mean() - real[place == k].mean())
-        for k in range(num_bins)
-        if (place == k).any()
-    ]
-    return float(sum(gaps))
+    return [((k + 0.5) / num_bins, place == k) for k in np.unique(place)]
 
 
 def area_under_roc(probability: FloatArray, real: BoolArray) -> float | None:
@@ -83,8 +78,7 @@ def area_under_roc(probability: FloatArray, real: BoolArray) -> float | None:
     gained, lost = probability[real], probability[~real]
     if not len(gained) or not len(lost):
         return None
-    above = (gained[:, None] > lost).mean()
-    return float(above + (gained[:, None] == lost).mean() / 2)
+    return float(mannwhitneyu(gained, lost).statistic / (len(gained) * len(lost)))
 
 
 def _mean(values: np.ndarray) -> float | None:
@@ -98,8 +92,8 @@ class Bin:
     Attributes:
         middle: of the probabilities that belong here.
         said: mean probability.
-        came_true: share.
-        interval: of that share.
+        came_true: share, with its interval.
+        interval: 95 % Wilson interval of the share.
         count: number of estimates.
     """
 
@@ -119,15 +113,13 @@ def reliability_bins(judgements: Sequence[Judgement]) -> list[Bin]:
     ]
     said = np.array([item.probability for item in judged])
     true = np.array([item.outcome == 'success' for item in judged], bool)
-    place = np.minimum((said * NUM_CHART_BINS).astype(int), NUM_CHART_BINS - 1)
     return [
         Bin(
-            middle=(k + 0.5) / NUM_CHART_BINS,
-            said=float(said[place == k].mean()),
-            came_true=float(true[place == k].mean()),
-            interval=wilson(int(true[place == k].sum()), int((place == k).sum())),
-            count=int((place == k).sum()),
+            middle=middle,
+            said=float(said[at].mean()),
+            came_true=float(true[at].mean()),
+            interval=wilson(int(true[at].sum()), int(at.sum())),
+            count=int(at.sum()),
         )
-        for k in range(NUM_CHART_BINS)
-        if (place == k).any()
+        for middle, at in _binned(said, NUM_CHART_BINS)
     ]

@@ -85,15 +85,11 @@ class ChartLine:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Point:
-    """Two values of one thing with their intervals; NaN = not known.
+    """Two values in [0, 1] of one thing with their intervals (low, high); NaN = not known.
 
     Attributes:
         label: short, beside the mark.
         title: shown where the mouse is, and for those who cannot see it.
-        x: in [0, 1].
-        y: in [0, 1].
-        x_interval: (low, high).
-        y_interval: (low, high).
         colour: variable of the style sheet.
     """
 
@@ -142,11 +138,11 @@ def _draw_dot(axes: Axes, row: int, dot: Dot) -> None:
 def line_chart(
     title: str, lines: Sequence[ChartLine], seconds: Sequence[float], y_label: str
 ) -> Markup:
-    """Returns values in [0, 1] over time.
+    """Returns values in [0, 1] over time, the last line on top.
 
     Args:
         title: for those who cannot see it.
-        lines: curves; the last one is drawn on top.
+        lines: the curves.
         seconds: time of each frame [s].
         y_label: name and unit of the values.
     """

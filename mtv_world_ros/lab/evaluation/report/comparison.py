@@ -43,22 +43,23 @@ class Line(NamedTuple):
         return {'j_union': found['j_copy_union'], 'j_moving': found['j_copy_moving']}
 
 
-def lines(summaries: Sequence[EvaluationSummary]) -> list[Line]:
+def labels(summaries: Sequence[EvaluationSummary]) -> list[str]:
+    """Returns what the rows of checkpoints are called."""
+    return [summary.label or summary.name for summary in summaries]
+
+
+def lines(summaries: Sequence[EvaluationSummary], names: Sequence[str]) -> list[Line]:
     """Returns a row per checkpoint, or per zero-shot set of each; the held first frame below.
 
-    Where a data set has zero-shot episodes, the row with the plain label is that of the others.
+    Where a data set has zero-shot episodes, the row with the plain name is that of the others.
     """
-    found = []
-    for summary in summaries:
-        sets = summary.zero_shot_sets
-        for name in sets or [None]:
+    found, held = [], {}
+    for summary, called in zip(summaries, names, strict=True):
+        for name in summary.zero_shot_sets or [None]:
             suffix = '' if name in (None, SEEN) else f', zero-shot {name}'
-            found.append(Line(f'{summary.label or summary.name}{suffix}', summary, name))
-    copy = {line.zero_shot: line for line in reversed(found)}
-    for name, line in reversed(copy.items()):
-        suffix = '' if name in (None, SEEN) else f', zero-shot {name}'
-        found.append(Line(f'{_COPY}{suffix}', line.summary, name, held=True))
-    return found
+            found.append(Line(f'{called}{suffix}', summary, name))
+            held.setdefault(name, Line(f'{_COPY}{suffix}', summary, name, held=True))
+    return [*found, *held.values()]
 
 
 def all_views(summaries: Sequence[EvaluationSummary]) -> list[str]:
@@ -66,27 +67,24 @@ def all_views(summaries: Sequence[EvaluationSummary]) -> list[str]:
     return list(dict.fromkeys(view for summary in summaries for view in summary.spec.views))
 
 
-def method_table(summaries: Sequence[EvaluationSummary]) -> str:
+def method_table(rows: Sequence[Line], views: Sequence[str]) -> Table:
     """Returns method by view: FID, FVD and J (the paper's table 1), and J of what moves."""
-    views = all_views(summaries)
     columns = ('FID ↓', 'FVD ↓', 'J ↑', 'J moving ↑')
     head = ['Method', *(f'{view} {what}' for view in views for what in columns)]
     body = []
-    for line in lines(summaries):
+    for line in rows:
         cells = [line.label]
         for view in views:
             found = line.numbers(view)
             cells += [tables.cell(found.get(name), 1) for name in ('fid', 'fvd')]
             cells += [tables.cell(found.get(name)) for name in ('j_union', 'j_moving')]
         body.append(cells)
-    return Table(head=head, rows=body).text()
+    return Table(head=head, rows=body)
 
 
-def task_tables(summaries: Sequence[EvaluationSummary]) -> str:
+def task_tables(rows: Sequence[Line], views: Sequence[str]) -> list[Table]:
     """Returns method by task and view: J (the paper's table 3), a few tasks at a time."""
-    views = all_views(summaries)
-    tasks = sorted({task for summary in summaries for task in summary.tasks})
-    rows = lines(summaries)
+    tasks = sorted({task for row in rows for task in row.summary.tasks})
     parts = []
     for first in range(0, len(tasks), TASKS_PER_TABLE):
         columns = [
@@ -97,18 +95,24 @@ def task_tables(summaries: Sequence[EvaluationSummary]) -> str:
             [row.label, *(tables.cell(row.numbers(v, t).get('j_union')) for t, v in columns)]
             for row in rows
         ]
-        parts.append(Table(head=head, rows=body).text())
-    return '\n\n'.join(parts)
+        parts.append(Table(head=head, rows=body))
+    return parts
 
 
 def markdown(summaries: Sequence[EvaluationSummary]) -> str:
     """Returns both tables with what they mean."""
-    numbers = ', '.join(f'{s.label or s.name}: {len(s.results)} episodes' for s in summaries)
+    names, views = labels(summaries), all_views(summaries)
+    rows = lines(summaries, names)
+    numbers = ', '.join(
+        f'{name}: {len(summary.results)} episodes'
+        for name, summary in zip(names, summaries, strict=True)
+    )
+    by_task = '\n\n'.join(table.text() for table in task_tables(rows, views))
     failed = sum(len(summary.failed) for summary in summaries)
     note = f' {failed} could not be scored, see the tables of each.' if failed else ''
     return (
-        f'# Methods\n\n{numbers}.{note}\n\n{_ABOUT}\n\n{method_table(summaries)}\n\n'
-        f'J by task and view:\n\n{task_tables(summaries)}\n'
+        f'# Methods\n\n{numbers}.{note}\n\n{_ABOUT}\n\n{method_table(rows, views).text()}\n\n'
+        f'J by task and view:\n\n{by_task}\n'
     )
 
 
@@ -119,7 +123,7 @@ def as_csv(summaries: Sequence[EvaluationSummary]) -> str:
     writer.writerow(
         ['method', 'zero_shot', 'task', 'view', 'number', 'value', 'low', 'high', 'num_episodes']
     )
-    for line in (line for line in lines(summaries) if not line.held):
+    for line in (line for line in lines(summaries, labels(summaries)) if not line.held):
         for view in line.summary.spec.views:
             for task in (None, *line.summary.tasks):
                 for name, found in line.numbers(view, task).items():
@@ -136,17 +140,11 @@ def _text(value: float) -> str:
     return '' if found is None else str(found)
 
 
-def write_comparison(summaries: Sequence[EvaluationSummary], out: Path) -> str:
-    """Writes `paper_tables.md` and `numbers.csv`; for several checkpoints `metrics.json` too.
-
-    Returns:
-        The tables, as Markdown.
-    """
-    text = markdown(summaries)
-    write_whole(out / 'paper_tables.md', text)
+def write_comparison(summaries: Sequence[EvaluationSummary], out: Path) -> None:
+    """Writes `paper_tables.md` and `numbers.csv`; for several checkpoints `metrics.json` too."""
+    write_whole(out / 'paper_tables.md', markdown(summaries))
     write_whole(out / 'numbers.csv', as_csv(summaries))
     if len(summaries) > 1:
-        methods = {summary.label or summary.name: summary.metrics() for summary in summaries}
+        methods = dict(zip(labels(summaries), (s.metrics for s in summaries), strict=True))
         counts = {name: found['num_episodes'] for name, found in methods.items()}
         write_json(out / 'metrics.json', {'num_episodes': counts, 'methods': methods})
-    return text

@@ -25,11 +25,9 @@ class Filter:
     within: Filter | None = None
 
     def classes(self, *values: str, of: str = '') -> str:
-        """Returns the classes of a card to which these options apply.
+        """Returns the classes of a card to which options apply; other values are left out.
 
-        Args:
-            values: options; others are left out.
-            of: the option of `within` for which they do; empty = for `all` of it.
+        `of` is the option of `within` for which they do; empty = for `all` of it.
         """
         return ' '.join(self._class(value, of) for value in values if value in self.options)
 

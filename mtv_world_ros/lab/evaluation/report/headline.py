@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from math import nan
+from collections.abc import Sequence
+from math import isfinite
 from typing import Any, NamedTuple
 
 from markupsafe import Markup
 import numpy as np
 
-from mtv_world_ros.lab.documents import DASH, number, Table, with_interval
+from mtv_world_ros.lab.documents import with_interval
 from mtv_world_ros.lab.evaluation.metrics.horizon import curve
-from mtv_world_ros.lab.evaluation.metrics.picture_scores import Following
-from mtv_world_ros.lab.evaluation.metrics.statistics import mean_interval, MIN_EPISODES
+from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate, mean_interval, MIN_EPISODES
 from mtv_world_ros.lab.evaluation.report.charts import ChartLine, Dot, dot_chart, line_chart
-from mtv_world_ros.lab.evaluation.report.read_back import Evaluated, ranked_by, scores
+from mtv_world_ros.lab.evaluation.report.comparison import all_views
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import (
+    EvaluationSummary,
+    NOT_MEASURED,
+)
+from mtv_world_ros.lab.evaluation.report.read_back import ranked_by, scores
+from mtv_world_ros.lab.evaluation.report.tables import chunk_table
 
 #: what is imagined, held and shuffled: (of objects that move, of all objects)
 _KEYS = (
@@ -46,16 +51,35 @@ _NUM_HUES = 6
 _DASHES = {'': ('-', 'none'), 'held': (':', '2 4'), 'shuffled': ('--', '6 4')}
 
 
-class Mark(NamedTuple):
-    """How the page calls one of several evaluations: A, B, ... Z, A2, ..., in its colour."""
+class Marked(NamedTuple):
+    """An evaluation of a page, and how the page calls it.
 
+    Attributes:
+        found: the evaluation.
+        letter: A, B, ... Z, A2, ...; empty where there is only one.
+        colour: variable of the style sheet that holds its colour.
+    """
+
+    found: EvaluationSummary
     letter: str
     colour: str
 
+    def name(self, words: str = '') -> str:
+        """Returns words, after the letter where there is one."""
+        return f'{self.letter} {words}'.strip()
 
-def mark(index: int, evaluations: Sequence[Evaluated]) -> Mark | None:
-    """Returns an evaluation's letter and colour; None where there is only one."""
-    return None if len(evaluations) == 1 else Mark(letter(index), hue(index))
+    @property
+    def title(self) -> str:
+        """The checkpoint, after the letter where there is one."""
+        return ' · '.join(filter(None, (self.letter, self.found.title)))
+
+
+def marked(evaluations: Sequence[EvaluationSummary]) -> list[Marked]:
+    """Returns evaluations with their letters and colours."""
+    return [
+        Marked(found, letter(index) if len(evaluations) > 1 else '', f'c{index % _NUM_HUES}')
+        for index, found in enumerate(evaluations)
+    ]
 
 
 def letter(index: int) -> str:
@@ -63,212 +87,146 @@ def letter(index: int) -> str:
     return chr(ord('A') + index % 26) + (str(index // 26 + 1) if index >= 26 else '')
 
 
-def hue(index: int) -> str:
-    """Returns the variable of the style sheet that holds an evaluation's colour."""
-    return f'c{index % _NUM_HUES}'
-
-
-def cell(numbers: Mapping[str, Any], key: str) -> str:
-    """Returns a number of metrics.json with its interval."""
-    return with_interval(numbers.get(key), interval(numbers, key))
-
-
-def interval(numbers: Mapping[str, Any], key: str) -> tuple[float, float]:
-    """Returns the interval of a number of metrics.json, NaN where there is none."""
-    low, high = numbers.get('intervals', {}).get(key) or (None, None)
-    return (nan, nan) if low is None or high is None else (low, high)
-
-
-def all_views(evaluations: Sequence[Evaluated]) -> list[str]:
+def views_of(evaluations: Sequence[Marked]) -> list[str]:
     """Returns the names of all views, in the order in which they come first."""
-    return list(dict.fromkeys(view for found in evaluations for view in found.views))
+    return all_views([one.found for one in evaluations])
 
 
-def headline(evaluations: Sequence[Evaluated]) -> dict[str, Any]:
+def headline(evaluations: Sequence[Marked]) -> dict[str, Any]:
     """Returns J per view with intervals, and whether it beats what knows nothing."""
     keys, words = _keys(evaluations)
-    overall = [found.metrics['overall'] for found in evaluations]
+    overall = [one.found.estimates(None) for one in evaluations]
     return {
         'words': words,
-        'follows': [
-            (mark(index, evaluations), Following(**found.metrics['follows_commands']).line)
-            for index, found in enumerate(evaluations)
-            if 'follows_commands' in found.metrics
-        ],
-        'verdicts': [
-            (mark(index, evaluations), _doubts(found), _few(found))
-            for index, found in enumerate(evaluations)
-        ],
+        'follows': [(one, one.found.following.line) for one in evaluations],
+        'verdicts': [(one, _doubts(one.found), _few(one.found)) for one in evaluations],
         'meanings': [
             text
             for key, text in _MEANINGS.items()
-            if any(numbers.get(key) is not None for numbers in overall)
+            if any(isfinite(numbers[key].value) for numbers in overall)
         ],
-        'panels': [(v, _dots(evaluations, v, keys)) for v in all_views(evaluations)],
+        'panels': [(view, _dots(evaluations, view, keys)) for view in views_of(evaluations)],
     }
 
 
-def compared(evaluations: Sequence[Evaluated]) -> list[tuple[Mark | None, str, bool]]:
+def compared(evaluations: Sequence[Marked]) -> list[tuple[Marked, str, bool]]:
     """Returns how each further evaluation does against the first on the episodes of both.
 
-    Mark, sentence, and whether the interval of the difference leaves out 0. Differences are
-    paired within the episodes.
+    The evaluation, a sentence, and whether the interval of the difference leaves out 0.
+    Differences are paired within the episodes.
     """
-    _, key, _ = ranked_by(evaluations)
+    key = ranked_by([one.found for one in evaluations])[1]
     words = 'J of ' + _keys(evaluations)[1]
-    first, *others = (scores(found, key) for found in evaluations)
+    (base, first), *others = ((one, scores(one.found, key)) for one in evaluations)
     sentences = []
-    for index, other in enumerate(others, start=1):
+    for one, other in others:
         names = sorted(set(first) & set(other))
         gained = np.array([[other[name] - first[name]] for name in names]).reshape(-1, 1)
         mean, ends = mean_interval(gained, np.ones_like(gained), low=-1, high=1)
         low, high = float(ends[0, 0]), float(ends[1, 0])
-        text = (
-            f'{letter(index)} - {letter(0)}, {words}: {with_interval(mean[0], (low, high))} over '
-            f'{len(names)} episodes of both; '
-        )
         verdict = 'better' if low > 0 else 'worse' if high < 0 else ''
-        text += (
-            f'{letter(index)} is {verdict}.'
-            if verdict
-            else 'these episodes do not tell them apart.'
+        ends_with = (
+            f'{one.letter} is {verdict}.' if verdict else 'these episodes do not tell them apart.'
         )
-        sentences.append((mark(index, evaluations), text, bool(verdict)))
+        text = (
+            f'{one.letter} - {base.letter}, {words}: {with_interval(mean[0], (low, high))} over '
+            f'{len(names)} episodes of both; {ends_with}'
+        )
+        sentences.append((one, text, bool(verdict)))
     return sentences
 
 
-def _keys(evaluations: Sequence[Evaluated]) -> tuple[tuple[str, str, str], str]:
+def _keys(evaluations: Sequence[Marked]) -> tuple[tuple[str, str, str], str]:
     moving, every = _KEYS
-    measured = any(found.metrics['overall'].get(moving[0]) is not None for found in evaluations)
+    measured = any(isfinite(one.found.estimates(None)[moving[0]].value) for one in evaluations)
     return (moving, 'objects that really move') if measured else (every, 'objects')
 
 
-def _doubts(found: Evaluated) -> list[str]:
+def _doubts(found: EvaluationSummary) -> list[str]:
     """What keeps the margins from being shown in every view."""
     return [
         doubt
-        for view, numbers in found.metrics['views'].items()
+        for view in found.spec.views
+        for numbers in [found.estimates(view)]
         for key, words in _MARGINS.items()
-        if (doubt := _doubt(numbers, key, f'{view}: margin over {words}'))
+        if (doubt := _doubt(numbers[key], f'{view}: margin over {words}'))
     ]
 
 
-def _few(found: Evaluated) -> str:
+def _few(found: EvaluationSummary) -> str:
     """Why nothing can be told at all, in words; empty = it can."""
-    count = int(found.metrics['num_episodes'])
+    count = len(found.results)
     if count >= MIN_EPISODES:
         return ''
     return f'Cannot tell from {count} episode{"s" * (count > 1)}: give at least {MIN_EPISODES}.'
 
 
-def _doubt(numbers: Mapping[str, Any], key: str, words: str) -> str:
+def _doubt(margin: Estimate, words: str) -> str:
     """What keeps a margin from being shown; empty = nothing."""
-    if number(numbers.get(key)) == DASH:
+    if not isfinite(margin.value):
         return f'{words} not measured'
-    count = numbers['num_episodes_with'][key]
-    if count < MIN_EPISODES:
-        return f'{words} of too few episodes ({count})'
-    return '' if interval(numbers, key)[0] > 0 else f'{words} not above 0'
+    if margin.num_episodes < MIN_EPISODES:
+        return f'{words} of too few episodes ({margin.num_episodes})'
+    return '' if margin.interval[0] > 0 else f'{words} not above 0'
 
 
-def _dots(evaluations: Sequence[Evaluated], view: str, keys: tuple[str, str, str]) -> Markup:
+def _dots(evaluations: Sequence[Marked], view: str, keys: tuple[str, str, str]) -> Markup:
     """All evaluations' dots of one kind below each other, so that they are compared."""
     words = {**dict(zip(keys, ('', 'held', 'shuffled'), strict=True)), **_MORE}
+    shown = [
+        (one, one.found.estimates(view)) for one in evaluations if view in one.found.spec.views
+    ]
     dots = [
-        dot
+        Dot(
+            label=one.name(word or 'imagined'),
+            value=numbers.get(key, NOT_MEASURED).value,
+            interval=numbers.get(key, NOT_MEASURED).interval,
+            colour='held' if key in _MORE else _colour(one, word),
+            is_filled=word != 'shuffled',
+        )
         for key, word in words.items()
-        for index in range(len(evaluations))
-        if (dot := _dot(index, evaluations, view, key, word)) is not None
+        for one, numbers in shown
+        if key not in _MORE or isfinite(numbers[key].value)
     ]
     return dot_chart(f'J in view {view}', dots)
 
 
-def _dot(
-    index: int, evaluations: Sequence[Evaluated], view: str, key: str, word: str
-) -> Dot | None:
-    numbers = evaluations[index].metrics['views'].get(view)
-    if numbers is None or (key in _MORE and numbers.get(key) is None):
-        return None
-    prefix = '' if len(evaluations) == 1 else f'{letter(index)} '
-    return Dot(
-        label=f'{prefix}{word or "imagined"}',
-        value=nan if numbers.get(key) is None else numbers[key],
-        interval=interval(numbers, key),
-        colour='held' if key in _MORE else _colour(index, evaluations, word),
-        is_filled=word != 'shuffled',
-    )
-
-
-def horizon(evaluations: Sequence[Evaluated]) -> dict[str, Any] | None:
+def horizon(evaluations: Sequence[Marked]) -> dict[str, Any] | None:
     """Returns J against how far ahead was imagined; None if no object moves anywhere."""
+    fps = evaluations[0].found.spec.fps  # all evaluations are on the first one's clock
     panels = []
-    for view in all_views(evaluations):
-        lines = [line for i in range(len(evaluations)) for line in _lines(i, evaluations, view)]
+    for view in views_of(evaluations):
+        lines = [line for one in evaluations for line in _lines(one, view, fps, len(evaluations))]
         if lines:
-            seconds = _seconds(evaluations, max(len(line.values) for line in lines))
+            seconds = [(k + 1) / fps for k in range(max(len(line.values) for line in lines))]
             title = f'J against time, view {view}'
             panels.append((view, line_chart(title, lines, seconds, 'J of moving objects')))
     if not panels:
         return None
-    return {'panels': panels, 'key': _key(evaluations), 'chunks': _by_chunk(evaluations)}
-
-
-def _key(evaluations: Sequence[Evaluated]) -> list[tuple[str, str, str]]:
-    """What the lines mean: words, colour, dashes."""
-    return [
-        (_line_name(index, evaluations, word), _colour(index, evaluations, word), dashes)
-        for index in range(len(evaluations))
+    key = [
+        (one.name(word or 'imagined'), _colour(one, word), dashes)
+        for one in evaluations
         for word, (_, dashes) in _DASHES.items()
     ]
+    chunks = [(one, table) for one in evaluations if (table := chunk_table(one.found))]
+    return {'panels': panels, 'key': key, 'chunks': chunks}
 
 
-def _line_name(index: int, evaluations: Sequence[Evaluated], word: str) -> str:
-    prefix = '' if len(evaluations) == 1 else f'{letter(index)} '
-    return f'{prefix}{word or "imagined"}'
-
-
-def _by_chunk(evaluations: Sequence[Evaluated]) -> Table | None:
-    """How J falls from chunk to chunk; None where no rollout has two."""
-    rows = []
-    for index, found in enumerate(evaluations):
-        for view, numbers in {**found.metrics['views'], 'all': found.metrics['overall']}.items():
-            values = numbers.get('j_moving_by_chunk') or []
-            around = numbers['j_moving_by_chunk_interval'] if values else []
-            cells = list(map(with_interval, values, around))
-            if cells:
-                rows.append([letter(index) if len(evaluations) > 1 else '', view, *cells])
-    if not rows:
-        return None
-    longest = max(map(len, rows))
-    head = ['', 'View', *(f'Chunk {k + 1}' for k in range(longest - 2))]
-    padded = [[*row, *[DASH] * (longest - len(row))] for row in rows]
-    return Table(head=head, rows=padded, num_labels=2, caption='J of objects that move, by chunk')
-
-
-def _seconds(evaluations: Sequence[Evaluated], count: int) -> list[float]:
-    """Times of the frames [s]; all evaluations on the first one's clock."""
-    return [(k + 1) / evaluations[0].metrics['model']['fps'] for k in range(count)]
-
-
-def _lines(index: int, evaluations: Sequence[Evaluated], view: str) -> list[ChartLine]:
-    found = evaluations[index]
-    rows = [result.rows for result in found.results.values()]
-    clock = evaluations[0].metrics['model']['fps'] / found.metrics['model']['fps']
+def _lines(one: Marked, view: str, fps: float, count: int) -> list[ChartLine]:
+    """The curves of an evaluation in a view, on a clock; all have bands where it is alone."""
+    rows = [result.rows for result in one.found.results]
+    clock = fps / one.found.spec.fps
     lines = []
     for field, word in _FIELDS.items():
         drawn = curve(rows, view, field)
         if not drawn.values:
             continue
-        label = _line_name(index, evaluations, word)
-        values = _on_clock(drawn.values, clock)
-        with_band = len(evaluations) == 1 or not word
-        band = _on_clock(drawn.band, clock) if with_band else ()
         lines.append(
             ChartLine(
-                label=label,
-                values=values,
-                band=band,
-                colour=_colour(index, evaluations, word),
+                label=one.name(word or 'imagined'),
+                values=_on_clock(drawn.values, clock),
+                band=_on_clock(drawn.band, clock) if count == 1 or not word else (),
+                colour=_colour(one, word),
                 dashes=_DASHES[word][0],
             )
         )
@@ -281,7 +239,7 @@ def _on_clock(values: Sequence[Any], clock: float) -> list[Any]:
     return [values[min(max(round((k + 1) / clock) - 1, 0), len(values) - 1)] for k in range(count)]
 
 
-def _colour(index: int, evaluations: Sequence[Evaluated], word: str) -> str:
-    if word == 'held' or (word == 'shuffled' and len(evaluations) == 1):
+def _colour(one: Marked, word: str) -> str:
+    if word == 'held' or (word == 'shuffled' and not one.letter):
         return word
-    return hue(index)
+    return one.colour

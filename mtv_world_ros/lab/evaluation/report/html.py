@@ -2,33 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import write_whole
-from mtv_world_ros.lab.documents import DASH, number, render
+from mtv_world_ros.lab.documents import DASH, number, render, Table
 from mtv_world_ros.lab.evaluation.metrics.statistics import METHOD
-from mtv_world_ros.lab.evaluation.report import details
+from mtv_world_ros.lab.evaluation.report import details, tables
 from mtv_world_ros.lab.evaluation.report.episode_cards import episode_cards
-from mtv_world_ros.lab.evaluation.report.headline import cell, compared, headline, horizon, mark
-from mtv_world_ros.lab.evaluation.report.read_back import (
-    Evaluated,
-    has_objects,
-    read_evaluations,
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
+from mtv_world_ros.lab.evaluation.report.headline import (
+    compared,
+    headline,
+    horizon,
+    Marked,
+    marked,
 )
+from mtv_world_ros.lab.evaluation.report.read_back import read_evaluations
 
 
 def write_report(folders: Sequence[Path], path: Path) -> Path:
-    """Writes the report of one or more evaluations beside its name and renames it.
-
-    Args:
-        folders: what `mtv-world evaluate --out` wrote; the first one sets the clock of the plots.
-        path: of the HTML file.
-
-    Returns:
-        The path.
+    """Writes the report of one or more evaluations; the first one sets the clock of the plots.
 
     Raises:
         ConfigError: none is given, or one holds no evaluation.
@@ -40,58 +37,75 @@ def write_report(folders: Sequence[Path], path: Path) -> Path:
     return path
 
 
-def page(evaluations: Sequence[Evaluated]) -> str:
+def page(evaluations: Sequence[EvaluationSummary]) -> str:
     """Returns the whole page."""
-    marks = [mark(index, evaluations) for index in range(len(evaluations))]
-    marked = list(zip(marks, evaluations, strict=True))
+    ones = marked(evaluations)
     return render(
         'evaluation.html.j2',
-        title=f'Evaluation of {", ".join(found.name for found in evaluations)}',
+        title=f'Evaluation of {", ".join(found.title for found in evaluations)}',
         method=METHOD,
-        header=[{'mark': letter, **_header(found)} for letter, found in marked],
-        headline=headline(evaluations),
-        horizon=horizon(evaluations),
-        compared=compared(evaluations),
-        cards=episode_cards(evaluations),
-        has_objects=any(map(has_objects, evaluations)),
-        pictures=details.pictures(evaluations),
-        paper=details.paper_tables(evaluations),
-        tasks=details.task_tables(evaluations),
-        success=details.success(evaluations),
-        statuses=details.statuses(evaluations),
-        failures=[(m, f.metrics['failed'], f.metrics.get('notes', {})) for m, f in marked],
-        episodes=details.episodes(evaluations),
-        made=[(letter, found.name, details.provenance(found)) for letter, found in marked],
+        header=[{'mark': one, **_header(one.found)} for one in ones],
+        headline=headline(ones),
+        horizon=horizon(ones),
+        compared=compared(ones),
+        cards=episode_cards(ones),
+        has_objects=any(found.has_objects for found in evaluations),
+        pictures=_each(ones, tables.pictures_table),
+        paper=details.paper_tables(ones),
+        quality=_each(ones, tables.quality_table),
+        tasks=[(one, table) for one in ones for table in _tables_of_numbers(one.found)],
+        success=details.success(ones),
+        statuses=_each(ones, _statuses),
+        failures=[(one, one.found.failed, one.found.metrics['notes']) for one in ones],
+        episodes=_each(ones, details.episodes),
+        made=[(one, one.found.title, details.provenance(one.found)) for one in ones],
         folders=[str(found.folder) for found in evaluations],
     )
 
 
-def _header(found: Evaluated) -> dict[str, Any]:
-    made = found.metrics['provenance']
-    about = [part for key in ('dataset', 'date') if (part := made.get(key, ''))]
-    return {'name': found.name, 'about': ' · '.join(about), 'tiles': _tiles(found)}
+def _each(
+    ones: Sequence[Marked], table: Callable[[EvaluationSummary], Table | None]
+) -> list[tuple[Marked, Table]]:
+    """A table of each evaluation that has one."""
+    return [(one, found) for one in ones if (found := table(one.found)) is not None]
 
 
-def _tiles(found: Evaluated) -> list[tuple[str, str, str]]:
+def _tables_of_numbers(found: EvaluationSummary) -> list[Table]:
+    return [tables.view_table(found), *tables.group_tables(found)]
+
+
+def _statuses(found: EvaluationSummary) -> Table:
+    """Counts by status, and how many rows have no score."""
+    table = tables.status_table(found)
+    views = found.metrics['views'].values()
+    last = ['not scored, in all', *(numbers['num_not_scored'] for numbers in views)]
+    return replace(table, rows=[*table.rows, last])
+
+
+def _header(found: EvaluationSummary) -> dict[str, Any]:
+    about = [part for key in ('dataset', 'date') if (part := found.provenance.get(key, ''))]
+    return {'name': found.title, 'about': ' · '.join(about), 'tiles': _tiles(found)}
+
+
+def _tiles(found: EvaluationSummary) -> list[tuple[str, str, str]]:
     """Name, number and what is below it."""
     metrics, shown = found.metrics, {
         'j_moving': 'J, objects that move',
         'margin_moving': 'margin over first frame held',
         'margin_over_shuffled': 'margin over shuffled actions',
     }  # fmt: skip
-    tiles = []
-    for key, name in shown.items() if has_objects(found) else ():
-        text, bracket, rest = cell(metrics['overall'], key).partition(' [')
+    tiles, overall = [], found.estimates(None)
+    for key, name in shown.items() if found.has_objects else ():
+        text, bracket, rest = tables.cell(overall[key]).partition(' [')
         below = 'not measured' if text == DASH else f'[{rest}' if bracket else ''
         tiles.append((name, text, below))
     for suffix, name in {'': 'PSNR, imagined', '_held': 'PSNR, first frame held'}.items():
-        psnr = metrics.get('pictures', {}).get('overall', {}).get(f'psnr{suffix}')
-        if psnr and not has_objects(found):
-            tiles.append((name, number(psnr['value'], 1), 'dB'))
-    failed = f'{len(metrics["failed"])} failed'
-    tiles.append(('episodes scored', str(len(found.results)), failed))
-    factor = metrics.get('real_time_factor')
+        psnr = found.pictures[None].get(f'psnr{suffix}')
+        if psnr and not found.has_objects:
+            tiles.append((name, number(psnr.value, 1), 'dB'))
+    tiles.append(('episodes scored', str(len(found.results)), f'{len(found.failed)} failed'))
+    factor = metrics['real_time_factor']
     if factor is not None:
-        seconds = number(metrics.get('seconds_per_chunk'), 2)
+        seconds = number(metrics['seconds_per_chunk'], 2)
         tiles.append(('real-time factor', number(factor, 1), f'{seconds} s a chunk'))
     return tiles

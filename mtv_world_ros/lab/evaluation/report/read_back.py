@@ -3,58 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from math import nan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mtv_world_ros.bounded_input import read_json
-from mtv_world_ros.data.stored_rollout import load_rollout, StoredRollout
+from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.lab.evaluation.metrics.scores import episode_means
-from mtv_world_ros.lab.evaluation.results import EpisodeResult, rollout_path
+from mtv_world_ros.lab.evaluation.metrics.scores import DISTANCES, episode_means
+from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate
+from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
+from mtv_world_ros.lab.evaluation.results import EpisodeResult
+from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
 from mtv_world_ros.vision.jaccard import mean_of_known
 
+_SETTINGS = (*EvaluationConfig.model_fields, 'topics', 'calibration', 'segmenter')
 _NEEDED = {'name', 'provenance', 'model', 'views', 'overall', 'tasks', 'failed', 'success'}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Evaluated:
-    """What an evaluation left in its folder.
-
-    Attributes:
-        folder: of the evaluation.
-        metrics: metrics.json.
-        results: scores by name of the episode.
-    """
-
-    folder: Path
-    metrics: dict[str, Any]
-    results: dict[str, EpisodeResult]
-
-    @property
-    def name(self) -> str:
-        """Of the checkpoint: what the user calls it, and its fingerprint."""
-        name, label = self.metrics['name'], self.metrics.get('label', '')
-        return ' · '.join(part for part in (label, name) if part) if label not in name else name
-
-    @property
-    def views(self) -> tuple[str, ...]:
-        """Names of the views."""
-        return tuple(self.metrics['views'])
-
-    def rollout(self, episode: str) -> StoredRollout | None:
-        """Returns the frames of a scored episode; None where they were not kept.
-
-        Raises:
-            EpisodeError: the frames cannot be read.
-        """
-        path = rollout_path(self.folder, episode)
-        return load_rollout(path) if episode in self.results and path.is_file() else None
-
-
-def read_evaluations(folder: Path) -> list[Evaluated]:
+def read_evaluations(folder: Path) -> list[EvaluationSummary]:
     """Reads what `mtv-world evaluate --out FOLDER` wrote: one evaluation, or one per checkpoint.
 
     Raises:
@@ -73,8 +42,8 @@ def read_evaluations(folder: Path) -> list[Evaluated]:
             f'({type(error).__name__}: {error}); {hint}'
         ) from error
     labels = list(metrics['methods'])
-    found = [part for part in parts if part.metrics.get('label') in labels]
-    return sorted(found, key=lambda part: labels.index(part.metrics['label']))
+    found = [part for part in parts if part.label in labels]
+    return sorted(found, key=lambda part: labels.index(part.label))
 
 
 def check_evaluation(folder: Path) -> str:
@@ -94,15 +63,44 @@ def check_evaluation(folder: Path) -> str:
     raise ConfigError(f"'{folder}' holds no evaluation (metrics.json); {hint}")
 
 
-def _read(folder: Path, metrics: dict[str, Any]) -> Evaluated:
+def _read(folder: Path, metrics: dict[str, Any]) -> EvaluationSummary:
     missing = sorted(_NEEDED - set(metrics))
     if missing:
         raise ConfigError(
             f"the evaluation in '{folder}' was written by another version (metrics.json lacks "
             f'{", ".join(missing)}); evaluate again into another --out'
         )
-    results = {name: _result(folder, name) for name in metrics['episodes']}
-    return Evaluated(folder=folder, metrics=metrics, results=results)
+    model = metrics['model']
+    groups = {None: metrics, **metrics.get('zero_shot', {})}
+    return EvaluationSummary(
+        folder=folder,
+        name=metrics['name'],
+        label=metrics.get('label', ''),
+        spec=WorldModelSpec(**{**model, 'views': tuple(model['views'])}),
+        settings={name: metrics[name] for name in _SETTINGS if name in metrics},
+        results=[_result(folder, name) for name in metrics['episodes']],
+        failed=metrics['failed'],
+        provenance=metrics['provenance'],
+        distances={
+            (name, view): _distances(numbers)
+            for name, group in groups.items()
+            for view, numbers in group['views'].items()
+        },
+    )
+
+
+def _distances(numbers: dict[str, Any]) -> dict[str, Estimate]:
+    """FID and FVD, as far as they were measured."""
+    measured = [name for name in DISTANCES if numbers.get(name) is not None]
+    return {
+        name: Estimate(
+            value=numbers[name],
+            interval=(nan, nan) if low is None else (low, high),
+            num_episodes=numbers['num_episodes_with'][name],
+        )
+        for name in measured
+        for low, high in [numbers['intervals'][name]]
+    }
 
 
 def _result(folder: Path, episode: str) -> EpisodeResult:
@@ -110,28 +108,13 @@ def _result(folder: Path, episode: str) -> EpisodeResult:
     return EpisodeResult.from_json(read_json(file)['result'])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EpisodePick:
-    """An episode worth looking at.
-
-    Attributes:
-        title: why.
-        episode: its name.
-        score: mean over the evaluations.
-    """
-
-    title: str
-    episode: str
-    score: float
-
-
-def scores(evaluated: Evaluated, key: str) -> dict[str, float]:
-    """Returns a number of `statistics.MEANS` by episode, over all views; unknown ones left out."""
-    means = {n: episode_means(r.rows, None)[key] for n, r in evaluated.results.items()}
+def scores(evaluated: EvaluationSummary, key: str) -> dict[str, float]:
+    """Returns a number of `scores.MEANS` by episode, over all views; unknown ones left out."""
+    means = {r.episode: episode_means(r.rows, None)[key] for r in evaluated.results}
     return {name: value for name, value in means.items() if np.isfinite(value)}
 
 
-def ranked_by(evaluations: Sequence[Evaluated]) -> tuple[str, str, dict[str, float]]:
+def ranked_by(evaluations: Sequence[EvaluationSummary]) -> tuple[str, str, dict[str, float]]:
     """Returns what episodes are ranked by: words, the number's name, its mean by episode.
 
     J of the objects that move, where any episode has it, else J of all objects; the mean over the
@@ -150,19 +133,11 @@ def ranked_by(evaluations: Sequence[Evaluated]) -> tuple[str, str, dict[str, flo
     return words, key, means
 
 
-def picks(evaluations: Sequence[Evaluated]) -> list[EpisodePick]:
-    """Returns the best, the median and the worst episode; see `ranked_by`."""
+def picks(evaluations: Sequence[EvaluationSummary]) -> dict[str, str]:
+    """Returns titles of the best, the median and the worst episode by name; see `ranked_by`."""
     means = ranked_by(evaluations)[2]
     ranked = sorted(means, key=lambda name: (-means[name], name))
     chosen = {0: 'Best', len(ranked) // 2: 'Median', len(ranked) - 1: 'Worst'}
     if len(ranked) < 3:
         chosen = ({}, {0: 'The only one'}, {0: 'Best', 1: 'Worst'})[len(ranked)]
-    return [
-        EpisodePick(title=title, episode=ranked[place], score=means[ranked[place]])
-        for place, title in chosen.items()
-    ]
-
-
-def has_objects(found: Evaluated) -> bool:
-    """Returns whether any episode names an object; else only pictures are compared."""
-    return any(numbers.get('num_rows', 1) for numbers in found.metrics['views'].values())
+    return {ranked[place]: title for place, title in chosen.items()}

@@ -60,7 +60,7 @@ def make_clip(
     tile_width: int = _VIDEO_TILE,
     with_sheet: bool = True,
 ) -> RolloutClip:
-    """Returns a rollout's video and contact sheet.
+    """Returns a rollout's video and contact sheet, masks outlined.
 
     Args:
         rollout: frames and masks to show.
@@ -95,11 +95,8 @@ def outlined(rollout: StoredRollout, tile_width: int) -> Comparison:
     """Returns the frames, enlarged, with the masks' outlines drawn over and J as captions.
 
     Recorded frames carry the recorded masks in the objects' colours; imagined frames the masks
-    found in them in the same colours, and the recorded ones in white.
-
-    Args:
-        rollout: frames and masks to show.
-        tile_width: width up to which frames are enlarged, by whole factors [px].
+    found in them in the same colours, and the recorded ones in white. Frames are enlarged by whole
+    factors, up to `tile_width` [px].
     """
     factor = max(tile_width // rollout.real.shape[3], 1)
     real, trajectory, imagined = (

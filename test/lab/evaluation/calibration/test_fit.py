@@ -85,10 +85,15 @@ def test_scores_are_those_of_torchmetrics():
 
 
 def test_what_abstains_counts_in_the_abstention_rate_alone():
-    found = agreement(judgements([0.9, nan, 0.2, nan], [1, 1, 0, 0]))
-    assert found['num_abstained'] == 2 and found['abstention_rate'] == 0.5
+    unknown = Judgement(probability=0.9, outcome='unknown')
+    found = agreement([*judgements([0.9, nan, 0.2, nan], [1, 1, 0, 0]), unknown])
+    assert (
+        found['num_outcomes_known'] == 4
+        and found['num_abstained'] == 2
+        and found['abstention_rate'] == 0.5
+    )
     assert found['accuracy'] == 1.0 and found['false_success_rate'] == 0.0
-    assert agreement([])['ece'] is None and agreement([])['auroc'] is None
+    assert all(agreement([])[name] is None for name in ('ece', 'auroc', 'accuracy'))
 
 
 def test_an_open_verdict_counts_in_scores_of_estimates_but_not_of_verdicts():

@@ -9,7 +9,6 @@ from mtv_world_ros.lab.evaluation.metrics.policy_agreement import (
     rate_agreement,
     rates,
 )
-from mtv_world_ros.lab.evaluation.metrics.statistics import wilson
 
 # SIMPLER (arXiv 2405.05941), task move_near: rt-2-x, rt-1-converged, rt-1-15pct, rt-1-x,
 # rt-1-begin, octo-base, on the real robot and in simulation; as in its repository
@@ -39,13 +38,6 @@ def test_what_is_not_known_does_not_count():
     assert np.isnan(mean_maximum_rank_violation([np.nan, 0.1], [0.1, 0.2]))
     with pytest.raises(ConfigError, match='same policies'):
         pearson([0.1], [0.1, 0.2])
-
-
-def test_wilson_interval_is_the_published_one():
-    # 8 of 10: .490 to .943 (Newcombe 1998 gives the same formula; R's prop.test, correct=FALSE)
-    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
-    assert wilson(0, 5)[0] == pytest.approx(0, abs=1e-12)
-    assert np.isnan(wilson(0, 0)).all()
 
 
 def test_point_lies_within_its_interval_which_narrows_with_episodes():

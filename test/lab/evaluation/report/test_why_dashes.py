@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.lab.evaluation.metrics.scores import ScoreRow
 from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
+from mtv_world_ros.lab.evaluation.report.tables import markdown
 from mtv_world_ros.lab.evaluation.results import EpisodeResult
 
 NAN = float('nan')
 ROW = ScoreRow(
     stretch=0, num_frames=2, view='low', name='red block', status='ok', moving=True, j=0.7,
-    j_visible=0.7, j_copy=0.5, j_shuffled=0.4, j_zero=NAN, j_ceiling=0.9,
-    j_self=1.0, j_frames=(0.7, 0.7), j_copy_frames=(0.5, 0.5), j_shuffled_frames=(0.4, 0.4),
+    j_copy=0.5, j_shuffled=0.4, j_ceiling=0.9, j_self=1.0,
 )  # fmt: skip
 NOT_SCORED = replace(
-    ROW, status='absent', moving=False, j=NAN, j_visible=NAN, j_copy=NAN, j_shuffled=NAN,
-    j_ceiling=NAN, j_self=NAN, j_frames=(NAN, NAN), j_copy_frames=(NAN, NAN),
-    j_shuffled_frames=(),
+    ROW, status='absent', moving=False, j=NAN, j_copy=NAN, j_shuffled=NAN, j_ceiling=NAN,
+    j_self=NAN,
 )  # fmt: skip
 
 
@@ -32,9 +32,11 @@ def tables_of(*rows: ScoreRow) -> str:
     spec = WorldModelSpec(
         views=('low',), fps=5.0, num_frames=2, width=96, height=72, robot='crane'
     )
-    return EvaluationSummary(
-        name='x', spec=spec, settings={}, results=[result], failed={}
-    ).markdown()
+    return markdown(
+        EvaluationSummary(
+            folder=Path(), name='x', spec=spec, settings={}, results=[result], failed={}
+        )
+    )
 
 
 @pytest.mark.parametrize(
@@ -43,7 +45,7 @@ def tables_of(*rows: ScoreRow) -> str:
         ((NOT_SCORED,), 'no named object could be scored in any stretch (1 absent)'),
         ((replace(ROW, moving=False),), 'no object that was scored really moves'),
         (
-            (replace(ROW, j_shuffled=NAN, j_shuffled_frames=()),),
+            (replace(ROW, j_shuffled=NAN),),
             "Dashes of shuffled actions: no rollout was imagined with another episode's actions",
         ),
         ((replace(ROW, j_ceiling=NAN),), 'Dashes of ceiling: no recorded frame went'),

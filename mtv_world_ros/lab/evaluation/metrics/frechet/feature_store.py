@@ -14,6 +14,7 @@ from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.lab.evaluation.metrics.frechet.features import ClipFeatures, FrameFeatures
+from mtv_world_ros.lab.evaluation.metrics.scores import DISTANCES
 from mtv_world_ros.lab.evaluation.metrics.statistics import (
     Estimate,
     MIN_EPISODES,
@@ -30,11 +31,7 @@ def frechet_distance(real: FloatArray, predicted: FloatArray) -> float:
 
     With C = A^T A the trace of the root is the sum of the singular values of A1 A2^T, so no root
     of a matrix is taken: the result is real and not negative whatever the rank of C, also with
-    fewer samples than features.
-
-    Args:
-        real: (N, D) features, N >= 2.
-        predicted: (M, D) features, M >= 2.
+    fewer samples (N, D) and (M, D) than features D.
 
     Raises:
         MtvWorldError: fewer than two samples, other numbers of features, or not finite.
@@ -73,19 +70,13 @@ def _moments(features: FloatArray) -> tuple[FloatArray, FloatArray]:
 def frechet_interval(
     real: Sequence[FloatArray], predicted: Sequence[FloatArray]
 ) -> tuple[float, float]:
-    """Returns a 95 % interval of the distance, by leaving out groups of episodes in turn.
+    """Returns a 95 % interval of the distance of (N, D) and (M, D) features of each episode.
 
-    A bootstrap would not do: a resample holds some samples twice, has a smaller covariance, and
-    lies further from the other set. The distance itself falls as samples grow in number; compare
+    Groups of episodes are left out in turn (jackknife): a resample of a bootstrap holds some
+    samples twice, has a smaller covariance, and lies further from the other set. The interval is
+    the distance of all -/+ the t quantile of the groups times the standard error, not below 0; NaN
+    with fewer than `MIN_EPISODES` episodes. The distance falls as samples grow in number: compare
     only distances of equally many.
-
-    Args:
-        real: (N, D) features of each episode.
-        predicted: (M, D) features of each episode, in the same order.
-
-    Returns:
-        The distance of all -/+ the t quantile of the groups times the jackknife standard error,
-        not below 0; NaN with fewer than `MIN_EPISODES` episodes.
     """
     count = len(real)
     if count < MIN_EPISODES:
@@ -103,8 +94,6 @@ def frechet_interval(
     return (max(whole - half, 0.0), whole + half)
 
 
-#: name of the distance -> what it is measured on
-DISTANCES = ('fid', 'fvd')
 _SIDES = ('predicted', 'real')
 
 
@@ -186,16 +175,8 @@ def load_features(path: Path) -> dict[str, FloatArray]:
         ) from error
 
 
-def distances(
-    episodes: Sequence[dict[str, FloatArray]], view: str, *, with_interval: bool = True
-) -> dict[str, Estimate]:
-    """Returns FID and FVD of a view over episodes, as far as their features were taken.
-
-    Args:
-        episodes: `load_features` of each.
-        view: name.
-        with_interval: also leave groups of episodes out in turn, which takes ten times as long.
-    """
+def distances(episodes: Sequence[dict[str, FloatArray]], view: str) -> dict[str, Estimate]:
+    """Returns FID and FVD of a view as far as measured, of what `load_features` gives of each."""
     found = {}
     for name in DISTANCES:
         keys = {side: f'{name}/{view}/{side}' for side in _SIDES}
@@ -209,12 +190,12 @@ def distances(
             value = frechet_distance(
                 *(np.concatenate(sides[side]) for side in ('real', 'predicted'))
             )
-            spread = with_interval and frechet_interval(sides['real'], sides['predicted'])
+            interval = frechet_interval(sides['real'], sides['predicted'])
         except MtvWorldError:  # a single clip has no covariance: not measured
             continue
         found[name] = Estimate(
             value=value,
-            interval=spread or (np.nan, np.nan),
+            interval=interval,
             num_episodes=len(sides['real']),
         )
     return found

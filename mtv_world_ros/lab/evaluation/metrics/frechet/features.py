@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 import torch
 from torch import nn, Tensor
 import torch.nn.functional as F
@@ -14,6 +16,7 @@ import torch.nn.functional as F
 from mtv_world_ros.bounded_input import check_weights
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import CheckpointError, ConfigError, EpisodeError
+from mtv_world_ros.lab.evaluation.metrics.frechet.inception import InceptionV3
 
 #: side of the frames that the network sees [px]
 SIZE = 224
@@ -111,9 +114,6 @@ class I3D(nn.Module):
         return self.logits(F.avg_pool3d(x, (2, 7, 7), 1)).mean((2, 3, 4))
 
 
-if TYPE_CHECKING:
-    import torch
-
 #: frames that go through the network at once
 _BATCH = 16
 
@@ -135,20 +135,12 @@ def frame_features(weights: Path, device: str = 'cpu') -> FrameFeatures:
         ConfigError: there is no such file.
         CheckpointError: the file holds other tensors.
     """
-    _check_file(weights, 'fid_weights')
-    import torch
-
-    from mtv_world_ros.lab.evaluation.metrics.frechet.inception import InceptionV3
-
-    network = _loaded(InceptionV3(), weights, device, 'fid_weights')
+    network = _loaded(InceptionV3, weights, device, 'fid_weights')
 
     def features(frames: ByteArray) -> FloatArray:
-        found = []
-        with torch.inference_mode():
-            for first in range(0, len(frames), _BATCH):
-                batch = torch.from_numpy(np.array(frames[first : first + _BATCH])).to(device)
-                found.append(network(batch.permute(0, 3, 1, 2).float()).float().cpu().numpy())
-        return np.concatenate(found)
+        images = frames.transpose(0, 3, 1, 2)
+        starts = range(0, len(images), _BATCH)
+        return np.concatenate([network(images[k : k + _BATCH]) for k in starts])
 
     return features
 
@@ -164,10 +156,7 @@ def clip_features(weights: Path, device: str = 'cpu') -> ClipFeatures:
         ConfigError: there is no such file.
         CheckpointError: the file holds other tensors.
     """
-    _check_file(weights, 'fvd_weights')
-    import torch
-
-    network = _loaded(I3D(), weights, device, 'fvd_weights')
+    network = _loaded(I3D, weights, device, 'fvd_weights')
 
     def features(clip: ByteArray) -> FloatArray:
         if len(clip) < MIN_FRAMES:
@@ -175,25 +164,36 @@ def clip_features(weights: Path, device: str = 'cpu') -> ClipFeatures:
                 f'FVD with I3D needs clips of at least {MIN_FRAMES} frames, this one has '
                 f"{len(clip)}; leave 'fvd_weights' out"
             )
-        with torch.inference_mode():
-            video = torch.from_numpy(np.array(clip)).to(device).permute(3, 0, 1, 2)
-            return network(video[None].float()).float().cpu().numpy()
+        return network(clip.transpose(3, 0, 1, 2)[None])
 
     return features
 
 
-def _loaded(network: torch.nn.Module, path: Path, device: str, option: str) -> torch.nn.Module:
-    """The network with its weights from a file, in evaluation mode."""
-    state = _state_dict(path, option)
+def _loaded(
+    kind: type[nn.Module], path: Path, device: str, option: str
+) -> Callable[[ByteArray], FloatArray]:
+    """A network with its weights from a file, from arrays to arrays."""
+    if not path.is_file():
+        raise ConfigError(
+            f"{option} '{path}' does not exist; nothing is downloaded, name a file that you have"
+        )
+    network, state = kind(), _state_dict(path, option)
     missing, unexpected = network.load_state_dict(_of_network(state, network), strict=False)
     missing = [name for name in missing if not name.endswith('num_batches_tracked')]
     if missing or unexpected:
         raise CheckpointError(
-            f"{option} '{path}' is not a {type(network).__name__}: it lacks {missing[:3]} and has "
+            f"{option} '{path}' is not a {kind.__name__}: it lacks {missing[:3]} and has "
             f'unknown {list(unexpected)[:3]}'
         )
     check_weights(network, path)
-    return network.to(device).eval()
+    network.to(device).eval()
+
+    @torch.inference_mode()
+    def run(pixels: ByteArray) -> FloatArray:
+        batch = torch.from_numpy(np.array(pixels)).to(device).float()
+        return network(batch).float().cpu().numpy()
+
+    return run
 
 
 def _of_network(state: dict[str, Any], network: torch.nn.Module) -> dict[str, Any]:
@@ -205,24 +205,12 @@ def _of_network(state: dict[str, Any], network: torch.nn.Module) -> dict[str, An
     }
 
 
-def _check_file(path: Path, option: str) -> None:
-    if not path.is_file():
-        raise ConfigError(
-            f"{option} '{path}' does not exist; nothing is downloaded, name a file that you have"
-        )
-
-
 def _state_dict(path: Path, option: str) -> dict[str, Any]:
     if path.suffix == '.safetensors':
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
-
         try:
             return load_file(path)
         except (OSError, SafetensorError) as error:
             raise CheckpointError(f"{option} '{path}' cannot be loaded: {error}") from error
-    import torch
-
     try:
         state = torch.load(path, map_location='cpu', weights_only=True)
     except Exception as error:  # torch raises pickle, zip and runtime errors alike
