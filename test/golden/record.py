@@ -1,6 +1,6 @@
 """Digests of what must not change while code moves: plans, bags, results, weights, interfaces.
 
-    python test/golden/record.py [--only plans,help] [--check]
+    python test/golden/record.py [--only plans,help] [--check [--part K/N]]
 
 writes `test/golden/SECTION.json`, or with `--check` prints the differences from what is there and
 exits with 1 where there are any. It uses the commands and looks modules up by their last name,
@@ -44,6 +44,8 @@ sys.path.insert(0, str(ROOT))
 #: seeds of plans; a robot of one arm, which has no faults of two
 SEEDS, ONE_ARM = (0, 1), 'franka'
 TASKS = 'place_bread_plate,shake_bottle'
+#: of plans and kinds: from which policy on, and every which
+PART = [1, 1]
 #: keys of results that differ from run to run, and texts with a path or a time in them
 _RUN_KEYS = re.compile(
     r'(^|_)(seconds|s|date|time|times|created|path|version|machine|host|commit)$|memory|per_second'
@@ -179,7 +181,7 @@ def _policies() -> list[str]:
     """The policies of the recorded plans; where there are none, of every kind."""
     recorded = HERE / 'plans.json'
     if recorded.exists():
-        return list(json.loads(recorded.read_text()))
+        return list(json.loads(recorded.read_text()))[PART[0] - 1 :: PART[1]]
     faults = module('faults', 'catalogue').FAULTS
     return ['expert', *(f'expert-{kind}-{fault.size.typical:g}' for kind, fault in faults.items())]
 
@@ -303,22 +305,37 @@ SECTIONS: dict[str, Callable[[], dict[str, Any]]] = {
 }  # fmt: skip
 
 
+def _text(name: str, found: dict[str, Any]) -> str:
+    if name == 'kinds':  # a line each
+        return json.dumps(found).replace('], "', '],\n "') + '\n'
+    return json.dumps(found, indent=1, ensure_ascii=False) + '\n'
+
+
 def main() -> int:
     """Records the sections, or prints how they differ from what is recorded."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('--only', default=','.join(SECTIONS), metavar='SECTIONS')
     parser.add_argument('--check', action='store_true', help='print differences; write nothing')
+    parser.add_argument(
+        '--part',
+        default='1/1',
+        metavar='K/N',
+        help='of plans and kinds: each Nth from the Kth on',
+    )
     arguments, differs = parser.parse_args(), False
+    PART[:] = map(int, arguments.part.split('/'))
+    if PART != [1, 1] and not arguments.check:
+        parser.error('--part is for --check')
     for name in arguments.only.split(','):
         path, found = HERE / f'{name}.json', SECTIONS[name]()
-        text = json.dumps(found, indent=1, ensure_ascii=False) + '\n'
-        if name == 'kinds':  # a line each
-            text = json.dumps(found).replace('], "', '],\n "') + '\n'
         if not arguments.check:
-            path.write_text(text)
+            path.write_text(_text(name, found))
             continue
-        before = path.read_text().split('\n')
-        lines = list(difflib.unified_diff(before, text.split('\n'), 'recorded', 'now', n=1))
+        before = json.loads(path.read_text())
+        if PART != [1, 1]:
+            before = {key: value for key, value in before.items() if key in found}
+        texts = (_text(name, one).split('\n') for one in (before, found))
+        lines = list(difflib.unified_diff(*texts, 'recorded', 'now', n=1))
         differs |= bool(lines)
         print(f'{name}: {"differs" if lines else "equal"}', *lines, sep='\n')
     return int(differs)

@@ -24,10 +24,10 @@ import time
 import traceback
 from typing import Any
 
-from cycles import descendants
 from node_messages import commit, ROOT, ros
 import numpy as np
 from policy_servers import _observation, fine, TIMEOUT_S
+from usage import descendants
 import yaml
 
 from mtv_world_ros.data_types import JointTrajectory

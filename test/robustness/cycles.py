@@ -10,14 +10,13 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import os
 from pathlib import Path
 import sys
 import time
 from typing import Any
 
 from node_messages import commit, ROOT, ros
-import numpy as np
+from usage import LABELS, plot, slope, usage
 
 #: growth that is allowed, once caches are filled [MB a cycle, descriptors a cycle]
 MOST_MB, MOST_DESCRIPTORS = 0.3, 0.02
@@ -30,44 +29,7 @@ WRITE_EVERY = 10
 #: a busy machine takes long to load a model [s]
 PATIENCE_S = 180.0
 NODE = ('-m', 'mtv_world_ros.ros.world_model.node')
-LABELS = {
-    'memory_mb': 'memory of all [MB]',
-    'processes': 'processes',
-    'descriptors': 'file descriptors',
-    'threads': 'threads',
-    'seconds': 'a cycle [s]',
-}
-
-
-def descendants(pid: int) -> list[int]:
-    """Process numbers of all children and theirs."""
-    found = []
-    for file in Path(f'/proc/{pid}/task').glob('*/children'):
-        try:
-            own = [int(number) for number in file.read_text().split()]
-        except OSError:
-            continue
-        for child in own:
-            found += [child, *descendants(child)]
-    return found
-
-
-def usage(pid: int) -> dict[str, float]:
-    """Memory of a process and its descendants; its descriptors and threads."""
-    total = 0
-    for one in (pid, *descendants(pid)):
-        try:
-            lines = Path(f'/proc/{one}/status').read_text().splitlines()
-        except OSError:
-            continue
-        total += sum(int(line.split()[1]) for line in lines if line.startswith('VmRSS'))
-    threads = len(os.listdir(f'/proc/{pid}/task'))
-    return {
-        'memory_mb': total / 1024,
-        'processes': 1 + len(descendants(pid)),
-        'descriptors': len(os.listdir(f'/proc/{pid}/fd')),
-        'threads': threads,
-    }
+PLOTTED = {**LABELS, 'memory_mb': 'memory of all [MB]', 'seconds': 'a cycle [s]'}
 
 
 class Cycles:
@@ -139,11 +101,8 @@ class Cycles:
     def summary(self) -> dict[str, Any]:
         """How much grew with a cycle once caches were filled."""
         kept = self.rows[int(WARM * len(self.rows)) :]
-        grown = {}
-        for key in ('memory_mb', 'descriptors', 'threads', 'processes'):
-            values = [row[key] for row in kept]
-            x = [row['cycle'] for row in kept]
-            grown[key] = float(np.polyfit(x, values, 1)[0]) if len(kept) > 3 else float('nan')
+        keys = ('memory_mb', 'descriptors', 'threads', 'processes')
+        grown = {key: slope(kept, 'cycle', key, 4) for key in keys}
         first, last = self.rows[0], self.rows[-1]
         return {
             'commit': commit(),
@@ -170,23 +129,6 @@ class Cycles:
         self.client.close()
 
 
-def plot(rows: list[dict[str, float]], path: Path) -> None:
-    """All of it over cycles."""
-    import matplotlib
-
-    matplotlib.use('Agg')
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(len(LABELS), sharex=True, figsize=(8, 9))
-    for axis, (key, label) in zip(axes, LABELS.items(), strict=True):
-        axis.plot([row['cycle'] for row in rows], [row[key] for row in rows], '.-', markersize=3)
-        axis.set_ylabel(label)
-        axis.set_ylim(0, 1.15 * max(row[key] for row in rows))
-    axes[-1].set_xlabel('cycle of deactivate, cleanup, configure and activate')
-    figure.savefig(path, bbox_inches='tight')
-    pyplot.close(figure)
-
-
 def main() -> int:
     """Cycles; 1 if something grew, was left or failed."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
@@ -200,7 +142,13 @@ def main() -> int:
     try:
         cycles.run(arguments.cases, arguments.seconds)
         cycles.write()
-        plot(cycles.rows, arguments.out / 'cycles.png')
+        plot(
+            cycles.rows,
+            'cycle',
+            'cycle of deactivate, cleanup, configure and activate',
+            PLOTTED,
+            arguments.out / 'cycles.png',
+        )
         found = cycles.summary()
     finally:
         cycles.close()

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from contextlib import closing
 from functools import cache, partial
+import importlib
 import importlib.util
-import os
 from pathlib import Path
 import pickle
 import shutil
@@ -18,7 +18,7 @@ import tempfile
 from typing import Any, NamedTuple
 
 import cv2
-from folder_kinds import answers, FOLDERS, parts, with_part
+from folder_kinds import answers, FOLDERS, make_checkpoint, parts, with_part
 from node_messages import DAMAGE, damaged, send
 import numpy as np
 import parameter_calls
@@ -104,6 +104,22 @@ def _file(path: Path, data: bytes) -> Path:
     return path
 
 
+@cache
+def _yam() -> Any:
+    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+
+
+def _reads(name: str, function: str, *more: Callable[[], Any]) -> Callable[[bytes, Path], Any]:
+    """Writes a case to a file of a name and gives it to `MODULE.FUNCTION` of the package."""
+    module, _, of = function.rpartition('.')
+
+    def read(data: bytes, folder: Path) -> Any:
+        load = getattr(importlib.import_module(f'mtv_world_ros.{module}'), of)
+        return load(_file(folder / name, data), *(make() for make in more))
+
+    return read
+
+
 def _config(folder: str) -> Callable[[], list[bytes]]:
     return lambda: [file.read_bytes() for file in share_path('config', folder).glob('*.yaml')]
 
@@ -136,8 +152,8 @@ def _bags() -> list[bytes]:
         return [(Path(folder) / 'bag' / 'bag_0.mcap').read_bytes()]
 
 
-def _read_bag(data: bytes, folder: Path) -> Any:
-    reader = BagReader(_file(folder / 'bag.mcap', data))
+def _read_bag(name: str, data: bytes, folder: Path) -> None:
+    reader = BagReader(_file(folder / name, data))
     for _ in reader.messages():
         pass
     if reader.truncated:
@@ -238,28 +254,6 @@ def _read_pickle(data: bytes, _: Path) -> Any:
     return read_timed_actions(data)
 
 
-def _checkpoint_parts() -> list[bytes]:
-    """Every JSON file of the bundled checkpoint, behind its name."""
-    folder = share_path('resource', 'checkpoint')
-    return [
-        f'{file.relative_to(folder)}\n'.encode() + file.read_bytes()
-        for file in sorted(folder.rglob('*.json'))
-    ]
-
-
-def _load_checkpoint(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.model.checkpoint import load_checkpoint
-
-    name, _, content = data.partition(b'\n')
-    source = share_path('resource', 'checkpoint')
-    path = name.decode()
-    shutil.rmtree(folder / 'copy', ignore_errors=True)
-    shutil.copytree(source, folder / 'copy', copy_function=os.symlink)
-    (folder / 'copy' / path).unlink()
-    (folder / 'copy' / path).write_bytes(content)
-    return load_checkpoint(folder / 'copy')
-
-
 def _recorded_sqlite() -> list[bytes]:
     """A bag as rosbag2_storage_sqlite3 makes it."""
     with tempfile.TemporaryDirectory() as folder:
@@ -282,14 +276,6 @@ def _recorded_sqlite() -> list[bytes]:
         return [path.read_bytes()]
 
 
-def _read_sqlite(data: bytes, folder: Path) -> Any:
-    reader = BagReader(_file(folder / 'bag.db3', data))
-    for _ in reader.messages():
-        pass
-    if reader.truncated:
-        raise MtvWorldError(reader.truncated)
-
-
 def _urdfs() -> list[bytes]:
     return [share_path('config', 'robots', 'yam_bimanual.urdf').read_bytes()]
 
@@ -299,29 +285,6 @@ def _read_urdf(data: bytes, folder: Path) -> Any:
     shutil.copy(share_path('config', 'robots', 'yam_bimanual.yaml'), folder)
     _file(folder / 'yam_bimanual.urdf', data)
     return load_robot(folder / 'yam_bimanual.yaml')
-
-
-@cache
-def _yam() -> Any:
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-
-
-def _read_policy(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.policies.policy import load_policy_config
-
-    return load_policy_config(_file(folder / 'policy.yaml', data), _yam())
-
-
-def _read_policies(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.bench.ranking.policy_list import load_policy_list
-
-    return load_policy_list(_file(folder / 'policies.yaml', data), _yam())
-
-
-def _read_mapping(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.data.bag_mapping import load_bag_mapping
-
-    return load_bag_mapping(_file(folder / 'mapping.yaml', data))
 
 
 def _read_dataset_mapping(data: bytes, folder: Path) -> Any:
@@ -346,26 +309,8 @@ def _video_mappings() -> list[bytes]:
     return [share_path('config', 'datasets', 'videos.yaml').read_bytes()]
 
 
-def _read_preset(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.lab.training.training_config import load_training_config
-
-    return load_training_config(str(_file(folder / 'preset.yaml', data)))
-
-
-def _read_describer(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.vision.describers.describer_config import load_describer_config
-
-    return load_describer_config(_file(folder / 'describer.yaml', data))
-
-
 def _object_lists() -> list[bytes]:
     return [b'objects: [red block, {name: plate}]\ninstructions:\n  stack them: [red block]\n']
-
-
-def _read_objects(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.vision.describers.describer_config import load_object_list
-
-    return load_object_list(_file(folder / 'objects.yaml', data))
 
 
 def _read_vlm_answer(data: bytes, _: Path) -> Any:
@@ -391,12 +336,6 @@ def _features() -> list[bytes]:
         path = Path(folder) / 'features.npz'
         np.savez(path, a=np.ones((4, 8), np.float32), b=np.zeros((2, 8), np.float32))
         return [path.read_bytes()]
-
-
-def _read_features(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.lab.evaluation.metrics.frechet.feature_store import load_features
-
-    return load_features(_file(folder / 'features.npz', data))
 
 
 def _videos() -> list[bytes]:
@@ -435,8 +374,7 @@ def _responses() -> list[bytes]:
 def _read_response(data: bytes, folder: Path) -> Any:
     from mtv_world_ros.foresight.loading import load_response
 
-    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-    return load_response(_file(folder / 'arm_response.json', data).parent, robot)
+    return load_response(_file(folder / 'arm_response.json', data).parent, _yam())
 
 
 def _contacts() -> list[bytes]:
@@ -459,45 +397,59 @@ def _scene_files() -> list[bytes]:
     return [yaml.safe_dump(values).encode()]
 
 
-def _read_scene_file(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.lab.inspection.foreseen_scene import load_scene
-
-    return load_scene(_file(folder / 'scene.yaml', data), _yam())
+def _read_folder(make: Any, read: Callable[[Path], Any], data: bytes, folder: Path) -> Any:
+    return read(with_part(make, data, folder))
 
 
+def _load_checkpoint(folder: Path) -> Any:
+    from mtv_world_ros.model.checkpoint import load_checkpoint
+
+    return load_checkpoint(folder)
+
+
+DESCRIBERS = 'vision.describers.describer_config'
+READS_POLICY = _reads('policy.yaml', 'policies.policy.load_policy_config', _yam)
+READS_PRESET = _reads('preset.yaml', 'lab.training.training_config.load_training_config')
+READS_SCENE = _reads('scene.yaml', 'lab.inspection.foreseen_scene.load_scene', _yam)
+CHECKPOINT_PARTS = partial(parts, make_checkpoint, '.json')
+LOADS_CHECKPOINT = partial(_read_folder, make_checkpoint, _load_checkpoint)
 KINDS = {
-    'scene file': Kind(_scene_files, _read_scene_file),
+    'scene file': Kind(_scene_files, READS_SCENE),
     'scene file, numbers': Kind(
-        _scene_files, judged(_read_scene_file, wild_numbers.plausible_scene),
+        _scene_files, judged(READS_SCENE, wild_numbers.plausible_scene),
         damage=with_wild_number),
     'calibration': Kind(_config('cameras'), lambda d, f: load_calibration(_file(f / 'c.yaml', d))),
     'robot': Kind(_config('robots'), _read_robot),
     'urdf': Kind(_urdfs, _read_urdf),
     'task': Kind(_config('tasks'), lambda d, f: load_task(_file(f / 'task.yaml', d))),
-    'policy': Kind(_config('policies'), _read_policy),
-    'policy list': Kind(_config('rankings'), _read_policies),
-    'preset': Kind(_config('models'), _read_preset),
+    'policy': Kind(_config('policies'), READS_POLICY),
+    'policy list': Kind(
+        _config('rankings'),
+        _reads('policies.yaml', 'bench.ranking.policy_list.load_policy_list', _yam)),
+    'preset': Kind(_config('models'), READS_PRESET),
     'bag mapping': Kind(lambda: [share_path('config', 'datasets', 'bag.yaml').read_bytes()],
-                        _read_mapping),
+                        _reads('mapping.yaml', 'data.bag_mapping.load_bag_mapping')),
     'dataset mapping': Kind(
         lambda: [share_path('config', 'datasets', 'example.yaml').read_bytes()],
         _read_dataset_mapping),
     'videos mapping': Kind(_video_mappings, _read_video_mapping),
     'describer': Kind(lambda: [share_path('config', 'describer.yaml').read_bytes()],
-                      _read_describer),
-    'object list': Kind(_object_lists, _read_objects),
+                      _reads('describer.yaml', f'{DESCRIBERS}.load_describer_config')),
+    'object list': Kind(_object_lists, _reads('objects.yaml', f'{DESCRIBERS}.load_object_list')),
     'image': Kind(_images, _read_image),
     'video': Kind(_videos, _read_video),
-    'bag': Kind(_bags, _read_bag),
-    'bag, sqlite3': Kind(_recorded_sqlite, _read_sqlite),
+    'bag': Kind(_bags, partial(_read_bag, 'bag.mcap')),
+    'bag, sqlite3': Kind(_recorded_sqlite, partial(_read_bag, 'bag.db3')),
     'recover': Kind(_bags, _recover),
     'metadata': Kind(_metadata, _read_metadata),
     'training state': Kind(_trees, _read_state_card),
-    'features': Kind(_features, _read_features),
+    'features': Kind(
+        _features,
+        _reads('features.npz', 'lab.evaluation.metrics.frechet.feature_store.load_features')),
     'weights': Kind(_weights, _read_weights),
     'arm response': Kind(_responses, _read_response),
     'contact': Kind(_contacts, _read_contact),
-    'checkpoint': Kind(_checkpoint_parts, _load_checkpoint, 20.0, _mutated_content, 0.1),
+    'checkpoint': Kind(CHECKPOINT_PARTS, LOADS_CHECKPOINT, 20.0, _mutated_content, 0.1),
     'instruction': Kind(_instructions, _match),
     'answer, msgpack': Kind(_answers, _read_answer),
     'answer, pickle': Kind(_pickles, _read_pickle),
@@ -518,12 +470,12 @@ KINDS = {
                wild_numbers.plausible_cameras),
         damage=with_wild_number),
     'checkpoint, numbers': Kind(
-        _checkpoint_parts, judged(_load_checkpoint, wild_numbers.plausible_checkpoint), 20.0,
+        CHECKPOINT_PARTS, judged(LOADS_CHECKPOINT, wild_numbers.plausible_checkpoint), 20.0,
         with_wild_number, 0.1),
     'task, numbers': Kind(_config('tasks'), lambda d, f: load_task(_file(f / 'task.yaml', d)),
                           damage=with_wild_number),
-    'policy, numbers': Kind(_config('policies'), _read_policy, damage=with_wild_number),
-    'preset, numbers': Kind(_config('models'), _read_preset, damage=with_wild_number),
+    'policy, numbers': Kind(_config('policies'), READS_POLICY, damage=with_wild_number),
+    'preset, numbers': Kind(_config('models'), READS_PRESET, damage=with_wild_number),
     'weights, numbers': Kind(
         _weights, wild_numbers.no_survivors(_read_weights, wild_numbers.are_finite),
         damage=wild_numbers.weights),
@@ -532,10 +484,6 @@ KINDS = {
     'plan, imagined': Kind(
         wild_plans.samples, wild_plans.imagine, 20.0, wild_plans.damaged, 0.1),
 }  # fmt: skip
-
-
-def _read_folder(make: Any, read: Callable[[Path], Any], data: bytes, folder: Path) -> Any:
-    return read(with_part(make, data, folder))
 
 
 KINDS |= {

@@ -30,11 +30,30 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @cache
+def _home() -> tempfile.TemporaryDirectory[str]:
+    """Holds all folders of this process; `clean_up` removes it, or the process's end."""
+    return tempfile.TemporaryDirectory(prefix='mtv_world_fuzz_')
+
+
+def new_folder() -> Path:
+    """An empty folder that is removed with the others."""
+    return Path(tempfile.mkdtemp(dir=_home().name))
+
+
+@cache
 def _made(make: Callable[[Path], None]) -> Path:
     """A folder that was filled once in this process."""
-    folder = Path(tempfile.mkdtemp(prefix='mtv_world_fuzz_'))
+    folder = new_folder()
     make(folder)
     return folder
+
+
+def clean_up() -> None:
+    """Removes the folders of this process."""
+    if _home.cache_info().currsize:
+        _home().cleanup()
+    _home.cache_clear()
+    _made.cache_clear()
 
 
 def parts(make: Callable[[Path], None], *endings: str) -> list[bytes]:
@@ -57,6 +76,12 @@ def with_part(make: Callable[[Path], None], data: bytes, folder: Path) -> Path:
     (copy / path).unlink()
     (copy / path).write_bytes(content)
     return copy
+
+
+def make_checkpoint(folder: Path) -> None:
+    """The bundled checkpoint; its files are linked."""
+    source = share_path('resource', 'checkpoint')
+    shutil.copytree(source, folder, copy_function=os.symlink, dirs_exist_ok=True)
 
 
 def make_episode(folder: Path) -> None:

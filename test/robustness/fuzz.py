@@ -141,6 +141,23 @@ def fuzz(row: dict[str, Any], cases: range, save: Callable[[], None] = lambda: N
         save: called now and then.
     """
     row['failures'].pop(NOT_STARTED, None)
+    with tempfile.TemporaryDirectory(prefix='mtv_world_fuzz_') as folder, _temporary(folder):
+        _fuzz(row, cases, save)
+
+
+@contextmanager
+def _temporary(folder: str) -> Iterator[None]:
+    """Processes that are started write into a folder: they are killed, and remove nothing."""
+    before = os.environ.get('TMPDIR')
+    os.environ['TMPDIR'] = folder
+    try:
+        yield
+    finally:
+        del os.environ['TMPDIR']
+        os.environ |= {} if before is None else {'TMPDIR': before}
+
+
+def _fuzz(row: dict[str, Any], cases: range, save: Callable[[], None]) -> None:
     spawn = multiprocessing.get_context(START)
     while cases:
         results = spawn.Queue()

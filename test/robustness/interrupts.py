@@ -90,8 +90,7 @@ COMMANDS: dict[str, Callable[[Path, Path], list[str]]] = {
 }  # fmt: skip
 #: what is refused since an interrupted run left finished results; said with the option that helps
 REPLACES = {'imagine': '--overwrite', 'calibrate': '--overwrite'}
-#: what nodes publish by the clock is recorded: no two runs have as many messages. An episode that
-#: was cut off is a whole bag, which episodes.json does not name
+#: what nodes publish by the clock is recorded: no two runs have as many messages
 BY_THE_CLOCK = ('imagine',)
 
 
@@ -177,6 +176,17 @@ def halves(out: Path, expected: dict[str, int], whole: dict[str, Any]) -> list[s
             continue
         if name in whole and found != whole[name]:
             wrong.append(f'{name}: {found}, whole {whole[name]}')
+    return wrong
+
+
+def unlisted(out: Path) -> list[str]:
+    """Whole bags of episodes that their `episodes.json` does not name."""
+    wrong = []
+    for bag in out.glob('imagined/episode_*'):
+        file = bag.parent / 'episodes.json'
+        listed = json.loads(file.read_text()) if file.is_file() else []
+        if bag.name not in {Path(entry['bag']).name for entry in listed}:
+            wrong.append(f'{bag.name}: episodes.json does not name it')
     return wrong
 
 
@@ -276,8 +286,8 @@ class Attack:
         return f'left {[_words(pid) for pid in left]}' if left else ''
 
     def _check_files(self, out: Path, status: int) -> str:
-        if wrong := halves(out, self.expected, self.content):
-            return f'half written: {"; ".join(wrong[:3])}'
+        if wrong := [*halves(out, self.expected, self.content), *unlisted(out)]:
+            return f'half written or unlisted: {"; ".join(wrong[:3])}'
         if status and self._differences(out):
             return self._again(out)
         return self._differences(out)  # of one that was done as the signal came, none

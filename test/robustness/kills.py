@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from contextlib import suppress
 import json
 import multiprocessing
 import os
@@ -26,9 +25,11 @@ import sys
 import time
 from typing import Any, NamedTuple
 
+from children import make_episode
 from node_messages import commit, ROOT, ros
 import numpy as np
 from rosbags.highlevel import AnyReader
+from usage import starved_s
 
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.lab.importing.recover import find_damaged, recover
@@ -138,8 +139,8 @@ class Kills:
         self._undelivered = 0
         self._client: Any = None
         self.renew_client()
-        self._episode = self._write_episode()
-        ros().make_calibration(out / 'calibration.yaml')
+        shutil.rmtree(out / 'episode', ignore_errors=True)
+        self._episode = make_episode(out, compressed=False)
         if not (out / 'checkpoint').exists():
             ros().make_checkpoint(out / 'checkpoint')
 
@@ -162,11 +163,11 @@ class Kills:
                 if time.monotonic() > end:
                     problem = f'it was not at work after {START_S:g} s'
                     break
-        starved_s = _waited_s(process.pid)
+        before_s = max(starved_s(process.pid).values(), default=0.0)
         self._client.spin_for(after_s)
         if process.exitcode is not None:
             problem = f'it had ended with {process.exitcode}'
-        self._starved_s = _waited_s(process.pid) - starved_s
+        self._starved_s = max(starved_s(process.pid).values(), default=0.0) - before_s
         process.kill()
         killed_ns = time.time_ns()
         process.join(10)
@@ -209,24 +210,6 @@ class Kills:
         while not log.exists() and time.monotonic() < end:
             time.sleep(0.01)
         return process
-
-    def _write_episode(self) -> Path:
-        from mtv_world_ros.data.episode_writer import EpisodeWriter
-        from mtv_world_ros.geometry.calibration_file import load_calibration
-
-        shutil.rmtree(self._out / 'episode', ignore_errors=True)
-        cameras = load_calibration(ros().make_calibration(self._out / 'calibration.yaml'))
-        with EpisodeWriter(
-            self._out / 'episode', task='', instruction='', robot='yam_bimanual',
-            cameras=list(cameras.values()),
-        ) as writer:  # fmt: skip
-            for step in range(200):
-                stamp_ns = 1_700_000_000_000_000_000 + step * 50_000_000
-                writer.write_joint_states(stamp_ns, ros().JOINTS, ros().HOME)
-                for view, camera in cameras.items():
-                    writer.write_camera_info(view, stamp_ns, camera)
-                    writer.write_image(view, stamp_ns, ros().make_pixels(view))
-        return self._out / 'episode'
 
     # recorder
 
@@ -322,15 +305,6 @@ class Kills:
         finally:
             process.kill()
             process.join(10)
-
-
-def _waited_s(pid: int) -> float:
-    """The longest that a thread of a process waited for a processor so far [s]."""
-    waits = [0]
-    for file in Path(f'/proc/{pid}/task').glob('*/schedstat'):
-        with suppress(OSError):  # it ended
-            waits.append(int(file.read_text().split()[1]))
-    return max(waits) / 1e9
 
 
 def _nothing(*_: object) -> None:

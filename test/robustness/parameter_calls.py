@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from functools import cache
 import os
-from pathlib import Path
-import tempfile
 from typing import Any
 
+from folder_kinds import clean_up, new_folder
 from node_messages import FLOATS, WORDS
 import numpy as np
 import wild_plans
@@ -26,7 +25,7 @@ INTEGERS = (0, 1, -1, 2**31 - 1, 2**31, 2**63 - 1, -(2**63), 7)
 
 @cache
 def _texts() -> tuple[str, ...]:
-    folder = Path(tempfile.mkdtemp(prefix='mtv_world_parameters_'))
+    folder = new_folder()
     fifo, loop = folder / 'fifo', folder / 'loop'
     os.mkfifo(fifo)
     loop.symlink_to(loop)
@@ -72,7 +71,7 @@ def _node(name: str) -> Any:
 
 
 def close() -> None:
-    """Ends the nodes, and ROS in this process if they began it."""
+    """Ends the nodes, and ROS in this process if they began it; removes the folders."""
     if _node.cache_info().currsize:
         import rclpy
 
@@ -80,6 +79,8 @@ def close() -> None:
             _node(name).close()
         _node.cache_clear()
         rclpy.shutdown()
+    _texts.cache_clear()
+    clean_up()
 
 
 def _value(rng: np.random.Generator) -> Any:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 import csv
 import json
 import os
@@ -25,6 +24,7 @@ from typing import Any, NamedTuple
 
 from node_messages import commit, ROOT, ros
 import numpy as np
+from usage import starved_s, usage
 
 from mtv_world_ros.ros.messages.conversions import NANO, to_ns, values_of
 
@@ -151,7 +151,7 @@ class Rate:
                 begin_s += STOP_S
             if number % 10 == 0:
                 self.client.send_scene()
-                self.memory.append((number, _megabytes(self.process.process.pid)))
+                self.memory.append((number, usage(self.process.process.pid)['memory_mb']))
             paced += 1
             self.spin(max(begin_s + paced / rate_hz - time.monotonic(), 0.0))
         end_s = time.monotonic() + PATIENCE_S
@@ -221,21 +221,6 @@ def growth(memory: Sequence[tuple[int, float]]) -> float | str:
         return f'not measured: {memory[-1][0] if memory else 0} plans'
     number, megabytes = np.array(kept).T
     return float(np.polyfit(number, megabytes, 1)[0]) * 1000
-
-
-def starved_s(pid: int) -> dict[str, float]:
-    """How long each thread of a process has waited for a processor so far [s]."""
-    waits = {}
-    for file in Path(f'/proc/{pid}/task').glob('*/schedstat'):
-        with suppress(OSError):  # it ended
-            waits[file.parent.name] = int(file.read_text().split()[1]) / NANO
-    return waits
-
-
-def _megabytes(pid: int) -> float:
-    lines = Path(f'/proc/{pid}/status').read_text().splitlines()
-    status = dict(line.split(':', 1) for line in lines if ':' in line)
-    return int(status['VmRSS'].split()[0]) / 1024
 
 
 def main() -> int:

@@ -12,43 +12,25 @@ from __future__ import annotations
 import argparse
 from contextlib import suppress
 import csv
-import importlib.util
-from itertools import pairwise
 import json
-import os
 from pathlib import Path
-import sys
 import time
 from typing import Any
 
-from node_messages import commit, ROOT
+from node_messages import commit, ROOT, ros
 import numpy as np
+from usage import LABELS, plot, slope, usage
 
 ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
 OUT_OF_MEMORY, CRASHES = 1100, 1300
 #: growth that is allowed [MB for 1,000 rollouts]
 MOST_GROWTH_MB = 1.0
 #: column of the CSV -> label in the plot
-LABELS = {
-    'memory_mb': 'memory [MB]',
-    'threads': 'threads',
-    'descriptors': 'file descriptors',
-    'latency_s': 'plan to last end [s]',
-}
+PLOTTED = {**LABELS, 'latency_s': 'plan to last end [s]'}
 #: rollouts after which all is written again
 WRITE_EVERY = 500
 #: rollouts before memory counts: caches and pools fill
 WARM = 200
-
-
-def load_client() -> Any:
-    """The client and messages of the tests over ROS."""
-    spec = importlib.util.spec_from_file_location('ros_client', ROOT / 'test/ros/conftest.py')
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules['ros_client'] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 class Soak:
@@ -94,7 +76,8 @@ class Soak:
             writer = csv.DictWriter(file, self.rows[0])
             writer.writeheader()
             writer.writerows(self.rows)
-        plot(self.rows, self._out / 'soak.png')
+        words = 'rollout; red = the node is killed and started again'
+        plot(self.rows, 'rollout', words, PLOTTED, self._out / 'soak.png')
         summary = {
             'seed': self._seed,
             'commit': commit(),
@@ -146,15 +129,8 @@ class Soak:
         return sum(v['state'] in ENDS for v in self._client.report_values()[since:])
 
     def _usage(self) -> dict[str, float]:
-        process = Path(f'/proc/{self._node.process.pid}')
-        status = dict(line.split(':', 1) for line in (process / 'status').read_text().splitlines())
-        return {
-            'memory_mb': int(status['VmRSS'].split()[0]) / 1024,
-            'threads': int(status['Threads']),
-            'descriptors': len(os.listdir(process / 'fd')),
-            'latency_s': self.latency_s,
-            'kills': self.kills,
-        }
+        own = {'latency_s': self.latency_s, 'kills': self.kills}
+        return {**usage(self._node.process.pid), **own}
 
     def come_and_go(self) -> None:
         """A subscriber of images comes, or the oldest goes."""
@@ -256,32 +232,7 @@ def growth(rows: list[dict[str, float]]) -> float:
         own = [row for row in rows if row['kills'] == kills]
         own = [row for row in own if row['rollout'] - own[0]['rollout'] >= WARM]
         best = max(best, own, key=len)
-    if len(best) < 5:
-        return float('nan')
-    x, y = (np.array([row[key] for row in best]) for key in ('rollout', 'memory_mb'))
-    return float(np.polyfit(x, y, 1)[0] * 1000)
-
-
-def plot(rows: list[dict[str, float]], path: Path) -> None:
-    """Memory, threads, descriptors and latency over rollouts."""
-    import matplotlib
-
-    matplotlib.use('Agg')
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(4, sharex=True, figsize=(9, 8))
-    x = [row['rollout'] for row in rows]
-    for axis, (key, label) in zip(axes, LABELS.items(), strict=True):
-        axis.plot(x, [row[key] for row in rows], '.', markersize=2)
-        axis.set_ylabel(label)
-        if key != 'memory_mb':
-            axis.set_ylim(0, 1.1 * max(row[key] for row in rows))
-        for before, row in pairwise(rows):
-            if row['kills'] > before['kills']:
-                axis.axvline(row['rollout'], color='tab:red', linewidth=0.5)
-    axes[-1].set_xlabel('rollout; red = the node is killed and started again')
-    figure.savefig(path, bbox_inches='tight')
-    pyplot.close(figure)
+    return slope(best, 'rollout', 'memory_mb', 5) * 1000
 
 
 def main() -> int:
@@ -293,7 +244,7 @@ def main() -> int:
     parser.add_argument('--out', type=Path, default=ROOT / 'out' / 'soak')
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    soak = Soak(load_client(), arguments.out, arguments.seed)
+    soak = Soak(ros(), arguments.out, arguments.seed)
     with suppress(KeyboardInterrupt):  # what was measured until then is written
         soak.run(arguments.rollouts, arguments.kill_every)
     summary = soak.write()

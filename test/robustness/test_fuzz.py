@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import os
+from pathlib import Path
 import resource
+import tempfile
 import tracemalloc
 
 from accidents import ACCIDENTS
@@ -78,6 +80,16 @@ def test_a_list_that_is_made_longer_takes_no_more_than_is_kept_of_it() -> None:
         tracemalloc.stop()
     assert max(lengths) >= 30_000
     assert peak_mb < 5  # 300 copies before the cut: 69 MB
+
+
+def test_processes_that_fuzz_leave_no_folder_behind(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv('TMPDIR', str(tmp_path))
+    monkeypatch.setattr(tempfile, 'tempdir', None)
+    row = fuzz.new_row('episode', SEED)
+    assert Path(tempfile.gettempdir()) == tmp_path
+    fuzz.fuzz(row, range(2))
+    assert row['tried'] == 2 and not row['failures']
+    assert list(tmp_path.iterdir()) == []
 
 
 def _die(data, folder):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 import json
 from math import isfinite
 from pathlib import Path
@@ -151,6 +152,7 @@ class EpisodeRunner(Node):
         self._awaited = ''
         self._recording = RecorderProcess(options.out, self._peers)
         self._results: list[dict[str, Any]] = []
+        self._running: dict[str, Any] = {}
         policy_report = f'{options.policy_node}/report'
         self.create_subscription(DiagnosticArray, policy_report, self._on_report, 100)
         self._outputs = {
@@ -180,26 +182,36 @@ class EpisodeRunner(Node):
             )
         self._connect()
         for number, start in enumerate(self._starts()):
+            self._running = {'episode': number, 'start': start.source, 'bag': ''}
             result = self._run_one(number, start)
-            self._results.append(result)
-            text = json.dumps(self._results, indent=2)
-            write_whole(options.out / 'episodes.json', text + '\n')
+            self._keep(result)
             said = f': {result["text"]}' if result['text'] else ''
             self.get_logger().info(f'episode {number}: {result["how"]}{said}')
             if result['how'].endswith('_died'):
                 raise ConfigError(f'episode {number}: {result["how"]}; see its log')
 
     def close(self) -> None:
-        """Closes the record of a running episode, and the node."""
+        """Closes the bag of a running episode and lists it as interrupted; ends the node."""
         self._recording.stop()
+        bag = self._options.out / f'episode_{self._running.get("episode", 0):05d}'
+        if self._running and bag.is_dir():
+            cut_off = {'how': 'interrupted', 'text': 'it was stopped before its end'}
+            with suppress(OSError):  # the disk is full: that is said already
+                self._keep({**self._running, 'bag': str(bag), **_ending(cut_off)})
         self.destroy_node()
+
+    def _keep(self, result: dict[str, Any]) -> None:
+        """Adds the result of an episode to `episodes.json`."""
+        self._results.append(result)
+        self._running = {}
+        text = json.dumps(self._results, indent=2)
+        write_whole(self._options.out / 'episodes.json', text + '\n')
 
     # one episode
 
     def _run_one(self, number: int, start: EpisodeStart) -> dict[str, Any]:
         begin_s = time.monotonic()
-        bag = self._recording.begin()
-        result: dict[str, Any] = {'episode': number, 'start': start.source, 'bag': bag}
+        result = {**self._running, 'bag': self._recording.begin()}
         begun_s = time.monotonic()
         try:
             seen = self._live_out(number, start)
@@ -211,8 +223,7 @@ class EpisodeRunner(Node):
         self._status.counts[f'episodes_{how}'] += 1
         if how not in (*GOOD_ENDS, 'max_seconds'):
             self._status.fault(how, seen.get('text', ''))
-        kept = ('how', 'text', 'policy', 'task', 'scene_seed', 'seed', 'num_chunks')
-        return {**result, **{key: seen.get(key, '') for key in kept}, **_estimate(seen)}
+        return {**result, **_ending(seen)}
 
     def _live_out(self, number: int, start: EpisodeStart) -> dict[str, str]:
         """Starts an episode and waits for its end; returns what was reported of that."""
@@ -352,10 +363,12 @@ def _is_viewed(topic: str) -> bool:
     return not topic.endswith('/camera_info')
 
 
-def _estimate(seen: Mapping[str, str]) -> dict[str, Any]:
-    """What the world model says of the episode's end: numbers that are null where it abstains."""
+def _ending(seen: Mapping[str, str]) -> dict[str, Any]:
+    """What was reported of an episode's end; the estimate's numbers are null where it abstains."""
+    kept = ('how', 'text', 'policy', 'task', 'scene_seed', 'seed', 'num_chunks')
     numbers = {key: float(seen.get(key, 'nan')) for key in ESTIMATE[:3]}
     return {
+        **{key: seen.get(key, '') for key in kept},
         **{key: value if isfinite(value) else None for key, value in numbers.items()},
         'verdict': verdict_word(numbers['success']),
         'reasons': seen.get(ESTIMATE[3], ''),

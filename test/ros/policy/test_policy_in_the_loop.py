@@ -251,3 +251,14 @@ def test_a_dead_recorder_ends_the_run_at_once_and_says_so(stack, ros):
     assert runner.wait(BUSY_S) == 1
     last = stack.runner.output().splitlines()[-1]
     assert last.startswith('EpisodeError: the recorder ended with status -9: ')
+
+
+def test_an_interrupted_run_lists_the_bag_that_it_closes(stack, ros):
+    out = stack.folder / 'stopped'
+    stack.start(out.name, ros, stack.episodes[:1], BLOCKED_SEED)
+    stack.wait(lambda: any(out.glob('.episode_*')), 'the begin of a bag')
+    stack.runner.stop(signal.SIGINT)
+    (listed,) = json.loads((out / 'episodes.json').read_text())
+    assert listed['how'] == 'interrupted' and listed['success'] is None
+    assert [str(bag) for bag in out.glob('episode_*')] == [listed['bag']]
+    assert list(BagReader(listed['bag']).messages({'/world_model/success'})) == []
