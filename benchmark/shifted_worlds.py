@@ -225,7 +225,7 @@ def ends_of(pipeline: Pipeline, sim: SimEpisode, names: tuple[str, ...]) -> dict
 
 def observed(sim: SimEpisode, seen: Any) -> Observation:
     """Returns what a policy sees, with the cameras as they are told."""
-    cameras = sim.told_cameras
+    cameras = sim.calibrated_cameras
     frames = np.stack([seen.images[camera.view] for camera in cameras])
     return Observation(cameras=cameras, frames=frames, positions=seen.positions, stamp_ns=1)
 

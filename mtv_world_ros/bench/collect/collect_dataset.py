@@ -174,7 +174,7 @@ class _DataSet:
                     if number % CARD_EVERY == 0:
                         self._write_card()
         except BaseException:
-            # the error to be told is the first one
+            # the first error is the one to report
             with suppress(SimulatorError):
                 self._write_card()
             raise

@@ -1,4 +1,4 @@
-"""The episodes of a data set before they are made: names, seeds, which of them miss."""
+"""Jobs of a data set: name, seed, and whether the grasp misses, by episode."""
 
 from __future__ import annotations
 

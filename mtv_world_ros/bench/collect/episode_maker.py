@@ -44,7 +44,7 @@ class CollectConfig:
         policies: scripted policies that take turns, `expert-late-0.6`; none = the expert, some of
             whose grasps miss.
         kinds: fault kinds that random policies are drawn from, one an episode; none = `policies`.
-        physics: name in the catalogue of what is true.
+        physics: physics of the simulator, a key of `config/physics.yaml`.
     """
 
     robot: str = _DEFAULT_ROBOT

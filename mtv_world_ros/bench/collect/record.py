@@ -97,7 +97,7 @@ class Take:
     object_poses: FloatArray
 
     def is_as_wanted(self) -> bool:
-        """Returns whether a success succeeded and held, or a miss left its object alone."""
+        """Returns whether the expert succeeded to the end, or a miss moved nothing."""
         if self.any_outcome:
             return True
         if self.missed is not None:
@@ -264,7 +264,7 @@ def write_take(
         task=sim.task.name,
         instruction=sim.instruction,
         robot=sim.robot.name,
-        cameras=sim.told_cameras,
+        cameras=sim.calibrated_cameras,
         seed=seed,
         objects=objects,
         metadata=metadata,
@@ -289,7 +289,7 @@ def write_take(
 
 
 def _write_frame(writer: EpisodeWriter, sim: SimEpisode, seen: SimObservation, stamp: int) -> None:
-    for camera in sim.told_cameras if seen.images else ():
+    for camera in sim.calibrated_cameras if seen.images else ():
         writer.write_camera_info(camera.view, stamp, camera)
         writer.write_image(camera.view, stamp, seen.images[camera.view])
         writer.write_mask(camera.view, stamp, seen.masks[camera.view])

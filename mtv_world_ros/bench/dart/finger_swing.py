@@ -1,9 +1,7 @@
 """How fingers swing as their hand moves: each has a mass and hangs on a drive that gives way.
 
-What a gripper reports is the mean of its fingers, so two that swing to the same side do not show,
-though both are millimetres off when they come down beside an object.
-
-Shape letters: K drives, T steps, F fingers.
+A gripper reports the mean of its fingers, so two that swing to the same side do not show, though
+both are millimetres off when they come down beside an object. Shape letters: T steps, F fingers.
 """
 
 from __future__ import annotations
@@ -17,14 +15,14 @@ from mtv_world_ros.data_types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FingerDrives:
-    """Drives of fingers, in the units of their joints; all (F,), or (K, F) to compare K drives.
+    """Drives of F fingers, in the units of their joints; all (F,).
 
     Attributes:
-        stiffness: [N/m or N m/rad].
-        damping: [N s/m or N m s/rad].
+        stiffness: of the drive [N/m or N m/rad].
+        damping: of the drive [N s/m or N m s/rad].
         mass: of finger and drive [kg or kg m^2].
-        lower: where the stops are [m or rad].
-        upper: likewise.
+        lower: lower joint limits [m or rad].
+        upper: upper joint limits [m or rad].
     """
 
     stiffness: FloatArray
@@ -36,13 +34,13 @@ class FingerDrives:
     def swings(
         self, pulls: FloatArray, ways: FloatArray, step_s: float, start: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Returns how far fingers are off their ways (..., 1 + T, F), and how it ends.
+        """Returns deviations (1 + T, F) of fingers from their ways, and the last row of `start`.
 
         Args:
             pulls: (T, F) forces of the moving hand [N or N m].
-            ways: (1 + T, F) of fingers that do not swing [m or rad].
-            step_s: between rows.
-            start: (2, ..., F) how far they are off in the first row, and how fast that grows.
+            ways: (1 + T, F) positions of fingers that do not swing [m or rad].
+            step_s: time between rows [s].
+            start: (2, F) deviations in the first row and their rates.
         """
         off, speed = start
         gain = step_s / self.mass
@@ -55,4 +53,4 @@ class FingerDrives:
             off = np.minimum(off, np.maximum(self.upper - way, 0.0))
             speed = np.where(off == free, speed, 0.0)
             rows.append(off)
-        return np.stack(rows, axis=-2), np.stack([off, speed])
+        return np.stack(rows), np.stack([off, speed])

@@ -1,8 +1,7 @@
 """A table, a robot and solids as rigid bodies of the engine DART (dartsim.github.io).
 
-Bodies do not sink into each other, and rub by Coulomb's law. Of two that rub, the lower friction
-counts. Everything is made of boxes and balls, of which the engine itself finds contacts best; a
-robot with meshes needs another way.
+Friction is Coulomb's, with the lower one of two bodies' coefficients. Everything is made of boxes
+and balls, of which the engine's own detector finds contacts best.
 
 Shape letters: J joints, D degrees of freedom of the description, O solids, A tools.
 """
@@ -28,7 +27,6 @@ from mtv_world_ros.errors import RobotError
 from mtv_world_ros.foresight.arm_response import ArmResponse
 from mtv_world_ros.foresight.arms import finger_travels
 from mtv_world_ros.foresight.contact_settings import ContactSettings
-from mtv_world_ros.geometry.robot.mesh_pieces import find_mesh
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.geometry.transforms import about_z
@@ -44,8 +42,8 @@ _SIDES = 16
 #: side of the square that has the area of a circle, in radii; a capsule is this much longer than
 #: its cylinder, in radii
 _SQUARE, _CAPS = np.sqrt(np.pi), 4 / 3
-#: what is slower than this is at rest, turns [rad/s] before ways [m/s]; an arm that is nearer to
-#: its way is on it [m or rad], [m/s or rad/s]
+#: largest velocity of a solid at rest, angular [rad/s] before linear [m/s]; largest deviations of
+#: an arm in free air from its way [m or rad], [m/s or rad/s]
 _REST = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
 _ON_WAY, _ON_WAY_SPEED = 5e-4, 0.01
 _LEAST_KG = 0.01
@@ -64,14 +62,6 @@ _TABLE_M = (1.5, 1.5, 0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BodyState:
-    """Positions and velocities of everything that moves, in the engine's order."""
-
-    positions: tuple[FloatArray, ...]
-    velocities: tuple[FloatArray, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class _Part:
     """A box of a solid, by its half extents."""
 
@@ -84,9 +74,6 @@ class _Part:
         """(3, 3) about its centre."""
         x, y, z = (4 * extent**2 for extent in self.size)
         return self.mass / 12 * np.diag([y + z, x + z, x + y])
-
-    def shape(self) -> Any:
-        return dart.dynamics.BoxShape(2 * np.array(self.size))
 
 
 class RigidBodies:
@@ -102,7 +89,7 @@ class RigidBodies:
         masses: (O,) of the solids [kg].
 
     Raises:
-        RobotError: the robot cannot be a tree of rigid bodies.
+        RobotError: the robot cannot be a tree of rigid bodies, or its drives are too stiff.
     """
 
     def __init__(
@@ -126,7 +113,8 @@ class RigidBodies:
             for number, (solid, mass) in enumerate(zip(solids, masses, strict=True))
         ]
         self.arms = Arms(robot, response, settings, pose)
-        detector = _detector(self.arms.skeleton)
+        self.arms.check_stable(step_s)
+        detector = dart.collision.DARTCollisionDetector()
         solver = self._world.getConstraintSolver()
         solver.setCollisionDetector(detector)
         self._option = solver.getCollisionOption()
@@ -170,7 +158,7 @@ class RigidBodies:
         return True
 
     def notice_touch(self) -> None:
-        """Gives what fingers touch by now the friction of grips, and the rest that of the table.
+        """Sets the friction of solids that fingers touch to that of grips, else to the table's.
 
         So what is gripped holds to fingers and slides on others. Friction of what is held or
         pushed is solved as a cone; else as a pyramid along x and y, which is quicker, and exact
@@ -202,8 +190,8 @@ class RigidBodies:
 
     @property
     def is_lost(self) -> bool:
-        """Whether the engine no longer knows where something is."""
-        return not np.isfinite(self.poses()).all()
+        """Whether the engine no longer knows where an object or an arm is."""
+        return not (np.isfinite(self.poses()).all() and np.isfinite(self.arms.joints).all())
 
     def _slopes(self, solid: Any) -> list[float]:
         """How upright the normals of contacts of fingers with a solid are, 0 to 1."""
@@ -231,19 +219,15 @@ class RigidBodies:
         return np.array(found).reshape(-1, 4, 4)
 
     @property
-    def state(self) -> BodyState:
-        """Where everything is now."""
+    def state(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Positions and velocities of everything that moves, in the engine's order."""
         moving = (*self._solids, self.arms.skeleton)
-        return BodyState(
-            positions=tuple(np.array(one.getPositions()) for one in moving),
-            velocities=tuple(np.array(one.getVelocities()) for one in moving),
-        )
+        return [(np.array(one.getPositions()), np.array(one.getVelocities())) for one in moving]
 
     @state.setter
-    def state(self, state: BodyState) -> None:
+    def state(self, state: list[tuple[FloatArray, FloatArray]]) -> None:
         moving = (*self._solids, self.arms.skeleton)
-        rows = zip(moving, state.positions, state.velocities, strict=True)
-        for one, positions, velocities in rows:
+        for one, (positions, velocities) in zip(moving, state, strict=True):
             one.setPositions(positions)
             one.setVelocities(velocities)
 
@@ -348,6 +332,24 @@ class Arms:
         """(J,) where the robot's joints are [rad or m]."""
         return self._means @ (self.skeleton.getPositions() - self._offsets)
 
+    def check_stable(self, step_s: float) -> None:
+        """Refuses drives that the engine's explicit steps would excite.
+
+        Args:
+            step_s: step of the engine [s].
+
+        Raises:
+            RobotError: names the joint.
+        """
+        inertia = np.diag(self.skeleton.getMassMatrix())
+        excited = 2 * self._damping * step_s + self._stiffness * step_s**2 > 4 * inertia
+        for row in np.flatnonzero(excited & self._driven):
+            raise RobotError(
+                f"robot '{self._robot.name}': the drive of joint "
+                f"'{self.skeleton.getDof(row).getName()}' is too stiff for the engine dart; "
+                'choose another --physics'
+            )
+
     def is_on(self, way: FloatArray, velocity: FloatArray) -> bool:
         """Tells whether the arms are where they are in free air, (D,) each."""
         off = np.abs(self.skeleton.getPositions() - way)[self._driven]
@@ -446,18 +448,10 @@ def _same_arm(arms: Any) -> list[tuple[Any, Any]]:
 
 
 def _cone() -> Any:
-    """What solves contacts with friction that is the same in all directions."""
+    """A solver of contacts whose friction is the same in all directions."""
     options = dart.constraint.NsgsFrictionSolver.Options()
     options.maxSweeps, options.tolerance = _SWEEPS, _TOLERANCE
     return dart.constraint.NsgsFrictionSolver(options)
-
-
-def _detector(arms: Any) -> Any:
-    """What finds contacts: the engine's own knows boxes and balls alone."""
-    kinds = {node.getShape().getType() for node in _moving_nodes(arms)}
-    if kinds <= {'BoxShape', 'SphereShape'}:
-        return dart.collision.DARTCollisionDetector()
-    return dart.collision.BulletCollisionDetector()
 
 
 def _boxed(shape: Any) -> Any:
@@ -548,17 +542,21 @@ def _skeleton(robot: RobotModel, path: Path, tree: ElementTree.Element) -> tuple
 
 
 def _described(path: Path) -> ElementTree.Element:
-    """A URDF without what is only looked at, its meshes where they lie."""
+    """A URDF without its visual shapes.
+
+    Raises:
+        RobotError: it collides with meshes, of which the engine finds no contacts.
+    """
     tree = ElementTree.fromstring(read_text(path, 'urdf_bytes'))
     for link in tree.iterfind('link'):
         for look in link.findall('visual'):
             link.remove(look)
-    for mesh in tree.iterfind('link/collision/geometry/mesh'):
-        name = mesh.get('filename', '')
-        file = find_mesh(name, path)
-        if file is None:
-            raise RobotError(f"'{path}': mesh '{name}' is missing; contact needs it")
-        mesh.set('filename', file.resolve().as_uri())
+    mesh = tree.find('link/collision/geometry/mesh')
+    if mesh is not None:
+        raise RobotError(
+            f"'{path}': '{mesh.get('filename')}' is a mesh; the engine dart takes box, cylinder, "
+            'capsule and sphere as collision shapes'
+        )
     return tree
 
 
@@ -581,7 +579,7 @@ def _add_drive(joint: Any, armature: float, *, is_finger: bool) -> None:
 def _settle(
     skeleton: Any, described: set[str], fingers: set[str], settings: ContactSettings
 ) -> None:
-    """Takes the weight off all links, which drives hold, and sets what rubs how."""
+    """Removes the weight of all links, which drives carry, and sets their friction."""
     for number in range(skeleton.getNumBodyNodes()):
         body = skeleton.getBodyNode(number)
         body.setGravityMode(False)
@@ -632,7 +630,7 @@ def _body(number: int, solid: Solid, settings: ContactSettings, given: float) ->
 
 
 def _add_part(body: Any, part: _Part, friction: float) -> None:
-    node = body.createShapeNode(part.shape())
+    node = body.createShapeNode(dart.dynamics.BoxShape(2 * np.array(part.size)))
     node.createCollisionAspect()
     node.createDynamicsAspect().setFrictionCoeff(friction)
     node.setRelativeTransform(dart.math.Isometry3(part.pose))

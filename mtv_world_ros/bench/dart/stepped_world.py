@@ -1,7 +1,7 @@
 """Rigid bodies of DART as a world that is commanded period by period.
 
-Shape letters: T periods, N steps of the engine, O solids, J joints, D degrees of
-freedom, F fingers.
+Shape letters: N steps of the engine in a period, O solids, J joints, D degrees of freedom,
+F fingers.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.solids import Solid
 
-#: steps of the engine in a period of commands
+#: steps of the engine in a period of commands, N
 _SUBSTEPS = 5
 STEP_S = PERIOD_S / _SUBSTEPS
 #: periods for which everything is still before arms only pass by
@@ -54,8 +54,8 @@ class SteppedWorld:
         self._robot, self._response = robot, response
         self._bodies = RigidBodies(robot, response, solids, settings, STEP_S, home, masses)
         self._free = ArmState(positions=home, velocities=np.zeros(len(home)), commands=home)
-        self._swings: FloatArray | None = None
-        self._still = 0
+        self._swings = np.zeros((2, len(self._bodies.arms.fingers)))
+        self._num_still = 0  # periods for which no solid has moved
 
     @property
     def joints(self) -> FloatArray:
@@ -71,7 +71,7 @@ class SteppedWorld:
         """Goes on by one period of commands, towards joints (J,).
 
         Raises:
-            SimulatorError: the engine has lost something.
+            SimulatorError: a position of an object or of an arm is not finite.
             TrajectoryError: the arms run away from the commands.
         """
         arms, before = self._bodies.arms, self._free
@@ -80,22 +80,41 @@ class SteppedWorld:
         # of the degrees of freedom, which offsets do not change
         speeds = arms.ways(np.stack([before.velocities, self._free.velocities]))
         speeds -= arms.ways(np.zeros((1, len(command))))
-        course, _, self._swings = course_of(arms, where, speeds[0], self._swings, speeds[1])
-        self._still = run_period(self._bodies, course, 0, self._still)
+        course, self._swings = course_of(arms, where, speeds, self._swings)
+        self._run(course)
         if self._bodies.is_lost:
-            raise SimulatorError('the engine dart has lost an object (--physics dart)')
+            raise SimulatorError(
+                'the engine dart has lost an object or an arm; choose another --physics'
+            )
+
+    def _run(self, course: Course) -> None:
+        """Steps the engine over a period, or moves arms that only pass by."""
+        bodies = self._bodies
+        self._num_still = self._num_still + 1 if bodies.is_at_rest else 0
+        is_free = self._num_still > _STILL_PERIODS and bodies.arms.is_on(
+            course.free[0], course.fast[0]
+        )
+        if is_free and bodies.passes(course.free[-1], course.fast[-1]):
+            return
+        before = bodies.state
+        bodies.notice_touch()
+        _step(bodies, course)
+        if bodies.is_lost:  # cones are solved by an iteration, which may diverge
+            bodies.state = before
+            bodies.solve_friction(as_cone=False)
+            _step(bodies, course)
 
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """What arms are to do, at steps of the engine.
+    """What arms are to do in a period of commands, at steps of the engine.
 
     Attributes:
-        ways: (1 + N, D) of drives.
-        velocities: (1 + N, D) likewise.
-        forces: (N, D) that move them so.
-        free: (1 + N, D) where all is if nothing is touched; fingers swing.
-        fast: (1 + N, D) velocities there.
+        ways: (1 + N, D) positions of drives.
+        velocities: (1 + N, D) velocities of drives.
+        forces: (N, D) forces that move them so in free air.
+        free: (1 + N, D) positions if nothing is touched; fingers swing.
+        fast: (1 + N, D) velocities if nothing is touched.
     """
 
     ways: FloatArray
@@ -106,93 +125,35 @@ class Course:
 
 
 def course_of(
-    arms: Arms,
-    where: FloatArray,
-    speeds: FloatArray | None = None,
-    swings: FloatArray | None = None,
-    last: FloatArray | None = None,
-) -> tuple[Course, FloatArray, FloatArray]:
-    """Returns what arms are to do; speeds (D,) and swings (2, F) after it.
+    arms: Arms, where: FloatArray, speeds: FloatArray, swings: FloatArray
+) -> tuple[Course, FloatArray]:
+    """Returns what arms are to do in a period, and the swings (2, F) of the fingers after it.
 
     Args:
-        arms: any.
-        where: (1 + T, J) their joints are, `PERIOD_S` apart [rad or m].
-        speeds: (D,) at first; None = at rest.
-        swings: (2, F) of the fingers at first: off their ways, and how fast; None = none.
-        last: (D,) speeds at last; None = as the way there goes on.
+        arms: arms of a world.
+        where: (2, J) joints at the begin and the end of the period [rad or m].
+        speeds: (2, D) velocities of the degrees of freedom there.
+        swings: (2, F) distance of the fingers from their ways at the begin, and its rate.
     """
-    fingers = arms.fingers
-    ways, velocities, forces, pulls = _driven(arms, where, _SUBSTEPS, speeds, last)
-    start = np.zeros((2, len(fingers))) if swings is None else swings
-    off, then = arms.finger_drives.swings(pulls, ways[:, fingers], STEP_S, start)
+    fingers, times, ends = arms.fingers, np.arange(2) * PERIOD_S, arms.ways(where)
+    curve = CubicSpline(times, ends, bc_type=((1, speeds[0]), (1, speeds[1])))  # type: ignore[arg-type]
+    ways = curve(np.arange(_SUBSTEPS + 1) * STEP_S)
+    velocities = np.concatenate([speeds[:1], np.diff(ways, axis=0) / STEP_S])
+    share = np.arange(_SUBSTEPS)[:, None] / _SUBSTEPS
+    forces, pulls = (
+        rows[0] * (1 - share) + rows[1] * share
+        for rows in arms.carried(ends, curve(times, 1), curve(times, 2))
+    )
+    off, then = arms.finger_drives.swings(pulls, ways[:, fingers], STEP_S, swings)
     free, fast = ways.copy(), velocities.copy()
     free[:, fingers] += off
-    fast[:, fingers] += np.concatenate([start[1:], np.diff(off, axis=0) / STEP_S])
-    return Course(ways, velocities, forces, free, fast), velocities[-1], then
+    fast[:, fingers] += np.concatenate([swings[1:], np.diff(off, axis=0) / STEP_S])
+    return Course(ways, velocities, forces, free, fast), then
 
 
-def _driven(
-    arms: Arms,
-    where: FloatArray,
-    substeps: int,
-    speeds: FloatArray | None = None,
-    last: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Returns what moves arms in free air, at N = T * `substeps` steps of the engine.
-
-    Args:
-        arms: any.
-        where: (1 + T, J) their joints are, `PERIOD_S` apart [rad or m].
-        substeps: of a period.
-        speeds: (D,) at first; None = at rest.
-        last: (D,) likewise at last; None = as the way there goes on.
-
-    Returns:
-        Ways (1 + N, D) of drives, velocities (1 + N, D), forces (N, D), and those with which hands
-        pull their fingers (N, F).
-    """
-    coarse, step_s = arms.ways(where), PERIOD_S / substeps
-    times = np.arange(len(coarse)) * PERIOD_S
-    first = np.zeros(coarse.shape[1]) if speeds is None else speeds
-    end = 'not-a-knot' if last is None else (1, last)
-    curve = CubicSpline(times, coarse, bc_type=((1, first), end))  # type: ignore[arg-type]
-    ways = curve(np.arange((len(coarse) - 1) * substeps + 1) * step_s)
-    velocities = np.concatenate([first[None], np.diff(ways, axis=0) / step_s])
-    share = np.arange(substeps)[:, None] / substeps
-
-    def between(rows: FloatArray) -> FloatArray:
-        mixed = rows[:-1, None] * (1 - share) + rows[1:, None] * share
-        return mixed.reshape(-1, rows.shape[1])
-
-    forces, pulls = arms.carried(coarse, curve(times, 1), curve(times, 2))
-    return ways, velocities, between(forces), between(pulls)
-
-
-def run_period(bodies: RigidBodies, course: Course, first: int, still: int) -> int:
-    """Goes on by one period of commands; returns for how many periods no solid has moved.
-
-    Args:
-        bodies: are moved.
-        course: what arms do.
-        first: step of the course at which the period begins.
-        still: for how many periods no solid has moved before.
-    """
-    last = first + _SUBSTEPS
-    still = still + 1 if bodies.is_at_rest else 0
-    is_free = still > _STILL_PERIODS and bodies.arms.is_on(course.free[first], course.fast[first])
-    if not (is_free and bodies.passes(course.free[last], course.fast[last])):
-        before = bodies.state
-        bodies.notice_touch()
-        _step(bodies, course, first, last)
-        if bodies.is_lost:  # cones are solved by an iteration, which may diverge
-            bodies.state = before
-            bodies.solve_friction(as_cone=False)
-            _step(bodies, course, first, last)
-    return still
-
-
-def _step(bodies: RigidBodies, course: Course, first: int, last: int) -> None:
-    """Goes on from one step of a course to another."""
-    for step in range(first, last):
-        forces = course.forces[step], course.ways[step], course.velocities[step]
-        bodies.step(bodies.arms.forces(*forces))
+def _step(bodies: RigidBodies, course: Course) -> None:
+    """Steps the engine through a course."""
+    for forces, way, velocity in zip(
+        course.forces, course.ways[:-1], course.velocities[:-1], strict=True
+    ):
+        bodies.step(bodies.arms.forces(forces, way, velocity))

@@ -23,7 +23,7 @@ from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.transforms import rotation
 
-#: by how much of the whole way the share of an arm is reduced until it reaches so far
+#: step by which the share of a way is reduced until the second arm reaches its end
 _LESS = 0.05
 
 
@@ -263,23 +263,21 @@ class Expert:
         free: dict[str, int] = {}
         for number, (move, goal) in enumerate(zip(task.moves, scene.goals, strict=True)):
             pick = self._pick(now, move, rng, miss=number == missed)
-            stops = usual = self._stops(pick, move, now, goal, rng)
-            objects = [np.asarray(item.position) for item in now.values()]
-            is_wrong = faults is not None and number == faults.move_of(len(task.moves))
-            wrong = faults if is_wrong else None
-            others = [arm for arm in self._tools if arm != pick.arm]
+            stops = fault_free = self._stops(pick, move, now, goal, rng)
+            other = next((arm for arm in self._tools if arm != pick.arm), '')
             draws = None
-            if wrong is not None:
-                rests = self.workcell.home_tools[others[0]] if others else None
-                draws = wrong.draws(pick.yaw, objects, rests)
-                stops = wrong.applied(stops, draws)
-                usual = usual if wrong.keeps_tempo else stops
-            pace = self._pace(pick.arm, usual, rng, alone=len(task.moves) == 1)
-            comes: list[tuple[FloatArray, int]] = []
-            if wrong is not None and draws is not None and others:
+            if faults is not None and number == faults.move_of(len(task.moves)):
+                rests = self.workcell.home_tools[other] if other else None
+                objects = [np.asarray(item.position) for item in now.values()]
+                draws = faults.draws(pick.yaw, objects, rests)
+                stops = faults.applied(stops, draws)
+            timed = fault_free if faults is not None and faults.keeps_tempo else stops
+            pace = self._pace(pick.arm, timed, rng, alone=len(task.moves) == 1)
+            second_arm: list[tuple[FloatArray, int]] = []
+            if faults is not None and draws is not None and other:
                 times = self._timed(stops, self.workcell.home_tools[pick.arm])
-                visits = wrong.visits(stops, draws, self._rests(others[0]), times)
-                waits, comes = self._visits(others[0], visits, pace)
+                visits = faults.visits(stops, draws, self._rests(other), times)
+                waits, second_arm = self._visits(other, visits, pace)
                 stops = [replace(stops[0], seconds=times[0] + waits), *stops[1:]]
             rows = self._follow(pick.arm, stops, pace)
             overlap = round(self._config.overlap_s * rate) if pick.arm != last_arm else 0
@@ -287,10 +285,10 @@ class Expert:
             busy = free[pick.arm] = start + len(rows)
             last_arm = pick.arm
             positions = self._lay(positions, rows, start, pick.arm)
-            for rows, before in comes:
-                first = max(start + before, free.get(others[0], 1))
-                free[others[0]] = first + len(rows)
-                positions = self._lay(positions, rows, first, others[0])
+            for rows, before in second_arm:
+                first = max(start + before, free.get(other, 1))
+                free[other] = first + len(rows)
+                positions = self._lay(positions, rows, first, other)
             now[move.subject] = replace(now[move.subject], position=goal)
         return JointTrajectory(
             joint_names=self.robot.joint_names,
@@ -416,18 +414,18 @@ class Expert:
     def _visits(
         self, other: str, visits: Sequence[Visit], pace: tuple[float, float]
     ) -> tuple[float, list[tuple[FloatArray, int]]]:
-        """How long the first arm waits for another one [s], and rows of that and how late."""
-        waits, comes = 0.0, list[tuple[FloatArray, int]]()
+        """Seconds that the first arm waits, and the second arm's rows with their first row."""
+        waits, rows_of_visits = 0.0, list[tuple[FloatArray, int]]()
         for visit in visits:
             rows, done = self._as_far_as_it_reaches(other, visit.ways, visit.share, pace)
             takes = sum(self._timed(done[: visit.done], self.workcell.home_tools[other]))
             late = visit.meets - takes + visit.is_timed * waits
             waits = max(waits, -late) if visit.waits else waits
-            comes.append((rows, self._late(late, pace)))
-        return waits, comes
+            rows_of_visits.append((rows, self._late(late, pace)))
+        return waits, rows_of_visits
 
     def _late(self, seconds: float, pace: tuple[float, float]) -> int:
-        """Rows before something begins, of a time before scaling [s]; none if it is too late."""
+        """Rows until an unscaled time [s]; 0 if it is negative."""
         return max(round(seconds * pace[0] / pace[1] * self._config.rate_hz), 0)
 
     def _rests(self, arm: str) -> WayPoint:
@@ -440,7 +438,7 @@ class Expert:
         share: float,
         pace: tuple[float, float],
     ) -> tuple[FloatArray, list[WayPoint]]:
-        """Rows and way points of an arm that goes a share of a way, or as much as it reaches."""
+        """Rows and way points of an arm that goes a share of a way, less if out of reach."""
         while True:
             way = ways(share)
             try:

@@ -56,7 +56,7 @@ def refuse_test_kinds(variants: Iterable[str], what: str) -> None:
 
     Args:
         variants: names of policies.
-        what: they are not for, in words.
+        what: purpose that they are refused for, e.g. `training`.
 
     Raises:
         PolicyError: names the policies and their kinds.

@@ -158,7 +158,7 @@ class ScriptedPolicy:
     def _intentions(
         self, rng: np.random.Generator, *, is_wrong: bool
     ) -> Iterator[tuple[Task, Scene]]:
-        """What it may set out to do, in order of preference."""
+        """Tasks and scenes that it may plan for, in order of preference."""
         if not is_wrong:
             size = self.variant.size('goal_object_moved_after')
             yield self._with_goal_object_moved(size, rng) if size else (self.task, self.scene)
@@ -212,7 +212,7 @@ class ScriptedPolicy:
         return [replace(move, subject=other, reference=reference), back]
 
     def _seen(self, scene: Scene, rng: np.random.Generator) -> Scene:
-        """The scene as the policy takes it to be."""
+        """The scene with the policy's errors of object and goal positions."""
         subjects = {move.subject for move in self.task.moves}
 
         def moved(place: Place, deviation: float) -> Place:

@@ -1,4 +1,4 @@
-"""Way points that an arm goes by, and what is drawn for one move."""
+"""Way points of an arm, and the random draws for one move."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from mtv_world_ros.data_types import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class WayPoint:
-    """Where one arm's tool is at the end of a segment.
+    """Pose of one arm's tool and opening of its gripper at the end of a segment.
 
     Attributes:
         phase: `above`, `grasp`, `close`, `lift`, `carry`, `lower`, `open`, `retreat` or `home`.
         position: (3,) of the tool [m].
         yaw: of the tool [rad].
         opening: of the gripper, 0..1.
-        seconds: that the segment takes; None = as the arm's speed has it.
+        seconds: duration of the segment; None = by the arm's speed.
         lean: of the tool about its own x [rad].
     """
 
@@ -40,7 +40,7 @@ Stops = list[WayPoint]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Draws:
-    """What is drawn for one move that goes wrong: to which side, and errors of way points.
+    """Random draws for a faulty move: side, direction and errors of way points.
 
     Attributes:
         yaw: of the grasp [rad]; the fingers travel along it.

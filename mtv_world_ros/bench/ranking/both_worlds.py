@@ -21,7 +21,7 @@ from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.success.estimator import verdict
 from mtv_world_ros.vision.jaccard import jaccard
 
-#: an object has parted where its overlap is too small in so many frames in a row
+#: number of frames in a row with too small an overlap after which an object has parted
 _FRAMES_APART = 3
 #: an object is hidden where this share of what was seen of it at first is seen in neither world
 _HIDDEN = 1 / 3

@@ -30,44 +30,6 @@ from mtv_world_ros.success.estimator import FAILURE_BELOW, SUCCESS_FROM
 TITLE = 'Policy ranking'
 #: hues of the report's style sheet
 _NUM_HUES = 6
-_MEANING = (
-    "Success in the simulator: the task's relations hold on true object poses at the end. In "
-    'imagination, which starts from the same first pictures, an estimate is made at the end: a '
-    f'rate is the mean of the estimates; a verdict is success from {SUCCESS_FROM} on, failure '
-    f'below {FAILURE_BELOW}, and open between. Scripted policies go by time and do not look: '
-    'only the world that their commands meet differs. Policies that look may also send other '
-    'commands in each world.'
-)
-_CEILING = (
-    "'{seen}' is what imagination could reach at best: its errors are the estimator's, the rest "
-    "are the world model's."
-)
-_WORTH = (
-    'What decides: the foreseen motions of objects; pictures show them. In the first table, '
-    'foreseen motions alone: the share of those that succeed, from the commands and the first '
-    "frame. Pictures alone: the paper's way, trails and first masks are drawn and no motion is "
-    'foreseen. Both: the estimate. The no-picture rule: an object sticks to a gripper that closes '
-    "near it. Real frames: the same estimator on the simulator's. n: rollouts with an estimate. "
-    'Cells: value [95 % interval] count; false success: real failures called a success, of those '
-    'with a verdict.'
-)
-_INTERVALS = (
-    'Intervals of rates: Wilson, 95 %. The noise of few scenes makes the observed r too small and '
-    'the observed MMRV too large. Noise-free: what they would be on endless scenes, an estimate '
-    'and its 95 % interval; none below 4 scenes or 3 policies. MMRV weighs a wrongly ranked pair '
-    'by how far its true rates lie apart; 0 is perfect.'
-)
-_OPTIMISM = (
-    'AUROC: of the rollouts with an estimate. Flips: a command whose true '
-    "outcome differs from the expert's in the same scene; how often the imagined last frame is "
-    'nearer to what really happened than to what happened under the expert, over the pixels in '
-    'which these differ; chance is .5. No pictures: a rule that sees the commands and the first '
-    'frame alone: an object sticks to a gripper that closes near it. AUROC - rule: on the same '
-    'rollouts. Intervals, over scenes: of shares clustered Wilson, of AUROC jackknife; none for '
-    'few scenes. r and MMRV, noise-free: estimated for endless scenes, posterior median and '
-    'interval; not below 3 policies. r, MMRV and AUROC of a kind: over its policies and the '
-    'expert.'
-)
 #: characters in the head of a column
 _NAME_LENGTH = 17
 
@@ -89,18 +51,18 @@ def tables(summary: Summary) -> list[Table]:
 
 def remarks(summary: Summary) -> list[str]:
     """Returns what has to be known to read the numbers."""
-    return [
-        _MEANING,
-        _CEILING.format(seen=REPORTED['seen'].capitalize()),
-        _WORTH,
-        _INTERVALS,
-        *([_OPTIMISM] if summary.optimism else []),
-        *_notes(summary),
-    ]
+    text = render(
+        'ranking_remarks.txt.j2',
+        success_from=SUCCESS_FROM,
+        failure_below=FAILURE_BELOW,
+        seen=REPORTED['seen'].capitalize(),
+        has_optimism=bool(summary.optimism),
+    )
+    return [*text.splitlines(), *_notes(summary)]
 
 
 def _notes(summary: Summary) -> list[str]:
-    """What holds of this ranking."""
+    """Remarks on this ranking: its truth, agreement, calibration, and what is missing."""
     found = [_truth_remark(summary), _agreement_remark(summary), _unknown_remark(summary)]
     reasons = ' '.join(reason for result in summary.results for reason in result.imagined.reasons)
     if 'uncalibrated' in reasons:

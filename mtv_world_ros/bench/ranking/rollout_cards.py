@@ -119,7 +119,7 @@ def estimate_text(judged: Judged) -> str:
 
 
 def _first_to_part(course: Course | None) -> str:
-    """What parts first; empty = not known."""
+    """Which of `_PARTS` differs first between the two worlds; empty = not known."""
     if course is None:
         return ''
     if not isfinite(course.part_s):

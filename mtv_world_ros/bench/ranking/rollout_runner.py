@@ -46,7 +46,7 @@ class RolloutConfig:
             number of answers in a row; 0 = then it goes on.
         clips: keep each rollout as a video, a contact sheet and frames; takes as long as
             imagining it.
-        physics: name in the catalogue of what is true in the simulator.
+        physics: physics of the simulator, a key of `config/physics.yaml`.
         make_policy: makes a policy for an episode.
     """
 

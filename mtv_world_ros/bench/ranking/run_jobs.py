@@ -117,10 +117,28 @@ class _Store:
             **({'hold': config.hold} if config.hold else {}),
         }
         check_same_settings(self._out / FOLDER, self._settings, overwrite)
-        for job in () if overwrite else jobs:
-            _check_same_policy(_path(self._out, job), job)
-        stored = {job: _stored(self._out, job, self._settings) for job in jobs}
+        stored = {job: self._stored(job, overwrite) for job in jobs}
         self.found = {job: result for job, result in stored.items() if result is not None}
+
+    def _stored(self, job: Job, overwrite: bool) -> Result | None:
+        """A result of an earlier run, if it is of the same job and settings."""
+        path = _path(self._out, job)
+        try:
+            values = read_json(path)
+            definition = values.get('definition', '')
+        except (OSError, ValueError, AttributeError):
+            return None  # not readable, thus nothing is lost
+        if definition != job.definition and not overwrite:
+            raise ConfigError(
+                f"'{path}' is of another policy with the name '{job.policy}'; give this one "
+                'another name, or --overwrite to replace its results'
+            )
+        try:
+            result = Result.from_json(values['result'])
+            same = values['settings'] == plain(self._settings) and result.seed == job.seed
+        except (ValueError, KeyError, TypeError):
+            return None
+        return result if same and definition == job.definition else None
 
     def add(self, job: Job, values: dict[str, Any]) -> None:
         """Writes a result."""
@@ -146,17 +164,6 @@ def _path(out: Path, job: Job) -> Path:
     return Path(out) / FOLDER / f'{job.name}.json'
 
 
-def _stored(out: Path, job: Job, settings: Mapping[str, Any]) -> Result | None:
-    """A result of an earlier run, if it is of the same job and settings."""
-    try:
-        values = read_json(_path(out, job))
-        result = Result.from_json(values['result'])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    same = values['settings'] == plain(settings) and result.seed == job.seed
-    return result if same and values.get('definition', '') == job.definition else None
-
-
 def read_results(out: Path) -> list[Result]:
     """Reads the results of a ranking's folder, whatever their settings.
 
@@ -174,16 +181,3 @@ def read_results(out: Path) -> list[Result]:
                 'where it stopped'
             ) from error
     return found
-
-
-def _check_same_policy(path: Path, job: Job) -> None:
-    """Refuses a result of another policy that had this name."""
-    try:
-        definition = read_json(path).get('definition', '')
-    except (OSError, ValueError, AttributeError):
-        return  # not readable, thus nothing is lost
-    if definition != job.definition:
-        raise ConfigError(
-            f"'{path}' is of another policy with the name '{job.policy}'; give this one another "
-            'name, or --overwrite to replace its results'
-        )

@@ -79,7 +79,7 @@ class Score:
     Attributes:
         value: the number.
         interval: 95 %.
-        count: policies, rollouts, failures or flips, as the measure has it.
+        count: policies, rollouts, failures or flips, depending on the measure.
         hits: successes of a rate; of estimates, their sum.
         num_unknown: rollouts of a rate without an estimate.
     """

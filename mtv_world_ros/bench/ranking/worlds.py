@@ -261,7 +261,7 @@ class SimulatedWorld:
         return seen
 
     def _observation(self, seen: SimObservation) -> Observation:
-        cameras = self._sim.told_cameras
+        cameras = self._sim.calibrated_cameras
         return Observation(
             cameras=cameras,
             frames=np.stack([seen.images[camera.view] for camera in cameras]),

@@ -1,7 +1,7 @@
 """Scenes of the benchmark's tasks: objects on the table, and the expert's moves.
 
-Instruction and success relations are in `config/tasks/<name>.yaml`; of tasks whose goal only the
-simulator knows, in `config/tasks/zero_shot`.
+Scenes are data, in `config/scenes.yaml`. Instruction and success relations of a task are in
+`config/tasks/<name>.yaml`, or in `config/tasks/zero_shot` where only the simulator knows the goal.
 """
 
 from __future__ import annotations
@@ -10,9 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from pydantic import ConfigDict, TypeAdapter
 
+from mtv_world_ros.config import read_yaml
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import nearest, SimulatorError
 from mtv_world_ros.files import share_path
@@ -40,6 +43,8 @@ class ObjectRole:
         probability: of the object being in the scene (below 1: distractors).
     """
 
+    __pydantic_config__ = ConfigDict(extra='forbid')
+
     role: str
     shapes: tuple[str, ...] = ('block',)
     size_share: Range = (0.0, 1.0)
@@ -62,11 +67,13 @@ class PickPlace:
         least: no goal is nearer than this to where the subject lies [m].
     """
 
+    __pydantic_config__ = ConfigDict(extra='forbid')
+
     subject: str
     reference: str
     offset: tuple[float, float] = (0.0, 0.0)
     spread: tuple[float, float] = (0.0, 0.0)
-    rest: str = 'table'
+    rest: Literal['table', 'on', 'in'] = 'table'
     least: float = 0.0
 
 
@@ -81,6 +88,8 @@ class Shake:
         lift: height it is shaken at, over where it stood [m].
         num_swings: from one side to the other.
     """
+
+    __pydantic_config__ = ConfigDict(extra='forbid')
 
     subject: str
     lean: tuple[float, float] = (0.45, -0.1)
@@ -102,6 +111,8 @@ class Task:
         mirrored: left and right of the whole scene are exchanged in every second episode.
         zero_shot: no part of the 15 tasks; for the zero-shot sets.
     """
+
+    __pydantic_config__ = ConfigDict(extra='forbid')
 
     name: str
     roles: tuple[ObjectRole, ...]
@@ -135,147 +146,14 @@ def _read(path: Path) -> TaskSpec:
     return load_task(path)
 
 
-_FOOD = ('bread', 'carrot', 'eggplant', 'corn')
-_TOYS = ('car', 'duck', 'block')
-_LEFT, _RIGHT, _MIDDLE = (-0.22, -0.135), (0.135, 0.22), (-0.015, 0.015)
-_DISTRACTOR = ObjectRole(role='distractor', probability=0.2)
-_TWO_BLOCKS = (ObjectRole(role='a'), ObjectRole(role='b'), _DISTRACTOR)
-_SMALL = (0.0, 0.3)
+def _read_tasks() -> dict[str, Task]:
+    """The tasks of `config/scenes.yaml`, in its order."""
+    entries = read_yaml(share_path('config', 'scenes.yaml'), 'scene file', 'config')
+    adapter = TypeAdapter(Task)
+    return {n: adapter.validate_python({'name': n, **values}) for n, values in entries.items()}
 
 
-def _collect(name: str, shapes: tuple[str, ...], container: str) -> Task:
-    """Two objects, one from either side, go into a container in the middle."""
-    roles = (
-        ObjectRole(role='a', shapes=shapes, x_range=_LEFT, y_range=(0.2, 0.31)),
-        ObjectRole(role='b', shapes=shapes, x_range=_RIGHT, y_range=(0.2, 0.31)),
-        ObjectRole(
-            role='c', shapes=(container,), x_range=_MIDDLE, y_range=(0.22, 0.245),
-            yaw_range=(-0.1, 0.1),
-        ),
-    )  # fmt: skip
-    rest = 'on' if container == 'tray' else 'in'
-    return Task(
-        name=name,
-        roles=roles,
-        moves=tuple(
-            PickPlace(subject=role, reference='c', offset=(side * 0.038, 0.0), rest=rest)
-            for role, side in (('a', -1), ('b', 1))
-        ),
-        mirrored=True,
-    )
-
-
-def _beside(name: str, side: float) -> Task:
-    """One block goes to the left (-1) or the right (+1) of another."""
-    return Task(
-        name=name,
-        roles=_TWO_BLOCKS,
-        moves=(PickPlace(subject='a', reference='b', offset=(side * 0.13, 0.0)),),
-    )
-
-
-def _both_beside(name: str, side: float) -> Task:
-    """Two blocks go to one side of a third, the farther one first."""
-    return Task(
-        name=name,
-        roles=tuple(ObjectRole(role=role, size_share=_SMALL) for role in 'abc'),
-        moves=(
-            PickPlace(subject='a', reference='c', offset=(side * 0.18, 0.015)),
-            PickPlace(subject='b', reference='c', offset=(side * 0.1, -0.015)),
-        ),
-    )
-
-
-def _serve(name: str, item: str) -> Task:
-    """Bread or a cup goes onto a plate."""
-    return Task(
-        name=name,
-        roles=(
-            ObjectRole(role='a', shapes=(item,)),
-            ObjectRole(role='b', shapes=('plate',), y_range=(0.22, 0.32)),
-            _DISTRACTOR,
-        ),
-        moves=(PickPlace(subject='a', reference='b', rest='on'),),
-    )
-
-
-_ALL = (
-    _collect('bussing_table', ('cup', 'bread', 'corn'), 'bin'),
-    _collect('collect_food', _FOOD, 'basket'),
-    _collect('collect_tableware', ('cup',), 'tray'),
-    _collect('collect_toy', _TOYS, 'basket'),
-    Task(
-        name='move_stack_block_ab',
-        roles=(
-            ObjectRole(role='a', x_range=(-0.21, -0.15), y_range=(0.2, 0.33)),
-            ObjectRole(role='b', x_range=(0.12, 0.21), y_range=(0.2, 0.33)),
-            _DISTRACTOR,
-        ),
-        moves=(
-            PickPlace(subject='a', reference=TABLE, offset=(0.0, 0.225), spread=(0.02, 0.015)),
-            PickPlace(subject='b', reference='a', rest='on'),
-        ),
-        mirrored=True,
-    ),
-    Task(
-        name='move_stack_plate',
-        roles=(
-            ObjectRole(role='a', shapes=('plate',), y_range=(0.22, 0.3)),
-            ObjectRole(role='b', shapes=('plate',), y_range=(0.22, 0.3)),
-        ),
-        moves=(PickPlace(subject='a', reference='b', rest='on'),),
-    ),
-    Task(
-        name='move_object_two',
-        roles=tuple(
-            ObjectRole(role=role, shapes=('block', 'cup', 'car', 'bread', 'bowl'), x_range=x_range,
-                       y_range=(0.29, 0.35))
-            for role, x_range in (('a', (-0.2, -0.07)), ('b', (0.07, 0.2)))
-        ),
-        moves=tuple(PickPlace(subject=role, reference=START, offset=(0, -0.1)) for role in 'ab'),
-        mirrored=True,
-    ),
-    _beside('place_block_a2b_left', -1),
-    _beside('place_block_a2b_right', 1),
-    _both_beside('place_block_ab2c_left', -1),
-    _both_beside('place_block_ab2c_right', 1),
-    _serve('place_bread_plate', 'bread'),
-    _serve('place_cup_plate', 'cup'),
-    Task(
-        name='shake_bottle',
-        roles=(
-            ObjectRole(role='a', shapes=('bottle',), x_range=(-0.2, -0.05), y_range=(0.23, 0.29)),
-            ObjectRole(role='b', shapes=('block', 'cup')),
-            _DISTRACTOR,
-        ),
-        moves=(Shake(subject='a'),),
-        mirrored=True,
-    ),
-    Task(
-        name='stack_blocks_two',
-        roles=_TWO_BLOCKS,
-        moves=(PickPlace(subject='a', reference='b', rest='on'),),
-    ),
-    Task(
-        name='random_pick_place',
-        roles=(
-            *(
-                ObjectRole(role=role, shapes=('bowl', 'cup', *_FOOD, *_TOYS),
-                           x_range=(-0.18, 0.18), y_range=(0.21, 0.33))
-                for role in 'ab'
-            ),
-            _DISTRACTOR,
-        ),
-        moves=(
-            PickPlace(
-                subject='a', reference=TABLE, offset=(0.0, 0.27), spread=(0.22, 0.07), least=0.08
-            ),
-        ),
-        zero_shot=True,
-    ),
-)  # fmt: skip
-
-TASKS = {task.name: task for task in _ALL}
+TASKS = _read_tasks()
 
 
 def task_named(name: str) -> Task:

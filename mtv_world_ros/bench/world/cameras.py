@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from pydantic import ConfigDict
 
 from mtv_world_ros.data_types import CameraModel, FloatArray
 
@@ -21,6 +22,8 @@ class CameraSpec:
         elevation: above the table [deg].
         visible_width: width of the view's plane through the target [m].
     """
+
+    __pydantic_config__ = ConfigDict(extra='forbid')
 
     view: str
     target: tuple[float, float, float]
@@ -42,6 +45,8 @@ class WristCameraSpec:
         right: (x, y, z) in the link, about the direction of the image's x.
         visible_width: width of the view's plane through the target [m].
     """
+
+    __pydantic_config__ = ConfigDict(extra='forbid')
 
     view: str
     link: str

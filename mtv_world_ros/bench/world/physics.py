@@ -24,7 +24,7 @@ from mtv_world_ros.geometry.robot.model import RobotModel
 DART = 'dart'
 #: geoms of this priority are the pads of fingers
 _PAD_PRIORITY = 1
-#: draws which way each joint's zero is off; of an episode's pictures and cameras its seed does
+#: seed of the directions of joint zeros; pictures and cameras are drawn by the episode's seed
 _ZERO_SEED, _SPAWN_KEY = 17, 8
 
 _Degrees = Annotated[float, Field(ge=0, le=180)]
@@ -102,7 +102,9 @@ class Physics(Schema):
             model.actuator_forcerange[number] *= self.gripper_force
         mujoco.mj_setConst(model, mujoco.MjData(model))
 
-    def told_cameras(self, cameras: Sequence[CameraModel], seed: int) -> tuple[CameraModel, ...]:
+    def calibrated_cameras(
+        self, cameras: Sequence[CameraModel], seed: int
+    ) -> tuple[CameraModel, ...]:
         """Returns the cameras as they are calibrated, off in directions that a seed draws."""
         if not (self.camera_m or self.camera_deg):
             return tuple(cameras)
@@ -161,11 +163,11 @@ class ModelParts:
 
 
 class DelayLine:
-    """Commands on their way to the joints.
+    """Delays commands on their way to the joints.
 
     Args:
-        first: (J,) commanded for ever before.
-        periods: they arrive so many periods late; between two of them they are interpolated.
+        first: (J,) command before the first one.
+        periods: delay in periods; commands between two periods are interpolated.
     """
 
     def __init__(self, first: FloatArray, periods: float) -> None:
@@ -173,13 +175,13 @@ class DelayLine:
         self._last = deque([first] * (int(periods) + 2), maxlen=int(periods) + 2)
 
     def pass_on(self, command: FloatArray) -> FloatArray:
-        """Returns (J,) what arrives as a command (J,) is sent."""
+        """Sends a command (J,); returns the one (J,) that arrives meanwhile."""
         self._last.append(command)
         return self._last[1] * (1 - self._share) + self._last[0] * self._share
 
 
 def picture_generator(seed: int) -> np.random.Generator:
-    """Returns what draws the noise of an episode's pictures."""
+    """Returns the generator of the noise of an episode's pictures."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_SPAWN_KEY, 1)))
 
 

@@ -59,7 +59,7 @@ class RandomizationConfig:
 def _draw_object(
     role: ObjectRole, side: float, taken: set[str], rng: Rng, scale: float
 ) -> SceneObject:
-    """An object of a role, in a colour that no other has; `side` -1 exchanges left and right."""
+    """Draws an object of a role in a free colour; `side` -1 exchanges left and right."""
     name = str(rng.choice([shape for shape in role.shapes if SHAPES[shape].free(taken)]))
     shape = SHAPES[name]
     word = str(rng.choice([word for word in shape.colours if word not in taken]))
@@ -142,7 +142,7 @@ def draw_scene(
     else:
         raise SimulatorError(
             f"no feasible placement for task '{task.name}' in {MAX_DRAWS} draws; widen x_range "
-            'and y_range of its roles (bench/tasks/tasks.py) or lower the clearance '
+            'and y_range of its roles (config/scenes.yaml) or lower the clearance '
             '(config/workcells)'
         )
     cameras = tuple(

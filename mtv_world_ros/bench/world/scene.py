@@ -172,7 +172,7 @@ def check_cameras(scene: Scene, base_link: str) -> None:
             raise SimulatorError(
                 f"camera '{camera.view}' does not see {', '.join(hidden)} as a whole; move its "
                 'target or widen visible_width (config/workcells), or narrow the region of '
-                'the objects (bench/tasks/tasks.py)'
+                'the objects (config/scenes.yaml)'
             )
 
 

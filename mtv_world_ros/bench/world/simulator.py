@@ -85,11 +85,11 @@ class SimEpisode:
         home: (J,) joint positions at reset [rad or m].
         config: what is randomised, and the image size; default: the workcell's.
         rendering: False runs physics alone, without OpenGL; images are then empty.
-        physics: name in the catalogue (`config/physics.yaml`) of what is true here.
+        physics: physics of the episode, a key of `config/physics.yaml`.
 
     Attributes:
         physics: that name.
-        told_cameras: the scene's cameras as they are calibrated.
+        calibrated_cameras: the scene's cameras as they are calibrated.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class SimEpisode:
         self._physics.change(self._model, mujoco, parts)
         self._data = mujoco.MjData(self._model)
         self._index_model()
-        self.told_cameras = self._physics.told_cameras(scene.cameras, self._seed)
+        self.calibrated_cameras = self._physics.calibrated_cameras(scene.cameras, self._seed)
         self._noise = picture_generator(self._seed)
         if self._rendering:
             height, width = scene.cameras[0].height, scene.cameras[0].width

@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from mtv_world_ros.bench.world.cameras import AnyCameraSpec, CameraSpec, WristCameraSpec
 from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, validated
@@ -28,31 +28,18 @@ class ArmEntry(Schema):
     home_joints: Vector = Field(description='joints near that pose, gripper left out [rad]')
 
 
-class CameraEntry(Schema):
-    """A fixed camera, see `CameraSpec`, or with `link` one on it, see `WristCameraSpec`."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlacementConfig:
+    """Limits of a feasible scene.
 
-    view: str
-    target: Vector
-    visible_width: Number
-    distance: Number | None = None
-    azimuth: Number = 0
-    elevation: Number = 0
-    link: str | None = None
-    position: Vector | None = None
-    right: Vector = (0, 1, 0)
+    Attributes:
+        clearance: least gap between the objects' outlines, room for a finger [m].
+        reach: how far from an arm's base its tool is sent, top-down, over the table [m].
+        reach_above: the same where it is higher, over or in another object [m].
+        max_x: goals are at most this far from the table's middle line, in all views [m].
+    """
 
-    def spec(self) -> AnyCameraSpec:
-        """Returns the camera."""
-        values = self.model_dump(exclude_unset=True)
-        kind = CameraSpec if self.link is None else WristCameraSpec
-        try:
-            return kind(**values)
-        except TypeError as error:
-            raise SimulatorError(f"camera '{self.view}' of a workcell: {error}") from error
-
-
-class PlacementEntry(Schema):
-    """See `PlacementConfig`."""
+    __pydantic_config__ = ConfigDict(extra='forbid')
 
     clearance: Length
     reach: Length
@@ -66,25 +53,8 @@ class WorkcellFile(Schema):
     arms: Mapping[str, ArmEntry]
     finger_width_m: Length
     finger_thickness_m: Length
-    placement: PlacementEntry
-    cameras: ListOf[CameraEntry]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlacementConfig:
-    """Limits of a feasible scene.
-
-    Attributes:
-        clearance: least gap between the objects' outlines, room for a finger [m].
-        reach: how far from an arm's base its tool is sent, top-down, over the table [m].
-        reach_above: the same where it is higher, over or in another object [m].
-        max_x: goals are at most this far from the table's middle line, in all views [m].
-    """
-
-    clearance: float
-    reach: float
-    reach_above: float
-    max_x: float
+    placement: PlacementConfig
+    cameras: ListOf[CameraSpec | WristCameraSpec]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,8 +120,8 @@ def workcell_of(robot: RobotModel) -> Workcell:
         },
         finger_width_m=file.finger_width_m,
         finger_thickness_m=file.finger_thickness_m,
-        placement=PlacementConfig(**dict(file.placement)),
-        cameras=tuple(entry.spec() for entry in file.cameras),
+        placement=file.placement,
+        cameras=file.cameras,
     )
 
 

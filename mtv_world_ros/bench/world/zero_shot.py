@@ -13,7 +13,7 @@ from mtv_world_ros.bench.world.cameras import CameraMoves, moved
 from mtv_world_ros.bench.world.randomize import RandomizationConfig
 from mtv_world_ros.errors import nearest, SimulatorError
 
-#: what an episode shows that no training or test episode does (paper, "Zero-Shot Ability")
+#: kinds of novelty: cameras, task or objects (paper, "Zero-Shot Ability")
 KINDS = ('view', 'task', 'object')
 UNSEEN_TASK = 'random_pick_place'
 #: shapes that no task asks for

@@ -56,10 +56,29 @@ def applied(name: str, stops: list[WayPoint], objects, seed: int = 0) -> list[Wa
 def test_every_kind_gives_the_plan_that_its_own_function_gave(expert, name):
     """Recorded by `test/golden/record.py` at v0.1.0, where each kind was a function of its own."""
     seed, num_commands, *wanted = RECORDED[name]
-    at = plan(expert, name, 'stack_blocks_two', seed)
+    at, usual = (plan(expert, one, 'stack_blocks_two', seed) for one in (name, 'expert'))
     assert len(at) == num_commands
     found = (at.mean(axis=0), at.std(axis=0), at[len(at) // 2])
     np.testing.assert_allclose(found, wanted, atol=2e-4)
+    assert at.shape != usual.shape or np.abs(at - usual).max() > 1e-3
+    assert (at >= expert.robot.lower - 1e-6).all() and (at <= expert.robot.upper + 1e-6).all()
+
+
+@pytest.mark.parametrize(('kind', 'size'), [('rub', 0.08), ('gnaw', 0.08)])
+def test_what_is_added_after_the_release_leaves_the_move_its_tempo(expert, kind, size):
+    usual, changed = plan(expert, 'expert'), plan(expert, f'expert-{kind}-{size}')
+    # way points that are added take at least 0.4 s each, before scaling
+    assert len(changed) > len(usual) + 80
+    first = np.argmax(np.abs(changed[: len(usual)] - usual).max(axis=1) > 1e-12)
+    assert first > 0.6 * len(usual)
+
+
+@pytest.mark.parametrize(('kind', 'size'), [('splay', 0.7), ('swirl', 0.03), ('crank', 1.0)])
+def test_what_is_added_before_the_grasp_leaves_the_move_its_tempo(expert, kind, size):
+    usual, changed = plan(expert, 'expert'), plan(expert, f'expert-{kind}-{size}')
+    assert len(changed) > len(usual) + 80
+    # from the grasp on
+    np.testing.assert_allclose(changed[-200:], usual[-200:], atol=0.02)
 
 
 def test_the_catalogue_is_wide_enough_and_its_splits_are_apart():
@@ -67,17 +86,6 @@ def test_the_catalogue_is_wide_enough_and_its_splits_are_apart():
     by_split = [set(kinds_of(split)) for split in SPLITS]
     assert set.union(*by_split) == set(FAULTS) and sum(map(len, by_split)) == len(FAULTS)
     assert all(len(kinds) >= 6 for kinds in by_split)
-
-
-@pytest.mark.parametrize('kind', sorted(FAULTS))
-def test_every_kind_changes_the_plan_and_a_larger_size_changes_it_more(expert, kind):
-    fault = FAULTS[kind]
-    expert_plan = plan(expert, 'expert')
-    changed = plan(expert, f'expert-{kind}-{fault.size.typical:g}')
-    length = min(len(changed), len(expert_plan))
-    assert np.abs(changed[:length] - expert_plan[:length]).max() > 1e-3
-    tools = [expert.robot.lower - 1e-6, expert.robot.upper + 1e-6]
-    assert (changed >= tools[0]).all() and (changed <= tools[1]).all()
 
 
 def test_siblings_part_where_the_fault_begins(expert):
@@ -157,33 +165,6 @@ def changed_stops(name: str) -> tuple[list[WayPoint], list[WayPoint]]:
     return stops, applied(name, stops, [own])
 
 
-@pytest.mark.parametrize(
-    ('kind', 'same', 'more'),
-    [
-        ('rub', 0.8, 80),
-        ('juggle', 0.3, 80),
-        ('tidy', 0.8, 60),
-        ('grind', 0.6, 80),
-        ('waggle', 0.3, 80),
-        ('jiggle', 0.6, 40),
-        ('smear', 0.35, 80),
-        ('gnaw', 0.6, 80),
-        ('jostle', 0.8, 60),
-        ('rattle', 0.8, 80),
-    ],
-)
-def test_what_is_added_leaves_the_other_moves_their_tempo(expert, kind, same, more):
-    expert_plan, changed = plan(expert, 'expert'), plan(expert, f'expert-{kind}-0.08')
-    # four or six way points more take at least 0.4 s each, before scaling
-    assert len(changed) > len(expert_plan) + more
-    first = np.argmax(np.abs(changed[: len(expert_plan)] - expert_plan).max(axis=1) > 1e-12)
-    assert first > same * len(expert_plan)
-    if kind == 'juggle':
-        # from the lift's height on over the half of the way that is left
-        after = [row[-100:] for row in (expert_plan, changed)]
-        np.testing.assert_allclose(after[0], after[1], atol=0.02)
-
-
 def test_a_grasp_is_torn_between_its_object_and_the_nearest_other_one():
     stops, _ = changed_stops('expert')
     own, near, far = stops[1].position, np.array([0.1, 0.2, 0.05]), np.array([-0.2, 0.3, 0.03])
@@ -193,33 +174,6 @@ def test_a_grasp_is_torn_between_its_object_and_the_nearest_other_one():
     assert changed[3:] == stops[3:]
     alone = applied('expert-torn-0.2', stops, [own])
     assert [stop.phase for stop in alone] == [stop.phase for stop in stops]
-
-
-@pytest.mark.parametrize('away', [0.06, 0.2])
-def test_it_cuts_the_corner_and_slides_in_from_where_it_comes_from(away):
-    stops, changed = changed_stops(f'expert-cut-{away}')
-    assert changed[:4] == stops[:4] and changed[-4:] == stops[-4:] and len(changed) == 10
-    over, low, lower = changed[4:7]
-    np.testing.assert_allclose(over.position - stops[4].position, [away, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(low.position - lower.position, [away, 0, 0], atol=1e-12)
-    assert over.opening == low.opening == 0 and low.phase == 'carry'
-
-
-@pytest.mark.parametrize('size', [0.04, 0.1])
-def test_what_is_let_go_too_early_is_pushed_on_from_behind(size):
-    stops, changed = changed_stops(f'expert-putt-{size}')
-    assert changed[:4] == stops[:4] and changed[-1] == stops[-1] and len(changed) == 13
-    # from the grasp to the goal it goes towards -x
-    for late, early in zip(stops[4:8], changed[4:8], strict=True):
-        np.testing.assert_allclose(early.position - late.position, [size, 0, 0], atol=1e-12)
-        assert (early.phase, early.opening) == (late.phase, late.opening)
-    push = changed[8:12]
-    assert all(stop.opening == 0 for stop in push)
-    ways = np.array([stop.position - stops[5].position for stop in push])
-    np.testing.assert_allclose(ways[:, 0], [size + 0.07, size + 0.07, 0.03, 0.03])
-    np.testing.assert_allclose(ways[:, 1], ways[0, 1])
-    assert 1e-4 < abs(ways[0, 1]) < 0.1
-    np.testing.assert_allclose(ways[:, 2], [0.1, 0, 0, 0.1], atol=1e-12)
 
 
 @pytest.mark.parametrize('is_near', [True, False])
@@ -358,44 +312,6 @@ def test_any_two_way_points_but_the_last_may_change_places():
     assert firsts == set(range(len(stops) - 2))
 
 
-@pytest.mark.parametrize('far', [0.06, 0.2])
-def test_what_it_holds_is_swung_over_its_goal_and_let_go_on_the_way(far):
-    stops, changed = changed_stops(f'expert-lob-{far}')
-    assert changed[:4] == stops[:4] and changed[-2:] == stops[-2:] and len(changed) == len(stops)
-    assert [stop.phase for stop in changed] == [stop.phase for stop in stops]
-    begin, swung, let_go = changed[4:7]
-    # over the goal, at the height from which it would have come down
-    np.testing.assert_array_equal(swung.position, stops[4].position)
-    np.testing.assert_array_equal(let_go.position, stops[4].position)
-    assert (begin.opening, swung.opening, let_go.opening) == (0, 0.7, 0.7)
-    assert swung.seconds is not None
-    way = swung.position - begin.position
-    assert np.linalg.norm(way) == pytest.approx(far) and way[2] == 0
-    # from where it comes from, which is 0.2 m away
-    if far < 0.2:
-        np.testing.assert_allclose(way, [-far, 0, 0], atol=1e-12)
-
-
-@pytest.mark.parametrize('far', [0.04, 0.1])
-def test_what_was_let_go_before_its_goal_is_dragged_on_from_above(far):
-    stops, changed = changed_stops(f'expert-smear-{far}')
-    assert changed[:4] == stops[:4] and changed[-1] == stops[-1] and len(changed) == 13
-    short = np.array(
-        [a.position - b.position for a, b in zip(changed[4:8], stops[4:8], strict=True)]
-    )
-    # from where it comes from
-    way = np.array([-far, 0, 0])
-    np.testing.assert_allclose(short, np.broadcast_to(-way, (4, 3)), atol=1e-12)
-    assert [stop.opening for stop in changed[4:8]] == [s.opening for s in stops[4:8]]
-    dragged, goal = changed[8:12], stops[5].position
-    assert all(stop.opening == 0 for stop in dragged)
-    ways = np.array([stop.position - goal for stop in dragged])
-    # pressed on it 1 cm over where it was held
-    np.testing.assert_allclose(ways[:, 2], [0.1, 0.01, 0.01, 0.1], atol=1e-12)
-    begin_and_end = [-way, -way, 0 * way, 0 * way]
-    np.testing.assert_allclose(ways * (1, 1, 0), begin_and_end, atol=1e-12)
-
-
 @pytest.mark.parametrize('is_near', [True, False])
 def test_what_is_next_to_the_goal_is_pushed_once_it_is_done(is_near):
     stops, _ = changed_stops('expert')
@@ -522,29 +438,6 @@ def test_it_first_puts_the_object_next_to_its_own_on_top_of_that():
     assert raised.position[2] == above.position[2]
     # where there is no other object, its own one
     np.testing.assert_array_equal(alone[1].position, own)
-
-
-@pytest.mark.parametrize(
-    ('kind', 'size'),
-    [
-        ('splay', 0.7),
-        ('topple', 0.9),
-        ('paw', 0.05),
-        ('nibble', 0.06),
-        ('decoy', 0.05),
-        ('swirl', 0.03),
-        ('swat', 0.03),
-        ('nod', 0.2),
-        ('peck', 0.02),
-        ('crank', 1.0),
-        ('hunt', 0.03),
-    ],
-)
-def test_what_comes_before_the_grasp_leaves_the_move_its_tempo(expert, kind, size):
-    expert_plan, changed = plan(expert, 'expert'), plan(expert, f'expert-{kind}-{size}')
-    assert len(changed) > len(expert_plan) + 80
-    # from the grasp on
-    np.testing.assert_allclose(changed[-200:], expert_plan[-200:], atol=0.02)
 
 
 @pytest.mark.parametrize('kind', ['crowd', 'rival'])

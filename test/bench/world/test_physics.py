@@ -203,12 +203,12 @@ def test_objects_are_of_another_size(name, factor):
 
 def test_cameras_are_told_elsewhere_and_see_the_same():
     sim, usual = episode('camera_off', rendering=True), episode(NOMINAL, rendering=True)
-    for told, true in zip(sim.told_cameras, sim.scene.cameras, strict=True):
+    for told, true in zip(sim.calibrated_cameras, sim.scene.cameras, strict=True):
         a, b = np.asarray(told.T_mount_camera), np.asarray(true.T_mount_camera)
         angle = np.arccos((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2)
         assert np.linalg.norm(a[:3, 3] - b[:3, 3]) == pytest.approx(0.01)
         assert np.rad2deg(angle) == pytest.approx(1.0)
-    assert usual.told_cameras == usual.scene.cameras
+    assert usual.calibrated_cameras == usual.scene.cameras
     for view, image in sim.observe().images.items():
         assert np.array_equal(image, usual.observe().images[view])
 

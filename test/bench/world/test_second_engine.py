@@ -12,7 +12,7 @@ from mtv_world_ros.bench.expert.expert import Expert
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 from mtv_world_ros.bench.tasks.tasks import task_named
 from mtv_world_ros.bench.world.simulator import SimEpisode
-from mtv_world_ros.errors import SimulatorError
+from mtv_world_ros.errors import RobotError, SimulatorError
 from mtv_world_ros.files import bundled
 from mtv_world_ros.geometry.robot.file import load_robot
 
@@ -72,6 +72,16 @@ def test_a_block_slides_as_far_as_friction_has_it(expert):
         sim.advance(sim.home)
     way = np.linalg.norm(sim.object_poses()[0, :3, 3] - before)
     assert way == pytest.approx(speed**2 / (2 * TABLE_FRICTION * GRAVITY), rel=0.1)
+
+
+def test_drives_that_explicit_steps_would_excite_are_refused(expert):
+    """Damping of 0.1 s of a gain of 25 limits/rad on 0.1 kg m2; below that, they diverge."""
+    robot = load_robot(bundled('robots', 'franka', '--robot'))
+    sim = SimEpisode(robot, Expert(robot, physics=PHYSICS).home, rendering=False, physics=PHYSICS)
+    with pytest.raises(
+        RobotError, match="robot 'franka': the drive of joint 'panda_joint1' is too"
+    ):
+        sim.reset(SEED, 'stack_blocks_two')
 
 
 def test_without_the_engine_an_error_says_what_to_install(monkeypatch):

@@ -295,7 +295,7 @@ def refuse_kinds(names: Iterable[str], split: str, what: str) -> None:
     Args:
         names: names of policies.
         split: split whose kinds are refused.
-        what: they are not for, in words.
+        what: purpose that they are refused for, e.g. `training`.
 
     Raises:
         PolicyError: names the policies and their kinds.

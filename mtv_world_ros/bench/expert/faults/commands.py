@@ -6,6 +6,7 @@ Shape letters: T commands, J joints, A arms, G grippers.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 
 import numpy as np
 
@@ -17,25 +18,24 @@ from mtv_world_ros.data_types import FloatArray
 _JUMP_S, _SET_IN_S = 0.1, 1.0
 #: part of a plan in which something happens once, as shares of it
 _ONCE = (0.1, 0.7)
-#: from one jerk of a gripper to the next [s]; from shut to open or back as it flickers [s], how
-#: often at most, how long before it passes its middle it is still open, or shut [s]
+#: period of gripper jerks [s]; range of the durations of a flicker [s], their number, and the time
+#: before a gripper passes its middle at which it is still at rest [s]
 _TWITCH_EVERY_S, _FLICKER_S, _NUM_FLICKERS, _BEFORE_S = 0.8, (0.1, 0.3), 30, 0.6
-#: arms flinch as a gripper passes this opening; it stands still where it moves less than this from
-#: one command to the next, both as shares of its range; how much faster they go back
+#: opening of a gripper at which arms flinch; change of the opening between two commands below
+#: which it stands still, both as shares of its range; speed factor of the way back
 _FLINCH_OPEN, _STANDS, _FLINCH_SPEED = 0.1, 1e-3, 2
-#: joints of a wrist, the last ones of an arm; way of a tool up to which its arm is at rest [m]
+#: number of wrist joints, the last ones of an arm; tool travel up to which an arm is at rest [m]
 _NUM_WRIST, _RESTS_M = 3, 1e-6
 #: length of a chunk of commands [s]; how often commands are lost
 _CHUNK_S, _NUM_LOST = 0.8, 3
-#: of arms that swing, as a share of the critical damping; times in which arms begin to swap their
-#: commands, do, and end [s]; periods of a wavy error over one turn of a joint
+#: damping of swinging arms, as a share of the critical one; onset, duration and end of a swap of
+#: commands [s]; periods of a wavy error over one turn of a joint
 _DAMPING, _SWAP_S, _NUM_WAVES = 0.2, (0.2, 0.4, 0.2), 4
-#: time in which arms that give way sink, lie, and rise again [s]; period of waves on which all
-#: tools go up and down [s]; a step to find out which joint lowers the tool by how much [rad];
-#: squares of those that are too small to sink by [m2/rad2]
+#: times of sinking, lying and rising of arms that give way [s]; period of vertical waves [s]; step
+#: of the numerical derivative of the tools' heights [rad], and its least square [m2/rad2]
 _SLUMP_S, _HEAVE_S, _STEP_RAD, _LEAST_SLOPE = (0.3, 0.4, 0.6), 2.0, 1e-4, 1e-3
-#: outliers of a plan, and how long each lasts [s]; a fast oscillation [Hz]; between the draws that
-#: a slow error is interpolated from [s]
+#: number and duration of outliers [s]; frequency of a tremor [Hz]; time between the draws that a
+#: slow error is interpolated from [s]
 _NUM_SPIKES, _SPIKE_S, _TREMBLE_HZ, _KNOT_S = 3, 0.4, 2.5, 0.5
 
 Rng = np.random.Generator
@@ -76,18 +76,27 @@ def lead(c: Commands, size: float, rng: Rng) -> FloatArray:
     return c.grippers_of(c.positions[ahead][:, c.grippers])
 
 
+def _followed(c: Commands, rule: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
+    """(T, J) of joints whose next position follows from their last one and the command."""
+    whole = c.positions.copy()
+    for row in range(1, len(whole)):
+        whole[row] = rule(whole[row - 1], c.positions[row])
+    return whole
+
+
 def lag(c: Commands, size: float, rng: Rng, *, joints: str) -> FloatArray:
     """`grippers` or `wrists` follow with a first-order lag, of a time constant [s]."""
-    columns = c.grippers if joints == 'grippers' else c.arms[:, -_NUM_WRIST:].ravel().tolist()
-    whole, share = c.positions.copy(), 1 - np.exp(-1 / (size / c.period))
-    for row in range(1, len(whole)):
-        last = whole[row - 1, columns]
-        whole[row, columns] = last + share * (c.positions[row, columns] - last)
+    share = 1 - np.exp(-1 / (size / c.period))
+    late = _followed(c, lambda last, now: last + share * (now - last))
+    if joints == 'grippers':
+        return c.grippers_of(late[:, c.grippers])
+    whole, columns = c.positions.copy(), c.arms[:, -_NUM_WRIST:].ravel()
+    whole[:, columns] = late[:, columns]
     return whole
 
 
 def give_way(c: Commands, size: float, rng: Rng, *, by: str) -> FloatArray:
-    """Grippers are at least as far open as a share of their range, by what happens to them."""
+    """Grippers open to at least a share of their range, weighted by one of `GIVE_WAY`."""
     opens = np.sign(c.travel)
     least = c.closed + np.minimum(size * GIVE_WAY[by](c), 1.0) * c.travel
     return c.grippers_of(np.maximum(c.positions[:, c.grippers] * opens, least * opens) * opens)
@@ -100,7 +109,7 @@ def _twitches(c: Commands) -> FloatArray:
 
 
 def _haste(c: Commands) -> FloatArray:
-    """(T, G) how fast the arm of each gripper moves, of its top speed."""
+    """(T, G) speed of the arm of each gripper, as a share of its top speed."""
     steps = np.gradient(c.positions, axis=0)
     steps[:, c.grippers] = 0.0
     speeds = np.linalg.norm(steps.reshape(len(steps), c.num_arms, -1), axis=2)
@@ -109,7 +118,7 @@ def _haste(c: Commands) -> FloatArray:
 
 
 def _reach(c: Commands) -> FloatArray:
-    """(T, G) how far the arm of each gripper reaches over the table, of its most."""
+    """(T, G) reach of the arm of each gripper over the table, as a share of its largest."""
     tools = np.stack([poses[:, :2, 3] for poses in c.robot.tool_poses(c.positions)], axis=1)
     ways = np.linalg.norm(tools - tools[0], axis=2)
     most = ways.max(axis=0)
@@ -121,7 +130,7 @@ def _arms_of_grippers(c: Commands) -> np.ndarray:
 
 
 def _since_shut(c: Commands) -> FloatArray:
-    """(T, G) for how long a gripper has been more shut than open [s]."""
+    """(T, G) time since a gripper was last more open than shut [s]."""
     is_open = (c.positions[:, c.grippers] - c.middles) * np.sign(c.travel) > 0
     rows = c.rows[:, None]
     return (rows - np.maximum.accumulate(np.where(is_open, rows, 0))) * c.period
@@ -176,7 +185,7 @@ def hurry(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def pause(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """From a moment on, the arms are behind the grippers [s]."""
+    """From a drawn time on, the arms are later than the grippers [s]."""
     first, num = int(_own(rng).uniform(0.15, 0.6) * len(c.positions)), c.num(size)
     stands = np.repeat(c.positions[first : first + 1], num, axis=0)
     arms = np.concatenate([c.positions[:first], stands, c.positions[first:]])
@@ -312,72 +321,71 @@ def quantise(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 def play(c: Commands, size: float, rng: Rng) -> FloatArray:
     """An arm joint stays where it is until its command is more than half the size off [rad]."""
-    whole, slack = c.positions.copy(), size / 2
-    for row in range(1, len(whole)):
-        now = c.positions[row]
-        whole[row] = np.clip(whole[row - 1], now - slack, now + slack)
-    return c.arms_of(whole)
+    slack = size / 2
+    return c.arms_of(_followed(c, lambda last, now: np.clip(last, now - slack, now + slack)))
 
 
 def stick(c: Commands, size: float, rng: Rng) -> FloatArray:
     """An arm joint stands until its command is more than the size off [rad], and jumps there."""
-    whole = c.positions.copy()
-    for row in range(1, len(whole)):
-        stays = np.abs(c.positions[row] - whole[row - 1]) <= size
-        whole[row] = np.where(stays, whole[row - 1], c.positions[row])
+    whole = _followed(c, lambda last, now: np.where(np.abs(now - last) <= size, last, now))
     return c.arms_of(_average(whole, c.num(_JUMP_S)))
 
 
-def scale_one(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """One of the arm joints that move lacks a share of its way."""
-    joint, whole = c.moving(_own(rng)), c.positions.copy()
-    whole[:, joint] -= size * (whole[:, joint] - whole[0, joint])
-    return whole
+def _of_one(
+    change: Callable[[Commands, FloatArray, float, Rng], FloatArray],
+) -> Callable[[Commands, float, Rng], FloatArray]:
+    """A primitive that changes the way (T,) of one of the arm joints that move, drawn."""
+
+    @wraps(change)
+    def primitive(c: Commands, size: float, rng: Rng) -> FloatArray:
+        own, whole = _own(rng), c.positions.copy()
+        joint = c.moving(own)
+        whole[:, joint] = change(c, whole[:, joint].copy(), size, own)
+        return whole
+
+    return primitive
 
 
-def stop_one(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """One of the arm joints that move stands still for a while [s], then catches up."""
-    own, whole = _own(rng), c.positions.copy()
-    joint = c.moving(own)
-    first = int(own.uniform(*_ONCE) * len(whole))
-    stands, after = whole[first, joint], np.maximum(np.arange(len(whole)) - first - c.num(size), 0)
-    blend = np.minimum(after * c.period / _JUMP_S, 1.0)[first:]
-    whole[first:, joint] = stands + blend * (c.positions[first:, joint] - stands)
-    return whole
+@_of_one
+def scale_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
+    """The joint lacks a share of its way."""
+    return way - size * (way - way[0])
 
 
-def limit_one(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """One of the arm joints that move does not come to the ends of its travel, by a share."""
-    joint, whole = c.moving(_own(rng)), c.positions.copy()
-    way = whole[:, joint] - whole[0, joint]
-    least, most = (1 - size) * way.min(), (1 - size) * way.max()
-    whole[:, joint] = whole[0, joint] + np.clip(way, least, most)
-    return whole
+@_of_one
+def stop_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
+    """The joint stands still for a while [s], then catches up."""
+    first = int(rng.uniform(*_ONCE) * len(way))
+    after = np.maximum(np.arange(len(way)) - first - c.num(size), 0)
+    blend = np.minimum(after * c.period / _JUMP_S, 1.0)
+    return np.where(c.rows < first, way, way[first] + blend * (way - way[first]))
 
 
-def bind_one(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """One of the arm joints that move sticks at one place until its command is so far on [rad]."""
-    draws, whole = _own(rng), c.positions.copy()
-    joint = c.moving(draws)
-    own = c.positions[:, joint]
-    away = own - draws.uniform(own.min(), own.max())
+@_of_one
+def limit_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
+    """The joint does not come to the ends of its travel, by a share."""
+    far = way - way[0]
+    return way[0] + np.clip(far, (1 - size) * far.min(), (1 - size) * far.max())
+
+
+@_of_one
+def bind_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
+    """The joint sticks at one place until its command is the size further [rad]."""
+    away = way - rng.uniform(way.min(), way.max())
     side = away[0]
     for row, far in enumerate(away):
         if far * side < 0 and abs(far) < size:
-            whole[row, joint] -= far
+            way[row] -= far
         elif far:
             side = far
-    whole[:, joint] = _average(whole, c.num(_JUMP_S))[:, joint]
-    return whole
+    return _average(way[:, None], c.num(_JUMP_S))[:, 0]
 
 
-def slip_one(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """One of the arm joints that move skips to one side [rad], and is off from there on."""
-    own, whole = _own(rng), c.positions.copy()
-    joint = c.moving(own)
-    first = int(own.uniform(*_ONCE) * len(whole))
-    whole[:, joint] += own.choice((-size, size)) * c.ramp(_JUMP_S, c.times[first])
-    return whole
+@_of_one
+def slip_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
+    """The joint skips to one side [rad], and is off from there on."""
+    first = int(rng.uniform(*_ONCE) * len(way))
+    return way + rng.choice((-size, size)) * c.ramp(_JUMP_S, c.times[first])
 
 
 def tow(c: Commands, size: float, rng: Rng) -> FloatArray:
@@ -403,11 +411,8 @@ def average(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 def limit_speed(c: Commands, size: float, rng: Rng) -> FloatArray:
     """No arm joint turns faster than at its top speed less a share, and so it is behind."""
-    whole = c.positions.copy()
     most = (1 - size) * np.abs(np.diff(c.positions, axis=0)).max(axis=0)
-    for row in range(1, len(whole)):
-        whole[row] = whole[row - 1] + np.clip(c.positions[row] - whole[row - 1], -most, most)
-    return c.arms_of(whole)
+    return c.arms_of(_followed(c, lambda last, now: last + np.clip(now - last, -most, most)))
 
 
 def lose_steps(c: Commands, size: float, rng: Rng) -> FloatArray:
@@ -496,7 +501,7 @@ def glitches(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def error(c: Commands, size: float, rng: Rng, *, of: str) -> FloatArray:
-    """What is added to the arms' commands."""
+    """Adds one of `ERRORS` to the arms' commands."""
     added = ERRORS[of](c, size, rng)
     added[:, c.grippers] = 0.0
     return c.positions + added
@@ -512,7 +517,7 @@ def _drifts(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def _mirrored(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Of arms at rest, the motion of the arm before in the order of the joints."""
+    """Arms at rest mirror the motion of the arm before them in the order of the joints."""
     is_still = (c.positions == c.positions[0]).astype(np.float64)
     at_rest = _average(is_still, c.num(_SET_IN_S))
     return size * at_rest * crossed(c.positions, c.positions.shape[1] // c.num_arms)
@@ -541,7 +546,7 @@ def _kicks(c: Commands, size: float, rng: Rng) -> FloatArray:
 def _triangles(
     c: Commands, middles: FloatArray, num_joints: int, deviation: float, rng: Rng
 ) -> FloatArray:
-    """(T, J) short triangles about some rows, each as large as drawn for each joint."""
+    """(T, J) short triangles about some rows, of heights drawn for each joint."""
     away = np.abs(c.rows[:, None] - middles) * c.period / (_SPIKE_S / 2)
     return np.maximum(1 - away, 0.0) @ rng.normal(0.0, deviation, (len(middles), num_joints))
 
@@ -553,7 +558,7 @@ def _with_grippers(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def _slow_noise(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """None at first, drawn anew every half second and linear in between."""
+    """(T, J) error, zero at first, drawn every half second and linear in between."""
     knots = np.arange(0.0, c.times[-1] + 2 * _KNOT_S, _KNOT_S)
     drawn = rng.normal(0.0, size, (len(knots), c.positions.shape[1]))
     drawn[0] = 0.0

@@ -108,7 +108,7 @@ def drawn_values(name: str) -> dict[str, Any]:
 
 
 def _edit(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
-    """A step that changes way points, and what it is in words."""
+    """A step that changes way points, and its description."""
     way = str(rng.choice(_DIRECTIONS))
     far = _round(rng.uniform(0.2, 0.8) if way == 'other' else rng.uniform(0.015, 0.06))
     group = list(_GROUPS[int(rng.integers(len(_GROUPS)))])
@@ -139,7 +139,7 @@ def _edit(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
 
 
 def _touched(which: int, rng: np.random.Generator) -> tuple[dict[str, Any], str]:
-    """A step of a kind of contact, and what it is in words."""
+    """A step of a kind of contact, and its description."""
     text, (least, most) = _CONTACT[which]
     far = _round(rng.uniform(least, most))
     size = [0.0, far]
@@ -162,7 +162,7 @@ def _touched(which: int, rng: np.random.Generator) -> tuple[dict[str, Any], str]
 
 
 def _command(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
-    """A step that changes commands, and what it is in words."""
+    """A step that changes commands, and its description."""
     name, options, (least, most) = _COMMANDS[int(rng.integers(len(_COMMANDS)))]
     typical = _round(rng.uniform(least, most))
     of = ' '.join(str(v) for v in options.values() if isinstance(v, str))

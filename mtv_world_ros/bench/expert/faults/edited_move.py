@@ -13,13 +13,13 @@ from mtv_world_ros.geometry.transforms import rotation
 
 #: lengths by direction
 By = Mapping[str, Any]
-#: objects nearer to where it grasps are the one that it grasps [m]
+#: an object nearer to the grasp than this is the grasped one [m]
 _OWN_M = 0.06
-#: another object by its goal is at most this far from that, and from where its arm rests, or this
-#: much farther from there than its goal; one by its own from where its arm rests [m]
+#: an object next to the goal: largest distance from the goal, and from the arm's rest, or by how
+#: much it may be farther from there than the goal; one next to the grasped object: the second [m]
 _GOAL_M, _ARM_M, _MORE_M = 0.2, 0.27, 0.03
-#: the lowest that a tool is carried over where it grasped; how far from its goal shut fingers come
-#: down at most under where it lets go; gap over what an object is put on [m]
+#: least height of a carried tool over the grasp; largest depth of shut fingers below the release;
+#: gap between an object and the one that it is put on [m]
 _LOWEST_M, _UNDER_M, _GAP_M = 0.004, 0.02, 0.005
 
 FLAT, UP = np.array([1.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -42,6 +42,11 @@ class EditedMove:
         self.there = self.home = stops[-1]
         self._ways: dict[str, FloatArray] = {}
         self._side = 0.0
+
+    @property
+    def floor(self) -> float:
+        """Height of the lowest way point [m]."""
+        return min(stop.position[2] for stop in self.stops)
 
     def index(self, name: str) -> int:
         """Returns the number of a way point: `start`, `carry_end`, `over`, or a phase's first."""
@@ -68,6 +73,12 @@ class EditedMove:
             return 0
         word, name = where.split()
         return self.end if name == 'last' else self.index(name) + (word == 'after')
+
+    def put(self, where: str, stops: Stops, drop: int = 0) -> None:
+        """Inserts way points, in place of `drop` that follow."""
+        number = self.at(where)
+        self.stops = [*self.stops[:number], *stops, *self.stops[number + drop :]]
+        self.end = number + len(stops)
 
     def place(self, name: str) -> FloatArray:
         """Returns a place (3,) by name [m]: of an object, or of a way point."""
@@ -149,14 +160,14 @@ def _anew(move: EditedMove) -> float:
 
 
 def _towards(move: EditedMove, begin: str, end: str, other: OfMove) -> FloatArray:
-    """Unit vector in the plane to another way point; `other` where it is nearer than the size."""
+    """Unit vector in the plane between way points; `other` if they are within the size."""
     way = _between(move, begin, end) * FLAT
     distance = float(np.linalg.norm(way))
     return way / distance if distance > move.size else other(move)
 
 
 def _to_other(move: EditedMove) -> FloatArray:
-    """In the plane from its grasp to the nearest other object; none where there is none."""
+    """Way in the plane from the grasp to the nearest other object; zero without one."""
     ways = [(place - move.stop('close').position) * FLAT for place in move.draws.objects]
     others = [way for way in ways if np.linalg.norm(way) > _OWN_M]
     return min(others, key=np.linalg.norm, default=np.zeros(3))
@@ -178,7 +189,7 @@ def _to_floor(move: EditedMove) -> FloatArray:
 
 
 def _other_arm(move: EditedMove) -> FloatArray:
-    """Unit vector in the plane from where its arm rests to where another one does."""
+    """Unit vector in the plane from the arm's rest to the other arm's."""
     other = move.draws.other_home
     return np.zeros(3) if other is None else unit((other - move.stops[-1].position) * FLAT)
 
@@ -189,20 +200,19 @@ def unit(way: FloatArray) -> FloatArray:
 
 
 def _wandering(move: EditedMove, stop: WayPoint) -> FloatArray:
-    """An error of its own, by the size, but not below the lowest way point."""
+    """Error of a way point, times the size, not below the lowest way point."""
     x, y, z = move.size * move.draws.errors[move.number_of(stop)]
-    floor = min(other.position[2] for other in move.stops)
-    return np.array([x, y, max(stop.position[2] + z, floor) - stop.position[2]])
+    return np.array([x, y, max(stop.position[2] + z, move.floor) - stop.position[2]])
 
 
 def _lowered(move: EditedMove, stop: WayPoint) -> FloatArray:
-    """Lower by the size, but not below where it grasped."""
+    """Down by the size, not below the grasp."""
     floor, z = move.stop('close').position[2] + _LOWEST_M, stop.position[2]
     return (max(z - move.size, min(z, floor)) - z) * UP
 
 
 def _to_fence(move: EditedMove, stop: WayPoint) -> FloatArray:
-    """Back to where it reaches: the size is the share that lacks of its farthest place."""
+    """Back into reach: the size is the missing share of the farthest place."""
     home = move.stops[-1].position
     farthest = max(np.linalg.norm((other.position - home) * FLAT) for other in move.stops)
     way, most = (stop.position - home) * FLAT, (1 - move.size) * farthest
@@ -210,7 +220,7 @@ def _to_fence(move: EditedMove, stop: WayPoint) -> FloatArray:
 
 
 def _about_home(move: EditedMove, stop: WayPoint) -> FloatArray:
-    """To where it is if all is turned about where the arm rests, by the size."""
+    """Displacement if all is turned about the arm's rest, by the size."""
     angle = move.draws.sign * move.size / 2
     turn = rotation((0.0, 0.0, np.sin(angle), np.cos(angle)))
     way = stop.position - move.stops[-1].position
@@ -222,7 +232,7 @@ def _to_grid(move: EditedMove, stop: WayPoint) -> FloatArray:
 
 
 def _same(move: EditedMove, name: str) -> FloatArray:
-    """A direction that another one is made of: both are the same draw."""
+    """A direction that another one is derived from: both use the same draw."""
     return move.way({name: 1}, move.stops[0])
 
 
@@ -277,7 +287,7 @@ def _others(move: EditedMove, own: FloatArray) -> list[FloatArray]:
 
 
 def _next_to_goal(move: EditedMove) -> FloatArray:
-    """The other object next to its goal; its goal where its arm is near none."""
+    """Position of the object next to the goal, else the goal."""
     return _object_by_goal(move, move.stop('open').position)
 
 
@@ -293,13 +303,13 @@ def _object_by_goal(move: EditedMove, other: FloatArray) -> FloatArray:
 
 
 def _on_next_to_goal(move: EditedMove) -> FloatArray:
-    """On it, as high as its own was grasped; what lies on the table is twice as high."""
+    """On top of the object next to the goal, which is twice as high as its centre."""
     at = _object_by_goal(move, move.stop('open').position * FLAT)
     return at * (1, 1, 2) + move.stop('close').position[2] * UP
 
 
 def _next_to_own(move: EditedMove) -> FloatArray:
-    """The other object next to its own; where it grasps if its arm is near none."""
+    """Position of the object next to the grasped one, else the grasp."""
     own, home = move.stop('close').position, move.stops[-1].position
     others = [place for place in _others(move, own) if _distance(place, home) < _ARM_M]
     grasp = move.stop('grasp').position
@@ -313,7 +323,7 @@ def _on_own(move: EditedMove) -> FloatArray:
 
 
 def _nearest_to_goal(move: EditedMove) -> FloatArray:
-    """The object nearest to its goal; its own where there is no other."""
+    """Position of the object nearest to the goal, else the grasped one's."""
     own, goal = move.stop('close').position, move.stop('open').position
     return min(_others(move, own), key=lambda place: _distance(place, goal), default=own)
 

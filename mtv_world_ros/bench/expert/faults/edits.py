@@ -20,7 +20,8 @@ from mtv_world_ros.bench.expert.way_points import Draws, Stops, WayPoint
 
 #: a program of `config/faults`: steps of one primitive and its options
 Program = Sequence[Mapping[str, Mapping[str, Any]]]
-#: half a finger and half a small object lie between the tool and the object's centre [m]
+#: distances of pushing fingers behind the object at first, and short of the push's end: half a
+#: finger and half a small object lie between the tool and the object's centre [m]
 _BEHIND_M, _SHORT_M = 0.07, 0.03
 _KEPT: Any = object()
 #: options of a row: what `changed` takes
@@ -122,10 +123,7 @@ def insert(
 
     `base` changes all of them. Rows are repeated with their ways shorter; `drop` that follow go.
     """
-    made = made_of(move, rows, like, repeat, base)
-    number = move.at(at)
-    move.stops = [*move.stops[:number], *made, *move.stops[number + drop :]]
-    move.end = number + len(made)
+    move.put(at, made_of(move, rows, like, repeat, base), drop)
 
 
 def made_of(
@@ -169,28 +167,22 @@ def push(
     rows = [stop.moved(away + up), stop.moved(away), stop.moved(end), stop.moved(end + up)]
     if stroke is not None:
         rows[2] = replace(rows[2], seconds=stroke)
-    number = move.at(at)
-    move.stops = [*move.stops[:number], *rows, *move.stops[number:]]
+    move.put(at, rows)
 
 
 def shake(move: EditedMove, *, at: str, to: str, times: int, **row: Any) -> None:
     """From the way point before to either side of it by the size and back, several times."""
-    number = move.at(at)
-    stop = changed(move.stops[number - 1], move, **row)
+    stop = changed(move.stops[move.at(at) - 1], move, **row)
     way = move.size * move.way({to: 1}, stop)
-    rows = [*(stop.moved(side * way) for side in (1, -1) * times), stop]
-    move.stops = [*move.stops[:number], *rows, *move.stops[number:]]
-    move.end = number + len(rows)
+    move.put(at, [*(stop.moved(side * way) for side in (1, -1) * times), stop])
 
 
 def rock(move: EditedMove, *, at: str, times: int = 3, least: float = 0.6, **row: Any) -> None:
-    """Leans to either side of the way point before, by angles up to the size, and back to it."""
-    number = move.at(at)
-    stop = changed(move.stops[number - 1], move, **row)
+    """Leans to either side at the way point before, by drawn angles up to the size, and back."""
+    stop = changed(move.stops[move.at(at) - 1], move, **row)
     left, right = move.size * move.draws.play.uniform(least, 1.0, 2)
     leans = (stop.lean + lean for lean in (*(left, -right) * times, 0.0))
-    rows = [replace(stop, lean=lean, seconds=0.2) for lean in leans]
-    move.stops = [*move.stops[:number], *rows, *move.stops[number:]]
+    move.put(at, [replace(stop, lean=lean, seconds=0.2) for lean in leans])
 
 
 def circle(
@@ -225,8 +217,7 @@ def circle(
         ring = [over, *ring, left]
     else:
         ring.append(replace(grasp, seconds=seconds))
-    number = move.at(at)
-    move.stops = [*move.stops[:number], *ring, *move.stops[number:]]
+    move.put(at, ring)
 
 
 def release_on_the_way(move: EditedMove) -> None:
@@ -261,7 +252,7 @@ def _carried(move: EditedMove, number: int) -> float:
     return sum(float(np.linalg.norm((b.position - a.position)[:2])) for a, b in pairs)
 
 
-#: by what an edit is larger at one way point than at another [m]
+#: weights of an edit by way point [m], or as shares
 WEIGHTS: Mapping[str, Callable[[EditedMove, int], float]] = {
     'reach': _reach,
     'reach_share': _reach_share,
@@ -270,17 +261,10 @@ WEIGHTS: Mapping[str, Callable[[EditedMove, int], float]] = {
 }
 
 
-def _random(draw: Callable[[Stops, float, Draws], Stops]) -> Callable[..., None]:
-    def step(move: EditedMove) -> None:
-        move.stops = draw(move.stops, move.size, move.draws)
-
-    return step
-
-
 PRIMITIVES: Mapping[str, Callable[..., None]] = {
     **{step.__name__: step for step in (edit, insert, push, shake, rock, circle)},
     'release_on_the_way': release_on_the_way,
-    **{name: _random(draw) for name, draw in RANDOM_EDITS.items()},
+    **RANDOM_EDITS,
 }
 
 

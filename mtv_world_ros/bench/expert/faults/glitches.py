@@ -1,4 +1,4 @@
-"""Glitches: what goes wrong with a policy's commands on their way, drawn at random.
+"""Glitches: temporary errors of a policy's commands, drawn at random.
 
 A glitch lasts for a while, somewhere in the plan. Lengths, depths and frequencies are drawn evenly
 over orders of magnitude, so that a few hundred episodes cover faults of many kinds.
@@ -16,17 +16,17 @@ from mtv_world_ros.data_types import FloatArray
 
 #: between the points of a trajectory that a policy publishes [s]
 _POINTS_S = 0.1
-#: how long one lasts, how long it takes to set in, and from one repetition to the next [s]
+#: ranges of its duration, its onset, and the pause between repetitions [s]
 _LENGTH_S, _ONSET_S, _EVERY_S = (0.06, 3.0), (0.02, 0.5), (0.3, 2.0)
 #: share of the glitches that are repeated to the end
 _REPEATED = 0.3
-#: standard deviation of what joints are off by [rad], and how often they swing about it [Hz]
+#: ranges of the standard deviation of joint errors [rad], and of their frequency [Hz]
 _OFF_RAD, _SWING_HZ = (0.005, 0.25), (0.2, 6.0)
-#: share of the glitches of joints that swing, and that only one joint has
+#: shares of joint glitches that oscillate, and that only one joint has
 _SWINGS, _ALONE = 0.5, 0.4
-#: how fast time may run, or for how long one command is held [s]
+#: ranges of the factor of time, and of the time for which a command is held [s]
 _SPEED, _HELD_S = (0.3, 4.0), (0.05, 1.5)
-#: share of its own motion by which an arm moves another that rests; delay of that [s]
+#: range of the share by which a resting arm follows another one, and its largest delay [s]
 _SHARE, _LAG_S = (0.3, 1.3), 1.0
 
 
@@ -54,7 +54,7 @@ def _log_uniform(bounds: tuple[float, float], rng: np.random.Generator) -> float
 
 
 def _presence(commands: Commands, rng: np.random.Generator) -> FloatArray:
-    """(T, 1) from 0 to 1: when the glitch is there."""
+    """(T, 1) weight of the glitch, 0 to 1."""
     times = np.arange(len(commands.positions)) * commands.period
     begin, length = rng.uniform(0.0, 0.95) * times[-1], _log_uniform(_LENGTH_S, rng)
     onset, pause = _log_uniform(_ONSET_S, rng), _log_uniform(_EVERY_S, rng)
@@ -95,12 +95,12 @@ def _joints(commands: Commands, rng: np.random.Generator) -> FloatArray:
 
 
 def _set_in(presence: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Half of them stay once they are there."""
+    """Half of the glitches stay once they have set in."""
     return np.maximum.accumulate(presence) if rng.random() < 0.5 else presence
 
 
 def _time(commands: Commands, rng: np.random.Generator) -> FloatArray:
-    """For a while time runs faster or slower, jumps, or commands come seldom."""
+    """For some time, time runs faster or slower or jumps, or commands are held."""
     rows, period = len(commands.positions), commands.period
     at = np.arange(rows, dtype=np.float64)
     begin = int(rng.uniform(0.05, 0.9) * rows)

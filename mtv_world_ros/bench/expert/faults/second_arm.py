@@ -63,7 +63,7 @@ class Visit:
 
     Attributes:
         ways: its way points up to where it rests, by the share of the way there that it goes.
-        share: of the way; it goes less far where it does not reach so far.
+        share: share of the way; less where it is out of reach.
         meets: time from the begin of the move, before scaling [s].
         done: number of its way points that are done then.
         waits: the first arm waits at its first way point if the second one takes longer.

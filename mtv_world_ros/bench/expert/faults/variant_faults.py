@@ -1,4 +1,4 @@
-"""What the faults of a policy variant make of a move's way points and of a plan's commands."""
+"""Applies the faults of a policy variant to a move's way points and to a plan's commands."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ class WayPointFaults:
         return any(fault.keeps_tempo for fault, _ in self._faults)
 
     def move_of(self, num_moves: int) -> int:
-        """Returns the number of the move that goes wrong."""
+        """Returns the number of the faulty move."""
         return int(self._move * num_moves)
 
     def draws(
         self, yaw: float, objects: Sequence[FloatArray], other_home: FloatArray | None = None
     ) -> Draws:
-        """Returns what is drawn for the move.
+        """Returns the random draws for the faulty move.
 
         Args:
             yaw: of its grasp [rad]; the fingers travel along it.
@@ -74,7 +74,7 @@ class WayPointFaults:
     def visits(
         self, stops: Stops, draws: Draws, home: WayPoint, times: Sequence[float]
     ) -> list[Visit]:
-        """Returns what a second arm does meanwhile.
+        """Returns the visits of a second arm during the move.
 
         Args:
             stops: way points of the move, with its faults.
