@@ -75,7 +75,9 @@ def plot(
     matplotlib.use('Agg')
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(len(labels), sharex=True, figsize=(9, 2 * len(labels)))
+    size = (9, 2 * len(labels))
+    figure, grid = pyplot.subplots(len(labels), sharex=True, squeeze=False, figsize=size)
+    axes = grid[:, 0]
     for axis, (key, label) in zip(axes, labels.items(), strict=True):
         axis.plot([row[x] for row in rows], [row[key] for row in rows], '.', markersize=2)
         axis.set_ylabel(label)

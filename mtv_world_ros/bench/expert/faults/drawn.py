@@ -7,10 +7,14 @@ a release a little, so that what is touched decides.
 
 from __future__ import annotations
 
+from functools import cache
 import re
 from typing import Any
 
 import numpy as np
+
+from mtv_world_ros.config import read_yaml
+from mtv_world_ros.files import share_path
 
 #: kinds of a set
 NUM_DRAWN = 12
@@ -19,49 +23,12 @@ RANKED, LARGEST = (0.6, 1.2), 3.0
 _NAME = re.compile(r'(drawn|drawn_contact)_(\d{1,9})_(\d{1,3})')
 #: sets that a seed draws
 DRAWN_SETS = ('drawn', 'drawn_contact')
-#: way points that are changed together; where rows are inserted, like which way point, and in
-#: which phase
-_GROUPS = (
-    *(('above', 'grasp', 'close'), ('grasp', 'close'), ('close',), ('lift', 'carry')),
-    *(('carry', 'lower', 'open', 'retreat'), ('open', 'retreat'), ('retreat',)),
-)
-_MOMENTS = (
-    *(('start', 'grasp', 'above'), ('before close', 'grasp', 'above')),
-    *(('after lift', 'lift', 'carry'), ('before open', 'lower', 'carry')),
-    *(('after open', 'open', 'retreat'), ('after retreat', 'retreat', 'retreat')),
-)
-_DIRECTIONS = ('up', 'along', 'across', 'anywhere', 'drawn', 'other')
-#: primitives of commands, their options, and the range of what is drawn
-_COMMANDS: tuple[tuple[str, dict[str, Any], tuple[float, float]], ...] = (
-    ('delay', {}, (0.2, 0.8)),
-    ('delay', {'only': 'opening'}, (0.3, 1.0)),
-    ('lead', {}, (0.2, 0.6)),
-    ('lag', {'joints': 'grippers'}, (0.2, 0.8)),
-    ('lag', {'joints': 'wrists'}, (0.1, 0.3)),
-    ('give_way', {'by': 'speed'}, (0.2, 0.6)),
-    ('give_way', {'by': 'reach'}, (0.3, 0.7)),
-    ('pause', {}, (0.4, 1.2)),
-    ('jump', {'between': [0.2, 0.7], 'back': True, 'seconds': 0.4}, (1.0, 2.0)),
-    ('delay_each', {}, (0.15, 0.4)),
-    ('error', {'of': 'offsets'}, (0.02, 0.06)),
-    ('error', {'of': 'tremors'}, (0.02, 0.04)),
-    ('error', {'of': 'grippers'}, (0.05, 0.12)),
-    ('quantise', {}, (0.06, 0.14)),
-    ('limit_speed', {}, (0.3, 0.3)),
-)
-#: way points of a grasp, of what is held, and of the way down
-_GRASP, _HELD, _DOWN = ('above', 'grasp', 'close'), ('close', 'lift', 'carry', 'lower'), ('lower',)
-#: what a drawn kind of contact does, and the range of what is drawn
-_CONTACT: tuple[tuple[str, tuple[float, float]], ...] = (
-    ('the grasp is {:g} m off along the fingers', (0.008, 0.025)),
-    ('the grasp is {:g} m off across the fingers', (0.008, 0.025)),
-    ('the grasp is {:g} m too high', (0.01, 0.035)),
-    ('the grasp is turned by {:g} rad', (0.3, 0.9)),
-    ('the gripper holds at least {:g} open', (0.3, 0.8)),
-    ('on the way down it opens {:g}', (0.5, 1.0)),
-    ('while it opens it goes {:g} m aside', (0.02, 0.07)),
-    ('what is held is shaken by {:g} m', (0.03, 0.08)),
-)
+
+
+@cache
+def _parts() -> dict[str, Any]:
+    """What drawn kinds are composed of: `config/faults/drawn.yaml`."""
+    return read_yaml(share_path('config', 'faults', 'drawn.yaml'), 'fault file', 'config/faults')
 
 
 def drawn_names(seed: int, drawn: str = 'drawn') -> tuple[str, ...]:
@@ -86,10 +53,11 @@ def drawn_values(name: str) -> dict[str, Any]:
     rng = np.random.default_rng([seed, number, *([1] if drawn == 'drawn_contact' else [])])
     edits, commands, said = [], [], []
     if drawn == 'drawn_contact':
-        for which in rng.choice(len(_CONTACT), int(rng.integers(1, 3)), replace=False):
-            step, text = _touched(int(which), rng)
-            edits.append(step)
-            said.append(text)
+        contacts = _parts()['contact']
+        for which in rng.choice(len(contacts), int(rng.integers(1, 3)), replace=False):
+            far = _round(rng.uniform(*contacts[which]['range']))
+            edits.append(_scaled(contacts[which]['step'], far))
+            said.append(contacts[which]['text'].format(far))
     else:
         for is_edit in ((True,), (True, True), (True, False), (False,))[int(rng.integers(4))]:
             step, text = _edit(rng) if is_edit else _command(rng)
@@ -109,11 +77,12 @@ def drawn_values(name: str) -> dict[str, Any]:
 
 def _edit(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
     """A step that changes way points, and its description."""
-    way = str(rng.choice(_DIRECTIONS))
+    parts = _parts()
+    way = str(rng.choice(parts['directions']))
     far = _round(rng.uniform(0.2, 0.8) if way == 'other' else rng.uniform(0.015, 0.06))
-    group = list(_GROUPS[int(rng.integers(len(_GROUPS)))])
-    at, like, phase = _MOMENTS[int(rng.integers(len(_MOMENTS)))]
-    where = {'at': at, 'like': like, 'phase': phase}
+    group = parts['groups'][int(rng.integers(len(parts['groups'])))]
+    where = parts['moments'][int(rng.integers(len(parts['moments'])))]
+    at = where['at']
     angle, opening = _round(rng.uniform(0.2, 0.7)), _round(rng.uniform(0.2, 0.7))
     match int(rng.integers(6)):
         case 0 | 1:
@@ -138,33 +107,24 @@ def _edit(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
             return {'insert': options}, f'{at}, it goes to and fro by {far:g} m'
 
 
-def _touched(which: int, rng: np.random.Generator) -> tuple[dict[str, Any], str]:
-    """A step of a kind of contact, and its description."""
-    text, (least, most) = _CONTACT[which]
-    far = _round(rng.uniform(least, most))
-    size = [0.0, far]
-    match which:
-        case 0 | 1 | 2:
-            way = ('along', 'across', 'up')[which]
-            step = {'edit': {'phases': list(_GRASP), 'by': {way: size}}}
-        case 3:
-            step = {'edit': {'phases': list(_GRASP), 'yaw': {'add': size, 'side': 'drawn'}}}
-        case 4 | 5:
-            held = list(_HELD if which == 4 else _DOWN)
-            step = {'edit': {'phases': held, 'opening': {'least': size}}}
-        case 6:
-            step = {'edit': {'phases': ['open', 'retreat'], 'by': {'anywhere': size}}}
-        case _:
-            rows = [{'by': {'drawn': [0.0, sign * far]}} for sign in (1, -1, 1)]
-            where = {'at': 'after lift', 'like': 'lift', 'phase': 'carry', 'seconds': 0.2}
-            step = {'insert': {**where, 'rows': [*rows, {}]}}
-    return step, text.format(far)
+def _scaled(step: Any, far: float) -> Any:
+    """A step whose lengths [0, k] are [0, k * far]."""
+    match step:
+        case dict():
+            return {key: _scaled(value, far) for key, value in step.items()}
+        case [0, factor]:
+            return [0.0, factor * far]
+        case list():
+            return [_scaled(value, far) for value in step]
+    return step
 
 
 def _command(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
     """A step that changes commands, and its description."""
-    name, options, (least, most) = _COMMANDS[int(rng.integers(len(_COMMANDS)))]
-    typical = _round(rng.uniform(least, most))
+    commands = _parts()['commands']
+    drawn = commands[int(rng.integers(len(commands)))]
+    name, options = drawn['step'], drawn.get('options', {})
+    typical = _round(rng.uniform(*drawn['range']))
     of = ' '.join(str(v) for v in options.values() if isinstance(v, str))
     step = {name: {**options, 'scale': typical}}
     return step, f'{name} {of}'.strip() + f' by {typical:g}'
