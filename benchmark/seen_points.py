@@ -1,71 +1,194 @@
-"""How far the tool point is drawn from where somebody saw it: episodes' cameras against points.
+"""How far are tools drawn from where somebody saw them, and do the stated errors hold that?
 
-python benchmark/seen_points.py EPISODES benchmark/seen_points_droid_lab.json
+    python benchmark/seen_points.py EPISODES POINTS [--ways points,same-focal] [--fitted 2]
+
+POINTS is what `mtv-world calibrate-camera --click` saves. Cameras are estimated from the first
+points of each recording, in different ways; the others judge them. The error that a way states
+from the others of all recordings but one is compared with those of that one. `recorded` judges
+the calibrations of the episodes as they are. The points of a Franka with a Robotiq
+(`seen_points_droid_lab.json`) were read by eye from enlarged frames of 320x192 with a grid,
+2026-11-27: the middle between the ends of the finger tips; rows are of 5 Hz.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
-import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+import time
+from typing import Any
 
 import numpy as np
+from page import table
+from scipy.stats import binomtest
 
-from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.errors import CalibrationError
-from mtv_world_ros.geometry.camera import camera_poses, project
+from mtv_world_ros.assembly import recorded_robot, robot_path
+from mtv_world_ros.config import read_yaml
+from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
+from mtv_world_ros.data_types import CameraModel, FloatArray
+from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import load_shape, RobotShape
 from mtv_world_ros.lab.inspection.clocks import JointTrack
+from mtv_world_ros.lab.inspection.shared_camera import (
+    estimate_shared,
+    expected_within,
+    seen_points,
+    SharedEstimate,
+)
+
+WAYS = ('recorded', 'search', 'points', 'same-focal')
+HEAD = (
+    'way of starting',
+    'view',
+    'places',
+    'fitted points: n, median [px]',
+    'others: n, median, largest [px]',
+    'fx [px], fy / fx, k1',
+    "the doctor's match",
+    'doubted',
+    'others within the 95 % that those of other recordings state',
+    'time [s]',
+)
+
+Points = dict[str, dict[str, list[Any]]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recordings:
+    """The recordings of a folder.
+
+    Attributes:
+        episodes: R recordings.
+        tracks: their joint states.
+        robot: of all.
+        shape: of the robot.
+    """
+
+    episodes: Sequence[Episode]
+    tracks: Sequence[JointTrack]
+    robot: RobotModel
+    shape: RobotShape
+
+    def apart(self, cameras: Sequence[CameraModel], points: Mapping[str, Any]) -> list[FloatArray]:
+        """Of each recording, how far its points are drawn from where they were seen [px]."""
+        seen = seen_points(points, self.episodes, self.tracks, self.robot, self.shape.parts)
+        found: list[list[float]] = [[] for _ in cameras]
+        for point in seen:
+            camera = cameras[point.recording]
+            pixel, _ = project(camera, camera.T_mount_camera[None], point.position[None])
+            found[point.recording].append(float(np.linalg.norm(pixel[0] - point.pixel)))
+        return [np.array(one) for one in found]
 
 
 def main() -> None:
-    """Prints a row for each view and episode, and all of a view."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Prints a row for each way and view."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument('episodes', type=Path)
     parser.add_argument('points', type=Path)
-    parser.add_argument('--robot', type=Path, help='default: robot/robot.yaml of the episodes')
-    arguments = parser.parse_args()
-    robot = load_robot(arguments.robot or arguments.episodes / 'robot' / 'robot.yaml')
-    given = json.loads(arguments.points.read_text(encoding='utf-8'))
-    print('| view | episode | points | median [px of 320] | largest | focal length [px of 320] |')
-    print('|---|---|---|---|---|---|')
-    for view, episodes in given['views'].items():
-        every: list[float] = []
-        for name, rows in episodes.items():
-            try:
-                found, focal = _errors(
-                    arguments.episodes / name, view, np.array(rows), robot,
-                    given['beyond_tool_point_m'],
-                )  # fmt: skip
-            except CalibrationError:
-                print(f'| {view} | {name} | {len(rows)} | no calibration | | |')
-                continue
-            every += found.tolist()
-            print(f'| {view} | {name} | {len(rows)} | {np.median(found):.1f} | {found.max():.1f} '
-                  f'| {focal:.1f} |')  # fmt: skip
-        if every:
-            print(f'| {view} | all | {len(every)} | {np.median(every):.1f} | {max(every):.1f} | |')
+    parser.add_argument('--ways', default='points,same-focal', help=', '.join(WAYS))
+    parser.add_argument('--fitted', type=int, default=2, help='points of each recording')
+    parser.add_argument('--robot', help='default: that of the episodes')
+    parser.add_argument('--seed', type=int, default=0)
+    options = parser.parse_args()
+    points: Points = read_yaml(options.points, 'points file', 'POINTS')
+    fitted, others = (
+        {view: {name: rows[part] for name, rows in of.items()} for view, of in points.items()}
+        for part in (slice(None, options.fitted), slice(options.fitted, None))
+    )
+    read = recordings(options, list(points))
+    rows = [
+        row
+        for way in options.ways.split(',')
+        for row in judged(way, read, fitted, others, options.seed)
+    ]
+    print(table(HEAD, rows))
 
 
-def _errors(
-    path: Path, view: str, rows: FloatArray, robot: RobotModel, beyond_m: float
-) -> tuple[FloatArray, float]:
-    """Distances [px of a width of 320] and focal length at that width."""
-    episode = read_episode(path, views=[view], with_masks=False, robot=robot)
-    assert episode.joint_states is not None
-    joints = JointTrack(episode.joint_states, robot)
-    stamps = joints.stamps_ns[0] + np.round(rows[:, 0] * 1e9).astype(np.int64)
-    positions = joints.at(stamps)
-    tools = robot.tool_poses(positions)[0]
-    points = tools[:, :3, 3] + beyond_m * tools[:, :3, 2]
-    camera = replace(episode.cameras[view])
-    pixels, _ = project(camera, camera_poses(camera, robot, positions), points)
-    scale = 320 / camera.width
-    apart = np.linalg.norm(pixels - rows[:, 1:], axis=1) * scale
-    return np.asarray(apart), float(camera.K[0, 0]) * scale
+def recordings(options: argparse.Namespace, views: Sequence[str]) -> Recordings:
+    """Reads the episodes; cameras may be unknown."""
+    paths = list_episodes(options.episodes)
+    file = recorded_robot(paths[0], read_info(paths[0]).robot)
+    robot = load_robot(robot_path(options.robot) if options.robot else file)
+    episodes = [
+        read_episode(
+            path, views=views, with_masks=False, robot=robot, unknown_mount=robot.base_link
+        )
+        for path in paths
+    ]
+    tracks = [
+        JointTrack(states, robot)
+        for states in (episode.joint_states for episode in episodes)
+        if states is not None
+    ]
+    return Recordings(episodes=episodes, tracks=tracks, robot=robot, shape=load_shape(robot))
+
+
+def judged(
+    way: str, read: Recordings, fitted: Points, others: Points, seed: int
+) -> Iterator[list[str]]:
+    """Yields the row of each view."""
+    views = list(fitted)
+    if way == 'recorded':
+        for view in views:
+            cameras = [episode.cameras[view] for episode in read.episodes]
+            yield [way, view, '–', *_distances(read, view, cameras, fitted, others), '–', '–',
+                   _covered(read.apart(cameras, others[view])), '–']  # fmt: skip
+        return
+    unknown = [e.unknown.get(view, '') for e in read.episodes for view in views]
+    for group in [views] if way == 'same-focal' else [[view] for view in views]:
+        begun = time.monotonic()
+        found = estimate_shared(
+            read.episodes,
+            group,
+            read.robot,
+            read.shape.parts,
+            guess=False,
+            points=None if way == 'search' else {view: fitted[view] for view in group},
+            focal_known=not any('intrinsics' in what for what in unknown),
+            seed=seed,
+        )
+        seconds = time.monotonic() - begun
+        for view, one in zip(group, found, strict=True):
+            yield [way, view, str(len(set(one.places.place.tolist()))),
+                   *_distances(read, view, one.cameras, fitted, others),
+                   *_matches(one), _covered(read.apart(one.cameras, others[view])),
+                   f'{seconds:.0f}']  # fmt: skip
+
+
+def _distances(
+    read: Recordings, view: str, cameras: Sequence[CameraModel], fitted: Points, others: Points
+) -> list[str]:
+    near, far = (np.concatenate(read.apart(cameras, part[view])) for part in (fitted, others))
+    K, bend = cameras[0].K, cameras[0].distortion
+    return [
+        f'{len(near)}, {np.median(near):.1f}',
+        f'{len(far)}, {np.median(far):.1f}, {far.max():.1f}',
+        f'{K[0, 0]:.1f}, {K[1, 1] / K[0, 0]:.3f}, {bend[0] if len(bend) else 0:.3f}',
+    ]
+
+
+def _matches(found: SharedEstimate) -> list[str]:
+    matches = [measure.match_here for measure in found.measures]
+    doubted = sum(bool(found.doubts(number)) for number in range(len(matches)))
+    return [f'{min(matches):.2f} to {max(matches):.2f}', f'{doubted} of {len(matches)}']
+
+
+def _covered(apart: Sequence[FloatArray]) -> str:
+    """How many points are within what the points of the other recordings state."""
+    held, count = 0, 0
+    for number, here in enumerate(apart):
+        elsewhere = np.concatenate([*apart[:number], *apart[number + 1 :]])
+        held += int((here <= expected_within(elsewhere)).sum())
+        count += len(here)
+    low, high = binomtest(held, count).proportion_ci(method='wilson')
+    stated = expected_within(np.concatenate(apart))
+    return f'{held} of {count} ({low:.0%} to {high:.0%}); {stated:.1f} px by all'
 
 
 if __name__ == '__main__':

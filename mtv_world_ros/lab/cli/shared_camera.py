@@ -170,9 +170,8 @@ def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_kno
     view, width = estimate.cameras[0].view, estimate.cameras[0].width
     how = 'as given' if focal_known or estimate.kept_guess else 'estimated'
     count = len(set(estimate.places.place.tolist()))
-    K = estimate.cameras[0].K
     focal = f'focal length {estimate.focal_px:.1f} px of {width} ({how}'
-    focal += ')' if focal_known else f', fy is {K[1, 1] / K[0, 0]:.3f} fx)'
+    focal += ')' if focal_known or estimate.kept_guess else f', {_lens(estimate)})'
     lines = [f"view '{view}': {focal}; {count} places in {len(episodes)} recordings"]
     if len(estimate.apart_px):
         lines.append(
@@ -198,6 +197,19 @@ def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_kno
         parts += [f'doubted: {doubt}'] if doubt else []
         lines.append(f'{episode.info.path.name}: {"; ".join(parts)}')
     return '\n'.join(lines)
+
+
+def _lens(estimate: SharedEstimate) -> str:
+    """What else was found of the lens, or why not."""
+    camera = estimate.cameras[0]
+    stretch = f'fy is {camera.K[1, 1] / camera.K[0, 0]:.3f} fx'
+    if not estimate.bent:
+        return (
+            f'{stretch}; distortion is not: that takes 8 --points, some of them a quarter of the '
+            'width from the middle of the image'
+        )
+    k1 = camera.distortion[0] if len(camera.distortion) else 0.0
+    return f'{stretch}, k1 is {k1:.3f}'
 
 
 def _write(

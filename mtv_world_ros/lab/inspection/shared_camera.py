@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,9 @@ from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import LinkShape, moving_links
 from mtv_world_ros.lab.inspection.clocks import JointTrack
+from mtv_world_ros.lab.inspection.finger_tips import tip_middles
 from mtv_world_ros.lab.inspection.fixed_camera import FixedCamera
-from mtv_world_ros.lab.inspection.joint_camera import (
-    JointCamera,
-    JointState,
-    SeenPoint,
-    zoomed,
-)
+from mtv_world_ros.lab.inspection.joint_camera import JointCamera, JointState, SeenPoint, through
 from mtv_world_ros.lab.inspection.motion_residual import (
     measure_residual,
     MotionResidual,
@@ -47,6 +43,18 @@ _LEAST_MATCH = 0.335
 _LEFT_OUT = 3
 
 
+def expected_within(apart_px: FloatArray) -> float:
+    """Distance from where it is within which 95 % of tool points are drawn [px]; NaN = not known.
+
+    Args:
+        apart_px: (N,) of points that were not fitted to, taken for normal in x and y.
+    """
+    count = len(apart_px)
+    if not count:
+        return np.nan
+    return float(np.sqrt(np.mean(apart_px**2) * f_distribution.ppf(0.95, 2, 2 * count)))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SharedEstimate:
     """What was found of one view in several recordings.
@@ -58,6 +66,7 @@ class SharedEstimate:
         guess_measures: the same of the guess; empty where there was none.
         kept_guess: whether the guess fits better and is what `cameras` has.
         focal_px: estimated, or the one given.
+        bent: whether the lens' k1 was estimated, too.
         fits: (R,) correlation of drawn and seen changes of each recording.
         apart_px: (N,) how far the seen tool points that were left out of a first fit are drawn
             from there; the last one is to all points.
@@ -69,19 +78,14 @@ class SharedEstimate:
     guess_measures: tuple[MotionResidual, ...]
     kept_guess: bool
     focal_px: float
+    bent: bool
     fits: FloatArray
     apart_px: FloatArray
 
     @property
     def within_px(self) -> float:
-        """Distance from where it is within which 95 % of tool points are drawn; NaN = not known.
-
-        From the seen points that were left out, as of errors that are normal in x and y.
-        """
-        count = len(self.apart_px)
-        if not count:
-            return np.nan
-        return float(np.sqrt(np.mean(self.apart_px**2) * f_distribution.ppf(0.95, 2, 2 * count)))
+        """`expected_within` of the seen points that were left out [px]."""
+        return expected_within(self.apart_px)
 
     def doubts(self, number: int) -> str:
         """Why the pose of a recording may be wrong; empty where nothing says so."""
@@ -158,12 +162,15 @@ def estimate_shared(
         _view(episodes, view, robot, shapes, tracks, (points or {}).get(view, {}), focal_known)
         for view in views
     ]
-    tested = _together(each, guess, focal_known, seed)
+    together = _Together(each, focal_known)
+    tested = together.found(guess, seed)
     states = tested
     if any(view.left_out for view in each):
-        states = _joined(each, [tested], focal_known, [[*v.points, *v.left_out] for v in each])
+        states = together.fitted([tested], [[*view.points, *view.left_out] for view in each])
     return tuple(
-        _judged(view, state, without, episodes, robot, shapes, tracks, guess=guess)
+        _judged(
+            view, state, without, episodes, robot, shapes, tracks, guess=guess, bent=together.bent
+        )
         for view, state, without in zip(each, states, tested, strict=True)
     )
 
@@ -179,7 +186,9 @@ def _view(
 ) -> _View:
     cameras = [_on_base(episode.cameras[view], robot) for episode in episodes]
     focal = float(np.median([camera.K[0, 0] for camera in cameras]))
-    cameras = [zoomed(camera, focal / camera.K[0, 0]) for camera in cameras]
+    cameras = [
+        through(camera, np.array([np.log(focal / camera.K[0, 0]), 0.0, 0.0])) for camera in cameras
+    ]
     recordings = [
         FixedCamera(
             episode.images[view], camera, robot, shapes, joints,
@@ -189,7 +198,9 @@ def _view(
     ]  # fmt: skip
     places = find_places([background(episode.images[view]) for episode in episodes])
     numbers = [int(n) for n in places.place]
-    fitted, left_out = (_seen_points(p, episodes, tracks, robot) for p in _parted(points))
+    fitted, left_out = (
+        seen_points(part, episodes, tracks, robot, shapes) for part in _parted(points)
+    )
     return _View(
         name=view,
         cameras=cameras,
@@ -201,64 +212,83 @@ def _view(
     )
 
 
-def _together(
-    each: Sequence[_View], guess: bool, focal_known: bool, seed: int
-) -> list[JointState]:
-    """The state of each view, with one zoom."""
-    if len(each) == 1:
-        view = each[0]
-        start = view.given if guess else None
-        return [view.joint.estimate(view.places, start, view.points, seed)]
-    own = [_start(view, guess, seed) for view in each]
-    zooms = [state.zoom for state in own]
-    zooms = [*zooms, np.exp(np.mean(np.log(zooms), axis=0))]
-    candidates = [
-        [
-            view.joint.from_points(view.places, view.points, seed, zoom)
-            if view.points and not guess
-            else replace(state, zoom=zoom)
-            for view, state in zip(each, own, strict=True)
+class _Together:
+    """Views that share their lens.
+
+    Args:
+        each: the views.
+        focal_known: whether the lens is that of a calibration.
+    """
+
+    def __init__(self, each: Sequence[_View], focal_known: bool) -> None:
+        self._each, self._focal_known = each, focal_known
+        self._places = np.cumsum([0, *(1 + max(view.numbers) for view in each)]).tolist()
+        self._rows = np.cumsum([0, *(len(view.numbers) for view in each)]).tolist()
+        self._joint = each[0].joint
+        if len(each) > 1:
+            self._joint = JointCamera(
+                [one for view in each for one in view.recordings],
+                [first + n for view, first in self._with_places() for n in view.numbers],
+                intrinsics_known=focal_known,
+                views=[number for number, view in enumerate(each) for _ in view.numbers],
+            )
+
+    @property
+    def bent(self) -> bool:
+        """Whether k1 was estimated in the last fit."""
+        return self._joint.bent
+
+    def _with_places(self) -> Iterator[tuple[_View, int]]:
+        """Each view with the number of its first place."""
+        return zip(self._each, self._places, strict=False)
+
+    def found(self, guess: bool, seed: int) -> list[JointState]:
+        """The state of each view, by the points that are not left out."""
+        if len(self._each) == 1:
+            view = self._each[0]
+            start = view.given if guess else None
+            return [view.joint.estimate(view.places, start, view.points, seed)]
+        own = [_start(view, guess, seed) for view in self._each]
+        lenses = [state.lens for state in own]
+        lenses = [*lenses, np.mean(lenses, axis=0)]
+        candidates = [
+            [
+                view.joint.from_points(view.places, view.points, seed, lens)
+                if view.points and not guess
+                else replace(state, lens=lens)
+                for view, state in zip(self._each, own, strict=True)
+            ]
+            for lens in lenses[: 1 if self._focal_known else None]
         ]
-        for zoom in zooms[: 1 if focal_known else None]
-    ]
-    return _joined(each, candidates, focal_known, [view.points for view in each])
+        return self.fitted(candidates, [view.points for view in self._each])
 
-
-def _joined(
-    each: Sequence[_View],
-    candidates: Sequence[Sequence[JointState]],
-    focal_known: bool,
-    points: Sequence[Sequence[SeenPoint]],
-) -> list[JointState]:
-    """The state of each view, fitted together from the best of some starts, to its points."""
-    firsts = np.cumsum([0, *(1 + max(view.numbers) for view in each)])
-    recordings = [one for view in each for one in view.recordings]
-    numbers = [int(first) + n for view, first in zip(each, firsts, strict=False)
-               for n in view.numbers]  # fmt: skip
-    of_view = [number for number, view in enumerate(each) for _ in view.numbers]
-    joint = JointCamera(recordings, numbers, intrinsics_known=focal_known, views=of_view)
-    rows = np.cumsum([0, *(len(view.numbers) for view in each)])
-    seen = [
-        replace(point, recording=point.recording + int(row))
-        for of_one, row in zip(points, rows, strict=False)
-        for point in of_one
-    ]
-    starts = [
-        JointState(
-            poses={
-                int(first) + place: T
-                for state, first in zip(states, firsts, strict=False)
-                for place, T in state.poses.items()
-            },
-            zoom=states[0].zoom,
-        )
-        for states in candidates
-    ]
-    found = joint.together(starts, seen)
-    return [
-        JointState(poses={n: found.poses[int(first) + n] for n in view.numbers}, zoom=found.zoom)
-        for view, first in zip(each, firsts, strict=False)
-    ]
+    def fitted(
+        self,
+        candidates: Sequence[Sequence[JointState]],
+        points: Sequence[Sequence[SeenPoint]],
+    ) -> list[JointState]:
+        """The state of each view, fitted together from the best of some starts, to its points."""
+        seen = [
+            replace(point, recording=point.recording + row)
+            for of_one, row in zip(points, self._rows, strict=False)
+            for point in of_one
+        ]
+        starts = [
+            JointState(
+                poses={
+                    first + place: T
+                    for state, first in zip(states, self._places, strict=False)
+                    for place, T in state.poses.items()
+                },
+                lens=states[0].lens,
+            )
+            for states in candidates
+        ]
+        found = self._joint.together(starts, seen)
+        return [
+            JointState(poses={n: found.poses[first + n] for n in view.numbers}, lens=found.lens)
+            for view, first in self._with_places()
+        ]
 
 
 def _start(view: _View, guess: bool, seed: int) -> JointState:
@@ -277,6 +307,7 @@ def _judged(
     tracks: Sequence[JointTrack],
     *,
     guess: bool,
+    bent: bool,
 ) -> SharedEstimate:
     """The better of guess and result by the doctor's measure.
 
@@ -292,14 +323,13 @@ def _judged(
 
     def placed(found: JointState) -> list[CameraModel]:
         return [
-            replace(zoomed(camera, found.zoom), T_mount_camera=found.poses[place])
+            replace(through(camera, found.lens), T_mount_camera=found.poses[place])
             for camera, place in zip(view.cameras, view.numbers, strict=True)
         ]
 
     ends = placed(state)
     measures, before = measured(ends), measured(view.cameras) if guess else ()
     kept = bool(before) and _mean_match(before) > _mean_match(measures)
-    focal = float(view.cameras[0].K[0, 0])
     tested = view.cameras if kept else placed(without)
     best = view.cameras if kept else ends
     return SharedEstimate(
@@ -308,7 +338,8 @@ def _judged(
         measures=before if kept else measures,
         guess_measures=before,
         kept_guess=kept,
-        focal_px=focal if kept else focal * float(state.zoom[0]),
+        focal_px=float(best[0].K[0, 0]),
+        bent=bent and not kept,
         fits=view.joint.fits(view.given if kept else state),
         apart_px=np.array([_apart(point, tested[point.recording]) for point in view.left_out]),
     )
@@ -352,12 +383,25 @@ def _parted(
     return parts
 
 
-def _seen_points(
+def seen_points(
     points: Mapping[str, Sequence[Any]],
     episodes: Sequence[Episode],
     tracks: Sequence[JointTrack],
     robot: RobotModel,
+    shapes: Sequence[LinkShape],
 ) -> list[SeenPoint]:
+    """Returns where what was seen is by the joint states.
+
+    Args:
+        points: by the name of the episode: (time [s], x, y [px]).
+        episodes: R recordings; points of others are left out.
+        tracks: joint states of each.
+        robot: of the recordings.
+        shapes: of its links.
+
+    Raises:
+        ConfigError: a point is of a time without joint states.
+    """
     names = [episode.info.path.name for episode in episodes]
     found = []
     for name, rows in points.items():
@@ -371,7 +415,7 @@ def _seen_points(
                     f"points: '{name}' has no joint states at {seconds:g} s; times are from the "
                     'first joint state on'
                 )
-            position = robot.tool_poses(tracks[number].at(stamp))[0, 0, :3, 3]
+            position = tip_middles(robot, shapes, tracks[number].at(stamp))[0]
             found.append(
                 SeenPoint(recording=number, position=position, pixel=np.array([x, y], float))
             )
