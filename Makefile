@@ -39,8 +39,10 @@ types: $(STAMP)
 test: style  ## the linters and all tests (8 to 15 minutes)
 	@$(MAKE) --no-print-directory --jobs=2 types tests
 
+# a worker has a core: torch's threads would only take turns
 tests: $(STAMP)
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
+		--no-loadscope-reorder
 
 fuzz: $(STAMP)  ## damage everything that is read from outside (minutes); prints seed and table
 	@mkdir -p out

@@ -35,6 +35,9 @@ _PLACES = {
 # takes a core, those that wait use up the time that the last one needs, and all is many times as
 # slow. The library reads this as it is loaded.
 os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
+# NumPy's matrices are small here, and its threads spin, too: several of them take more time of the
+# processor than one, four times as much in a search, and no less time by the clock.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 
 def __getattr__(name: str) -> Any:

@@ -53,6 +53,21 @@ OBSTACLES = {
     'native_ros': _no_native_ros,
     'control_msgs': _no_control_msgs,
 }
+#: files of tests that take longest, which begin first: no worker has one of them alone at the end
+SLOW = [
+    'test_your_robot_page', 'test_shell_lines', 'test_calibrate_camera', 'test_shared_camera',
+    'test_finger_fit', 'test_doctor', 'test_contact_fit', 'test_doctor_of_folders',
+    'test_node_setups', 'test_imagine_command', 'test_foreseen_scenes', 'test_cli',
+    'test_distributed', 'test_wan_benchmarks', 'test_player_recorder', 'test_kill',
+    'test_interval_coverage', 'test_never_lost', 'test_full_disk', 'test_wan_commands',
+    'test_collect', 'test_runner', 'test_workers', 'test_wan_training', 'test_processes',
+    'test_serving', 'test_evaluate', 'test_lifecycle', 'test_interrupts',
+    'test_policy_in_the_loop', 'test_html', 'test_bundled_episode', 'test_trainer',
+    'test_rank_command', 'test_comparison', 'test_doctor_of_own_robot', 'test_held_out',
+    'test_policy_beside_a_robot', 'test_both_worlds', 'test_own_checkpoint',
+    'test_adapter_parameter', 'test_signals', 'test_evaluate_command', 'test_parameter_values',
+    'test_bad_input', 'test_stored_objects',
+]  # fmt: skip
 
 
 @pytest.fixture(scope='session')
@@ -112,6 +127,8 @@ class Failing:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    rank = {name: number for number, name in enumerate(SLOW)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(SLOW)))
     for marker, obstacle in OBSTACLES.items():
         marked = [item for item in items if item.get_closest_marker(marker)]
         reason = obstacle() if marked else ''

@@ -39,6 +39,13 @@ def test_help_does_not_load_the_model(tmp_path):
         assert command in done.stdout.decode()
 
 
+def test_numpy_starts_no_threads():
+    """Those of its matrix products spin while they wait; ours are small."""
+    code = 'import mtv_world_ros, numpy, os\nprint(len(os.listdir("/proc/self/task")))'
+    kept = {name: text for name, text in os.environ.items() if 'NUM_THREADS' not in name}
+    assert subprocess.check_output([sys.executable, '-c', code], env=kept) == b'1\n'
+
+
 def test_a_command_that_left_says_where_it_is(capsys):
     with pytest.raises(SystemExit) as end:
         main(['distill', 'bundled', 'data/sim', '--out', 'x'])
