@@ -32,6 +32,38 @@ PREFIX = 'MTV_WORLD_MAX_'
 #: plain YAML values may be numbers, whose digits cost quadratic time
 _LONGEST_NUMBER = 4_000
 _LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+_MERGE = 'tag:yaml.org,2002:merge'
+
+
+class _UniqueKeys(_LOADER):
+    """A loader that refuses a key that a mapping has twice: the first would be lost unsaid."""
+
+    def get_single_node(self) -> yaml.Node | None:
+        """The root of the text, before merges are written out."""
+        root = super().get_single_node()
+        left, known = [root], set[int]()
+        while left:
+            node = left.pop()
+            if not isinstance(node, yaml.CollectionNode) or id(node) in known:
+                continue
+            known.add(id(node))
+            if isinstance(node, yaml.MappingNode):
+                _check_keys(node)
+                left += [part for row in node.value for part in row]
+            else:
+                left += node.value
+        return root
+
+
+def _check_keys(node: yaml.MappingNode) -> None:
+    first: dict[tuple[str, str], int] = {}
+    for key, _ in node.value:
+        if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
+            line = key.start_mark.line + 1
+            if (key.tag, key.value) in first:
+                before = first[key.tag, key.value]
+                raise yaml.YAMLError(f"'{key.value}' is there twice, in lines {before} and {line}")
+            first[key.tag, key.value] = line
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -262,7 +294,7 @@ def parse_yaml(text: str | bytes) -> Any:
     try:
         check_limit('yaml_bytes', len(text), 'the text')
         _YamlCount().check(yaml.parse(text, Loader=_LOADER))
-        return yaml.load(text, Loader=_LOADER)  # noqa: S506
+        return yaml.load(text, Loader=_UniqueKeys)  # noqa: S506
     except yaml.YAMLError:
         raise
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:

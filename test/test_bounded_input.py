@@ -64,6 +64,14 @@ def test_yaml_with_aliases_and_merges_is_read_as_before():
     assert parse_yaml(text) == yaml.safe_load(text)
 
 
+def test_a_key_that_a_mapping_has_twice_is_named_with_its_lines():
+    for text in ('a: 1\nb: 2\na: 3', 'top:\n  a: 1\n  a: 3', '- {b: 1,\n   a: 1}\n- {b: 1, b: 2}'):
+        with pytest.raises(yaml.YAMLError, match=r"'[ab]' is there twice, in lines \d and 3"):
+            parse_yaml(text)
+    merged = 'x: &x {b: 1}\na: {inner: &c {<<: *x, b: 2}}\nd: {<<: *c, b: 3}\n1: one\n"1": two'
+    assert parse_yaml(merged) == yaml.safe_load(merged)
+
+
 @pytest.mark.parametrize('value', ['.inf', '-.inf', '.nan', '1e400', '[' * 5000, '"x"', '2**9'])
 def test_a_calibration_with_a_wild_size_is_a_clear_error(tmp_path, value):
     file = tmp_path / 'calibration.yaml'

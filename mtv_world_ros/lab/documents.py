@@ -9,8 +9,10 @@ from functools import cache
 from math import isfinite
 from typing import Any
 
+import cv2
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.files import share_path
 
 #: instead of a number that was not measured
@@ -106,6 +108,19 @@ def with_interval(
 def render(template: str, **values: Any) -> str:
     """Returns a template of `resource/report/` with its values; those of HTML are escaped."""
     return _environment().get_template(template).render(**values)
+
+
+def clicked_frame(recording: str, seconds: float, frame: ByteArray) -> dict[str, object]:
+    """Returns what `clicks.html.j2` shows of a frame (H, W, 3) uint8 RGB at a time [s]."""
+    done, data = cv2.imencode('.jpg', frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+    assert done
+    return {
+        'episode': recording,
+        'seconds': round(seconds, 3),
+        'width': frame.shape[1],
+        'height': frame.shape[0],
+        'jpeg': base64.b64encode(data.tobytes()).decode(),
+    }
 
 
 @cache

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.data.bag_mapping import BagMapping
     from mtv_world_ros.data.episode import Episode
     from mtv_world_ros.lab.importing.convert import ImportSummary
+    from mtv_world_ros.lab.importing.lerobot import EpisodeEntry
     from mtv_world_ros.lab.importing.recover import Recovered
     from mtv_world_ros.lab.importing.stored_objects import ObjectStage
 
@@ -89,6 +90,33 @@ def _add_boxes(parser: argparse.ArgumentParser) -> None:
         help='boxes around objects in a few frames; their masks are stored with the episodes, and '
         'OUT/objects.safetensors, for --segmenter of other commands, with what was learnt',
     )
+    parser.add_argument(
+        '--click',
+        type=Path,
+        metavar='PAGE',
+        help='only write an HTML page on which to draw these boxes; it saves the file for '
+        '--objects',
+    )
+
+
+def _write_page(
+    arguments: argparse.Namespace,
+    found: Mapping[str, Any],
+    read: Callable[[Any], Episode],
+    names: Sequence[str],
+) -> int:
+    """Writes the page on which boxes are drawn; nothing is imported."""
+    from mtv_world_ros.files import write_whole
+    from mtv_world_ros.lab.importing.boxes_page import boxes_page
+
+    if arguments.objects is not None:
+        raise ConfigError('--click writes the page that makes the file for --objects; give one')
+    write_whole(arguments.click, boxes_page(found, read, names))
+    print(
+        f'page: {arguments.click}\nopen it in a browser, draw, save, and give what it saves as '
+        '--objects; nothing was imported'
+    )
+    return 0
 
 
 def _boxed_stage(
@@ -175,18 +203,21 @@ def _import_bag(arguments: argparse.Namespace) -> int:
         mapping = mapping.replace(action=arguments.action)
     bags = find_bags(arguments.bags)
     mapping = with_guessed_views(mapping, bags[0])
-    robot = _robot_of_bags(arguments, mapping, bags[0])
 
     def frames(bag: Path) -> Episode:
         return read_episode(bag, views=list(mapping.views), mapping=mapping, with_cameras=False)
 
+    found = {episode_name(bag): bag for bag in bags}
+    if arguments.click:
+        return _write_page(arguments, found, frames, mapping.objects)
+    robot = _robot_of_bags(arguments, mapping, bags[0])
     summary = import_bags(
         bags,
         arguments.out,
         mapping,
         robot,
         calibration=arguments.calibration,
-        stage=_boxed_stage(arguments, {episode_name(bag): bag for bag in bags}, frames),
+        stage=_boxed_stage(arguments, found, frames),
         progress=lambda paths: tqdm(paths, unit='bag', disable=None),
     )
     values = mapping.replace(robot='robot/robot.yaml').model_dump(
@@ -266,6 +297,10 @@ def _import_videos(arguments: argparse.Namespace) -> int:
 
     mapping = load_video_mapping(arguments.mapping)
     found = {one.name: one for one in find_recordings(arguments.folder, mapping)}
+    if arguments.click:
+        return _write_page(
+            arguments, found, lambda one: read_recording(one, mapping), mapping.objects
+        )
     summary = import_videos(
         arguments.folder,
         arguments.out,
@@ -303,6 +338,7 @@ def _add_import_dataset(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--episodes', help="numbers, comma-separated, e.g. '0,4,7'; default: all")
     _add_objects(parser)
+    _add_boxes(parser)
     parser.set_defaults(handler=_import_dataset)
 
 
@@ -310,14 +346,25 @@ def _import_dataset(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from mtv_world_ros.geometry.robot.file import ROBOT_YAML
-    from mtv_world_ros.lab.importing.convert import import_dataset
+    from mtv_world_ros.lab.importing.convert import episode_name, import_dataset, read_frames
+    from mtv_world_ros.lab.importing.lerobot import LeRobotDataset
+    from mtv_world_ros.lab.importing.mapping import load_mapping
 
+    file = arguments.mapping or _guessed_mapping(arguments)
+    source, mapping = LeRobotDataset(arguments.dataset), load_mapping(file)
+    found = {episode_name(number): entry for number, entry in sorted(source.episodes.items())}
+
+    def read(entry: EpisodeEntry) -> Episode:
+        return read_frames(source, entry, mapping)
+
+    if arguments.click:
+        return _write_page(arguments, found, read, mapping.objects)
     summary = import_dataset(
         arguments.dataset,
-        arguments.mapping or _guessed_mapping(arguments),
+        file,
         arguments.out,
         episodes=_numbers(arguments.episodes),
-        stage=_object_stage(arguments),
+        stage=_boxed_stage(arguments, found, read),
         progress=lambda numbers: tqdm(numbers, unit='ep', disable=None),
     )
     status = _import_status(summary, 'episode {}'.format)

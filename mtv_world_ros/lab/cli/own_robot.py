@@ -198,7 +198,12 @@ def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
         tqdm(paths, unit='ep', disable=None),
         inspector,
         lambda path: read_for_checks(
-            path, arguments.views, source, inspector.robot, inspector.robot.base_link
+            path,
+            arguments.views,
+            source,
+            inspector.robot,
+            inspector.robot.base_link,
+            with_masks=True,
         ),
     )
     out = arguments.out or Path('out/doctor') / arguments.episode.resolve().name
@@ -222,7 +227,9 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     file, source = robot_file(arguments, path)
     inspector = load_inspector(file)
     robot = inspector.robot
-    episode = read_for_checks(path, arguments.views, source, robot, robot.base_link)
+    episode = read_for_checks(
+        path, arguments.views, source, robot, robot.base_link, with_masks=True
+    )
     bar = partial(tqdm, desc='comparing', unit='view', disable=None)
     inspection = inspector.inspect(episode, bar)
     out = arguments.out or Path('out/doctor') / name
@@ -275,7 +282,7 @@ def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:
         '--points',
         type=Path,
         metavar='FILE',
-        help='where the tool point is seen, to start from: '
+        help='where the middle between the finger tips is seen, to start from: '
         '{VIEW: {EPISODE: [[seconds, x, y], ...]}} in YAML [s, px], four points or more',
     )
     parser.add_argument(

@@ -133,6 +133,8 @@ def read_for_checks(
     source: EpisodeSource,
     robot: RobotModel,
     unknown_mount: str = '',
+    *,
+    with_masks: bool = False,
 ) -> Episode:
     """Returns a recording; with `unknown_mount` its cameras may be unknown."""
     from mtv_world_ros.data.episode_reader import read_episode
@@ -141,7 +143,7 @@ def read_for_checks(
         path,
         views=views,
         calibration=source.calibration,
-        with_masks=False,
+        with_masks=with_masks,
         mapping=source.mapping,
         robot=robot,
         unknown_mount=unknown_mount,

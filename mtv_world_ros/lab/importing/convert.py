@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from mtv_world_ros.data.episode import Episode, EpisodeInfo, Track
 from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
@@ -76,6 +79,57 @@ def import_each(
     return summary
 
 
+def episode_name(number: int) -> str:
+    """Returns the name of an imported episode."""
+    return f'episode_{number:06d}'
+
+
+def read_frames(dataset: LeRobotDataset, entry: EpisodeEntry, mapping: DatasetMapping) -> Episode:
+    """Reads an episode's frames alone, each when it is asked for.
+
+    Raises:
+        EpisodeError: its rows cannot be read.
+    """
+    times = dataset.rows(entry, ['timestamp'])['timestamp'].ravel()
+    stamps = START_NS + np.round((times - times[0]) * 1e9).astype(np.int64)
+    return Episode(
+        info=EpisodeInfo(path=dataset.root / episode_name(entry.index)),
+        views=tuple(mapping.views),
+        images={
+            view: Track(stamps, _Frames(dataset, entry, source.feature, times))
+            for view, source in mapping.views.items()
+        },
+        cameras={},
+        joint_states=None,
+        trajectories=[],
+        masks=None,
+        instructions=[],
+    )
+
+
+class _Frames:
+    """Frames of an episode; each is decoded when it is asked for, from the first one on."""
+
+    def __init__(
+        self, dataset: LeRobotDataset, entry: EpisodeEntry, feature: str, times: FloatArray
+    ) -> None:
+        self._dataset, self._entry, self._feature = dataset, entry, feature
+        self._times = times
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def __getitem__(self, index: Any) -> ByteArray:
+        frames = self._dataset.frames(self._entry, self._feature, self._times[: index + 1])
+        frame = next(islice(frames, index, None), None)
+        if frame is None:
+            raise EpisodeError(f"'{self._feature}' has no frame {index}")
+        return frame
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.stack(list(self._dataset.frames(self._entry, self._feature, self._times)))
+
+
 def import_dataset(
     dataset: Path,
     mapping: Path,
@@ -115,7 +169,7 @@ def import_dataset(
         return convert_episode(source, source.episodes[number], chosen, path, stage, key)
 
     summary = import_each(
-        progress(wanted), key, lambda number: out / f'episode_{number:06d}', convert
+        progress(wanted), key, lambda number: out / episode_name(number), convert
     )
     if summary.made or summary.kept:
         save_robot(chosen.robot_file, out / 'robot')

@@ -16,17 +16,20 @@ from mtv_world_ros.data_types import BoolArray, ByteArray
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.vision.segmenters.examples import Box, Example, ObjectExamples
 
-_LEAST_SIDE = 3
+#: of a box [px]
+LEAST_SIDE = 3
 #: a box belongs to the frame nearest to its time, at most this far away [s]
 _NEAR_S = 0.5
+#: recordings that an error names
+_LISTED = 12
 
 
 def _box(row: tuple[float, ...]) -> tuple[float, ...]:
     seconds, left, top, right, bottom = row
-    if seconds < 0 or min(left, top) < 0 or min(right - left, bottom - top) < _LEAST_SIDE:
+    if seconds < 0 or min(left, top) < 0 or min(right - left, bottom - top) < LEAST_SIDE:
         raise wrong(
             'seconds of at least 0, then left, top, right, bottom [px], at least '
-            f'{_LEAST_SIDE} px apart'
+            f'{LEAST_SIDE} px apart'
         )
     return row
 
@@ -107,7 +110,7 @@ def learn_objects(
         if name not in found:
             raise ConfigError(
                 f"objects: there is no recording '{name}'{nearest(name, found)}; there are "
-                f'{", ".join(found)}'
+                f'{", ".join(list(found)[:_LISTED])}{", ..." if len(found) > _LISTED else ""}'
             )
         episode = read(found[name])
         for view, rows in boxes.boxes.items():

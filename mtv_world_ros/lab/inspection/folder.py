@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data.episode import Episode, MASKS_BY
 from mtv_world_ros.data_types import ByteArray, CameraModel
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.geometry.transforms import inverse
@@ -84,6 +84,7 @@ def inspect_folder(
     backgrounds: dict[str, dict[str, ByteArray]] = {}
     known: dict[str, dict[str, CameraModel]] = {}
     posed: dict[str, dict[str, CameraModel]] = {}
+    segmenters: dict[str, list[str]] = {}
     for path in paths:
         try:
             episode = read(path)
@@ -94,6 +95,9 @@ def inspect_folder(
         except MtvWorldError as error:
             failed[path.name] = str(error)
             continue
+        by = episode.info.metadata.get(MASKS_BY, '')
+        if episode.masks and by:
+            segmenters.setdefault(by, []).append(path.name)
         for view in episode.views:
             if inspector.stands_still(episode, view):
                 backgrounds.setdefault(view, {})[path.name] = background(episode.images[view])
@@ -106,7 +110,7 @@ def inspect_folder(
     members = {view: list(found) for view, found in backgrounds.items()}
     found = FolderInspection(
         episodes=inspections, failed=failed, places=places, members=members,
-        findings=(*_focal_findings(known),),
+        findings=(*_focal_findings(known), *_segmenter_findings(segmenters)),
     )  # fmt: skip
     return _with_places(_with_strangers(found), posed), pictures
 
@@ -126,6 +130,19 @@ def _focal_findings(known: dict[str, dict[str, CameraModel]]) -> list[Finding]:
                 )
             )
     return found
+
+
+def _segmenter_findings(segmenters: dict[str, list[str]]) -> list[Finding]:
+    """Masks by other segmenters, or other examples, are of other pixels."""
+    if len(segmenters) < 2:
+        return []
+    groups = '; '.join(f"'{by}': {' '.join(names)}" for by, names in segmenters.items())
+    return [
+        suspicious(
+            f'masks are not by one segmenter ({groups}): import all with the same --segmenter or '
+            '--objects'
+        )
+    ]
 
 
 def _with_strangers(found: FolderInspection) -> FolderInspection:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.lab.documents import render
+from mtv_world_ros.lab.documents import clicked_frame, render
 from mtv_world_ros.lab.inspection.clocks import JointTrack
 
 #: frames of each recording and view
@@ -38,7 +36,7 @@ def points_page(episodes: Sequence[Episode], views: Sequence[str], robot: RobotM
         for view in views
     }
     title = f'Where is the tool point? {", ".join(views)}'
-    return render('points.html.j2', title=title, views=shown)
+    return render('points.html.j2', title=title, file='points.yaml', views=shown)
 
 
 def _frames(episode: Episode, view: str, robot: RobotModel) -> list[dict[str, object]]:
@@ -54,17 +52,7 @@ def _frames(episode: Episode, view: str, robot: RobotModel) -> list[dict[str, ob
     for row in sorted(_far_apart(places)):
         index = int(covered[row])
         seconds = float(track.stamps_ns[index] - joints.stamps_ns[0]) * 1e-9
-        frame = np.asarray(track.frames[index])
-        done, data = cv2.imencode('.jpg', frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
-        assert done
-        found.append(
-            {
-                'episode': name,
-                'seconds': round(seconds, 3),
-                'width': frame.shape[1],
-                'jpeg': base64.b64encode(data.tobytes()).decode(),
-            }
-        )
+        found.append(clicked_frame(name, seconds, np.asarray(track.frames[index])))
     return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+import hashlib
 from math import hypot
 from pathlib import Path
 
@@ -159,6 +160,16 @@ class ObjectExamples:
         """Names of the objects."""
         return tuple(dict.fromkeys(example.name for example in self.examples))
 
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of all: masks by other examples are told apart by it."""
+        digest = hashlib.sha256(self.elsewhere.tobytes())
+        for one in self.examples:
+            shape = (*one.frame.shape, *one.size.tolist())
+            digest.update(f'{one.name} {shape}'.encode())
+            digest.update(one.frame.tobytes() + one.mask.astype(np.uint8).tobytes())
+        return digest.hexdigest()
+
     def of_name(self, name: str) -> list[Example]:
         """The examples of one object."""
         return [example for example in self.examples if example.name == name]
@@ -276,9 +287,8 @@ class ExampleSegmenter:
         examples: of the objects.
     """
 
-    name = 'examples'
-
     def __init__(self, examples: ObjectExamples) -> None:
+        self.name = f'examples {examples.digest[:8]}'
         elsewhere = _histogram(examples.elsewhere)
         self._looks = {name: _Look(examples.of_name(name), elsewhere) for name in examples.names}
         self._words = ColourSegmenter()

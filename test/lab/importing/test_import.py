@@ -23,6 +23,7 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError
 from mtv_world_ros.lab.importing.convert import import_dataset
 from mtv_world_ros.lab.importing.lerobot import frames_at
+from mtv_world_ros.vision.segmenters.examples import ObjectExamples
 
 START_NS = 1_000_000_000
 KINDS = ('v2.0', 'v2.1', 'v3.0', 'v3.0, unnamed index', 'images')
@@ -81,6 +82,29 @@ def test_without_joint_actions_the_measured_rows_are_the_commands(
     assert stamp == START_NS
     assert trajectory.times == pytest.approx(np.arange(1, 12) / 10, abs=2e-6)
     assert trajectory.positions == pytest.approx(expected_positions(0, np.arange(1, 12)), abs=1e-6)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_boxes_teach_from_the_frame_in_which_they_are_drawn(
+    kind, datasets, make_mapping, tmp_path
+):
+    """`--objects`, and the page with the first frame of each episode."""
+    mapping, page = make_mapping(), tmp_path / 'boxes.html'
+    command = ['import-dataset', str(datasets(kind)), '--mapping', str(mapping), '--out']
+    assert main([*command, str(tmp_path / 'out'), '--click', str(page)]) == 0
+    assert page.read_text().count('data-seconds="0.0"') == 2 and not (tmp_path / 'out').exists()
+    box = [0.3, 10, 10, 30, 30]
+    values = {'boxes': {'front': {'episode_000001': {'thing': [box]}}}}
+    (tmp_path / 'objects.yaml').write_text(json.dumps(values))
+    more = ['--objects', str(tmp_path / 'objects.yaml')]
+    assert main([*command, str(tmp_path / 'out'), *more, '--episodes', '1']) == 0
+    (example,) = ObjectExamples.load(tmp_path / 'out' / 'objects.safetensors').examples
+    assert example.frame.mean() == pytest.approx(23 + 16 * 3, abs=4)
+    episode = read_episode(tmp_path / 'out' / 'episode_000001')
+    assert episode.info.objects == ('thing',) and episode.masks is not None
+    values['boxes']['front']['episode_000007'] = {'thing': [box]}
+    (tmp_path / 'objects.yaml').write_text(json.dumps(values))
+    assert main([*command, str(tmp_path / 'other'), *more]) == 1
 
 
 def test_words_outcome_and_source_are_kept(datasets, make_mapping, tmp_path):

@@ -1,8 +1,11 @@
-"""`--objects` of imports: masks of drawn boxes, and what is wrong with the file."""
+"""`--objects` of imports: masks of drawn boxes, what is wrong with the file, and its page."""
 
 import csv
 import re
+import shutil
+from urllib.parse import unquote
 
+from browser import Browser
 import numpy as np
 import pytest
 import yaml
@@ -11,6 +14,7 @@ from mtv_world_ros.assembly import robot_path
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.lab.importing.object_boxes import load_object_boxes
 from mtv_world_ros.rendering.video import encode_video
 from mtv_world_ros.vision.jaccard import jaccard
 
@@ -77,7 +81,7 @@ def j_of(path, begin):
     for mask, (left, top) in zip(true, places(begin), strict=True):
         mask[top : top + SIZE[1], left : left + SIZE[0]] = True
     assert episode.info.objects == ('mug',)
-    assert episode.info.metadata['masks_by'] == 'examples'
+    assert re.fullmatch('examples [0-9a-f]{8}', episode.info.metadata['masks_by'])
     return jaccard(np.asarray(episode.masks['front'].frames[:]) == 1, true)
 
 
@@ -133,3 +137,106 @@ def test_boxes_beside_another_segmenter_are_refused(raw, capsys):
     boxes(raw)
     assert import_videos(raw, 'data', '--segmenter', 'colour') == 1
     assert '--objects' in capsys.readouterr().err
+
+
+def test_masks_by_other_examples_are_told_apart_by_doctor(raw, capsys):
+    """Two files of boxes: two segmenters, by name and for `doctor FOLDER`."""
+    boxes(raw)
+    assert import_videos(raw, 'one') == 0
+    boxes(raw, rows=((0.0, 28, 58, 56, 82), (1.0, 36, 58, 64, 82)))
+    assert import_videos(raw, 'two') == 0
+    shutil.rmtree(raw / 'one' / 'b')
+    (raw / 'two' / 'b').rename(raw / 'one' / 'b')
+    capsys.readouterr()
+    main(['doctor', str(raw / 'one'), '--robot', str(raw / 'one' / 'robot' / 'robot.yaml'),
+          '--out', str(raw / 'report')])  # fmt: skip
+    said = capsys.readouterr().out
+    names = re.search(
+        r"masks are not by one segmenter \('(examples \w+)': a; '(examples \w+)': b\)", said
+    )
+    assert names and names[1] != names[2], said
+
+
+def test_doctor_names_an_object_that_is_hardly_seen(raw, capsys):
+    """The command reads the stored masks."""
+    boxes(raw, recording='b', rows=((0.0, 78, 58, 106, 82),))
+    (raw / 'lab.yaml').write_text((raw / 'lab.yaml').read_text().replace('- mug', '- red thing'))
+    assert import_videos(raw) == 0
+    capsys.readouterr()
+    main(['doctor', str(raw / 'data' / 'a'), '--robot', str(raw / 'data/robot/robot.yaml'),
+          '--out', str(raw / 'report')])  # fmt: skip
+    assert "object 'red thing' is found in 0% of the frames" in capsys.readouterr().out
+
+
+#: draws a box from one pixel of the recorded image to another, as a user does, on the screen
+DRAW = """
+function draw(number, name, from, to, button = 0) {
+  const frame = document.querySelectorAll('.frame')[number], image = frame.querySelector('img');
+  const box = image.getBoundingClientRect(), scale = box.width / 160;
+  document.getElementById('name').value = name;
+  const send = (target, kind, [x, y]) => target.dispatchEvent(new MouseEvent(kind, {bubbles: true,
+    cancelable: true, button, clientX: box.left + x * scale, clientY: box.top + y * scale}));
+  if (button) { send(image, 'contextmenu', from); return; }
+  send(image, 'mousedown', from); send(window, 'mousemove', to); send(window, 'mouseup', to);
+}
+HTMLAnchorElement.prototype.click = function() { window.saved = this.href; };
+0
+"""
+
+
+@pytest.fixture
+def page(raw, capsys):
+    file = raw / 'boxes.html'
+    assert main(['import-videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml'),
+                 '--out', str(raw / 'data'), '--click', str(file)]) == 0  # fmt: skip
+    said = capsys.readouterr().out
+    assert f'page: {file}' in said and 'nothing was imported' in said
+    assert not (raw / 'data').exists()
+    return file
+
+
+def test_it_has_the_first_frame_of_every_recording_and_the_known_names(page):
+    text = page.read_text()
+    assert text.count('data-episode="a"') == 1 and text.count('data-episode="b"') == 1
+    assert '<option value="mug">' in text
+    assert 'http://' not in text and 'https://' not in text
+
+
+def test_what_it_saves_is_what_the_import_takes(page, raw, capsys):
+    browser = Browser(raw / 'profile')
+    try:
+        browser.open(page.as_uri())
+        browser.run(DRAW)
+        browser.run("draw(0, 'mug', [40, 90], [10, 10]); 0")  # replaced by the next
+        browser.run("draw(0, 'mug', [56, 82], [28, 58]); 0")  # from any corner
+        browser.run("draw(1, 'towel', [10, 40], [30, 60]); 0")  # taken away again
+        browser.run("draw(1, '', [12, 42], [40, 60]); 0")  # nobody said of what
+        assert 'which object' in browser.run("document.getElementById('count').textContent")
+        browser.run("draw(1, 'dot', [12, 42], [13, 43]); 0")  # too small
+        assert 'at least 3 px' in browser.run("document.getElementById('count').textContent")
+        browser.run("draw(1, '', [12, 42], null, 2); 0")
+        browser.run("draw(1, 'cup', [140, 100], [900, 900]); 0")  # let go outside of the picture
+        assert browser.run("document.getElementById('count').textContent") == (
+            '2 boxes of 2 objects'
+        )
+        browser.run("document.getElementById('save').dispatchEvent(new MouseEvent('click')); 0")
+        saved = browser.run('window.saved')
+    finally:
+        browser.close()
+    file = raw / 'objects.yaml'
+    file.write_text(unquote(saved.partition(',')[2]))
+    drawn = load_object_boxes(file).boxes
+    (row,) = drawn['front']['a']['mug']
+    assert row == pytest.approx((0, 28, 58, 56, 82), abs=0.2)
+    assert drawn['front']['b'].keys() == {'cup'}
+    assert drawn['front']['b']['cup'][0][3:] == (160, 120)
+    command = ['import-videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml')]
+    assert main([*command, '--objects', str(file), '--out', str(raw / 'data')]) == 0
+    assert 'object mug: found by its colours' in capsys.readouterr().out
+
+
+def test_the_page_and_the_file_at_once_are_refused(raw, capsys):
+    command = ['import-videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml')]
+    more = ['--click', str(raw / 'p.html'), '--objects', str(raw / 'o.yaml')]
+    assert main([*command, '--out', str(raw / 'data'), *more]) == 1
+    assert 'give one' in capsys.readouterr().err and not (raw / 'p.html').exists()

@@ -153,7 +153,7 @@ def test_examples_are_the_same_after_they_were_stored(examples, segmenter, tmp_p
     frames, _ = video(scene(mug=(90, 40), seed=3))
     names = ('plate', 'brown mug')
     want, have = segmenter.segment(frames, names), again.segment(frames, names)
-    assert again.name == 'examples'
+    assert again.name == segmenter.name
     assert have.status == want.status and (have.masks == want.masks).all()
 
 
