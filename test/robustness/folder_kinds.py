@@ -213,8 +213,10 @@ def make_evaluation(folder: Path) -> None:
         quality={'low': {'psnr': 20.0}}, probability=0.5, reasons=(), notes=(),
         seconds_per_chunk=1.0, seconds={}, has_ids=True,
     )  # fmt: skip
-    empty = dict.fromkeys(('provenance', 'model', 'overall', 'tasks', 'failed', 'success'), {})
-    metrics = {'name': 'a', 'label': 'a', 'episodes': ['a'], 'views': ['low'], **empty}
+    empty = dict.fromkeys(('provenance', 'overall', 'tasks', 'failed', 'success'), {})
+    model = {'views': ['low'], 'fps': 5, 'num_frames': 2, 'width': 48, 'height': 40, 'robot': 'a'}
+    metrics = {'name': 'a', 'label': 'a', 'episodes': ['a'], 'views': {'low': {}}, 'model': model}
+    metrics |= empty
     (folder / 'metrics.json').write_text(json.dumps(metrics))
     (folder / 'episodes').mkdir()
     (folder / 'episodes' / 'a.json').write_text(json.dumps({'result': result.as_json()}))

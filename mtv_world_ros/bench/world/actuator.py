@@ -26,10 +26,3 @@ class Actuator:
     kp: float
     kv: float
     max_force: float
-
-    def xml(self) -> str:
-        """Returns its MJCF."""
-        return (
-            f'<position joint="{self.joint}" kp="{self.kp}" kv="{self.kv}" '
-            f'forcerange="-{self.max_force} {self.max_force}"/>'
-        )

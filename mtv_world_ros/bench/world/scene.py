@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from pydantic import ConfigDict
 
+from mtv_world_ros.bench.mjcf import template
 from mtv_world_ros.bench.shapes import shape_named, Size
 from mtv_world_ros.bench.world.arm import actuators_of, bodies_xml
 from mtv_world_ros.bench.world.cameras import camera_xml
@@ -78,70 +78,19 @@ class Scene:
     table_m: float = 0.0
 
 
-def _numbers(values: tuple[float, ...]) -> str:
-    return ' '.join(f'{value:.9g}' for value in values)
-
-
-def _object_xml(item: SceneObject) -> str:
-    geoms = shape_named(item.shape).geoms(item.size, item.rgb)
-    turn = _numbers((float(np.cos(item.yaw / 2)), 0, 0, float(np.sin(item.yaw / 2))))
-    return (
-        f'<body name="{item.role}" pos="{_numbers(item.position)}" quat="{turn}">'
-        f'<freejoint name="{item.role}"/>{geoms}</body>'
-    )
-
-
-def _classes_xml(names: Sequence[str]) -> str:
-    """Arms collide with objects, the table and each other, but no arm with itself."""
-    bits = [2 << number for number in range(len(names))]
-    arms = ''.join(
-        f'<default class="{arm}_arm"><geom contype="{own}" conaffinity="{1 + sum(bits) - own}" '
-        f'friction="0.6"/><default class="{arm}_pad"><geom friction="1.6 0.02 0.0005" condim="4" '
-        'solref="0.008 1" priority="1"/></default></default>'
-        for arm, own in zip(names, bits, strict=True)
-    )
-    return (
-        '<default><geom solref="0.006 1"/>'
-        '<default class="object"><geom friction="0.9 0.01 0.0005" condim="4"/></default>'
-        f'{arms}</default>'
-    )
-
-
 def scene_xml(scene: Scene, robot: RobotModel) -> str:
-    """Returns the MJCF document of a scene with the arms at the origin pose of all joints.
-
-    Without a GPU, triangles cost more than pixels: half the stacks and undivided boxes take a
-    third off the time of an image, and outlines stay as they are.
-    """
-    look = scene.look
+    """Returns the MJCF document of a scene with the arms at the origin pose of all joints."""
     fixed = [camera for camera in scene.cameras if camera.mount_link == robot.base_link]
     moving = [camera for camera in scene.cameras if camera.mount_link != robot.base_link]
-    width = max(camera.width for camera in scene.cameras)
-    height = max(camera.height for camera in scene.cameras)
-    return f"""<mujoco model="bimanual_table">
-  <compiler angle="radian" autolimits="true"/>
-  <option timestep="{TIMESTEP_S}" integrator="implicitfast" cone="elliptic" impratio="10"/>
-  <visual>
-    <global offwidth="{width}" offheight="{height}"/>
-    <quality shadowsize="0" offsamples="0" numstacks="8" numquads="1"/>
-    <map znear="0.05" zfar="20"/>
-    <headlight ambient="{look.ambient} {look.ambient} {look.ambient}" diffuse="0.15 0.15 0.15"
-               specular="0 0 0"/>
-  </visual>
-  <asset><material name="matte" specular="0" shininess="0"/></asset>
-  {_classes_xml([tool.arm for tool in robot.tools])}
-  <worldbody>
-    <light type="directional" dir="{_numbers(look.light_direction)}" pos="0 0 2" castshadow="false"
-           diffuse="{look.diffuse} {look.diffuse} {look.diffuse}" ambient="0 0 0"
-           specular="0 0 0"/>
-    <geom name="table" type="plane" pos="0 0 {scene.table_m:.9g}" size="3 3 0.1"
-          rgba="{_numbers(look.table_rgb)} 1" friction="0.9 0.01 0.0005" condim="4"/>
-    {''.join(camera_xml(camera, camera.T_mount_camera) for camera in fixed)}
-    {bodies_xml(robot, moving)}
-    {''.join(_object_xml(item) for item in scene.objects)}
-  </worldbody>
-  <actuator>{''.join(actuator.xml() for actuator in actuators_of(robot))}</actuator>
-</mujoco>"""
+    return template('scene').render(
+        scene=scene,
+        timestep_s=TIMESTEP_S,
+        arms=[tool.arm for tool in robot.tools],
+        cameras=''.join(camera_xml(camera, camera.T_mount_camera) for camera in fixed),
+        bodies=bodies_xml(robot, moving),
+        geoms=[shape_named(item.shape).xml(item.size, item.rgb) for item in scene.objects],
+        actuators=actuators_of(robot),
+    )
 
 
 def rotation_of(item: SceneObject) -> FloatArray:

@@ -1,10 +1,9 @@
-"""The YAM arms as MJCF: primitive geoms on the published kinematics, masses and gains."""
+"""The YAM arms as MJCF: `config/mjcf/yam_arm.xml`, their fingers and gains."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from mtv_world_ros.bench.world.actuator import Actuator
+from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.model import RobotModel
 
 #: name of the robot that this is
@@ -14,57 +13,10 @@ ARMS = ('left', 'right')
 _BASE_POSITIONS = {'left': (-0.28, 0.0, 0.0), 'right': (0.28, 0.0, 0.0)}
 FINGER_WIDTH_M, FINGER_THICKNESS_M = 0.015, 0.01
 
-_LIGHT, _MID, _DARK = '0.62 0.62 0.63 1', '0.36 0.36 0.38 1', '0.16 0.16 0.17 1'
-
-
-@dataclass(frozen=True, slots=True)
-class Link:
-    """One moving body of the arm: frame in its parent, joint, mass and drawn/colliding geoms."""
-
-    position: str
-    quaternion: str
-    joint_range: tuple[float, float]
-    mass: float
-    kp: float
-    kv: float
-    max_torque: float
-    geoms: tuple[str, ...]
-
-
-def _capsule(start: str, end: str, radius: float, rgba: str) -> str:
-    return f'type="capsule" fromto="{start} {end}" size="{radius}" rgba="{rgba}"'
-
-
-def _cylinder(start: str, end: str, radius: float, rgba: str) -> str:
-    return f'type="cylinder" fromto="{start} {end}" size="{radius}" rgba="{rgba}"'
-
-
-def _box(center: str, half_sizes: str, rgba: str) -> str:
-    return f'type="box" pos="{center}" size="{half_sizes}" rgba="{rgba}"'
-
-
-#: kp [N m/rad], kv [N m s/rad] and largest torque [N m] of the joints
+_LIGHT, _DARK = '0.62 0.62 0.63 1', '0.16 0.16 0.17 1'
+#: kp [N m/rad], kv [N m s/rad] and largest torque [N m] of joints 1-6
 _SHOULDER, _ELBOW, _WRIST = (40, 2.5, 28), (20, 1.0, 10), (10, 0.5, 10)
-
-#: links 1-6, wxyz quaternions as published (not normalised); the first geom carries the mass
-LINKS = (
-    Link('0 0 0.0631', '1 0 0 1', (-2.61799, 3.05433), 0.124, *_SHOULDER,
-         geoms=(_cylinder('0 0 -0.02', '0 0 0.03', 0.036, _DARK),)),
-    Link('0.000025 -0.02 0.0409', '1 1 1 1', (0, 3.66519), 1.244, *_SHOULDER,
-         geoms=(_capsule('0.02 0 0', '0.24 0 0', 0.032, _LIGHT),
-                _cylinder('0 0 -0.04', '0 0 0.04', 0.036, _DARK),
-                _cylinder('0.264 0 -0.04', '0.264 0 0.04', 0.034, _DARK))),
-    Link('0.264 0 0', '0 1 0 0', (0, 3.66519), 0.854, *_SHOULDER,
-         geoms=(_capsule('-0.26 -0.06 0', '-0.02 -0.06 0', 0.034, _LIGHT),
-                _capsule('0 0 0', '-0.03 -0.06 0', 0.03, _MID))),
-    Link('-0.245 -0.06 0', '1 0 0 0', (-1.5708, 1.5708), 0.464, *_ELBOW,
-         geoms=(_capsule('0 0 0', '-0.074 -0.0395 0', 0.029, _MID),)),
-    Link('-0.074 -0.0395 0.000025', '1 -1 1 1', (-1.5708, 1.5708), 0.351, *_ELBOW,
-         geoms=(_capsule('0 0 0', '0 0.0353 0.0395', 0.028, _DARK),)),
-    Link('0 0.0353 0.0395', '1 -1 0 0', (-2.0944, 2.0944), 0.367, *_WRIST,
-         geoms=(_cylinder('0 0 0', '0 0 0.05', 0.03, _MID),
-                _box('0 0 0.06', '0.05 0.02 0.014', _DARK))),
-)  # fmt: skip
+_GAINS = (_SHOULDER, _SHOULDER, _SHOULDER, _ELBOW, _ELBOW, _WRIST)
 FINGER_MASS, FINGER_KP, FINGER_KV, FINGER_FORCE = 0.118, 100.0, 10.0, 20.0
 _FINGER_RANGE = (-0.00205, 0.037524)
 _FINGER_BASES = {'left': (-0.037, 0.0392, 0.0605), 'right': (0.037, -0.0392, 0.0605)}
@@ -86,9 +38,10 @@ def _finger_xml(arm: str, side: str, closed: float) -> str:
       <body name="{arm}_{side}_finger" pos="{x} {y} {z}" quat="1 0 1 0" gravcomp="1">
         <joint name="{arm}_{side}_finger" type="slide" axis="0 0 1" range="{low} {high}"
                armature="0.05"/>
-        <geom class="{arm}_pad" mass="{FINGER_MASS}"
-              {_box(pad, f'0.035 {FINGER_WIDTH_M / 2} {thickness}', _LIGHT)}/>
-        <geom class="{arm}_arm" mass="0" {_box(rail, '0.008 0.014 0.008', _DARK)}/>
+        <geom class="{arm}_pad" mass="{FINGER_MASS}" type="box" pos="{pad}"
+              size="0.035 {FINGER_WIDTH_M / 2} {thickness}" rgba="{_LIGHT}"/>
+        <geom class="{arm}_arm" mass="0" type="box" pos="{rail}" size="0.008 0.014 0.008"
+              rgba="{_DARK}"/>
       </body>"""
 
 
@@ -99,22 +52,9 @@ def arm_xml(arm: str, robot: RobotModel) -> str:
     """
     tool = next(tool for tool in robot.tools if tool.arm == arm)
     x, y, z = _BASE_POSITIONS[arm]
-    pedestal = f'<geom class="{arm}_arm" {_cylinder("0 0 0", "0 0 0.045", 0.05, _DARK)}/>'
-    opening = [f'<body name="{arm}_base" pos="{x} {y} {z}" quat="1 0 0 1">{pedestal}']
-    for number, link in enumerate(LINKS, 1):
-        low, high = link.joint_range
-        geoms = ''.join(
-            f'<geom class="{arm}_arm" mass="{link.mass if i == 0 else 0}" {geom}/>'
-            for i, geom in enumerate(link.geoms)
-        )
-        opening.append(
-            f'<body name="{arm}_link_{number}" pos="{link.position}" quat="{link.quaternion}" '
-            f'gravcomp="1"><joint name="{arm}_joint{number}" axis="0 0 1" range="{low} {high}" '
-            f'armature="0.03" damping="0.05"/>{geoms}'
-        )
     fingers = ''.join(_finger_xml(arm, side, tool.gripper_closed) for side in ('left', 'right'))
-    site = f'<site name="{arm}_tool" pos="0 0 0.1347" quat="1 0 0 -1" size="0.002" group="5"/>'
-    return ''.join(opening) + site + fingers + '</body>' * len(opening)
+    text = share_path('config', 'mjcf', 'yam_arm.xml').read_text(encoding='utf-8')
+    return text.format(arm=arm, base=f'{x} {y} {z}', fingers=fingers)
 
 
 def actuators() -> tuple[Actuator, ...]:
@@ -129,16 +69,16 @@ def _actuators(arm: str, first: int) -> list[Actuator]:
         Actuator(
             joint=f'{arm}_joint{number + 1}',
             column=first + number,
-            kp=link.kp,
-            kv=link.kv,
-            max_force=link.max_torque,
+            kp=kp,
+            kv=kv,
+            max_force=max_torque,
         )
-        for number, link in enumerate(LINKS)
+        for number, (kp, kv, max_torque) in enumerate(_GAINS)
     ]
     fingers = [
         Actuator(
             joint=f'{arm}_{side}_finger',
-            column=first + len(LINKS),
+            column=first + len(_GAINS),
             multiplier=sign,
             kp=FINGER_KP,
             kv=FINGER_KV,
