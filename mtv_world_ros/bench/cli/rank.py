@@ -24,10 +24,10 @@ from mtv_world_ros.cli.shared_options import (
 from mtv_world_ros.errors import ConfigError, PolicyError
 
 if TYPE_CHECKING:
-    from mtv_world_ros.bench.ranking.live_ranking import LiveRanking
     from mtv_world_ros.bench.ranking.policy_list import ListedPolicy
     from mtv_world_ros.bench.ranking.rollout_jobs import Job
     from mtv_world_ros.bench.ranking.run_jobs import RankedCheckpoint
+    from mtv_world_ros.bench.ranking.shown_rollouts import LiveRanking
 
 _DESCRIPTION = """\
 Runs policies on the same episodes in the simulator and in imagination, and says how well the two
@@ -193,7 +193,7 @@ def _viewer(arguments: argparse.Namespace) -> LiveRanking | None:
     """The viewer that `--watch` asks for; says where it is to be seen."""
     if arguments.watch is None:
         return None
-    from mtv_world_ros.bench.ranking.live_ranking import LiveRanking
+    from mtv_world_ros.bench.ranking.shown_rollouts import LiveRanking
     from mtv_world_ros.viewing import rerun_log
 
     stream = rerun_log.recording('ranking')

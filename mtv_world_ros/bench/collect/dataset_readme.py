@@ -130,14 +130,6 @@ def _cameras(cameras: Mapping[str, CameraModel]) -> Table:
     return Table(head=('view', 'image', 'focal length', 'position', 'looking down'), rows=rows)
 
 
-def _topics(path: Path) -> tuple[Table, dict[str, str]]:
-    """Topics of a written episode, and its metadata record."""
-    bag = BagReader(path)
-    found = Counter((message.topic, message.msgtype) for message in bag.messages())
-    rows = [(f'`{topic}`', f'`{kind}`', count) for (topic, kind), count in sorted(found.items())]
-    return Table(head=('topic', 'type', 'messages'), rows=rows), bag.metadata[METADATA_NAME]
-
-
 def _objects(entries: Iterable[CardEntry]) -> Table:
     """Nouns and colours of all objects, by how often they occur."""
     nouns: Counter[str] = Counter()
@@ -162,8 +154,8 @@ def readme(out: Path, card: Mapping[str, Any], entries: Sequence[CardEntry]) -> 
         entries: its episodes, at least one.
     """
     first = out / min(entry.name for entry in entries)
-    topics, metadata = _topics(first)
-    keys = [(f'`{key}`', KEYS.get(key, ''), f'`{text}`') for key, text in metadata.items()]
+    bag = BagReader(first)
+    topics = Counter((message.topic, message.msgtype) for message in bag.messages())
     config, is_zero_shot = card['config'], card['kind'] == ZERO_SHOT_SET
     return render(
         'dataset.md.j2',
@@ -181,9 +173,10 @@ def readme(out: Path, card: Mapping[str, Any], entries: Sequence[CardEntry]) -> 
         cameras=_cameras(read_episode(first, with_masks=False).cameras),
         objects=_objects(entries),
         first=first.name,
-        topics=topics,
+        topics=sorted(topics.items()),
         metadata_name=METADATA_NAME,
-        keys=Table(head=('key', 'meaning', 'first episode'), rows=keys),
+        metadata=bag.metadata[METADATA_NAME],
+        meanings=KEYS,
     )
 
 

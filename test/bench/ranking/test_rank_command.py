@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from mtv_world_ros.bench.ranking.live_ranking import rates_table
+from mtv_world_ros.bench.ranking.shown_rollouts import rates_table
 from mtv_world_ros.bench.world.opengl import missing_opengl
 from mtv_world_ros.cli import main
 
