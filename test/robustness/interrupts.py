@@ -54,10 +54,17 @@ TINY = (
     'transformer.num_attention_heads=2 transformer.attention_head_dim=12 transformer.ffn_dim=32 '
     'transformer.num_layers=1 transformer.stem_widths=[8,16,16] transformer.frames_per_token=2 '
     'transformer.freq_dim=16 video.num_frames=2 video.width=48 video.height=40 '
-    'optimizer.batch_size=1 optimizer.warmup_steps=1 optimizer.steps=12'
+    'optimizer.batch_size=1 optimizer.warmup_steps=1'
 )
 ONE_STEP = ['--steps', '1', '--threads', '1']
 SIZE = ['--width', '96', '--height', '72', '--fps', '5']
+
+
+def settings(steps: int) -> list[str]:
+    """Options of `train` for a tiny model and a number of steps."""
+    values = [*TINY.split(), f'optimizer.steps={steps}']
+    return [word for value in values for word in ('--set', value)]
+
 
 #: command -> its words, of the folder with the inputs and that of the results
 COMMANDS: dict[str, Callable[[Path, Path], list[str]]] = {
@@ -71,7 +78,7 @@ COMMANDS: dict[str, Callable[[Path, Path], list[str]]] = {
     'train': lambda given, out: [
         'train', str(given / 'set'), '--out', str(out / 'run'), '--dtype', 'float32',
         '--threads', '1', '--save-every', '5',
-        *(word for value in TINY.split() for word in ('--set', value))],
+        *settings(12)],
     'evaluate': lambda given, out: [
         'evaluate', 'bundled', str(given / 'set'), '--split', 'all', '--actions', 'true',
         '--no-ceiling', '--out', str(out / 'evaluation'), *ONE_STEP],

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 import subprocess
 
+from interrupts import ONE_STEP, settings
 import pytest
 from wan_files import AUTOENCODER, SCHEDULER, TRANSFORMER, write_videox
 import yaml
@@ -21,16 +22,8 @@ from mtv_world_ros.lab.inspection.motion_residual import ResidualSearch
 
 EPISODE = share_path('resource', 'demo_episode')
 URDF = share_path('config', 'robots', 'yam_bimanual.urdf')
-#: of the preset `small`, made tiny
-TINY = (
-    'transformer.num_attention_heads=2 transformer.attention_head_dim=12 transformer.ffn_dim=32 '
-    'transformer.num_layers=1 transformer.stem_widths=[8,16,16] transformer.frames_per_token=2 '
-    'transformer.freq_dim=16 video.num_frames=2 video.width=48 video.height=40 '
-    'optimizer.batch_size=1 optimizer.warmup_steps=1 optimizer.steps=2'
-)
 QUICK = ResidualSearch(max_pairs=5, lags_s=(0.0,), rolls_deg=(), zooms=())
-ONE_STEP = ['--steps', '1', '--threads', '1']
-SETTINGS = [word for value in TINY.split() for word in ('--set', value)]
+SETTINGS = settings(2)
 
 #: command -> its words, of the folder on the full disk
 WRITERS: dict[str, Callable[[Path], list[str]]] = {

@@ -19,7 +19,7 @@ def add_physics(parser: argparse.ArgumentParser) -> None:
 
 
 def physics_text(name: str) -> str:
-    """Returns what is true, for pages.
+    """Returns a physics' name and text, for pages.
 
     Raises:
         SimulatorError: unknown name.

@@ -190,7 +190,7 @@ def _rank(arguments: argparse.Namespace) -> int:
 
 
 def _viewer(arguments: argparse.Namespace) -> LiveRanking | None:
-    """The viewer that `--watch` asks for; says where it is to be seen."""
+    """The viewer of `--watch`; prints its address."""
     if arguments.watch is None:
         return None
     from mtv_world_ros.bench.ranking.shown_rollouts import LiveRanking

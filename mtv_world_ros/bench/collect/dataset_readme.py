@@ -106,7 +106,7 @@ def _robot(config: Mapping[str, Any]) -> str:
 
 
 def _is_usual(config: Mapping[str, Any]) -> bool:
-    """Whether a command alone makes the set again."""
+    """Whether the configuration is that of a plain command."""
     usual = plain_config(CollectConfig(robot=_robot(config)))
     for key in ('moved_share', 'policies', 'kinds'):
         usual |= {key: config[key]} if key in config else {}

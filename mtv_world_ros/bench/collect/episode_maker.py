@@ -138,7 +138,7 @@ class EpisodeMaker:
         return SimEpisode(self._robot, home, randomization, physics=physics)
 
     def _policy(self, job: CollectJob, seed: int) -> PolicyVariant | None:
-        """What acts in place of the expert."""
+        """The scripted policy in place of the expert; None = the expert."""
         if self._config.kinds:
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
             return draw_variant(self._config.kinds, rng)

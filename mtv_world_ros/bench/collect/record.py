@@ -193,7 +193,7 @@ def carry_out(
 
 
 def as_published(commands: JointTrajectory, config: RecordConfig) -> JointTrajectory:
-    """Returns commands of every control period as the action chunks tell them.
+    """Returns commands at every control period, interpolated between action chunks' points.
 
     Chunks have fewer points, so that what is quicker than them is not in them. The arms do what
     the recording says, so that commands and motion match.

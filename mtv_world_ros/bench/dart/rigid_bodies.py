@@ -317,7 +317,7 @@ class Arms:
 
     @property
     def finger_drives(self) -> FingerDrives:
-        """What the fingers hang on."""
+        """Drives of the fingers."""
         dofs = [self.skeleton.getDof(number) for number in self.fingers]
         return FingerDrives(
             stiffness=self._stiffness[self.fingers],
@@ -357,7 +357,7 @@ class Arms:
         return bool((off < _ON_WAY).all() and (slow < _ON_WAY_SPEED).all())
 
     def ways(self, positions: FloatArray) -> FloatArray:
-        """Returns where the degrees of freedom are (T, D) at joints (T, J)."""
+        """Returns positions (T, D) of the degrees of freedom at joints (T, J)."""
         return positions @ self._follows.T + self._offsets
 
     def carried(

@@ -35,7 +35,7 @@ _BLANK = 225
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BothWorlds:
-    """What was seen and imagined under a policy, from the same first observation.
+    """Chunks of one rollout in the simulator and in imagination, from one first observation.
 
     Attributes:
         fps: frames a second of the model.
@@ -190,7 +190,7 @@ def _first(holds: BoolArray, times: FloatArray) -> float:
 
 
 def _padded(values: Any, num: int, axis: int, blank: float) -> Any:
-    """An array with its axis filled up to a length."""
+    """Pads an axis of an array to a length."""
     missing = [(0, num - values.shape[axis] if k == axis else 0) for k in range(values.ndim)]
     return np.pad(values, missing, constant_values=blank)
 

@@ -48,7 +48,7 @@ class Thing:
 
     @property
     def is_hollow(self) -> bool:
-        """Others lie in it, not on it."""
+        """Whether objects lie in it, not on it."""
         shape = SHAPES.get(self.name.split()[-1])
         return shape is not None and shape.hollow
 
@@ -205,7 +205,7 @@ class _Gripper:
         now: dict[str, Thing],
         turns: dict[str, FloatArray],
     ) -> None:
-        """Moves what it holds to the tool's pose (4, 4), takes and drops."""
+        """Moves the held objects with the tool's pose (4, 4); takes and drops."""
         for role, T_tool_object in self._held.items():
             pose = tool @ T_tool_object
             now[role], turns[role] = replace(now[role], centre=pose[:3, 3]), pose[:3, :3]
@@ -237,7 +237,7 @@ class _Gripper:
 def _width(
     cameras: Sequence[CameraModel], poses: Sequence[FloatArray], masks: BoolArray, at: FloatArray
 ) -> float:
-    """How wide masks (V, H, W) of something at (3,) are [m]; the median of the views."""
+    """Width of masks (V, H, W) of an object at (3,) [m], the median of the views."""
     found = []
     for camera, pose, mask in zip(cameras, poses, masks, strict=True):
         columns = np.flatnonzero(mask.any(0))

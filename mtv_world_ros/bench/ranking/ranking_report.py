@@ -50,7 +50,7 @@ def tables(summary: Summary) -> list[Table]:
 
 
 def remarks(summary: Summary) -> list[str]:
-    """Returns what has to be known to read the numbers."""
+    """Returns the remarks that explain the numbers."""
     text = render(
         'ranking_remarks.txt.j2',
         success_from=SUCCESS_FROM,
@@ -391,7 +391,7 @@ def _failures(summary: Summary) -> list[Table]:
 
 
 def console(summary: Summary) -> str:
-    """Returns what is worth a look at once: what decides, and rates; the report has the rest."""
+    """Returns the text for the console: what decides, success rates, failures, remarks."""
     tables = [_worth(summary), _rates(summary, None), *_failures(summary)]
     parts = [f'{found.caption}\n\n{found.text()}' for found in tables]
     return '\n\n'.join([*parts, *_notes(summary)])
@@ -448,7 +448,7 @@ def _answer(summary: Summary) -> tuple[str, str]:
 
 
 def _tiles(summary: Summary) -> list[tuple[str, str, str]]:
-    """Name, number and what is below it."""
+    """Name, number and note of each tile."""
     tiles = []
     judges = {'imagined': 'imagined', RULE: 'no-picture rule', 'seen': "simulator's frames"}
     for name, label in (('pearson', "Pearson's r"), ('mmrv', 'MMRV, 0 is perfect')):
@@ -464,7 +464,7 @@ def _tiles(summary: Summary) -> list[tuple[str, str, str]]:
 
 
 def _content(summary: Summary) -> dict[str, Any]:
-    """What both pages hold."""
+    """Values that the Markdown and the HTML page share."""
     return {
         'title': TITLE,
         'remarks': remarks(summary),

@@ -72,13 +72,13 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Of its result."""
+        """Stem of its result's files."""
         return f'{self.task}_{self.index:05d}_{self.policy}'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judged:
-    """A success estimate as it is kept.
+    """A success estimate in a result file.
 
     Attributes:
         probability: NaN = abstains.
@@ -108,7 +108,7 @@ class Judged:
 
     @classmethod
     def of_motions(cls, estimate: SuccessEstimate | None) -> Judged:
-        """Returns what the motions alone say that an estimate rests on: how many succeed."""
+        """Returns the share of an estimate's foreseen motions that succeed."""
         feature = nan if estimate is None else estimate.features.get('foreseen', nan)
         if not isfinite(feature):
             return cls.stated(nan, 'abstains: no motion was foreseen')
@@ -220,7 +220,7 @@ class Result:
 
     @property
     def name(self) -> str:
-        """Of its files."""
+        """Stem of its files."""
         return f'{self.task}_{self.index:05d}_{self.policy}'
 
     def as_json(self) -> dict[str, Any]:

@@ -37,7 +37,7 @@ MakePolicy = Callable[[str, str, int, Expert], Policy]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RolloutConfig:
-    """How episodes are run.
+    """Settings of a ranking's rollouts.
 
     Attributes:
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.

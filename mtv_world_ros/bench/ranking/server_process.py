@@ -63,7 +63,7 @@ class ServerProcess:
         return True
 
     def answered(self) -> None:
-        """It gave a good answer: it may be started again as often as at first."""
+        """Notes a good answer, which resets the count of starts."""
         self._num_fruitless = 0
 
     def stop(self) -> None:

@@ -168,7 +168,7 @@ class ImaginedWorld:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeenChunk:
-    """What was seen while an answer was executed.
+    """Frames and joints while one answer was executed.
 
     Attributes:
         frames: (V, T, H, W, 3) uint8 RGB at the model's rate.

@@ -136,7 +136,7 @@ class Physics(Schema):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelParts:
-    """Numbers of what a shift changes in a compiled scene.
+    """Indices of the bodies and actuators that a shift changes in a compiled scene.
 
     Attributes:
         objects: bodies of the free objects.
@@ -150,7 +150,7 @@ class ModelParts:
     def of(
         cls, model: Any, roles: Sequence[str], robot: RobotModel, actuators: Sequence[Actuator]
     ) -> ModelParts:
-        """Returns those of a scene with objects of these roles."""
+        """Returns the indices for a scene with objects of these roles."""
         columns = {
             robot.joint_names.index(tool.gripper_joint)
             for tool in robot.tools

@@ -20,9 +20,9 @@ from mtv_world_ros.geometry.solids import Solid
 if TYPE_CHECKING:
     from mtv_world_ros.bench.dart.stepped_world import SteppedWorld
 
-#: with which finger tips give way [N/m]; of what is not weighed one by one [kg/m3]
+#: stiffness of finger tips [N/m]; density of solids without a stated mass [kg/m3]
 _PAD_STIFFNESS, _DENSITY = 1e4, 300.0
-#: what is as long as wide is round, but for these
+#: shapes that are as long as wide and not round
 _SQUARE = frozenset({'block'})
 
 
@@ -72,7 +72,7 @@ def _solid(item: SceneObject) -> Solid:
 
 
 def _response(model: Any, robot: RobotModel, actuators: Sequence[Actuator]) -> ArmResponse:
-    """How joints follow by their gains; those of fingers that follow one joint add up."""
+    """Response of the joints by their gains; gains of the fingers of one joint add up."""
     gain, armature, damping, lead = np.zeros((4, len(robot.joint_names)))
     for number, actuator in enumerate(actuators):
         column, share = actuator.column, actuator.multiplier**2

@@ -35,7 +35,7 @@ CONTROL_PERIOD_S = 0.02
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimObservation:
-    """What a policy sees after a step.
+    """Observation after a step.
 
     Attributes:
         time_s: simulated time since reset [s].
@@ -58,7 +58,7 @@ def scene_generator(seed: int) -> np.random.Generator:
 
 
 def situation_of(scene: Scene, task: Task, poses: FloatArray, openings: FloatArray) -> TruePoses:
-    """Returns where objects were, from the table up.
+    """Returns the objects' poses over time, with heights above the table.
 
     Args:
         scene: of O objects.
