@@ -15,7 +15,6 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial import ConvexHull, QhullError
 
-from mtv_world_ros.bounded_input import parse_yaml, read_text
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.geometry.robot.mesh_pieces import convex_pieces
@@ -27,6 +26,7 @@ from mtv_world_ros.geometry.robot.shape import (
     moving_links,
     rods,
     shape_origin,
+    urdf_links,
 )
 
 #: of links that state no inertia: that of water, as MuJoCo takes it [kg/m^3]
@@ -79,7 +79,7 @@ def load_parts(robot: RobotModel) -> RobotParts:
     Raises:
         RobotError: a mesh is missing or cannot be read.
     """
-    described = _urdf_links(robot)
+    described = urdf_links(robot)
     if described is None:
         return _rods(robot, f"robot '{robot.name}' has no shapes: rods stand for its links")
     path, links = described
@@ -150,18 +150,6 @@ def _inertia(points: FloatArray) -> pin.Inertia:
     second -= volumes.sum() * np.outer(centre, centre)
     moment = DENSITY * (np.trace(second) * np.eye(3) - second)
     return pin.Inertia(float(DENSITY * volumes.sum()), middle + centre, moment)
-
-
-def _urdf_links(robot: RobotModel) -> tuple[Path, dict[str, ElementTree.Element]] | None:
-    """The URDF's path and links; None where the robot has none."""
-    if robot.file is None:
-        return None
-    urdf = parse_yaml(read_text(robot.file, 'yaml_bytes')).get('urdf')
-    if urdf is None:
-        return None
-    path = robot.file.parent / str(urdf)
-    tree = ElementTree.fromstring(read_text(path, 'urdf_bytes'))
-    return path, {link.attrib['name']: link for link in tree.iter('link')}
 
 
 def _rods(robot: RobotModel, note: str) -> RobotParts:

@@ -21,13 +21,14 @@ import numpy as np
 from scipy.optimize import nnls
 
 from mtv_world_ros.bench.dart.finger_swing import FingerDrives
-from mtv_world_ros.bounded_input import parse_yaml, read_text
+from mtv_world_ros.bounded_input import read_text
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.foresight.arm_response import ArmResponse
 from mtv_world_ros.foresight.arms import finger_travels
 from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import urdf_path
 from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.geometry.transforms import about_z
 
@@ -250,7 +251,9 @@ class Arms:
         followers |= {m.joint: (m.source, m.multiplier, m.offset) for m in robot.mimics}
         travels = finger_travels(robot)
         grips = {name for name, (source, *_) in followers.items() if source in travels}
-        path = _urdf(robot)
+        path = urdf_path(robot)
+        if path is None:
+            raise RobotError(f"robot '{robot.name}' has no URDF; contact needs one")
         tree = _described(path)
         pads = _add_pads(tree, robot, grips) if settings.pad_stiffness else set[str]()
         self.skeleton, described = _skeleton(robot, path, tree)
@@ -462,16 +465,6 @@ def _boxed(shape: Any) -> Any:
     radius = shape.getRadius()
     side, length = _SQUARE * radius, shape.getHeight() + caps * radius
     return dart.dynamics.BoxShape(np.array([side, side, length]))
-
-
-def _urdf(robot: RobotModel) -> Path:
-    """Where the robot is described."""
-    urdf = None
-    if robot.file is not None:
-        urdf = parse_yaml(read_text(robot.file, 'yaml_bytes')).get('urdf')
-    if robot.file is None or urdf is None:
-        raise RobotError(f"robot '{robot.name}' has no URDF; contact needs one")
-    return robot.file.parent / str(urdf)
 
 
 def _add_pads(tree: ElementTree.Element, robot: RobotModel, grips: set[str]) -> set[str]:

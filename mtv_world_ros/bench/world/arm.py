@@ -14,10 +14,10 @@ from mtv_world_ros.bench.world import yam
 from mtv_world_ros.bench.world.actuator import Actuator
 from mtv_world_ros.bench.world.cameras import camera_xml
 from mtv_world_ros.bounded_input import read_text
-from mtv_world_ros.config import read_yaml
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import urdf_path
 
 #: gains of a joint by its largest torque or force: kp [1/rad], [1/m], and kv as a share of kp [s]
 _TURN_GAIN, _SLIDE_GAIN, _DAMPING_S = 25.0, 10.0, 0.1
@@ -115,11 +115,10 @@ class _UrdfBodies:
         )
 
     def _add_shapes(self) -> None:
-        file = self._robot.file
-        urdf = None if file is None else read_yaml(file, 'robot file', 'robot').get('urdf')
-        if file is None or urdf is None:
+        path = urdf_path(self._robot)
+        if path is None:
             raise SimulatorError(f"robot '{self._robot.name}' has no URDF to be simulated with")
-        text = read_text(file.parent / urdf, 'urdf_bytes')
+        text = read_text(path, 'urdf_bytes')
         shapes = pin.buildGeomFromUrdfString(self._model, text, pin.GeometryType.VISUAL)
         for shape in shapes.geometryObjects:
             joint = int(shape.parentJoint)

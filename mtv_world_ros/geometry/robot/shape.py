@@ -73,6 +73,23 @@ class RobotShape:
     missing: tuple[str, ...] = ()
 
 
+def urdf_path(robot: RobotModel) -> Path | None:
+    """Returns where a robot's URDF lies; None = it is given by a table, or made in code."""
+    if robot.file is None:
+        return None
+    urdf = parse_yaml(read_text(robot.file, 'yaml_bytes')).get('urdf')
+    return None if urdf is None else robot.file.parent / str(urdf)
+
+
+def urdf_links(robot: RobotModel) -> tuple[Path, dict[str, ElementTree.Element]] | None:
+    """Returns the URDF's path and its links by name; None where the robot has none."""
+    path = urdf_path(robot)
+    if path is None:
+        return None
+    tree = ElementTree.fromstring(read_text(path, 'urdf_bytes'))
+    return path, {link.attrib['name']: link for link in tree.iter('link')}
+
+
 def load_shape(robot: RobotModel) -> RobotShape:
     """Returns the robot's shape.
 
@@ -85,14 +102,10 @@ def load_shape(robot: RobotModel) -> RobotShape:
     """
     if robot.file is None:
         return rods(robot, 'the robot has no file')
-    urdf = parse_yaml(read_text(robot.file, 'yaml_bytes')).get('urdf')
-    if urdf is None:
+    described = urdf_links(robot)
+    if described is None:
         return rods(robot, 'the robot is given by a table')
-    path = robot.file.parent / str(urdf)
-    links = {
-        link.attrib['name']: link
-        for link in ElementTree.fromstring(read_text(path, 'urdf_bytes')).iter('link')
-    }
+    path, links = described
     found = {name: link_shapes(link, path, sliced=True) for name, link in links.items()}
     moving = moving_links(robot)
     parts = tuple(part for shapes, _ in found.values() for part in shapes)
