@@ -1,10 +1,11 @@
 from dataclasses import replace
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 import pytest
 
 from mtv_world_ros.bench.shapes import SHAPES
-from mtv_world_ros.bench.tasks.tasks import task_named, TASKS, tasks_named
+from mtv_world_ros.bench.tasks.tasks import Task, task_named, TASKS, tasks_named
 from mtv_world_ros.bench.world.randomize import draw_scene, instruction_of, start_situation
 from mtv_world_ros.bench.world.workcell import workcell_of
 from mtv_world_ros.errors import SimulatorError
@@ -131,3 +132,12 @@ def test_things_that_grow_keep_their_colour_and_no_two_objects_share_one():
         for name in names:
             word, kind = name.split()
             assert grown.get(kind, word) == word
+
+
+def test_a_mistyped_key_of_a_scene_is_refused():
+    role = {'role': 'a', 'shapes': ['block']}
+    scene = {'name': 'x', 'roles': [role], 'moves': [{'subject': 'a', 'reference': 'table'}]}
+    assert TypeAdapter(Task).validate_python(scene).roles[0].shapes == ('block',)
+    for wrong in ({**scene, 'mirored': True}, {**scene, 'roles': [{**role, 'shape': 'cup'}]}):
+        with pytest.raises(ValidationError, match='mirored|shape'):
+            TypeAdapter(Task).validate_python(wrong)
