@@ -73,11 +73,7 @@ class Table:
         return '\n\n'.join(part.markdown() for part in self.narrow(width))
 
     def markdown(self, *, aligned: bool = True) -> str:
-        """Returns the table without its caption.
-
-        Args:
-            aligned: columns as wide as their widest cell, for those who read it as text.
-        """
+        """Returns the table without its caption, its columns `aligned` for reading as text."""
         lines = [[str(cell) for cell in row] for row in (self.head, *self.rows)]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         if not aligned:

@@ -19,9 +19,8 @@ if TYPE_CHECKING:
 
     from mtv_world_ros.data.bag_mapping import EpisodeSource
     from mtv_world_ros.data.stored_rollout import StoredRollout
-    from mtv_world_ros.lab.training.training_config import TrainingConfig, TrainingRun
+    from mtv_world_ros.lab.training.training_config import TrainingConfig
     from mtv_world_ros.lab.training.training_run import HeldOut, Judge
-    from mtv_world_ros.vision.describers.describer import Describer
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -53,29 +52,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         'share it',
     )
     add_options(parser, 'source')
-    add_run_options(parser)
-    parser.add_argument(
-        '--data-workers',
-        type=int,
-        default=0,
-        metavar='N',
-        help='processes that prepare clips, with segmenters on the CPU; 0 = a thread. The log '
-        'says how long training waited for clips',
-    )
-    parser.add_argument(
-        '--peak-tflops',
-        type=float,
-        default=0.0,
-        metavar='N',
-        help='of a device, for the model-FLOP utilisation in the log; 0 = that of a product of '
-        'large matrices, measured at the start',
-    )
-    add_held_out(parser)
-    parser.set_defaults(handler=_train)
-
-
-def add_run_options(parser: argparse.ArgumentParser) -> None:
-    """Adds overrides, episodes, seed, device, saving."""
     parser.add_argument(
         '--set',
         action='append',
@@ -112,12 +88,42 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
         default=10.0,
         help='longest time between saved states [min]; Ctrl-C and SIGTERM save, too',
     )
+    parser.add_argument(
+        '--data-workers',
+        type=int,
+        default=0,
+        metavar='N',
+        help='processes that prepare clips, with segmenters on the CPU; 0 = a thread. The log '
+        'says how long training waited for clips',
+    )
+    parser.add_argument(
+        '--peak-tflops',
+        type=float,
+        default=0.0,
+        metavar='N',
+        help='of a device, for the model-FLOP utilisation in the log; 0 = that of a product of '
+        'large matrices, measured at the start',
+    )
+    parser.add_argument(
+        '--sample-every',
+        type=int,
+        default=0,
+        metavar='STEPS',
+        help='imagine and score held-out episodes, and keep the best as checkpoint-best; 0 = off',
+    )
+    parser.add_argument(
+        '--held-out',
+        type=Path,
+        metavar='DIR',
+        help="data set they are of; default: DATASET. Its split 'val', else 'test'",
+    )
+    parser.add_argument('--held-out-episodes', type=int, default=4, metavar='N')
+    parser.set_defaults(handler=_train)
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.errors import ConfigError
     from mtv_world_ros.lab.splits import select
-    from mtv_world_ros.lab.training.training_config import load_training_config
+    from mtv_world_ros.lab.training.training_config import load_training_config, TrainingRun
 
     config = load_training_config(arguments.preset, _overrides(arguments))
     if arguments.dry_run:
@@ -151,21 +157,24 @@ def _train(arguments: argparse.Namespace) -> int:
     source = load_source(arguments.topics, arguments.calibration)
     dtype = choose_dtype(arguments.dtype, arguments.device)
     paths = select(arguments.dataset, arguments.split, default='train').paths
-    use_threads(arguments)
+    _use_threads(arguments)
     refuse_test_kinds(paths, 'training')
-    run = run_of(arguments, config, paths).replace(
-        initial=checkpoint_path(arguments.init) if arguments.init else None,
-        data_workers=arguments.data_workers,
-        peak_tflops=arguments.peak_tflops,
-        latent_cache=arguments.latent_cache,
+    same = ('out', 'seed', 'device', 'dtype', 'save_every', 'save_minutes', 'cache')
+    same += ('latent_cache', 'data_workers', 'peak_tflops')
+    run = TrainingRun(
+        config=config,
+        dataset=tuple(paths),
+        num_episodes=arguments.episodes,
         source=source,
+        initial=checkpoint_path(arguments.init) if arguments.init else None,
+        **{name: getattr(arguments, name) for name in same},
     )
     folder = train(
         run,
         robot=load_robot(robot_path(config.video.robot)),
         segmenter=assemble_segmenter(arguments.segmenter, device=arguments.device),
         describer=asked_describer(arguments.describer),
-        held_out=held_out(arguments, paths, dtype, source),
+        held_out=_held_out(arguments, paths, dtype, source),
     )
     print(f'{f"adapter for {arguments.init}" if config.lora.rank else "checkpoint"}: {folder}')
     model = [str(arguments.init), '--adapter', str(folder)] if config.lora.rank else [str(folder)]
@@ -176,7 +185,7 @@ def _train(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def use_threads(arguments: argparse.Namespace) -> None:
+def _use_threads(arguments: argparse.Namespace) -> None:
     """Lets torch use the threads of `--threads`: 0 = the process's share of the cores."""
     import os
 
@@ -188,30 +197,8 @@ def use_threads(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(arguments.threads or threads_each(processes))
 
 
-def run_of(
-    arguments: argparse.Namespace, config: TrainingConfig, paths: Sequence[Path]
-) -> TrainingRun:
-    """Returns the training of the options that `add_run_options` adds."""
-    from mtv_world_ros.lab.training.training_config import TrainingRun
-
-    return TrainingRun(
-        config=config,
-        dataset=tuple(paths),
-        out=arguments.out,
-        num_episodes=arguments.episodes,
-        seed=arguments.seed,
-        device=arguments.device,
-        dtype=arguments.dtype,
-        save_every=arguments.save_every,
-        save_minutes=arguments.save_minutes,
-        cache=arguments.cache,
-    )
-
-
 def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     """Overrides of the preset by options; --set has precedence."""
-    from mtv_world_ros.errors import ConfigError
-
     overrides: dict[str, Any] = {}
     if arguments.views is not None:
         views = [view.strip() for view in arguments.views.split(',') if view.strip()]
@@ -232,7 +219,6 @@ def set_overrides(items: list[str]) -> dict[str, Any]:
     import yaml
 
     from mtv_world_ros.bounded_input import parse_yaml
-    from mtv_world_ros.errors import ConfigError
 
     overrides: dict[str, Any] = {}
     for item in items:
@@ -265,25 +251,7 @@ def _dry_run(config: TrainingConfig, arguments: argparse.Namespace) -> int:
 _SPLITS = ('val', 'test')
 
 
-def add_held_out(parser: argparse.ArgumentParser) -> None:
-    """Adds the options."""
-    parser.add_argument(
-        '--sample-every',
-        type=int,
-        default=0,
-        metavar='STEPS',
-        help='imagine and score held-out episodes, and keep the best as checkpoint-best; 0 = off',
-    )
-    parser.add_argument(
-        '--held-out',
-        type=Path,
-        metavar='DIR',
-        help="data set they are of; default: DATASET. Its split 'val', else 'test'",
-    )
-    parser.add_argument('--held-out-episodes', type=int, default=4, metavar='N')
-
-
-def held_out(
+def _held_out(
     arguments: argparse.Namespace,
     trained_on: Sequence[Path],
     dtype: torch.dtype,
@@ -296,7 +264,6 @@ def held_out(
     """
     if not arguments.sample_every:
         return None
-    from mtv_world_ros.assembly import asked_describer
     from mtv_world_ros.lab.training.training_run import HeldOut, spread
 
     paths = spread(_paths(arguments), arguments.held_out_episodes)
@@ -306,17 +273,7 @@ def held_out(
             f"'{min(both)}' and {len(both) - 1} more would be trained on and held out; give "
             '--held-out another folder, or --split train'
         )
-    judge = make_judge(
-        paths,
-        arguments.out / 'held_out',
-        arguments.device,
-        dtype,
-        base=arguments.init,
-        source=source,
-        segmenter=arguments.segmenter,
-        describer=asked_describer(arguments.describer),
-    )
-    return HeldOut(judge, arguments.sample_every)
+    return HeldOut(_judge(arguments, paths, dtype, source), arguments.sample_every)
 
 
 def _paths(arguments: argparse.Namespace) -> Sequence[Path]:
@@ -335,32 +292,16 @@ def _paths(arguments: argparse.Namespace) -> Sequence[Path]:
     return selection.paths
 
 
-def make_judge(
-    paths: Sequence[Path],
-    out: Path,
-    device: str,
-    dtype: torch.dtype,
-    base: str | None = None,
-    source: EpisodeSource | None = None,
-    segmenter: str = 'auto',
-    describer: Describer | None = None,
+def _judge(
+    arguments: argparse.Namespace, paths: Sequence[Path], dtype: torch.dtype, source: EpisodeSource
 ) -> Judge:
     """Returns a function that scores checkpoints by J of moving objects, as `mtv-world evaluate`.
 
-    Args:
-        paths: of the episodes.
-        out: gets a folder per step, with `metrics.json` and an MP4 per episode.
-        device: of the model.
-        dtype: of the model.
-        base: checkpoint that adapters are used on.
-        source: topics and robot of the episodes; None = this package's own format.
-        segmenter: finds the objects' masks.
-        describer: names the objects; None = the episodes, else their instructions.
+    `OUT/held_out` gets a folder per step, with `metrics.json` and an MP4 per episode.
     """
     import torch
 
-    from mtv_world_ros.assembly import load_pipeline
-    from mtv_world_ros.data.bag_mapping import EpisodeSource
+    from mtv_world_ros.assembly import asked_describer, load_pipeline
     from mtv_world_ros.data.stored_rollout import load_rollout
     from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
     from mtv_world_ros.lab.evaluation.results import rollout_path
@@ -368,42 +309,44 @@ def make_judge(
     from mtv_world_ros.lab.training.training_run import HeldOutScores
     from mtv_world_ros.model.lora import ADAPTER
 
+    describer = asked_describer(arguments.describer)
+
     def judge(checkpoint: Path, step: int) -> HeldOutScores:
-        folder = out / f'{step:07d}'
+        folder = arguments.out / 'held_out' / f'{step:07d}'
         is_adapter = (checkpoint / ADAPTER).is_file()
         pipeline = load_pipeline(
-            base if is_adapter and base else checkpoint,
+            arguments.init if is_adapter and arguments.init else checkpoint,
             adapter=checkpoint if is_adapter else None,
-            device=device,
+            device=arguments.device,
             dtype=str(dtype).removeprefix('torch.'),
             num_threads=torch.get_num_threads(),  # keep the training's threads
-            segmenter=segmenter,
+            segmenter=arguments.segmenter,
         )
         summary = evaluate(
             pipeline,
             paths,
             folder,
-            EvaluationConfig(actions=('true',), ceiling=False, source=source or EpisodeSource()),
+            EvaluationConfig(actions=('true',), ceiling=False, source=source),
             describer=describer,
             show_progress=False,
         )
         for result in summary.results:
-            show(load_rollout(rollout_path(folder, result.episode)), folder / result.episode)
+            _show(load_rollout(rollout_path(folder, result.episode)), folder / result.episode)
         shutil.rmtree(folder / 'episodes')
         by_view = {None: '', **{view: f'_{view}' for view in pipeline.spec.views}}
-        numbers = {}
-        for view, suffix in by_view.items():
-            estimates = summary.estimates(view)
-            for name in ('j_moving', 'j_copy_moving'):
-                value = estimates[name].value if name in estimates else math.nan
-                if math.isfinite(value):
-                    numbers[name + suffix] = round(value, 4)
+        numbers = {
+            name + suffix: round(estimates[name].value, 4)
+            for view, suffix in by_view.items()
+            for estimates in [summary.estimates(view)]
+            for name in ('j_moving', 'j_copy_moving')
+            if math.isfinite(estimates[name].value)
+        }
         return HeldOutScores(score=numbers.get('j_moving', math.nan), numbers=numbers)
 
     return judge
 
 
-def show(rollout: StoredRollout, path: Path) -> None:
+def _show(rollout: StoredRollout, path: Path) -> None:
     """Writes an MP4: recorded, trajectory video and imagined side by side, views below."""
     import numpy as np
 

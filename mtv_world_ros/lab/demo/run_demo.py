@@ -37,19 +37,6 @@ from mtv_world_ros.rendering.video import (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScoredDemo:
-    """Chunks beside the recording.
-
-    Attributes:
-        comparison: frames that are both recorded and imagined.
-        rows: their J.
-    """
-
-    comparison: Comparison
-    rows: tuple[ScoreRow, ...]
-
-
 def run_demo(
     episode: Path,
     out: Path,
@@ -81,20 +68,21 @@ def run_demo(
     )
     record_through_node(episode, spec.views, out, options)
     predictions = read_predictions(out / 'predictions', spec.views)
-    scored = _score(recording, predictions.chunks, spec.views)
-    report = _report(recording, predictions, scored, spec.views)
+    comparison, rows = _score(recording, predictions.chunks, spec.views)
+    report = _report(recording, predictions, rows, spec.views)
     write_whole(out / 'report.json', json.dumps(report, indent=2) + '\n')
     notes = sheet_notes(report, spec.views)
     text = '\n'.join([*_object_rows(report), *notes])
-    sheet = contact_sheet(scored.comparison, title=recording.instruction, notes=notes)
+    sheet = contact_sheet(comparison, title=recording.instruction, notes=notes)
     write_png(out / 'contact_sheet.png', sheet)
-    write_video(out / 'comparison.mp4', side_by_side(scored.comparison), spec.fps)
+    write_video(out / 'comparison.mp4', side_by_side(comparison), spec.fps)
     return f'{text}\n\nwritten to {out}: contact_sheet.png comparison.mp4 predictions/ report.json'
 
 
 def _score(
     recording: Recording, chunks: Sequence[RecordedChunk], views: tuple[str, ...]
-) -> ScoredDemo:
+) -> tuple[Comparison, list[ScoreRow]]:
+    """The frames that are both recorded and imagined, and their J."""
     segmenter = assemble_segmenter('colour')
     rows: list[ScoreRow] = []
     shown: list[tuple[np.ndarray, ...]] = []
@@ -118,7 +106,7 @@ def _score(
     comparison = Comparison(
         views=views, times=times, real=real, trajectory=trajectory, imagined=imagined
     )
-    return ScoredDemo(comparison=comparison, rows=tuple(rows))
+    return comparison, rows
 
 
 def _frames_at(recording: Recording, stamps_ns: np.ndarray) -> np.ndarray:
@@ -129,13 +117,16 @@ def _frames_at(recording: Recording, stamps_ns: np.ndarray) -> np.ndarray:
 
 
 def _report(
-    recording: Recording, predictions: Predictions, scored: ScoredDemo, views: tuple[str, ...]
+    recording: Recording,
+    predictions: Predictions,
+    rows: Sequence[ScoreRow],
+    views: tuple[str, ...],
 ) -> dict[str, Any]:
     reports = [chunk.report for chunk in predictions.chunks]
     sent = [r for r in predictions.reports if r.get('state') == 'published']
     published = sum(int(report['frames_published']) for report in sent) * len(views)
     keys = ('j_object_mean', 'j_moving', 'j_copy_mean', 'j_copy_moving')
-    means = {view: episode_means(scored.rows, view) for view in views}
+    means = {view: episode_means(rows, view) for view in views}
     judged = _whole_chunks(recording, predictions.chunks)
     success = float(judged[-1].report['success'])
     return {
@@ -163,7 +154,7 @@ def _report(
                 'j': _known(row.j),
                 'j_copy': _known(row.j_copy),
             }
-            for row in scored.rows
+            for row in rows
             if row.name
         ],
     }
@@ -193,12 +184,7 @@ def _object_rows(report: dict[str, Any]) -> list[str]:
 
 
 def sheet_notes(report: dict[str, Any], views: tuple[str, ...]) -> list[str]:
-    """Returns the lines below the contact sheet, which also end the table.
-
-    Args:
-        report: what `report.json` holds.
-        views: cameras; each has a line.
-    """
+    """Returns the lines below the contact sheet, which also end the table."""
     lines = []
     for view in views:
         means = report['views'][view]
@@ -246,14 +232,7 @@ class RecordedChunk:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Predictions:
-    """Everything that was recorded from the node.
-
-    Attributes:
-        chunks: in order.
-        reports: all reports, as text by key.
-        num_frames: predicted images received, all views.
-        num_infos: CameraInfos received beside them.
-    """
+    """Everything that was recorded from the node; counts of images are over all views."""
 
     chunks: tuple[RecordedChunk, ...]
     reports: tuple[dict[str, str], ...]

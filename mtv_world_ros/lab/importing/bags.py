@@ -174,7 +174,7 @@ def import_bags(
         out: folder of the episodes.
         mapping: names and kinds of the topics, with views.
         robot_file: the robot's YAML.
-        calibration: of the cameras; None = the bags' own.
+        calibration: file of the cameras; None = the bags' own.
         stage: names the objects and finds their masks.
         progress: wraps the bags, e.g. in a progress bar.
 
@@ -199,12 +199,7 @@ def episode_name(bag: Path) -> str:
 
 
 def summary_line(path: Path, objects: bool = False) -> str:
-    """What an imported episode holds, in one line.
-
-    Args:
-        path: its folder.
-        objects: whether masks were looked for.
-    """
+    """What an imported episode holds, in one line; `objects` = also where none are named."""
     episode = read_episode(path, with_cameras=False)
     states = episode.joint_states
     assert states is not None
@@ -236,14 +231,7 @@ def convert_bag(
     key: str = '',
     stage: ObjectStage = AS_RECORDED,
 ) -> tuple[str, ...]:
-    """Writes a bag as an episode, whose folder appears when it is complete.
-
-    Returns:
-        What was odd and how it was handled.
-
-    Raises:
-        MtvWorldError: the bag cannot be converted; nothing is left behind.
-    """
+    """Writes a bag as an episode; see `write_imported`."""
     episode = read_episode(
         bag,
         views=list(mapping.views),
@@ -264,15 +252,15 @@ def write_imported(
     key: str = '',
     stage: ObjectStage = AS_RECORDED,
 ) -> tuple[str, ...]:
-    """Writes what was read of a recording as an episode of this package.
+    """Writes a recording as an episode, whose folder appears when it is complete.
 
     Args:
-        episode: with cameras.
+        episode: what was read, with cameras.
         source: name of the recording.
         out: folder of the episode.
-        mapping: what is said of it, and how commands are checked.
-        robot: the robot.
-        key: of mapping, robot and calibration.
+        mapping: task, outcome and quality of what is written, and how commands are checked.
+        robot: gives the order of joints and their limits.
+        key: digest of mapping, robot and calibration.
         stage: names the objects and finds their masks.
 
     Returns:
@@ -291,10 +279,10 @@ def write_imported(
         '--no-guess'
         for view, what in episode.unknown.items()
     ]
-    told = mapping.instruction or episode.info.instruction
+    instruction = mapping.instruction or episode.info.instruction
     names = stage.names(
         out.name,
-        told,
+        instruction,
         lambda: np.asarray(episode.images[episode.views[0]].frames[0]),
         given=mapping.objects,
         stored=episode.info.objects,
@@ -305,7 +293,7 @@ def write_imported(
     with EpisodeWriter(
         out,
         task=mapping.task or episode.info.task,
-        instruction=told,
+        instruction=instruction,
         robot=robot.name,
         cameras=[episode.cameras[v] for v in episode.views if v not in episode.unknown],
         objects=names,
@@ -384,7 +372,7 @@ def _in_order(
     def add(stamp: int, rank: int, write: Callable[..., Any], *values: Any) -> None:
         entries.append((stamp, rank, lambda: write(*values)))
 
-    for stamp, words in _told(episode, mapping, int(stamps[0])):
+    for stamp, words in _instructions(episode, mapping, int(stamps[0])):
         add(stamp, 0, writer.write_instruction, stamp, words)
     for stamp, row in zip(stamps.tolist(), positions, strict=True):
         add(stamp, 1, writer.write_joint_states, stamp, robot.joint_names, row)
@@ -405,7 +393,7 @@ def _in_order(
     return [write for _, _, write in sorted(entries, key=lambda entry: entry[:2])]
 
 
-def _told(episode: Episode, mapping: BagMapping, start_ns: int) -> list[tuple[int, str]]:
+def _instructions(episode: Episode, mapping: BagMapping, start_ns: int) -> list[tuple[int, str]]:
     """Instructions by stamp, at least one."""
     if mapping.instruction or not episode.instructions:
         return [(start_ns, mapping.instruction or episode.info.instruction)]

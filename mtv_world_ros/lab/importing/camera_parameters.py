@@ -115,17 +115,17 @@ class CameraTrack(NamedTuple):
     note: str = ''
 
 
-def camera_model(
+def camera_track(
     source: CameraSource,
     dataset: Path,
     episode_index: int,
     values: Mapping[str, FloatArray],
     size: tuple[int, int],
-) -> CameraModel:
-    """Returns the view's camera for images of `size`; see `camera_track`.
+) -> CameraTrack:
+    """Returns a view's camera for images of a width and height [px].
 
     Args:
-        source: of the view.
+        source: calibration file or camera parameters of the view.
         dataset: root of the dataset.
         episode_index: for file names that hold `{episode_index}`.
         values: (T, ...) values of the features that the source names.
@@ -134,17 +134,6 @@ def camera_model(
     Raises:
         CalibrationError: the parameters are missing or wrong, or change within the episode.
     """
-    return camera_track(source, dataset, episode_index, values, size).camera
-
-
-def camera_track(
-    source: CameraSource,
-    dataset: Path,
-    episode_index: int,
-    values: Mapping[str, FloatArray],
-    size: tuple[int, int],
-) -> CameraTrack:
-    """Returns `camera_model`, and the poses of the rows of a camera that moves."""
     if source.calibration is not None:
         cameras = load_calibration(source.calibration)
         if source.view not in cameras:

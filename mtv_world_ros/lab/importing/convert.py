@@ -56,8 +56,8 @@ def import_each(
 
     Args:
         items: e.g. numbers of a data set's episodes.
-        key: of mapping, robot and calibration; an episode that was made with others is an error.
-        place: the folder of an item's episode.
+        key: digest of mapping, robot and calibration; an episode made with others is an error.
+        place: gives the folder of an item's episode.
         convert: writes the folder; returns what was odd and how it was handled.
     """
     summary = ImportSummary[Item]()
@@ -142,7 +142,7 @@ def import_dataset(
     """Converts a LeRobot dataset into episodes `out/episode_<number>`, with `out/robot/` beside.
 
     Args:
-        dataset: its folder.
+        dataset: folder of the dataset.
         mapping: mapping file, see `load_mapping`.
         out: folder of the episodes.
         episodes: numbers of those wanted; None = all.

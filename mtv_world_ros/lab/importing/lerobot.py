@@ -56,10 +56,7 @@ class EpisodeEntry:
 
 
 class LeRobotDataset:
-    """A dataset's folder.
-
-    Args:
-        root: folder with `meta/`, `data/` and `videos/`.
+    """A dataset: a folder with `meta/`, `data/` and `videos/`.
 
     Attributes:
         root: the folder.
@@ -379,15 +376,10 @@ def pyarrow_modules() -> tuple[Any, Any]:
 
 
 def frames_at(path: Path, times: FloatArray, tolerance_s: float) -> Iterator[ByteArray]:
-    """Yields the (H, W, 3) RGB frame at each of increasing times, in one pass.
-
-    Args:
-        path: video file.
-        times: (T,) presentation times in the file [s], increasing.
-        tolerance_s: largest distance of a frame from its time [s].
+    """Yields the (H, W, 3) RGB frame of a video at each of (T,) increasing times [s], in one pass.
 
     Raises:
-        EpisodeError: the file is missing or damaged, or has no frame at a time.
+        EpisodeError: the file is missing or damaged, or has no frame near enough to a time.
     """
     if len(times) == 0:
         return

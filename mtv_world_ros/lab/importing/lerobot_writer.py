@@ -87,8 +87,8 @@ def export_dataset(
     Args:
         episodes: folders of episodes with the same views and image sizes.
         out: folder of the dataset.
-        robot: of the episodes.
-        robot_name: its bundled name or file, for the mapping.
+        robot: gives the order of joints.
+        robot_name: bundled name or file of the robot, for the mapping.
         fps: rows a second [Hz].
         progress: wraps the episodes, e.g. in a progress bar.
         size: width and height of the images [px]; None = as recorded.

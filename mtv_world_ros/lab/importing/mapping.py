@@ -77,7 +77,7 @@ class ActionStream(Stream):
             values: in the dataset's units.
             names: of the columns; empty where the dataset does not name them.
             measured: (T, J) positions of the same rows.
-            robot: the robot.
+            robot: gives the order of joints, and the tools.
 
         Raises:
             ConfigError: a column is not there.
@@ -177,9 +177,8 @@ def guess_mapping(
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Returns the values of a mapping for columns that are named like the robot's joints.
 
-    And the image features that are left out, since the calibration has no such view.
-
-    Views are the image features that the calibration has, by the last part of their names.
+    Views are the image features that the calibration has, by the last part of their names; the
+    others are returned beside.
 
     Raises:
         ConfigError: the calibration has none of the views.

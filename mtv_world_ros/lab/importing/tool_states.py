@@ -23,21 +23,12 @@ def joints_of_poses(
     arm: str,
     poses: ToolTargets,
     wanted: FloatArray,
-    seed: int = 0,
 ) -> str:
-    """Writes an arm's joints for measured poses of its tool into `positions` (T, J).
+    """Writes an arm's joints for measured poses (T, 4, 4) of its tool into `positions` (T, J).
 
     Of the solutions of the first pose, the one nearest to the middle of the limits is taken;
     each later one is the nearest to the one before. An arm of more than six joints has more
     freedom than a pose tells: its elbow is where the least motion brings it, not where it was.
-
-    Args:
-        positions: to be changed.
-        robot: the robot.
-        arm: whose tool it is.
-        poses: frame and link of the poses.
-        wanted: (T, 4, 4) poses.
-        seed: of the postures that the first pose is solved from.
 
     Returns:
         What is left of the poses, in words.
@@ -51,7 +42,7 @@ def joints_of_poses(
     solver = ArmSolver(robot, tool)
     T_base_frame = robot.link_poses(poses.frame or robot.base_link, positions)
     goals = T_base_frame @ wanted
-    row, lost = _first(solver, robot, goals[0], seed), 0
+    row, lost = _first(solver, robot, goals[0]), 0
     if row is None:
         raise EpisodeError(f"arm '{arm}': its first pose is out of reach: {_HINT}")
     for k, goal in enumerate(goals):
@@ -76,11 +67,11 @@ def joints_of_poses(
 _HINT = 'are frame, link, unit and rotation_is right?'
 
 
-def _first(solver: ArmSolver, robot: RobotModel, goal: FloatArray, seed: int) -> FloatArray | None:
+def _first(solver: ArmSolver, robot: RobotModel, goal: FloatArray) -> FloatArray | None:
     """The solution nearest to the middle of the limits; None where there is none."""
     lower = np.maximum(robot.lower[solver.indices], -np.pi)
     upper = np.minimum(robot.upper[solver.indices], np.pi)
-    middle, generator = (lower + upper) / 2, np.random.default_rng(seed)
+    middle, generator = (lower + upper) / 2, np.random.default_rng(0)
     starts = [middle, *generator.uniform(lower, upper, (_NUM_STARTS, len(middle)))]
     solutions = []
     for start in starts:

@@ -145,7 +145,7 @@ def import_videos(
         folder: of the files that the mapping names.
         out: folder of the episodes.
         mapping: which file and column is what.
-        calibration: of the cameras; None = not known.
+        calibration: file of the cameras; None = not known.
         stage: names the objects and finds their masks.
         progress: wraps the recordings, e.g. in a progress bar.
 
@@ -286,11 +286,7 @@ def _instruction(keys: Mapping[str, Any], mapping: VideoMapping, path: Path) -> 
 
 
 class VideoFrames:
-    """Frames of a video file, decoded one after the other.
-
-    Args:
-        path: the file.
-        count: frames that are taken; None = all.
+    """The first `count` frames (None = all) of a video file, decoded one after the other.
 
     Raises:
         EpisodeError: the file is missing or damaged, or holds no video.

@@ -15,11 +15,10 @@ class AveragedWeights:
 
     Parameters without `requires_grad` stay unchanged and take no further memory.
 
-    Args:
-        transformer: becomes `worker`, the working copy.
-        device: of all weights.
-        dtype: of forward and backward.
-        ema_decay: of the averaged weights.
+    Attributes:
+        worker: the transformer, in the number format of forward and backward.
+        master: trained parameters in float32, by name.
+        ema: moving averages of these.
     """
 
     def __init__(

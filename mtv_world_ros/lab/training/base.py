@@ -52,16 +52,10 @@ def load_base(
     *,
     seed: int,
 ) -> Base:
-    """Loads a checkpoint and adds a new adapter where the preset trains one.
+    """Loads a checkpoint and adds a new adapter, drawn by the seed, where the preset trains one.
 
-    umT5 is loaded to encode the prompt, then freed.
-
-    Args:
-        config: the preset.
-        folder: of the checkpoint.
-        device: of the training.
-        dtype: of forward and backward, and of the encoders: the same as in serving.
-        seed: of a new adapter.
+    Encoders have the number format of forward and backward, as in serving. umT5 is loaded to
+    encode the prompt, then freed.
 
     Raises:
         TrainingError: there is no folder, or its model is not the preset's.

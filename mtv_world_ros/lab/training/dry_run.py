@@ -75,13 +75,7 @@ class StepCost:
 
 
 def step_cost(config: TrainingConfig, *, dtype: torch.dtype, fake: bool = True) -> StepCost:
-    """Runs one step on shapes only and counts operations and bytes.
-
-    Args:
-        config: the preset.
-        dtype: of forward and backward.
-        fake: shapes only; False computes the step on the CPU.
-    """
+    """Counts operations and bytes of a step on shapes only; `fake=False` computes it on a CPU."""
     # fake tensors have shapes and no numbers; said to be on the CPU, they take the attention that
     # keeps no attention matrix, as a GPU does (on `meta` they would take the one that does)
     with torch.device('meta' if fake else 'cpu'):

@@ -104,22 +104,14 @@ class LatentCache:
         return {name.partition('/')[2]: shard.get_tensor(name) for name in mine}
 
     def changed(self, labels: Mapping[str, str]) -> list[str]:
-        """Returns the labels of clips that are here with another content.
-
-        Args:
-            labels: names of the clips, by key.
-        """
+        """Returns those of the labels (by key) whose clips are here with another content."""
         held = {label: key for key, label in self._labels.items()}
         return sorted(
             label for key, label in labels.items() if key not in self._shards and label in held
         )
 
     def add(self, key: str, label: str, tensors: Mapping[str, Tensor]) -> None:
-        """Adds the tensors of a clip; they are on disk once its shard is full, or after `flush`.
-
-        Raises:
-            TrainingError: the disk is full, or the folder cannot be written.
-        """
+        """Adds the tensors of a clip; they are on disk once a shard is full, or after `flush`."""
         for name, tensor in tensors.items():
             self._waiting[f'{key}/{name}'] = tensor.detach().cpu().contiguous()
         self._waiting_labels[key] = label
@@ -216,12 +208,8 @@ def settings_of(
 ) -> dict[str, Any]:
     """Returns everything that the latents of all clips depend on, as plain values.
 
-    Args:
-        config: the preset.
-        base: checkpoint whose encoders are used.
-        robot: its kinematics place what trajectory videos show.
-        segmenter: its name.
-        dtype: of the encoders and of what is kept.
+    That is the preset, the encoders of the base checkpoint, the robot's kinematics, the segmenter,
+    and the number format of the encoders and of what is kept.
     """
     video = config.video.model_dump()
     names = ('views', 'fps', 'num_frames', 'width', 'height')
@@ -252,11 +240,7 @@ def _robot_digest(robot: RobotModel) -> str:
 
 
 def list_clips(recordings: Sequence[tuple[Recording, np.ndarray]]) -> list[CachedClip]:
-    """Returns the clips of recordings, keyed by the content of their episode's files and names.
-
-    Args:
-        recordings: each with the frames that its clips start from.
-    """
+    """Returns the clips of recordings and starts, keyed by the content of their episodes."""
     clips = []
     for recording, starts in recordings:
         content = content_digest(recording.path)
@@ -296,20 +280,6 @@ def _alone(array: np.ndarray) -> Tensor:
     return torch.from_numpy(np.array(array))[None]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Build:
-    """Progress of filling a cache: clips encoded, seconds since the first, bytes per clip."""
-
-    num_encoded: int
-    seconds: float
-    clip_bytes: int
-
-    @property
-    def clips_per_s(self) -> float:
-        """Encoded clips a second."""
-        return self.num_encoded / max(self.seconds, 1e-9)
-
-
 def fill(
     cache: LatentCache,
     clips: Sequence[CachedClip],
@@ -317,16 +287,8 @@ def fill(
     encoders: Encoders,
     device: torch.device,
     dtype: torch.dtype,
-) -> Iterator[Build]:
-    """Encodes the missing clips of a cache, and yields after each.
-
-    Args:
-        cache: of the settings that all of the other arguments follow from.
-        clips: all clips of the training.
-        read: gives a clip, undisturbed, as a batch of one.
-        encoders: on the device.
-        device: of the encoder.
-        dtype: of the stored latents.
+) -> Iterator[str]:
+    """Encodes the missing clips of a cache; yields after each how many are, and how fast.
 
     Raises:
         TrainingError: the disk is full, or will be before all clips are there.
@@ -339,7 +301,9 @@ def fill(
         if number == 1:
             _check_space(cache.root, size, len(missing))
         cache.add(clip.key, clip.label, tensors)
-        yield Build(num_encoded=number, seconds=time.perf_counter() - started, clip_bytes=size)
+        seconds = time.perf_counter() - started
+        rate = number / max(seconds, 1e-9)
+        yield f'{number} encoded in {seconds:.1f} s ({rate:.2f} clips/s, {size / 1e6:.2f} MB each)'
     cache.flush()
 
 
@@ -391,14 +355,7 @@ def cached(
 ) -> CachedSource:
     """Encodes missing clips, reports what it did, and returns batches from the cache.
 
-    Args:
-        source: of the same clips, not cached; it is closed.
-        root: of caches.
-        config: the preset.
-        base: whose encoders are used.
-        seed: of the clips' order.
-        dtype: of the stored latents.
-        processes: the processes of the training.
+    The source of the same clips, which encodes nothing, is closed.
 
     Raises:
         ConfigError: the preset disturbs pictures, or has no encoder worth a cache.
@@ -422,14 +379,9 @@ def cached(
         dtype,
     )
     held = sum(clip.key in cache for clip in clips)
-    made = 'none to encode'
-    for build in tqdm(
-        steps, total=len(clips) - held, desc='encoding clips', unit='clip', disable=None
-    ):
-        made = (
-            f'{build.num_encoded} encoded in {build.seconds:.1f} s ({build.clips_per_s:.2f} '
-            f'clips/s, {build.clip_bytes / 1e6:.2f} MB each)'
-        )
+    missing = len(clips) - held
+    done = [*tqdm(steps, total=missing, desc='encoding clips', unit='clip', disable=None)]
+    made = done[-1] if done else 'none to encode'
     tqdm.write(f"latent cache '{cache.folder}': {held} of {len(clips)} clips were there, {made}")
     return CachedSource(
         cache,
@@ -478,7 +430,7 @@ class CachedSource:
 
     Args:
         cache: has all clips.
-        clips: of the training.
+        clips: all clips of the training.
         objective: pixel weights.
         text: (1, 512, text_dim) umT5 tokens of the prompt, in models with text.
         batch_size: clips of a step, over all processes.

@@ -19,10 +19,7 @@ from mtv_world_ros.lab.training.training_config import ObjectiveConfig
 class NoiseDraws:
     """Random numbers per clip of a batch; they depend only on seed, step and clip number.
 
-    Args:
-        seed: of the run.
-        step: of the training.
-        numbers: of the clips within the step's whole batch.
+    Numbers are those of the clips within the step's whole batch.
     """
 
     def __init__(self, seed: int, step: int, numbers: Sequence[int]) -> None:
@@ -79,7 +76,7 @@ def pixel_weights(frames: Tensor, object_ids: Tensor | None, config: ObjectiveCo
     Args:
         frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
         object_ids: (B, V, 1 + T, H, W) uint8 instance ids, 0 = none; None where unknown.
-        config: the weights.
+        config: extra weights of pixels.
     """
     difference = (frames[:, :, 1:].short() - frames[:, :, :1].short()).abs().amax(-1)
     weights = 1.0 + config.change_weight * (difference > CHANGE_THRESHOLD).float()
@@ -144,11 +141,11 @@ def sample_loss(
     delta: float | None,
     by_sample: Tensor | None = None,
 ) -> Loss:
-    """Returns the weighted loss between predicted and clean latents.
+    """Returns the weighted loss between predicted and clean latents (B, V, C, T, h, w).
 
     Args:
-        predicted: (B, V, C, T, h, w).
-        clean: the clean latents, of the same shape.
+        predicted: what the transformer gives.
+        clean: what it should give.
         weights: positive weights, of the same shape.
         delta: error from which on the Huber loss is linear; None = the squared error.
         by_sample: (B,) weights of samples; None = equal.

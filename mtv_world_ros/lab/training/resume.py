@@ -114,12 +114,7 @@ def check_architecture(folder: Path, config: TrainingConfig) -> None:
 
 
 def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
-    """Checks that a saved state belongs to this run.
-
-    Args:
-        folder: of the training.
-        card: of the state.
-        mine: `seed` and `base` (a digest, or None) of this run.
+    """Checks that a saved state is of this run's seed and base (a digest, or None).
 
     Raises:
         TrainingError: seed or base of the state differ from this run's.

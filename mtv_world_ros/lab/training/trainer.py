@@ -42,7 +42,7 @@ from mtv_world_ros.lab.training.resume import (
     STATE,
 )
 from mtv_world_ros.lab.training.training_config import OptimizerConfig, TrainingConfig
-from mtv_world_ros.model.card import CheckpointCard, OPTIONAL_KEYS, ROBOT_FOLDER
+from mtv_world_ros.model.card import OPTIONAL_KEYS, ROBOT_FOLDER
 from mtv_world_ros.model.checkpoint import (
     Checkpoint,
     load_checkpoint,
@@ -100,7 +100,7 @@ class Trainer:
 
     Args:
         config: the preset.
-        folder: of state, logs and checkpoints.
+        folder: gets state, logs and checkpoints.
         seed: of weights, noise and batches.
         device: e.g. `cpu`, `cuda`.
         dtype: of forward and backward; master weights stay float32.
@@ -250,9 +250,6 @@ class Trainer:
     def gradients(self, batch: ClipBatch | EncodedBatch) -> float:
         """Leaves the gradients of a step in the float32 weights and returns the step's loss.
 
-        Args:
-            batch: this process's part of the step's clips.
-
         Raises:
             TrainingError: the loss is not finite, or another process is gone.
         """
@@ -329,59 +326,36 @@ class Trainer:
         return self.folder / ('adapter' if self.config.lora.rank else 'checkpoint')
 
     def export(self, folder: Path, *, dtype: torch.dtype = torch.float16) -> None:
-        """Writes the averaged weights, see `export_checkpoint`."""
+        """Writes the averaged weights, with all other parts of a checkpoint beside them.
+
+        Of an adapter, which is in float32, the weights that are trained beside it and its card.
+        """
+        base = self.base
+        theirs = base.checkpoint.card.plain() if base else {}  # prompt and guidance
         card = self.config.card({**self.trained_on, 'steps': self.step, 'seed': self.seed})
+        card = card.replace(**{name: theirs[name] for name in OPTIONAL_KEYS if name in theirs})
         if self.config.lora.rank:
-            return export_adapter(folder, self.weights, card, self.base)
+            averages = self.weights.averages()
+            return save_adapter(self.weights.worker, folder, weights=averages, card=card)
         # what `fit-contact` put there stays
         mine = folder / OBJECT_MOTION_FOLDER
-        motion = mine if mine.is_dir() else self._object_motion
-        parts = (self.config, self.encoders, motion, self.robot)
-        export_checkpoint(folder, self.weights, card, self.base, *parts, dtype)
+        parts = Checkpoint(
+            transformer=self.weights.averaged(),
+            autoencoder=self.encoders.autoencoder,
+            scheduler=build_scheduler(self.config.scheduler),
+            card=card,
+            object_motion=mine if mine.is_dir() else self._object_motion,
+            robot=self.robot,
+            text_encoder=base and base.checkpoint.text_encoder,
+            image_encoder=base and base.checkpoint.image_encoder,
+        )
+        save_checkpoint(parts, folder, dtype=dtype)
 
     @property
     def robot(self) -> Path | None:
         """Folder of the robot that checkpoints carry, where `train` has put one."""
         folder = self.folder / ROBOT_FOLDER
         return folder if folder.is_dir() else None
-
-
-def export_adapter(
-    folder: Path, weights: AveragedWeights, card: CheckpointCard, base: Base | None
-) -> None:
-    """Writes the averaged adapter in float32, with the weights trained beside it and its card."""
-    save_adapter(weights.worker, folder, weights=weights.averages(), card=_with_text(card, base))
-
-
-def export_checkpoint(
-    folder: Path,
-    weights: AveragedWeights,
-    card: CheckpointCard,
-    base: Base | None,
-    config: TrainingConfig,
-    encoders: Encoders,
-    object_motion: Path | None,
-    robot: Path | None,
-    dtype: torch.dtype,
-) -> None:
-    """Writes the averaged weights in a number format, with all other parts beside them."""
-    parts = Checkpoint(
-        transformer=weights.averaged(),
-        autoencoder=encoders.autoencoder,
-        scheduler=build_scheduler(config.scheduler),
-        card=_with_text(card, base),
-        object_motion=object_motion,
-        robot=robot,
-        text_encoder=base and base.checkpoint.text_encoder,
-        image_encoder=base and base.checkpoint.image_encoder,
-    )
-    save_checkpoint(parts, folder, dtype=dtype)
-
-
-def _with_text(card: CheckpointCard, base: Base | None) -> CheckpointCard:
-    """With the prompt and guidance that the base has."""
-    theirs = base.checkpoint.card.plain() if base else {}
-    return card.replace(**{name: theirs[name] for name in OPTIONAL_KEYS if name in theirs})
 
 
 def batch_loss(
@@ -392,15 +366,10 @@ def batch_loss(
     draws: NoiseDraws,
     device: torch.device,
 ) -> Loss:
-    """Returns the loss of a batch, as sums over its clips.
+    """Returns the loss of a batch, or of what a latent cache holds of one, as sums over its clips.
 
-    Args:
-        transformer: on `device`, in the number format of forward and backward.
-        encoders: on `device`.
-        batch: clips, or what a latent cache holds of them.
-        config: the preset.
-        draws: of its clips; noise levels, noise and what is dropped come from them.
-        device: of the computation.
+    Transformer and encoders are on the device; noise levels, noise and what is dropped are drawn
+    for each clip.
     """
     objective, dtype = config.objective, transformer.dtype
     if isinstance(batch, ClipBatch):

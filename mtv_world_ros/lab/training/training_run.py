@@ -86,11 +86,11 @@ def load_recordings(
     """Returns the usable recordings, and the reason for each one left out, by path.
 
     Args:
-        paths: of the episodes.
+        paths: folders of episodes.
         spec: sizes and rates of the model's inputs and outputs.
-        robot: of the episodes.
+        robot: kinematics and limits of the recorded robot.
         cache: folder of the decoded recordings.
-        source: topics and robot of the episodes.
+        source: topics and calibration of the episodes.
         describer: names the objects; None = the names stored with the episodes, else those of
             the instructions.
 
@@ -170,23 +170,19 @@ def train(
     segmenter: Segmenter,
     describer: Describer | None = None,
     held_out: HeldOut | None = None,
-    make_trainer: Callable[..., Trainer] = Trainer,
 ) -> Path:
     """Trains, resuming what `run.out` holds, and returns the folder of the result.
 
     That is a checkpoint, or an adapter for the checkpoint `run.initial` where the preset trains
-    one.
-
-    Started by `torchrun` or `accelerate launch`, each process trains a share of every step's
+    one. Started by `torchrun` or `accelerate launch`, each process trains a share of every step's
     clips, and the main one alone writes; `out` and `cache` must be the same for all.
 
     Args:
-        run: the training.
+        run: preset, data, device, saving.
         robot: of the episodes.
         segmenter: finds the objects of the first frames.
         describer: names the objects; None = see `load_recordings`.
         held_out: scores checkpoints on held-out episodes and keeps the best.
-        make_trainer: makes the trainer, with the arguments of `Trainer`.
 
     Raises:
         ConfigError: the device is not there.
@@ -222,7 +218,7 @@ def train(
         numbers=processes.share(config.optimizer.batch_size),
     )
     base = None
-    if make_trainer is Trainer and needs_base(config):  # another trainer brings its own
+    if needs_base(config):
         base = load_base(config, run.initial, processes.device, dtype, seed=run.seed)
     if run.latent_cache is not None:
         with processes.main_first():
@@ -235,7 +231,7 @@ def train(
                 dtype=dtype,
                 processes=processes,
             )
-    trainer = make_trainer(
+    trainer = Trainer(
         config.with_steps(source.num_clips),
         out,
         seed=run.seed,
@@ -422,11 +418,7 @@ def check_clips(recording: Recording, spec: WorldModelSpec) -> None:
 
 
 def counted(skipped: Mapping[str, str]) -> list[str]:
-    """Returns a line for each reason, without paths, the most frequent first.
-
-    Args:
-        skipped: reasons by the episode's path.
-    """
+    """Returns a line for each of the reasons (by path), without paths, the most frequent first."""
     reasons = Counter(
         reason.replace(path, '...').replace(Path(path).name, '...')
         for path, reason in skipped.items()
@@ -449,12 +441,7 @@ _BEST = 'best.json'
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldOutScores:
-    """Score of a checkpoint on held-out episodes.
-
-    Attributes:
-        score: the higher the better; NaN = undefined.
-        numbers: by name, for the log.
-    """
+    """Score of a checkpoint on held-out episodes (NaN = undefined), and numbers by name."""
 
     score: float
     numbers: Mapping[str, float]
@@ -465,11 +452,7 @@ Judge = Callable[[Path, int], HeldOutScores]
 
 
 class HeldOut:
-    """Scores checkpoints at regular steps during a training.
-
-    Args:
-        judge: scores it.
-        every: steps between two scores; the last step is scored, too.
+    """Scores checkpoints by a judge at every so many steps of a training, and at the last one.
 
     Raises:
         ConfigError: `every` is not positive.
@@ -481,10 +464,7 @@ class HeldOut:
         self._judge, self._every = judge, every
 
     def after(self, step: int, trainer: Trainer, log: TrainingLog) -> None:
-        """Scores the averaged weights if due; the best go to `checkpoint-best/`.
-
-        An adapter goes to `adapter-best/`.
-        """
+        """Scores the averaged weights if due; the best go to the result's folder with `-best`."""
         if step % self._every and step != trainer.config.optimizer.steps:
             return
         folder = trainer.folder

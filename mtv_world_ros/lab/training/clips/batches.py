@@ -85,9 +85,9 @@ class BatchSource:
     """Cuts, renders and disturbs clips; the next batch is prepared during a training step.
 
     Args:
-        recordings: the clips are cut from them.
+        recordings: episodes that clips are cut from.
         config: views and times of clips, how they are drawn and disturbed, clips per step.
-        robot: of the recordings.
+        robot: kinematics of the recorded robot.
         segmenter: finds the objects of the first frames.
         seed: of choice and disturbances.
         numbers: the clips of a step that this process makes; None: all.
@@ -164,7 +164,7 @@ class BatchSource:
             frames=torch.from_numpy(np.stack([s.frames for s in samples])),
             start_frame=torch.from_numpy(np.stack([s.start_frame for s in samples])),
             trajectory=torch.from_numpy(np.stack([s.trajectory for s in samples])),
-            object_ids=_stack(_with_zeros([s.object_ids for s in samples])),
+            object_ids=_stacked([s.object_ids for s in samples]),
             **pasts([s.past for s in samples]),
         )
 
@@ -228,18 +228,14 @@ def _spaced(recording: Recording, starts: np.ndarray, stride_s: float) -> np.nda
     return np.array(kept, dtype=int)
 
 
-def _with_zeros(ids: Sequence[ByteArray | None]) -> list[ByteArray | None]:
-    """Zero ids in place of missing ones, if another clip has some."""
+def _stacked(ids: Sequence[ByteArray | None]) -> Tensor | None:
+    """Ids of a batch, zero in clips that have none; None if no clip has any."""
     known = next((part for part in ids if part is not None), None)
     if known is None:
-        return list(ids)
-    return [np.zeros_like(known) if part is None else part for part in ids]
-
-
-def _stack(parts: Sequence[np.ndarray | None]) -> Tensor | None:
-    """Stacked tensor of a batch; None if a clip has none."""
-    found = [part for part in parts if part is not None]
-    return torch.from_numpy(np.stack(found)) if len(found) == len(parts) else None
+        return None
+    return torch.from_numpy(
+        np.stack([np.zeros_like(known) if part is None else part for part in ids])
+    )
 
 
 def _disturb(frames: ByteArray, noise_std: float, rng: np.random.Generator) -> ByteArray:
@@ -256,12 +252,7 @@ MakeClip = Callable[[int, int], Any]
 
 
 class ClipWorkers:
-    """Makes clips in worker processes, forked so that they share the recordings.
-
-    Args:
-        make_clip: its results are sent between processes; it must not use a GPU.
-        count: processes.
-    """
+    """Makes clips in processes, forked so that they share the recordings; none uses a GPU."""
 
     def __init__(self, make_clip: MakeClip, count: int) -> None:
         self._pool = WorkerPool(partial(_on_one_thread, make_clip), count, method='fork')

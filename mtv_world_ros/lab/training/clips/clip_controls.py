@@ -90,38 +90,25 @@ class ControlMaker:
     # batches are prepared in one thread while the model's rollouts are drawn in another
     _lock: Lock = field(default_factory=Lock)
 
-    def make(
-        self, clip: Clip, names: tuple[str, ...], start_frame: ByteArray | None = None
-    ) -> ByteArray:
-        """Returns the trajectory video (V, 1 + T, H, W, 3) uint8 RGB.
+    def make(self, clip: Clip, names: tuple[str, ...]) -> ByteArray:
+        """Returns the trajectory video (V, 1 + T, H, W, 3) uint8 RGB of a clip.
 
-        Args:
-            clip: one chunk; its cameras, times and positions count.
-            names: of the objects.
-            start_frame: (V, H, W, 3) uint8 RGB, an imagined first frame of the chunk; objects are
-                searched in it. None = the clip's own; its masks are those stored with the
-                episode if this segmenter made them.
+        Objects are searched in its first frame, unless this segmenter made the masks that are
+        stored with the episode.
         """
-        masks = None
-        if self.object_mask:
-            masks = self._start_masks(clip, names, start_frame)
         video = render_trajectory_video(
             cameras=clip.cameras,
             robot=self.robot,
             positions=clip.positions,
             times=clip.times,
-            object_masks=masks,
+            object_masks=self._start_masks(clip, names) if self.object_mask else None,
             objects=self._objects(clip, names) if self.object_mask else None,
             config=self.rendering,
         )
         return video.frames
 
-    def _start_masks(
-        self, clip: Clip, names: tuple[str, ...], start_frame: ByteArray | None
-    ) -> BoolArray:
-        """(V, O, H, W) of a clip's start frame, or of an imagined one in its place."""
-        if start_frame is not None:
-            return self._masks(start_frame, names)
+    def _start_masks(self, clip: Clip, names: tuple[str, ...]) -> BoolArray:
+        """(V, O, H, W) of a clip's start frame."""
         ids = clip.object_ids
         if (
             ids is None

@@ -37,7 +37,7 @@ from mtv_world_ros.lab.training.object_motion.tracks import (
     fine_commands,
     first_frame,
     FirstFrame,
-    object_ways,
+    object_displacements,
     read_each,
     recorded_positions,
 )
@@ -88,12 +88,8 @@ def fit_fingers(
 ) -> ContactSettings:
     """Returns settings with the numbers of fingers that explain what grippers reported.
 
-    Where swinging fingers explain little the settings are as they were, and fingers do not swing.
-
-    Args:
-        grippers: of some episodes.
-        arms: of the robot, with how they follow.
-        settings: start of the search.
+    The search begins at the settings. Where swinging fingers explain little, they are returned as
+    they were, and fingers do not swing.
     """
     known = [one for one in grippers if len(one.positions) >= _SHORTEST]
     known = [one for one in known if np.isfinite(one.recorded).any()]
@@ -203,7 +199,7 @@ class ContactRecording:
         frame: the first.
         positions: (1 + T * n, J) commanded, `PERIOD_S` apart [rad or m].
         recorded: (1 + T * n, J) reported by the joints then.
-        ways: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
+        displacements: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
         grippers: before they close.
     """
 
@@ -211,7 +207,7 @@ class ContactRecording:
     frame: FirstFrame
     positions: FloatArray
     recorded: FloatArray
-    ways: FloatArray
+    displacements: FloatArray
     grippers: FreeGrippers
 
 
@@ -255,22 +251,22 @@ def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> Contact
     """Reads what an episode says about contact: masks, commands and joint states.
 
     Raises:
-        EpisodeError: see `object_ways`.
+        EpisodeError: see `object_displacements`.
     """
     # poses of objects that a simulator recorded are not looked at
     episode = replace(read_episode(path, views=tuple(views)), object_poses=None)
-    ways = object_ways(episode, robot, views)
+    displacements = object_displacements(episode, robot, views)
     times, positions = fine_commands(episode, robot, views)
     assert episode.masks is not None and episode.joint_states is not None
     stamps_ns = episode.masks[views[0]].stamps_ns[0] + times * 1e9
-    shown = _unhidden(episode, views, len(ways))
+    shown = _unhidden(episode, views, len(displacements))
     recorded = recorded_positions(episode.joint_states, robot, stamps_ns)
     return ContactRecording(
         names=tuple(episode.info.objects),
         frame=first_frame(episode, robot, views),
         positions=positions,
         recorded=recorded,
-        ways=np.where(shown[..., None], ways, np.nan),
+        displacements=np.where(shown[..., None], displacements, np.nan),
         grippers=FreeGrippers.of(robot, positions, recorded),
     )
 
@@ -333,19 +329,19 @@ def fit_contact(
     """Returns likely settings with their spread, and what was found with intervals.
 
     Args:
-        recordings: E.
-        arms: of the robot that was recorded.
+        recordings: E episodes.
+        arms: how the recorded robot follows its commands.
         first: numbers that were found before, where the search begins; None = it begins with
             `first_settings`, and with fingers as `fit_fingers` finds them.
-        threads: that foresee.
-        report: is told how each round went.
+        threads: CPU threads of the engine.
+        report: takes a line about each number and round.
         progress: wraps the numbers of what is foreseen, e.g. in a progress bar.
 
     Raises:
         TrainingError: no recording says where an object went.
         RobotError: see `Arms`.
     """
-    if not any(np.isfinite(recording.ways).any() for recording in recordings):
+    if not any(np.isfinite(recording.displacements).any() for recording in recordings):
         raise TrainingError('no episode says where an object went; contact cannot be fitted')
     if first is None:
         first = fit_fingers([r.grippers for r in recordings], arms, first_settings(arms))
@@ -380,10 +376,11 @@ def fit_contact(
     )
     for one in (*found, hold):
         report(str(one))
-    if _worth(weights) < _FEW:
+    deciding = _effective_draws(weights)
+    if deciding < _FEW:
         report(
-            f'{_worth(weights):.1f} draws decide: these numbers are likely together, but their '
-            'intervals are too narrow'
+            f'{deciding:.1f} draws decide: these numbers are likely together, but their intervals '
+            'are too narrow'
         )
     return first.model_copy(update={**values, 'spread': spread}), [table, delay, *found, hold]
 
@@ -430,7 +427,7 @@ def _populations(
         mean, wide = weights @ draws, _WIDER**2 * _covariance(draws, weights)
         wide += _LEAST**2 * np.eye(len(mean))
         tempered = '' if counts == 1 else f', {counts:.2g} of the likelihood counted'
-        worth = f'worth {_worth(weights):.1f} alike'
+        worth = f'worth {_effective_draws(weights):.1f} alike'
         report(f'round {number + 1}: {len(draws)} draws, {worth}{tempered}')
         proposals.append((mean, wide))
         rng = np.random.default_rng((_SEED, number))
@@ -443,10 +440,7 @@ def _weights(likelihoods: FloatArray, others: FloatArray) -> tuple[FloatArray, f
 
     Foresight is rough whatever the settings, which a likelihood of many recordings does not know:
     few draws would decide. So as much of it counts as leaves enough draws (tempering).
-
-    Args:
-        likelihoods: (N,) logarithms.
-        others: (N,) all other logarithms of weights.
+    `likelihoods` and `others`, all that weighs besides, are logarithms (N,).
     """
     enough = min(_ENOUGH, _ENOUGH_SHARE * len(likelihoods))
     weights, share = np.zeros(0), 1.0
@@ -454,7 +448,7 @@ def _weights(likelihoods: FloatArray, others: FloatArray) -> tuple[FloatArray, f
         logs = share * likelihoods + others
         weights = np.exp(logs - logs.max())
         weights /= weights.sum()
-        if _worth(weights) >= enough:
+        if _effective_draws(weights) >= enough:
             break
     return weights, float(share)
 
@@ -472,7 +466,7 @@ def _conditional(draws: FloatArray, weights: FloatArray) -> FloatArray:
     return np.asarray(np.diag(np.linalg.inv(covariance + floor)) ** -0.5, np.float64)
 
 
-def _worth(weights: FloatArray) -> float:
+def _effective_draws(weights: FloatArray) -> float:
     """Number of draws of one weight that would tell as much as these (N,), which sum to 1."""
     return float(1 / (weights**2).sum())
 
@@ -503,7 +497,7 @@ def _finding(
     Args:
         name: of the number.
         values: (N,) logarithms.
-        likelihoods: (N, E) of the draws.
+        likelihoods: (N, E) of the draws, by recording.
         weights: (N,) of the draws, which sum to 1.
         conditional: standard deviation if the other numbers are known; None = it stands alone.
     """
@@ -536,12 +530,12 @@ class _Trial:
     Attributes:
         solids: of the O objects that two views see at first.
         positions: (1 + T * n, J) commanded.
-        ways: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
+        displacements: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
     """
 
     solids: tuple[Solid, ...]
     positions: FloatArray
-    ways: FloatArray
+    displacements: FloatArray
 
     @classmethod
     def of(cls, recording: ContactRecording, settings: ContactSettings) -> _Trial:
@@ -558,7 +552,7 @@ class _Trial:
         return cls(
             solids=tuple(solid for solid in found if solid is not None),
             positions=recording.positions,
-            ways=recording.ways[:, known],
+            displacements=recording.displacements[:, known],
         )
 
     def likelihoods(self, engine: Engine, settings: Sequence[ContactSettings]) -> FloatArray:
@@ -569,14 +563,14 @@ class _Trial:
             for one in settings
         ]
         motion, state = engine.begin(futures).advance(self.positions, COMMANDS_A_STEP)
-        rows = min(motion.points.shape[1], len(self.ways))
+        rows = min(motion.points.shape[1], len(self.displacements))
         # how it ends counts: at first nothing has moved whatever the settings
         late = slice(rows // 2, rows)
         foreseen = motion.points[:, late] - motion.points[:, :1]
-        away = np.linalg.norm(foreseen - self.ways[late], axis=-1)
+        away = np.linalg.norm(foreseen - self.displacements[late], axis=-1)
         away = np.clip(np.nan_to_num(away, nan=np.nan), 0.0, _LOST_M)
         unlikely = np.log1p((away / _NEAR_M) ** 2)
-        known = np.isfinite(self.ways[late]).all(-1)
+        known = np.isfinite(self.displacements[late]).all(-1)
         counted = np.where(known, np.nan_to_num(unlikely), 0.0).sum(1)
         found = -(counted / np.maximum(known.sum(0), 1)).sum(-1)
         found[list(state.lost)] = -np.log1p((_LOST_M / _NEAR_M) ** 2) * len(self.solids)
@@ -639,14 +633,9 @@ def _resampled(
     counted: str,
     middle: Callable[..., Any],
 ) -> Finding:
-    """What rows say of a number, with an interval from resampled ones.
+    """The `middle` of (E, ...) known rows, with an interval from resampled ones.
 
-    Args:
-        name: of the number.
-        known: (E, ...) rows of those that say something.
-        of: that were looked at.
-        counted: what they are.
-        middle: gives the number of rows.
+    `of` rows were looked at; `counted` is what they are.
     """
     if not len(known):
         nothing = dict.fromkeys(('value', 'low', 'high', 'spread'), 0.0)

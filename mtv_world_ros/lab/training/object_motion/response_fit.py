@@ -114,10 +114,7 @@ def tool_errors(
 ) -> FloatArray:
     """Returns (N,) how far moving tools are from where they are expected [m].
 
-    Args:
-        robot: of the recordings.
-        recordings: commands and measured positions.
-        response: predicts the positions; None = the commands themselves.
+    Expected are the positions that the response predicts; without one, the commands themselves.
     """
     errors = []
     for commands, positions in recordings:
@@ -131,12 +128,7 @@ def tool_errors(
 
 
 def fit_response(robot: RobotModel, recordings: Sequence[Recording]) -> ArmResponse:
-    """Returns the response that explains recorded joints best.
-
-    Args:
-        robot: gives the inertia.
-        recordings: commands and measured positions, both (T, J), `PERIOD_S` apart.
-    """
+    """Returns the response that explains recorded joints best."""
     parts = [_equations(robot, *recording) for recording in recordings]
     left = np.concatenate([part[0] for part in parts])  # (N, J, 4)
     right = np.concatenate([part[1] for part in parts])  # (N, J)
@@ -158,11 +150,6 @@ def with_floor(
     """Returns the response with the height at which fingertips stopped though they were to sink.
 
     As it is where too few did, or where that does not explain the recordings better.
-
-    Args:
-        response: of arms in free air.
-        robot: whose fingertips they are.
-        recordings: commands and measured positions, both (T, J), `PERIOD_S` apart.
     """
     mechanics, stopped = RobotMechanics(robot), []
     for commands, positions in recordings:

@@ -29,13 +29,7 @@ Read = TypeVar('Read')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FirstFrame:
-    """What the first masks of an episode show.
-
-    Attributes:
-        masks: (V, O, H, W).
-        cameras: V.
-        poses: V of T_base_camera (4, 4).
-    """
+    """The first masks (V, O, H, W) of an episode, with V cameras and their T_base_camera."""
 
     masks: BoolArray
     cameras: tuple[CameraModel, ...]
@@ -59,7 +53,7 @@ def read_each(
     return found, skipped
 
 
-def object_ways(episode: Episode, robot: RobotModel, views: Sequence[str]) -> FloatArray:
+def object_displacements(episode: Episode, robot: RobotModel, views: Sequence[str]) -> FloatArray:
     """Returns (1 + T, O, 3) how far objects went since the first frame [m], NaN = not known.
 
     Taken from `/object_poses`, or else from the masks.
@@ -108,13 +102,7 @@ def first_frame(episode: Episode, robot: RobotModel, views: Sequence[str]) -> Fi
 def fine_commands(
     episode: Episode, robot: RobotModel, views: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns times (1 + T * n,) from the first masks on [s], and commands (1 + T * n, J) then.
-
-    Args:
-        episode: with masks, joint states and commands.
-        robot: gives the order of joints.
-        views: whose masks are used.
-    """
+    """Returns times (1 + T * n,) from the first masks on [s], and commands (1 + T * n, J) then."""
     assert episode.masks is not None and episode.joint_states is not None
     stamp = int(episode.masks[views[0]].stamps_ns[0])
     count = int(_last_ns(episode, views[0]) / 1e9 / STEP_S + 1e-6)
