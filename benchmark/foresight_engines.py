@@ -40,7 +40,6 @@ from page import old_checkout, parse_arguments, publish, ROOT, table
 from mtv_world_ros.assembly import (
     checkpoint_path,
     checkpoint_robot,
-    fingerprint,
     robot_path,
 )
 from mtv_world_ros.bench.ranking.no_picture_rule import is_done, things_in
@@ -55,6 +54,7 @@ from mtv_world_ros.geometry.object_motion import FoundObjects
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.lab.evaluation.metrics.statistics import wilson
 from mtv_world_ros.lab.evaluation.metrics.success_agreement import area_under_roc
+from mtv_world_ros.lab.jobs import fingerprint
 from mtv_world_ros.lab.splits import refuse_test_kinds
 from mtv_world_ros.lab.training.object_motion.tracks import fine_commands, first_frame
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER

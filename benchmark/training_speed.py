@@ -28,7 +28,7 @@ from diffusers.training_utils import EMAModel
 from page import in_turns, parse_arguments, publish, ratio, table
 import torch
 
-from mtv_world_ros.assembly import assemble_segmenter, robot_path
+from mtv_world_ros.assembly import robot_path
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.lab.cli.train import set_overrides
 from mtv_world_ros.lab.splits import select
@@ -40,6 +40,7 @@ from mtv_world_ros.lab.training.training_config import load_training_config
 from mtv_world_ros.lab.training.training_run import load_recordings, spread
 from mtv_world_ros.model.runtime import choose_dtype, place
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
 _WARM_UP = 2
 
@@ -76,7 +77,7 @@ def make(options: argparse.Namespace) -> tuple[Trainer, BatchSource]:
         recordings,
         config,
         robot=robot,
-        segmenter=assemble_segmenter('colour'),
+        segmenter=choose_segmenter('colour'),
         seed=options.seed,
         workers=options.data_workers,
     )

@@ -29,9 +29,7 @@ from mtv_world_ros.policies.policy import (
 from mtv_world_ros.processes import threads_each
 from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.calibration import (
-    CALIBRATION,
     Calibration,
-    HORIZON,
     HorizonCurve,
     load_calibration,
     load_horizon,
@@ -46,7 +44,6 @@ from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 if TYPE_CHECKING:
     from mtv_world_ros.vision.describers.describer_config import DescriberConfig
-    from mtv_world_ros.vision.describers.vlm import Chat
 
 BUNDLED = 'bundled'
 _YAML = ('.yaml', '.yml')
@@ -57,32 +54,6 @@ PolicyMaker = Callable[[EpisodeOrigin], Policy]
 def checkpoint_path(name: str | Path) -> Path:
     """Returns the folder of a checkpoint; `bundled` is the one that ships with the package."""
     return share_path('resource', 'checkpoint') if str(name) == BUNDLED else Path(name)
-
-
-def fingerprint(
-    checkpoint: str | Path,
-    *,
-    calibrated: bool = True,
-    adapter: Path | None = None,
-    task: str | None = None,
-) -> str:
-    """Returns the checkpoint's name and a hash of its files: other weights, other name.
-
-    Args:
-        checkpoint: folder, or `bundled`.
-        calibrated: the calibration counts too.
-        adapter: LoRA adapter that is used with it.
-        task: name or file of the task that is judged.
-    """
-    without = () if calibrated else (CALIBRATION, HORIZON)
-    parts = [f'{checkpoint} ({content_digest(checkpoint_path(checkpoint), without)[:8]})']
-    files = [] if adapter is None else [('adapter', adapter)]
-    if task is not None and not task.endswith(_YAML):
-        parts.append(f'task {task}')
-    elif task is not None:
-        files += [('task', Path(task))]
-    parts += [f'{what} {path} ({content_digest(path)[:8]})' for what, path in files]
-    return ', '.join(parts)
 
 
 def robot_path(name: str | Path) -> Path:
@@ -170,7 +141,7 @@ def load_pipeline(
         robot=model,
         objects=objects,
         task=task,
-        segmenter=assemble_segmenter(segmenter, device=device),
+        segmenter=choose_segmenter(segmenter, device=device),
         describer=asked_describer(describer),
         calibration=load_calibration(checkpoint_path(checkpoint)) if calibrated else None,
         horizon=load_horizon(checkpoint_path(checkpoint)),
@@ -181,12 +152,7 @@ def load_pipeline(
 
 
 def fitting_setting(checkpoint: str | Path, robot: RobotModel) -> Setting:
-    """Returns what a calibration of a checkpoint is fitted to, but for cameras.
-
-    Args:
-        checkpoint: folder, or `bundled`.
-        robot: the robot that moves in the pictures.
-    """
+    """Returns what a checkpoint's calibration is fitted to, without cameras: robot, foresight."""
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 
     folder = checkpoint_path(checkpoint) / OBJECT_MOTION_FOLDER
@@ -209,7 +175,7 @@ def assemble(
     setting: Setting | None = None,
 ) -> Pipeline:
     """Puts the main path around a world model trained as the card says."""
-    segmenter = segmenter or assemble_segmenter()
+    segmenter = segmenter or choose_segmenter()
     return Pipeline(
         robot=robot,
         world_model=world_model,
@@ -237,25 +203,6 @@ def _tasks(task: str | None) -> tuple[tuple[TaskSpec, ...], str | None]:
         return known, task
     given = load_task(Path(task))
     return (*(spec for spec in known if spec.name != given.name), given), given.name
-
-
-def recorded_robot(episode: Path, name: str) -> Path:
-    """Returns the YAML of the robot that an episode shows.
-
-    Args:
-        episode: its folder; an imported data set has its robot in `robot/` beside the episodes.
-        name: of the robot, by the episode's metadata.
-
-    Raises:
-        ConfigError: there is no file of that name.
-    """
-    for folder in (episode, *list(episode.resolve().parents)[:2]):
-        file = folder / ROBOT_FOLDER / ROBOT_YAML
-        if file.is_file() and load_robot(file).name == name:
-            return file
-    if not name:
-        raise ConfigError(f"'{episode}' does not say which robot it shows; name it with --robot")
-    return robot_path(name)
 
 
 def checkpoint_robot(checkpoint: str | Path, robot: str | Path | None = None) -> RobotModel:
@@ -355,11 +302,6 @@ def _recorded(
     return RecordedPolicy(commands, settings.hold_s)
 
 
-def assemble_segmenter(choice: str = 'auto', device: str = 'cpu') -> Segmenter:
-    """Returns the segmenter of that name, see `choose_segmenter`; its `name` says which it is."""
-    return choose_segmenter(choice, device=device)
-
-
 def asked_describer(file: str | Path | None) -> Describer | None:
     """Returns the describer of `--describer` or the parameter `describer`; None = none is asked.
 
@@ -381,6 +323,7 @@ def assemble_describer(config: DescriberConfig | str | Path | None = None) -> De
     from mtv_world_ros.vision.describers.describer_config import (
         DescriberConfig,
         load_describer_config,
+        load_object_list,
     )
 
     if config is None:
@@ -388,21 +331,11 @@ def assemble_describer(config: DescriberConfig | str | Path | None = None) -> De
     if not isinstance(config, DescriberConfig):
         config = load_describer_config(Path(config))
     if config.kind == 'list':
-        from mtv_world_ros.vision.describers.describer_config import load_object_list
-
         return load_object_list(Path(config.list))
-    chat = _chat(config)
-    if chat is None:
+    if config.kind != 'openai' or not config.openai:
         return InstructionDescriber()
+    from mtv_world_ros.vision.describers.openai_chat import OpenAIChat
     from mtv_world_ros.vision.describers.vlm import DescriptionCache, VlmDescriber
 
-    return VlmDescriber(chat, DescriptionCache(Path(config.cache)) if config.cache else None)
-
-
-def _chat(config: DescriberConfig) -> Chat | None:
-    """The vision-language model, if one is asked for."""
-    if config.kind == 'openai' and config.openai:
-        from mtv_world_ros.vision.describers.openai_chat import OpenAIChat
-
-        return OpenAIChat(config.openai)
-    return None
+    cache = DescriptionCache(Path(config.cache)) if config.cache else None
+    return VlmDescriber(OpenAIChat(config.openai), cache)

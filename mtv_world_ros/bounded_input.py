@@ -68,7 +68,7 @@ def _check_keys(node: yaml.MappingNode) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Most of everything that is taken from outside.
+    """The largest sizes that are accepted from outside.
 
     Attributes:
         yaml_bytes: of a YAML text.
@@ -104,30 +104,25 @@ class Limits:
     answer_bytes: int = 64 * 2**20
     array_bytes: int = 256 * 2**20
 
-    @classmethod
-    def from_environment(cls) -> Limits:
-        """Returns the limits as the environment sets them.
-
-        Raises:
-            ConfigError: a variable is not a positive whole number.
-        """
-        values = {}
-        for field in fields(cls):
-            variable = PREFIX + field.name.upper()
-            text = os.environ.get(variable)
-            if text is not None:
-                if not (text.isascii() and text.isdigit() and len(text) < 16 and int(text) > 0):
-                    raise ConfigError(
-                        f"environment variable '{variable}' is '{text}'; it must be a positive "
-                        'whole number'
-                    )
-                values[field.name] = int(text)
-        return cls(**values)
-
 
 def limits() -> Limits:
-    """Returns the present limits."""
-    return Limits.from_environment()
+    """Returns the limits as the environment sets them.
+
+    Raises:
+        ConfigError: a variable is not a positive whole number.
+    """
+    values = {}
+    for field in fields(Limits):
+        variable = PREFIX + field.name.upper()
+        text = os.environ.get(variable)
+        if text is not None:
+            if not (text.isascii() and text.isdigit() and len(text) < 16 and int(text) > 0):
+                raise ConfigError(
+                    f"environment variable '{variable}' is '{text}'; it must be a positive "
+                    'whole number'
+                )
+            values[field.name] = int(text)
+    return Limits(**values)
 
 
 class LimitError(ValueError):
@@ -135,12 +130,7 @@ class LimitError(ValueError):
 
 
 def check_limit(name: str, value: int, what: str) -> None:
-    """Checks a size against the limit of this name.
-
-    Args:
-        name: of the field of `Limits`.
-        value: the size.
-        what: has the size, e.g. `the image`.
+    """Checks the size of `what`, e.g. `the image`, against the field `name` of `Limits`.
 
     Raises:
         LimitError: the value is larger; names the environment variable that allows more.
@@ -155,11 +145,7 @@ def check_limit(name: str, value: int, what: str) -> None:
 
 
 def read_bytes(path: Path | str, limit: str) -> bytes:
-    """Returns the content of a regular file; never waits for a pipe or a device.
-
-    Args:
-        path: the file.
-        limit: name of the field of `Limits`.
+    """Returns the content of a regular file within a field of `Limits`; never blocks on a pipe.
 
     Raises:
         OSError: the file cannot be read, or is no regular file.
@@ -211,18 +197,14 @@ def parse_json(text: str | bytes, what: str) -> Any:
 
 
 def _whole_number(digits: str) -> int:
-    """A number that a float can hold: more digits are no count and no measure of anything."""
+    """An integer of no more digits than a float can hold."""
     if len(digits) > sys.float_info.max_10_exp:
         raise LimitError(f'a whole number has {len(digits)} digits')
     return int(digits)
 
 
 def read_arrays(path: Path | str, limit: str = 'array_bytes') -> dict[str, np.ndarray]:
-    """Returns the arrays of an .npz file by name.
-
-    Args:
-        path: the file.
-        limit: name of the field of `Limits` for all of them together, inflated.
+    """Returns the arrays of an .npz file by name; inflated they are within a field of `Limits`.
 
     Raises:
         OSError: the file cannot be read, or is no regular file.
@@ -244,7 +226,7 @@ def read_arrays(path: Path | str, limit: str = 'array_bytes') -> dict[str, np.nd
 
 
 def _array(data: bytes) -> np.ndarray:
-    """An array of as many bytes as it says it has."""
+    """The array of an .npy file whose header states the size that it has."""
     stream = BytesIO(data)
     version = np.lib.format.read_magic(stream)
     if version == (1, 0):
@@ -266,8 +248,8 @@ def check_finite(tensor: Any, name: str, file: Path) -> None:
     """
     if not tensor.is_floating_point() or tensor.numel() == 0:
         return
-    # one value that is not finite is felt by the sum, which takes a fortieth of the time of
-    # looking at each; a sum alone may be too large, and formats of 8 bits have none
+    # a value that is not finite makes the sum so, which takes a fortieth of the time of testing
+    # each; the sum of finite values may overflow, and 8-bit formats have no sum
     values = tensor.float() if tensor.element_size() < 2 else tensor
     if math.isfinite(float(values.sum())):
         return
@@ -303,7 +285,7 @@ def parse_yaml(text: str | bytes) -> Any:
 
 
 class _YamlCount:
-    """Counts nodes with every alias written out, as merging and comparing them would."""
+    """Counts the nodes of a YAML text with every alias expanded."""
 
     def __init__(self) -> None:
         self._sizes: dict[str, int] = {}  # by anchor; of those that are complete

@@ -1,4 +1,4 @@
-"""What users write: typed models, and errors that say the file, the key and what would be valid.
+"""Schemas of configuration: typed models whose errors name file, key and valid values.
 
 A model is a `Schema`: frozen, strict (no text where a number belongs) and without unknown keys.
 Defaults, ranges and descriptions stand in its fields and nowhere else.
@@ -56,15 +56,15 @@ def expected(what: str, says: str = ', must be', parts: int = 1) -> WrapValidato
 
 #: a YAML list
 ListOf = Annotated[tuple[Item, ...], Strict(False)]
-#: [s]; more than a day is a mistake of the unit
+#: [s]; longer than a day is a wrong unit
 Seconds = Annotated[float, Field(gt=0, le=86_400)]
 #: a duration that may be none [s]
 Wait = Annotated[float, Field(ge=0, le=86_400)]
-#: [m]; what is larger stands in no room
+#: [m]; larger than a room
 Length = Annotated[float, Field(gt=0, le=100)]
-#: by which something is larger or stronger than usual
+#: a multiple of a usual value
 Factor = Annotated[float, Field(gt=0, le=1000)]
-#: of statistics and of what robots count in: encoder ticks, degrees, percent
+#: of statistics and joint units: encoder ticks, degrees, percent
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 #: a part of a rotation
 Quaternion = Annotated[float, Field(ge=-1000, le=1000)]
@@ -72,7 +72,7 @@ Count = Annotated[int, Field(ge=1)]
 Pair = Annotated[
     tuple[Number, Number], Strict(False), expected('a list of 2 numbers of at most 1e6 either way')
 ]
-#: [m]; what is further away is a mistake of the unit, or worse
+#: a coordinate [m]; farther away is a wrong unit
 Metres = Annotated[float, Field(ge=-100, le=100)]
 Share = Annotated[float, Field(ge=0, le=1), expected('in [0, 1]')]
 
@@ -92,7 +92,7 @@ def _vast(value: Any) -> Iterator[float]:
 
 
 class Schema(BaseModel):
-    """Base of everything that users write.
+    """Base of all configuration.
 
     Attributes:
         section: how errors name a value: None = by its quoted key; a text = by its dotted path,

@@ -6,7 +6,7 @@ V views, T frames, J joints, A arms, O objects, H W pixels; `p_a = T_a_b @ p_b`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -24,9 +24,9 @@ FloatArray = NDArray[np.float64]
 ByteArray = NDArray[np.uint8]
 BoolArray = NDArray[np.bool_]
 
-#: distortion models of sensor_msgs/CameraInfo and how many coefficients OpenCV reads for each
-#: of a camera from the link that carries it [m]
+#: largest distance of a camera from the link that carries it [m]
 FARTHEST_M = 1000.0
+#: distortion models of sensor_msgs/CameraInfo and how many coefficients OpenCV reads for each
 DISTORTION_MODELS = {
     'none': (0,),
     'plumb_bob': (4, 5),
@@ -160,10 +160,19 @@ class JointTrajectory:
                 f"joint '{self.joint_names[joint]}' is not finite at point {point}"
             )
 
+    def points(self, rows: np.ndarray, times: FloatArray) -> JointTrajectory:
+        """Returns some of the points (`rows` numbers or marks them), at other times (T,) [s]."""
+        return replace(
+            self,
+            times=times[rows],
+            positions=self.positions[rows],
+            velocities=None if self.velocities is None else self.velocities[rows],
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observation:
-    """What the robot sees and where it stands at one instant.
+    """Camera frames and joint positions at one instant.
 
     Attributes:
         cameras: V calibrated views, in the model's order, for the size of `frames`.
@@ -197,7 +206,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class History:
-    """What of a rollout comes before the frame that its next chunk starts from.
+    """The frames of a rollout before the frame that its next chunk starts from.
 
     Attributes:
         anchor: (V, H, W, 3) uint8 RGB, the first frame of the rollout: the observed one.
@@ -218,11 +227,11 @@ class History:
 
     @staticmethod
     def begin(start_frame: ByteArray) -> History:
-        """Returns that of a rollout which begins at a frame (V, H, W, 3)."""
+        """Returns the empty history of a rollout that begins at a frame (V, H, W, 3)."""
         return History(anchor=start_frame, frames=start_frame[:, None][:, :0])
 
     def after(self, start_frame: ByteArray, predicted: ByteArray, num_kept: int) -> History:
-        """Returns that of the next chunk, which starts from the last predicted frame.
+        """Returns the history of the next chunk, which starts from the last predicted frame.
 
         Args:
             start_frame: (V, H, W, 3) where the chunk started.

@@ -1,4 +1,4 @@
-"""What upper floors and other packages register: commands, policy kinds, rollout readers."""
+"""Entry points of upper floors and other packages: commands, policy kinds, rollout readers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def load(entry: metadata.EntryPoint) -> Any:
     """
     try:
         return entry.load()
-    except Exception as error:  # a module of somebody else's raises anything
+    except Exception as error:  # a third-party module may raise anything
         raise broken(entry, error) from error
 
 

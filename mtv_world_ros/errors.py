@@ -38,10 +38,6 @@ class CheckpointError(MtvWorldError):
     """A checkpoint folder is incomplete or is for another model."""
 
 
-class ModelError(MtvWorldError):
-    """The model cannot go on; the rollout was dropped."""
-
-
 class ModelMemoryError(MtvWorldError):
     """The device ran out of memory; the rollout was dropped."""
 
@@ -75,7 +71,7 @@ class PolicyServerError(PolicyError):
 
 
 class DescriptionError(MtvWorldError):
-    """Naming the objects of a scene failed; not the same answer as "there are none".
+    """Naming the objects of a scene failed, as opposed to a scene without objects.
 
     Attributes:
         status: `unreachable`, `timeout`, `rate_limited`, `server_error`, `rejected`, `refused`,
@@ -92,11 +88,11 @@ class RolloutPreempted(MtvWorldError):
 
 
 class CannotTell(Exception):
-    """Why something about a situation is not known; the estimator abstains with this reason."""
+    """A quantity of a situation is unknown; the estimator abstains with this reason."""
 
 
 def masked(text: str, key: str) -> str:
-    """Returns the text without an API key; servers may quote it, and it belongs into no log."""
+    """Returns the text with an API key masked, which servers may quote and no log may hold."""
     return text.replace(key, '***') if key else text
 
 

@@ -72,8 +72,8 @@ def content_digest(folder: Path, without: Collection[str] = ()) -> str:
     """Returns the SHA-256 of a folder's files, or of one: other names or contents, another digest.
 
     Args:
-        folder: is looked through with all folders in it; or a file.
-        without: names of files that do not count.
+        folder: searched recursively; or a file.
+        without: names of files to leave out.
     """
     digest = hashlib.sha256()
     paths = [folder] if folder.is_file() else folder.rglob('*')
@@ -87,7 +87,7 @@ def content_digest(folder: Path, without: Collection[str] = ()) -> str:
 
 
 def check_free(path: Path, overwrite: bool, instead: str = '--out') -> None:
-    """Refuses to replace what a command of the user's did not ask to replace.
+    """Refuses to replace an existing file or folder unless the user asked for it.
 
     Args:
         path: file or folder that would be written; an empty folder counts as free.
@@ -103,11 +103,7 @@ def check_free(path: Path, overwrite: bool, instead: str = '--out') -> None:
 
 
 def check_room(folder: Path, num_bytes: int) -> None:
-    """Refuses a disk that is as good as full, before processes are started that write to it.
-
-    Args:
-        folder: is made where it is missing.
-        num_bytes: free space that is needed at least.
+    """Checks the free space of a folder's disk before processes write to it; makes the folder.
 
     Raises:
         OSError: the disk has less.
@@ -162,9 +158,6 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
     A folder of that name stays until then. A process that is killed between the two renames
     leaves it under the name `<folder>.old`; see `recover_folder`.
-
-    Args:
-        folder: the final name.
 
     Raises:
         OSError: the folder cannot be written; the old one is untouched.

@@ -1,4 +1,4 @@
-"""An episode in the world model: what goes from chunk to chunk, of imagined and of real frames."""
+"""An episode in the world model: its state from chunk to chunk, imagined or observed."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from mtv_world_ros.vision.describers.describer import name_objects
 if TYPE_CHECKING:
     from mtv_world_ros.pipeline import Pipeline
 
-#: the seeds of an episode's rollouts lie so far apart that those of their chunks never meet
+#: distance between the seeds of an episode's rollouts, so that those of their chunks never meet
 SEED_STEP = 1_000_003
 
 
 class ObservedChunk(NamedTuple):
-    """What was found in real frames: masks of the frame before them (T = 1) and of all of them."""
+    """Masks and estimate of real frames; `start_masks` are of the frame before them (T = 1)."""
 
     start_masks: ObjectMasks
     masks: ObjectMasks
@@ -44,7 +44,7 @@ class ObservedChunk(NamedTuple):
 
 @dataclass(slots=True, kw_only=True)
 class ImaginedEpisode:
-    """An episode in the world model: owns everything that goes from chunk to chunk.
+    """An episode in the world model: owns the state that is carried from chunk to chunk.
 
     It has `num_seeds` rollouts of the same plans that differ in their noise; the first one is
     what `observation` and the predictions show, the estimate is the mean of all. The attributes
@@ -61,9 +61,9 @@ class ImaginedEpisode:
         limit_tolerance: joints may exceed their limits by this [rad or m].
         should_stop: asked between denoising steps and between chunks.
         num_chunks: imagined so far.
-        camera_check: what the first pictures say about the cameras, which are corrected by it.
-        doubt: why the fitted physics is not to be believed, which widens the estimate; empty =
-            nothing speaks against it.
+        camera_check: calibration check on the first frames; its corrections are applied.
+        doubt: why the fitted physics does not hold here, which widens the estimate; empty = no
+            contradiction was observed.
     """
 
     pipeline: Pipeline
@@ -189,7 +189,7 @@ class ImaginedEpisode:
     def _chunks(self, trajectory: JointTrajectory) -> list[ChunkPlan]:
         """The trajectory on the model's clock, cut into chunks."""
         robot, spec, start = self.pipeline.robot, self.pipeline.spec, self.observation
-        trajectory = match_joints(trajectory, robot, start.positions)
+        trajectory = match_joints(trajectory, robot)
         check_plan(robot, trajectory, start.positions, tolerance=self.limit_tolerance)
         return plan_chunks(
             trajectory, start.positions, start.stamp_ns, num_frames=spec.num_frames, fps=spec.fps

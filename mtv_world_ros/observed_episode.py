@@ -1,4 +1,4 @@
-"""The real frames of an episode before a plan, which the estimate remembers."""
+"""The real frames of an episode before a plan, which enter the estimate."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from mtv_world_ros.data_types import Observation
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.rollout_state import fit_observation
 
-#: a real frame is looked at if it comes at least this share of the model's period after another
+#: least time between two frames that are kept, as a share of the model's period
 _SEEN_SHARE = 0.9
-#: chunks of real frames that may wait to be looked at; then every second frame is dropped
+#: most chunks of real frames in the queue; beyond that every second frame is dropped
 _MOST_WAITING_CHUNKS = 8
 
 
@@ -23,7 +23,7 @@ class ObservedEpisode:
     `see` may be called from another thread than the others.
 
     Args:
-        pipeline: finds and judges what is seen.
+        pipeline: finds and judges objects in the frames.
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
@@ -42,12 +42,12 @@ class ObservedEpisode:
 
     @property
     def is_behind(self) -> bool:
-        """Whether a chunk of observations waits to be looked at."""
+        """Whether a whole chunk of observations is queued."""
         with self._lock:
             return len(self._waiting) >= self._pipeline.spec.num_frames
 
     def see(self, observation: Observation) -> None:
-        """Keeps a real observation until it is looked at.
+        """Queues a real observation.
 
         Raises:
             ObservationError: the views are not the model's.
@@ -59,12 +59,12 @@ class ObservedEpisode:
                 del self._waiting[::2]
 
     def forget(self) -> None:
-        """The next plan begins a new episode."""
+        """Drops the episode so far: the next plan begins a new one."""
         with self._lock:
             self._seen, self._waiting = None, []
 
     def catch_up(self) -> None:
-        """Looks at the observations that wait."""
+        """Processes the queued observations."""
         with self._lock:
             seen, waiting = self._seen, self._waiting
             self._waiting = []
@@ -103,7 +103,7 @@ class ObservedEpisode:
 
 
 def _look_at(episode: ImaginedEpisode, observations: Sequence[Observation]) -> None:
-    """The episode observes these, at the model's size."""
+    """Lets the episode observe these, at the model's size."""
     if observations:
         frames = np.stack([observation.frames for observation in observations], axis=1)
         positions = [episode.observation, *observations]

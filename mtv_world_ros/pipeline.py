@@ -50,7 +50,7 @@ class WorldModel(Protocol):
 
     @property
     def spec(self) -> WorldModelSpec:
-        """What it takes and gives."""
+        """Its frame size, rate and views."""
         ...
 
     def predict(
@@ -90,7 +90,7 @@ def _never() -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pipeline:
-    """What imagines and judges; holds no state: `begin` returns the object that does.
+    """Imagines and judges; stateless: `begin` returns the episode, which holds the state.
 
     Attributes:
         robot: joints, limits and tools.
@@ -102,9 +102,9 @@ class Pipeline:
         objects: names of the objects; empty = the describer's.
         describer: names the objects of an episode's first frame; None = the instruction's words.
         horizon: measured J by horizon; None = not measured.
-        object_motion: where objects go, for models whose trajectory videos show that; None = the
-            trajectory video shows them where they were.
-        camera_checker: compares the first pictures with the arm's outline; None = nothing does.
+        object_motion: foresees object motions, for models whose trajectory videos show them;
+            None = objects are drawn where they were.
+        camera_checker: compares the first frames with the arm's outline; None = no check.
     """
 
     robot: RobotModel
@@ -121,11 +121,11 @@ class Pipeline:
 
     @property
     def spec(self) -> WorldModelSpec:
-        """Of the world model."""
+        """The world model's frame size, rate and views."""
         return self.world_model.spec
 
     def with_robot(self, robot: RobotModel) -> Pipeline:
-        """Returns the same for a robot of the same joints and tools, e.g. a calibrated one."""
+        """Returns the pipeline for a robot of the same joints and tools, e.g. a calibrated one."""
         motion, checker = self.object_motion, self.camera_checker
         return replace(
             self,
@@ -135,7 +135,7 @@ class Pipeline:
         )
 
     def without_foresight(self) -> Pipeline:
-        """Returns the paper's way: trails and first masks are drawn, no motion is foreseen."""
+        """Returns the paper's pipeline: draws trails and first masks, foresees no motion."""
         return replace(self, object_motion=None)
 
     def begin(
@@ -176,14 +176,7 @@ class Pipeline:
     def imagine(
         self, episode: ImaginedEpisode, state: RolloutState, plan: ChunkPlan, seed: int
     ) -> tuple[Prediction, RolloutState]:
-        """Returns one chunk of one rollout, stage by stage, and where the rollout stands then.
-
-        Args:
-            episode: that the chunk belongs to.
-            state: the rollout so far.
-            plan: the chunk.
-            seed: of the noise.
-        """
+        """Returns one chunk of one rollout, stage by stage, and the rollout's state after it."""
         start, clock = state.observation, StageClock()
         num_steps = episode.num_inference_steps or self.spec.num_inference_steps
         shown = [tools_in_view(c, self.robot, plan.positions) for c in start.cameras]
@@ -317,7 +310,7 @@ class Pipeline:
         )
 
     def _majority(self, episode: ImaginedEpisode, state: RolloutState) -> Majority:
-        """Says which futures end as most do, so that pictures and the estimate say the same."""
+        """The rule that selects futures of majority outcome, for pictures and estimate."""
 
         def majority(motions: ForeseenMotions) -> BoolArray | None:
             ends = self.estimator.foresee(motions, episode.instruction, state.memory)

@@ -1,4 +1,4 @@
-"""One imagined chunk and what was made on the way; the mean over several seeds."""
+"""One imagined chunk with its intermediate results; the mean over several seeds."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ _T = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
 class StageClock:
-    """Time per stage of a chunk: `seconds` by name."""
+    """Durations of a chunk's stages: `seconds` by name."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:
-        """Ends a stage, which began where the one before it ended."""
+        """Ends a stage, which began at the end of the one before."""
         now = time.perf_counter()
         self.seconds[stage] = now - self._last
         self._last = now
@@ -40,7 +40,7 @@ class StageClock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
-    """One imagined chunk and what was made on the way.
+    """One imagined chunk and its intermediate results.
 
     Attributes:
         start: the observation that the chunk starts from, at the model's size.

@@ -14,15 +14,15 @@ import threading
 import time
 from types import FrameType
 
-#: a stopped command tidies up for this long [s]
+#: longest clean-up of a command that a signal stops [s]
 _TIDY_S = 5.0
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-#: tells a node whose child it is: it ends with that process, however that ends
+#: environment variable with the parent's process number: a node ends with its parent
 PARENT_VARIABLE = 'MTV_WORLD_PARENT'
 _STOP_S = 30.0
-#: a process that stands still (SIGSTOP) for longer is given up [s]
+#: time after which a stopped process (SIGSTOP) is given up [s]
 STILL_S = 5.0
-#: who looks no oftener than this may have stood still as well [s]
+#: longer gaps between two looks mean that this process was stopped as well [s]
 _LONGEST_GAP_S = 2.0
 _TAIL_BYTES = 4000
 
@@ -84,10 +84,10 @@ def ended_by_signals(name: str) -> Iterator[None]:
 
 @contextmanager
 def stopped_by_sigterm() -> Iterator[None]:
-    """Within it SIGTERM raises `Stopped`, as SIGINT does KeyboardInterrupt: the command tidies up.
+    """Within it SIGTERM raises `Stopped`, as SIGINT does KeyboardInterrupt, for a clean-up.
 
-    What still tidies up after `_TIDY_S` is ended, and at once at a second SIGTERM. Where SIGTERM
-    has a handler, that stays.
+    A clean-up longer than `_TIDY_S` is ended, and so is any at a second SIGTERM. An existing
+    handler of SIGTERM stays.
     """
     is_main = threading.current_thread() is threading.main_thread()
     if not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
@@ -163,30 +163,27 @@ def start_process(
 
 
 def last_line(log: Path, otherwise: str) -> str:
-    """Returns what a process wrote last into its log; `otherwise` where it wrote nothing."""
+    """Returns the last line of a log; `otherwise` where it is empty."""
     tail = log.read_bytes()[-_TAIL_BYTES:].decode(errors='replace')
     lines = [line.strip() for line in tail.splitlines() if line.strip()]
     return lines[-1] if lines else otherwise
 
 
 def how_it_ended(name: str, process: subprocess.Popen[bytes], logs: Path) -> str:
-    """Returns with which status a process of `start_process` ended, and what it said last."""
+    """Returns the exit status of a process of `start_process` and its last line, in words."""
     text = last_line(logs / f'{name}.log', 'its log is empty')
     return f"'{name}' ended with status {process.returncode}: {text} (logs are in '{logs}')"
 
 
 class StandStill:
-    """Tells processes that somebody stopped (SIGSTOP) from those that are at work.
-
-    What waits for a process looks here, many times a second: one that stands still never ends.
-    """
+    """Detects stopped processes (SIGSTOP), which never end; to be polled many times a second."""
 
     def __init__(self) -> None:
         self._since: dict[int, float] = {}
         self._looked_s = 0.0
 
     def find(self, pids: Iterable[int]) -> int | None:
-        """Returns the number of a process that has stood still for `STILL_S`, or None."""
+        """Returns the number of a process that has been stopped for `STILL_S`, or None."""
         now_s = time.monotonic()
         if now_s - self._looked_s > _LONGEST_GAP_S:  # a terminal stopped this process as well
             self._since.clear()
@@ -196,7 +193,7 @@ class StandStill:
         return next(still, None)
 
     def said(self, processes: Mapping[str, subprocess.Popen[bytes]]) -> str:
-        """Says which of named processes has stood still for `STILL_S`; empty = none."""
+        """Returns which of named processes has been stopped for `STILL_S`, in words; or empty."""
         found = self.find(process.pid for process in processes.values())
         names = [name for name, process in processes.items() if process.pid == found]
         return f"'{names[0]}' was stopped and stood still for {STILL_S:g} s" if names else ''
@@ -216,7 +213,7 @@ def stop_process(process: subprocess.Popen[bytes] | None) -> None:
         return
     process.send_signal(signal.SIGINT)
     with suppress(ProcessLookupError):
-        process.send_signal(signal.SIGCONT)  # one that stands still hears nothing
+        process.send_signal(signal.SIGCONT)  # a stopped process handles no signal
     try:
         process.wait(_STOP_S)
     except subprocess.TimeoutExpired:

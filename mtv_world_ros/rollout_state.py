@@ -1,4 +1,4 @@
-"""Where a rollout stands between two chunks."""
+"""The state of a rollout between two chunks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mtv_world_ros.success.rollout_memory import RolloutMemory
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RolloutState:
-    """Where the rollout of one seed stands: what its next chunk goes on from.
+    """The state of one seed's rollout, which its next chunk starts from.
 
     Attributes:
         observation: its last frame, at the model's size.
@@ -42,11 +42,6 @@ class RolloutState:
     ) -> RolloutState:
         """Returns the state of an episode that begins at a real observation.
 
-        Args:
-            observation: of V views.
-            spec: of the world model.
-            objects: that are looked for in it.
-
         Raises:
             ObservationError: the views are not the model's.
         """
@@ -59,7 +54,7 @@ class RolloutState:
 
     @property
     def is_begun(self) -> bool:
-        """Whether nothing real was seen since the episode began."""
+        """Whether no real frame was observed since the episode began."""
         return self.memory is None or self.memory.num_frames == 1 + self.num_imagined
 
     def after(

@@ -1,4 +1,4 @@
-"""What the topics of a robot's own bags are: views, joints, commands, namespaces."""
+"""Mapping files of bags: which topics hold views, joint states and commands."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STATE = 'state'
 
 
 class ViewTopics(Schema):
-    """Where a view is from."""
+    """Topics of a view."""
 
     image: str = Field(description='topic of Image, CompressedImage or FFMPEGPacket')
     camera_info: str = Field(default='', description='default: beside the images')
@@ -26,7 +26,7 @@ class ViewTopics(Schema):
 
 
 class ToolTopic(ToolTargets):
-    """Where the commanded poses of an arm's tool are from."""
+    """Topic of the commanded poses of an arm's tool."""
 
     topic: str = Field(description='of PoseStamped')
     frame: str = Field(
@@ -40,7 +40,7 @@ def _view(value: Any) -> Any:
 
 
 class Written(Schema):
-    """What is said of the episodes that an import writes, and how they are written."""
+    """Description and encoding of the episodes that an import writes."""
 
     task: str = Field(default='', description='name of the task; empty = none')
     outcome: Annotated[str, AfterValidator(check_outcome)] = 'unknown'

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import json
 from pathlib import Path
@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from mtv_world_ros.bounded_input import parse_json
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
-from mtv_world_ros.errors import EpisodeError, nearest
+from mtv_world_ros.errors import EpisodeError, MtvWorldError, nearest
+from mtv_world_ros.geometry.resample import interpolated, match_joints
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 JOINT_STATES = '/joint_states'
 JOINT_TRAJECTORY = '/joint_trajectory'
@@ -149,6 +151,48 @@ class Frames(Protocol):
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]: ...
 
 
+class LazyFrames:
+    """`Frames` of image messages, each of which is decoded by itself.
+
+    Args:
+        topic: name of the topic, for error texts.
+        messages: image messages of the topic.
+        decode: turns a message into a frame, (H, W, 3) uint8 RGB.
+    """
+
+    def __init__(
+        self, topic: str, messages: Sequence[Any], decode: Callable[[Any], ByteArray]
+    ) -> None:
+        self._topic = topic
+        self._messages = messages
+        self._decode = decode
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    def __getitem__(self, index: Any) -> ByteArray:
+        chosen = np.arange(len(self))[index]
+        if chosen.ndim == 0:
+            return self._frame(int(chosen))
+        return self._stack([self._frame(int(i)) for i in chosen])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        frames = self[:]
+        return frames if dtype is None else frames.astype(dtype, copy=False)
+
+    def _frame(self, index: int) -> ByteArray:
+        try:
+            return self._decode(self._messages[index])
+        except MtvWorldError as error:
+            raise EpisodeError(f"'{self._topic}', frame {index}: {error}") from error
+
+    def _stack(self, frames: list[ByteArray]) -> ByteArray:
+        sizes = sorted({frame.shape[:2] for frame in frames})
+        if len(sizes) > 1:
+            raise EpisodeError(f"'{self._topic}': the frames have several sizes (H, W): {sizes}")
+        return np.stack(frames) if frames else np.empty((0, 0, 0, 3), np.uint8)
+
+
 class Track(NamedTuple):
     """Frames over time.
 
@@ -174,6 +218,21 @@ class JointStates:
     stamps_ns: NDArray[np.int64]
     joint_names: tuple[str, ...]
     positions: FloatArray
+
+    def at(self, stamps_ns: NDArray[np.int64], robot: RobotModel) -> FloatArray:
+        """Returns (T, J) positions at stamps (T,), interpolated, in the robot's joint order.
+
+        Raises:
+            TrajectoryError: joints of the robot are missing.
+        """
+        known, rows = np.unique(self.stamps_ns, return_index=True)
+        track = JointTrajectory(
+            joint_names=self.joint_names,
+            times=(known - known[0]) * 1e-9,
+            positions=self.positions[rows],
+        )
+        matched = match_joints(track, robot)
+        return interpolated((stamps_ns - known[0]) * 1e-9, matched.times, matched.positions)
 
 
 class ObjectPoses(NamedTuple):

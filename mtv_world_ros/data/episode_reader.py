@@ -13,15 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtv_world_ros.data.bag import messages
-from mtv_world_ros.data.bag.image_decoding import (
-    check_compressed,
-    check_raw,
-    compressed_to_ids,
-    compressed_to_rgb,
-    raw_to_rgb,
-)
+from mtv_world_ros.data.bag.image_decoding import check_image, to_ids, to_rgb
 from mtv_world_ros.data.bag.messages import IMAGE_TYPES
-from mtv_world_ros.data.bag.reader import BagReader, iter_messages
+from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.video_packets import (
     check_packet,
     FFMPEG_PACKET,
@@ -38,6 +32,7 @@ from mtv_world_ros.data.episode import (
     JOINT_STATES,
     JOINT_TRAJECTORY,
     JointStates,
+    LazyFrames,
     METADATA_NAME,
     OBJECT_POSES,
     ObjectPoses,
@@ -54,8 +49,6 @@ from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.camera import unknown_camera, with_camera_info
 from mtv_world_ros.geometry.image_window import ImageWindow, WHOLE, window_of, windowed_camera
 from mtv_world_ros.geometry.robot.model import RobotModel
-
-__all__ = ['iter_messages', 'list_episodes', 'read_episode', 'read_info']
 
 Stamped = list[tuple[int, Any]]
 #: joints that a warning names at most
@@ -222,18 +215,17 @@ class _EpisodeReader:
                 self._warn_once(f"'{message.topic}': headers without stamp; log times are used")
 
     def _images(self, view: str, names: ViewTopics) -> Track:
-        track = self._track(names.image, _check_image, _to_rgb)
+        track = self._track(names.image, to_rgb)
         if track is None:
             reasons = self.refused.get(names.image) or ['it holds no messages']
             raise EpisodeError(f"'{self.path}', view '{view}': '{names.image}': {reasons[0]}")
         return track
 
     def _masks(self, names: ViewTopics) -> Track | None:
-        return self._track(names.mask, _check_image, _to_ids) if self.with_masks else None
+        return self._track(names.mask, to_ids) if self.with_masks else None
 
-    def _track(
-        self, topic: str, check: Callable[[Any], None], decode: Callable[[Any], ByteArray]
-    ) -> Track | None:
+    def _track(self, topic: str, decode: Callable[[Any], ByteArray]) -> Track | None:
+        check = check_packet if self.types.get(topic) == FFMPEG_PACKET else check_image
         good: Stamped = []
         for stamp, (_, message) in self.received.get(topic, []):
             try:
@@ -315,10 +307,10 @@ class _EpisodeReader:
             for arm, tool in self.mapping.tools.items()
         }
         try:
-            led, odd = joints_of_tools(targets, self.robot, states, others)
+            led, warnings = joints_of_tools(targets, self.robot, states, others)
         except ValueError as error:
             raise EpisodeError(f"'{self.path}': {error}") from error
-        self.warnings += odd
+        self.warnings += warnings
         return following(led, self.mapping.chunk_s, self.seen_ns)
 
     def _tool_poses(self, arm: str, tool: ToolTopic, robot: RobotModel) -> ToolTrack:
@@ -388,13 +380,13 @@ class _EpisodeReader:
             )
         if self.robot is None or self.mapping.tools:
             return plans
-        whole = complete_plans(plans, states, self.robot, chunk_s)
-        if whole.taken:
+        whole, measured = complete_plans(plans, states, self.robot, chunk_s)
+        if measured:
             self._warn_once(
-                f"'{topic}': trajectories leave out joints {', '.join(whole.taken)}; their "
+                f"'{topic}': trajectories leave out joints {', '.join(measured)}; their "
                 'measured positions stand in for commands'
             )
-        return whole.plans
+        return whole
 
     def _object_poses(self, num_objects: int) -> ObjectPoses | None:
         topic = self.topics.object_poses
@@ -627,33 +619,6 @@ def _rectified(info: Any) -> Any:
     return replace(info, k=np.asarray(info.p).reshape(3, 4)[:, :3].ravel(), d=np.zeros(0))
 
 
-def _is_raw(message: Any) -> bool:
-    return hasattr(message, 'step')
-
-
-def _layout(message: Any) -> dict[str, Any]:
-    return {key: getattr(message, key) for key in ('encoding', 'height', 'width', 'step')}
-
-
-def _check_image(message: Any) -> None:
-    if _is_raw(message):
-        check_raw(**_layout(message), num_bytes=len(message.data))
-    elif hasattr(message, 'pts'):
-        check_packet(message)
-    else:
-        check_compressed(message.format, message.data)
-
-
-def _to_rgb(message: Any) -> ByteArray:
-    if _is_raw(message):
-        return raw_to_rgb(message.data, **_layout(message), is_bigendian=message.is_bigendian)
-    return compressed_to_rgb(message.format, message.data)
-
-
-def _to_ids(message: Any) -> ByteArray:
-    return compressed_to_ids(message.format, message.data)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewTopics:
     """Topics of one view: images (raw or compressed), CameraInfo, masks."""
@@ -748,48 +713,6 @@ def _view_topics(
 
 def _listed(names: Sequence[str]) -> str:
     return ', '.join(names) or 'none'
-
-
-class LazyFrames:
-    """Frames that are decoded when asked for (`episode.Frames`).
-
-    Args:
-        topic: name of the topic, for error texts.
-        messages: image messages of the topic.
-        decode: turns a message into a frame, (H, W, 3) uint8 RGB.
-    """
-
-    def __init__(
-        self, topic: str, messages: Sequence[Any], decode: Callable[[Any], ByteArray]
-    ) -> None:
-        self._topic = topic
-        self._messages = messages
-        self._decode = decode
-
-    def __len__(self) -> int:
-        return len(self._messages)
-
-    def __getitem__(self, index: Any) -> ByteArray:
-        chosen = np.arange(len(self))[index]
-        if chosen.ndim == 0:
-            return self._frame(int(chosen))
-        return self._stack([self._frame(int(i)) for i in chosen])
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        frames = self[:]
-        return frames if dtype is None else frames.astype(dtype, copy=False)
-
-    def _frame(self, index: int) -> ByteArray:
-        try:
-            return self._decode(self._messages[index])
-        except MtvWorldError as error:
-            raise EpisodeError(f"'{self._topic}', frame {index}: {error}") from error
-
-    def _stack(self, frames: list[ByteArray]) -> ByteArray:
-        sizes = sorted({frame.shape[:2] for frame in frames})
-        if len(sizes) > 1:
-            raise EpisodeError(f"'{self._topic}': the frames have several sizes (H, W): {sizes}")
-        return np.stack(frames) if frames else np.empty((0, 0, 0, 3), np.uint8)
 
 
 def in_order(

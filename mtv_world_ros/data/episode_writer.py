@@ -76,7 +76,7 @@ class EpisodeWriter(BagWriter):
             try:
                 save_calibration(self.folder / CALIBRATION_FILE, by_view)
             except BaseException:
-                self.abort()  # nobody has this writer yet
+                self.abort()  # no caller has this writer to close it
                 raise
 
     def write_image(
@@ -87,28 +87,15 @@ class EpisodeWriter(BagWriter):
             raise EpisodeError(
                 f"view '{view}': frame is {rgb.shape} {rgb.dtype}, expected (H, W, 3) uint8"
             )
+        frame = optical_frame(view)
         if compressed:
             data = encode_jpeg(rgb, self._jpeg_quality)
-            self._write_compressed(
-                f'{image_topic(view)}/compressed',
-                view,
-                stamp_ns,
-                'rgb8; jpeg compressed bgr8',
-                data,
-            )
-            return
-        height, width, _ = rgb.shape
-        message = messages.make(
-            messages.IMAGE,
-            header=messages.make_header(stamp_ns, optical_frame(view)),
-            height=height,
-            width=width,
-            encoding='rgb8',
-            is_bigendian=0,
-            step=3 * width,
-            data=np.ascontiguousarray(rgb).ravel(),
-        )
-        self.write_message(image_topic(view), messages.IMAGE, stamp_ns, message)
+            topic, kind = f'{image_topic(view)}/compressed', messages.COMPRESSED_IMAGE
+            message = messages.make_compressed(stamp_ns, frame, data)
+        else:
+            topic, kind = image_topic(view), messages.IMAGE
+            message = messages.make_image(stamp_ns, frame, rgb)
+        self.write_message(topic, kind, stamp_ns, message)
 
     def write_mask(self, view: str, stamp_ns: int, ids: ByteArray) -> None:
         """Records object masks, (H, W) uint8: 0 = none, i + 1 = objects[i]."""
@@ -116,10 +103,10 @@ class EpisodeWriter(BagWriter):
             raise EpisodeError(
                 f"view '{view}': mask is {ids.shape} {ids.dtype}, expected (H, W) uint8"
             )
-        data = encode_png(ids)
-        self._write_compressed(
-            mask_topic(view), view, stamp_ns, 'mono8; png compressed mono8', data
+        message = messages.make_compressed(
+            stamp_ns, optical_frame(view), encode_png(ids), messages.PNG_LABELS
         )
+        self.write_message(mask_topic(view), messages.COMPRESSED_IMAGE, stamp_ns, message)
 
     def write_camera_info(self, view: str, stamp_ns: int, camera: CameraModel) -> None:
         """Records the view's intrinsics."""
@@ -181,14 +168,3 @@ class EpisodeWriter(BagWriter):
             metadata=self.metadata,
         )
         self.set_metadata(METADATA_NAME, dump_info(info))
-
-    def _write_compressed(
-        self, topic: str, view: str, stamp_ns: int, layout: str, data: bytes
-    ) -> None:
-        message = messages.make(
-            messages.COMPRESSED_IMAGE,
-            header=messages.make_header(stamp_ns, optical_frame(view)),
-            format=layout,
-            data=np.frombuffer(data, np.uint8),
-        )
-        self.write_message(topic, messages.COMPRESSED_IMAGE, stamp_ns, message)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from itertools import groupby, pairwise
 from typing import Any
@@ -15,7 +14,7 @@ from mtv_world_ros.bounded_input import check_limit, LimitError
 from mtv_world_ros.data.episode import JointStates
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import TrajectoryError
-from mtv_world_ros.geometry.resample import match_joints, resample, SAME_S
+from mtv_world_ros.geometry.resample import interpolated, match_joints, resample, SAME_S
 from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
 
 Plan = tuple[int, JointTrajectory]
@@ -31,7 +30,7 @@ _MOVED = 1e-3
 
 
 class PlanFault(StrEnum):
-    """What a plan is refused for, as `/diagnostics` and `~/report` count it."""
+    """Why a plan is rejected, as counted in `/diagnostics` and `~/report`."""
 
     EMPTY = 'trajectory_empty'
     MALFORMED = 'trajectory_malformed'
@@ -42,7 +41,7 @@ class PlanFault(StrEnum):
 
 
 class PlanError(TrajectoryError):
-    """A plan cannot be used; `fault` is what it counts under."""
+    """A plan is rejected; `fault` is the reason as it is counted."""
 
     def __init__(self, fault: PlanFault, text: str) -> None:
         super().__init__(text)
@@ -53,7 +52,7 @@ def read_plan(message: Any) -> JointTrajectory:
     """Returns the trajectory of a message, of rclpy's or rosbags' class.
 
     Times count from the message's stamp. Velocities are kept where every point has them. Limits
-    are not looked at: what was commanded in a recording is a fact. Who imagines a plan checks it
+    are not checked, as recorded commands are facts; before a plan is imagined they are
     (`check_plan_joints`, `plan_limits.check_plan`).
 
     Raises:
@@ -112,19 +111,14 @@ def _rows(names: Sequence[str], points: Iterable[Any], field: str) -> FloatArray
 
 
 def check_plan_joints(plan: JointTrajectory, robot: RobotModel, tolerance: float) -> None:
-    """Checks that all joints that are named are the robot's, and none is outside its limits.
-
-    Args:
-        plan: of all joints, or of some of them.
-        robot: the robot.
-        tolerance: how far outside of the limits a position may be [rad or m].
+    """Checks that a plan's joints are the robot's and in their limits, up to a tolerance.
 
     Raises:
         PlanError: an unknown joint, or a position outside of its limits.
     """
     home = np.clip(0.0, robot.lower, robot.upper)
     try:
-        whole = match_joints(plan, robot, home, allow_missing=True)
+        whole = match_joints(plan, robot, home)
     except TrajectoryError as error:
         raise PlanError(PlanFault.NAMES, str(error)) from error
     try:
@@ -207,35 +201,25 @@ def _runs(plans: Sequence[Plan]) -> list[list[Plan]]:
     return [[plan for _, plan in group] for _, group in grouped]
 
 
-@dataclass(frozen=True, slots=True)
-class CompletedPlans:
-    """Plans of all joints.
-
-    Attributes:
-        plans: (start stamp [ns], trajectory), by stamp.
-        taken: joints whose commands are measured positions, as some plan does not name them.
-    """
-
-    plans: list[Plan]
-    taken: tuple[str, ...] = ()
-
-
 def complete_plans(
     plans: Sequence[Plan], states: JointStates | None, robot: RobotModel, chunk_s: float
-) -> CompletedPlans:
-    """Gives joints that plans leave out the positions that were measured meanwhile.
+) -> tuple[list[Plan], tuple[str, ...]]:
+    """Completes plans of some of the joints with the positions measured meanwhile.
 
-    Those of a gripper, say, that an action drives. Where such joints move between two plans,
-    plans are made of that. Plans that name joints which are not the robot's are left as they are.
+    An example is a gripper that an action drives. Motions of such joints between two plans become
+    plans of their own. Plans that name unknown joints are not changed.
 
     Args:
         plans: (start stamp [ns], trajectory), by stamp.
         states: measured positions; None = nothing is completed.
         robot: the robot.
         chunk_s: length of plans between plans [s].
+
+    Returns:
+        Plans of all joints by stamp, and the joints that some plan does not name.
     """
     if states is None or not set(robot.joint_names) <= set(states.joint_names):
-        return CompletedPlans(list(plans))
+        return list(plans), ()
     measured = _Measured(states, robot)
     done: list[Plan] = []
     taken: dict[str, None] = {}
@@ -247,7 +231,7 @@ def complete_plans(
         taken.update(dict.fromkeys(missing))
         next_ns = plans[index + 1][0] if index + 1 < len(plans) else int(states.stamps_ns[-1])
         done += measured.completed(stamp_ns, plan, missing, next_ns, chunk_s)
-    return CompletedPlans(done, tuple(taken))
+    return done, tuple(taken)
 
 
 class _Measured:
@@ -265,8 +249,7 @@ class _Measured:
 
     def at(self, stamp_ns: int, seconds: FloatArray) -> FloatArray:
         """(N, J) at times after a stamp [s]."""
-        known = (self._stamps - stamp_ns) * 1e-9
-        return np.stack([np.interp(seconds, known, row) for row in self._rows.T], axis=1)
+        return interpolated(seconds, (self._stamps - stamp_ns) * 1e-9, self._rows)
 
     def times(self, stamp_ns: int, begin_s: float, end_s: float) -> FloatArray:
         """Times of samples after a stamp [s], no denser than needed."""

@@ -45,7 +45,7 @@ class Recording:
         outcome: `success`, `failure` or `unknown`.
         instruction: text for the robot.
         objects: names of the objects by the episode; what `object_ids` stand for.
-        described: names of the objects by a describer; empty = none was asked.
+        described: names of the objects by a describer; empty = not described.
         masks_by: the segmenter that made `object_ids`; empty = they are the simulator's.
         camera_tracks: (N, 4, 4) T_mount_camera [m] of views whose camera moves against the
             robot's links; see `cameras_at`.
@@ -237,8 +237,9 @@ def _object_poses(episode: Episode, stamps: np.ndarray) -> FloatArray | None:
 
 def stitched_commands(episode: Episode, robot: RobotModel, origin_ns: int) -> JointTrajectory:
     """Returns what was commanded in the robot's joint order; see `stitch`, `complete_plans`."""
-    whole = complete_plans(episode.trajectories, episode.joint_states, robot, BagMapping().chunk_s)
-    matched = [(s, match_joints(t, robot, None)) for s, t in whole.plans]
+    chunk_s = BagMapping().chunk_s
+    whole, _ = complete_plans(episode.trajectories, episode.joint_states, robot, chunk_s)
+    matched = [(s, match_joints(t, robot)) for s, t in whole]
     return stitch(matched, origin_ns)
 
 
@@ -252,15 +253,7 @@ def measured_positions(episode: Episode, robot: RobotModel, stamps: np.ndarray) 
     states = episode.joint_states
     if states is None or len(states.stamps_ns) == 0:
         raise EpisodeError(f"episode '{episode.info.path}' has no joint_states")
-    seconds = (np.asarray(states.stamps_ns) - stamps[0]) * 1e-9
-    seconds, first = np.unique(seconds, return_index=True)
-    track = JointTrajectory(
-        joint_names=states.joint_names, times=seconds, positions=states.positions[first]
-    )
-    matched = match_joints(track, robot, None)
-    wanted = (stamps - stamps[0]) * 1e-9
-    columns = [np.interp(wanted, matched.times, column) for column in matched.positions.T]
-    return np.stack(columns, axis=1)
+    return states.at(stamps, robot)
 
 
 def frame_indices(
@@ -280,15 +273,9 @@ def frame_indices(
 
 def commands_from(recording: Recording, start: int) -> JointTrajectory:
     """The commands that are due after frame `start`, counted from it."""
-    commands = recording.commands
-    times = commands.times - recording.times[start]
+    times = recording.commands.times - recording.times[start]
     due = times > 1e-6
     if not due.any():
         due[-1] = True
         times = np.where(due, 1e-3, times)
-    return JointTrajectory(
-        joint_names=commands.joint_names,
-        times=times[due],
-        positions=commands.positions[due],
-        velocities=None if commands.velocities is None else commands.velocities[due],
-    )
+    return recording.commands.points(due, times)

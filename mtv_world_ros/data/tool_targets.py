@@ -1,4 +1,4 @@
-"""Commands that are poses of an arm's tool, or differences of them, and the joints for them.
+"""Commanded poses of an arm's tool, or differences of poses, and their inverse kinematics.
 
 T rows, J joints, n joints of an arm.
 """
@@ -18,7 +18,6 @@ from mtv_world_ros.config import Pair, Schema
 from mtv_world_ros.data.episode import JointStates
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import EpisodeError, nearest, TrajectoryError
-from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot.model import RobotModel, Tool
 
@@ -27,7 +26,7 @@ _MOST_OUT_OF_REACH = 0.5
 
 
 class ToolTargets(Schema):
-    """What commanded poses of an arm's tool mean."""
+    """The meaning of commanded poses of an arm's tool."""
 
     scale: Pair = Field(
         default=(1.0, 1.0), description='factors of position and rotation (of a controller)'
@@ -160,7 +159,7 @@ def joints_of_tools(
     states: JointStates,
     others: Sequence[tuple[int, JointTrajectory]],
 ) -> tuple[JointStates, list[str]]:
-    """Returns joint positions to be reached over time for commanded tool poses, and what was odd.
+    """Returns joint positions that follow commanded tool poses, and warnings.
 
     The first tool's stamps are the clock; of the other tools the newest pose before counts. A
     pose is reached at its own stamp, a difference at the stamp that follows.
@@ -185,32 +184,23 @@ def joints_of_tools(
             f'{len(stamps)} tool poses come while joint positions are measured; do their stamps '
             'come from the same clock?'
         )
-    matched = match_joints(
-        JointTrajectory(
-            joint_names=states.joint_names,
-            times=np.asarray((known - known[0]) * 1e-9, np.float64),
-            positions=states.positions,
-        ),
-        robot,
-        None,
-    )
-    seconds = (stamps - known[0]) * 1e-9
-    columns = [np.interp(seconds, matched.times, column) for column in matched.positions.T]
-    measured = np.stack(columns, axis=1)
-    positions, odd = measured.copy(), []
+    measured = states.at(stamps, robot)
+    positions, warnings = measured.copy(), []
     led = led_joints({arm: track.targets for arm, track in tools.items()}, robot)
     free = [name for name in robot.joint_names if name not in led]
     uncommanded = _add_others(positions, robot, free, stamps, others)
     if uncommanded:
-        odd.append(f'joints {", ".join(uncommanded)} have no commands; they keep what is measured')
+        warnings.append(
+            f'joints {", ".join(uncommanded)} have no commands; they keep what is measured'
+        )
     for arm, (targets, known_ns, poses) in tools.items():
         newest = np.searchsorted(known_ns, stamps, side='right') - 1
         wanted = _scaled(poses[newest], targets.scale)
-        odd.append(add_tool_poses(positions, measured, robot, arm, targets, wanted))
+        warnings.append(add_tool_poses(positions, measured, robot, arm, targets, wanted))
     if any(track.targets.difference for track in tools.values()):
         stamps, positions = stamps[1:], positions[:-1]
     reached = JointStates(stamps_ns=stamps, joint_names=robot.joint_names, positions=positions)
-    return reached, list(filter(None, odd))
+    return reached, list(filter(None, warnings))
 
 
 def _add_others(

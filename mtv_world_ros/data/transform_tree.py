@@ -31,24 +31,12 @@ _Numbers = tuple[float, ...]
 MAX_GAP_S = 0.5
 
 
-class PoseTrack(NamedTuple):
-    """A frame that moves against every link of the robot.
-
-    Attributes:
-        link: a link of the robot.
-        T_link_frame: (N, 4, 4) poses of the frame in it [m].
-    """
-
-    link: str
-    T_link_frame: FloatArray
-
-
 class Mount(NamedTuple):
     """What carries a frame.
 
     Attributes:
         link: a link of the robot that is fixed to the frame.
-        T_link_frame: (4, 4) pose of the frame in it [m].
+        T_link_frame: (4, 4) pose of the frame in it [m]; of `pose_track` (N, 4, 4).
         stamp_ns: when the least recent transform between the two was published [ns]; None = all
             of them are from /tf_static and hold for good.
     """
@@ -60,7 +48,7 @@ class Mount(NamedTuple):
 
 @dataclass(slots=True)
 class _Edge:
-    """The transforms from one frame to another: the first one, and how far they vary.
+    """The transforms from one frame to another: the first one and their span.
 
     Attributes:
         T: (4, 4) the first one [m].
@@ -83,7 +71,7 @@ class _Edge:
     recent: deque[tuple[int, _Numbers]] = field(default_factory=lambda: deque(maxlen=_NUM_RECENT))
 
     def see(self, numbers: _Numbers, stamp_ns: int | None) -> None:
-        """Widens the span by a transform; one that moves anyway is not looked at."""
+        """Adds a transform: widens the span of an edge that has not moved so far."""
         self.count += 1
         if numbers != self.last and self.is_still:
             T = pose(numbers[:3], numbers[3:])
@@ -247,12 +235,7 @@ class TransformTree:
     def moving_mount(
         self, frame: str, links: Collection[str], stamp_ns: int | None = None
     ) -> Mount:
-        """Returns the nearest of the robot's links that TF leads to.
-
-        Args:
-            frame: e.g. a camera's optical frame.
-            links: of the robot.
-            stamp_ns: when the pose is wanted [ns]; None = by the newest transforms.
+        """Returns the nearest link that TF leads to, at a time [ns] or by the newest transforms.
 
         Raises:
             CalibrationError: TF does not lead from the frame to a link.
@@ -311,11 +294,6 @@ class TransformTree:
         """Yields the frames that TF leads to as mounts, itself and the nearest first.
 
         A breadth-first search that visits a frame once: frames in a circle end it, too.
-
-        Args:
-            frame: where the search begins.
-            only_still: leave out transforms that move.
-            stamp_ns: when the poses are wanted [ns]; None = by the newest transforms.
         """
         neighbours: dict[str, list[tuple[str, _Edge]]] = defaultdict(list)
         for child, parent in self._parents().items():
@@ -352,7 +330,7 @@ def pose_track(
     links: Collection[str],
     stamps_ns: NDArray[np.int64],
     prefix: str = '',
-) -> PoseTrack:
+) -> Mount:
     """Returns the poses of a frame that moves against every link of the robot.
 
     Args:
@@ -377,7 +355,7 @@ def pose_track(
                 break
             T[start] = _interpolated(edge, series[edge], stamps_ns) @ T[start]
             name = edge[0]
-    return PoseTrack(link, np.linalg.inv(T[link]) @ T[frame])
+    return Mount(link, np.linalg.inv(T[link]) @ T[frame], None)
 
 
 def _series(

@@ -48,19 +48,6 @@ class ImageWindow:
         return f'{roi}, binning {self.binning[0]}x{self.binning[1]}'
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WindowedPixels:
-    """How pixels of the calibrated image become those of the images.
-
-    Attributes:
-        to_image: (3, 3), maps homogeneous pixels of the calibrated image to those of the images.
-        note: what the camera's description leaves open, and how it is taken; empty = nothing.
-    """
-
-    to_image: FloatArray
-    note: str = ''
-
-
 WHOLE = ImageWindow()
 
 
@@ -80,28 +67,25 @@ def window_of(info: Any) -> ImageWindow:
 def windowed_camera(
     camera: CameraModel, width: int, height: int, window: ImageWindow = WHOLE
 ) -> tuple[CameraModel, str]:
-    """Returns the camera for images of a size, and what had to be assumed; see `windowed_pixels`.
+    """Returns the calibrated camera for images of a size [px], and the assumptions made.
 
-    Args:
-        camera: the calibrated camera, before cropping.
-        width: of the images [px].
-        height: of the images [px].
-        window: part of the calibrated image that the frames show.
+    See `windowed_pixels`.
 
     Raises:
         CalibrationError: images of this size are not explained.
     """
-    found = windowed_pixels(camera, width, height, window)
-    if np.array_equal(found.to_image, np.eye(3)):
-        return camera, found.note
-    K = found.to_image @ camera.K
-    return replace(camera, width=width, height=height, K=K), found.note
+    to_image, note = windowed_pixels(camera, width, height, window)
+    if np.array_equal(to_image, np.eye(3)):
+        return camera, note
+    return replace(camera, width=width, height=height, K=to_image @ camera.K), note
 
 
 def windowed_pixels(
     camera: CameraModel, width: int, height: int, window: ImageWindow = WHOLE
-) -> WindowedPixels:
-    """Returns the map from calibrated pixels to those of images of a size.
+) -> tuple[FloatArray, str]:
+    """Returns the map (3, 3) from calibrated pixels to those of images of a size, and a note.
+
+    The note says what the camera's description leaves open and how it is taken; empty = nothing.
 
     By the words of sensor_msgs/CameraInfo: K, P, width and height are of the full resolution,
     `roi` is a part of it in unbinned pixels, and binned images have floor(size / binning) pixels.
@@ -119,14 +103,14 @@ def windowed_pixels(
     )
     if size == sent or _are_near(size, sent) and max(window.binning) > 1:
         _check_K(camera, window, size)
-        return WindowedPixels(to_image=_shift(window) if window != WHOLE else np.eye(3))
+        return _shift(window) if window != WHOLE else np.eye(3), ''
     if size == full:
-        return WindowedPixels(
-            to_image=np.eye(3),
-            note=f"view '{camera.view}': its camera_info has {window}, that is images of "
+        note = (
+            f"view '{camera.view}': its camera_info has {window}, that is images of "
             f'{sent[0]}x{sent[1]}; they are of {width}x{height}, the whole size: taken as whole '
-            'images, which its K is for',
+            'images, which its K is for'
         )
+        return np.eye(3), note
     if not _has_aspect(size, sent) or window != WHOLE and size > sent:
         raise CalibrationError(
             f"view '{camera.view}' has images of {width}x{height}, but a camera_info or "
@@ -137,11 +121,11 @@ def windowed_pixels(
     scale = np.array([width / sent[0], height / sent[1]])
     resized = np.diag([*scale, 1.0])
     resized[:2, 2] = (scale - 1) / 2
-    return WindowedPixels(
-        to_image=resized @ _shift(window),
-        note=f"view '{camera.view}': images of {width}x{height}, camera_info or calibration for "
-        f'{sent[0]}x{sent[1]}: taken as resized, focal lengths times {scale[0]:.4g}',
+    note = (
+        f"view '{camera.view}': images of {width}x{height}, camera_info or calibration for "
+        f'{sent[0]}x{sent[1]}: taken as resized, focal lengths times {scale[0]:.4g}'
     )
+    return resized @ _shift(window), note
 
 
 def _shift(window: ImageWindow) -> FloatArray:

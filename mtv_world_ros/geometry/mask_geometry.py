@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
-from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.camera import project, triangulate, unproject
 
 #: error of the centroid of a small mask [px]
 CENTROID_NOISE_PX = 0.3
-#: holds back the lean that no view sees; squared shares of a view that sees it wholly
+#: ridge on the lean that no view determines, as a squared share of a view that shows it fully
 _RIDGE = 0.02
 
 
@@ -52,23 +51,20 @@ def locate(
 ) -> Location | None:
     """Triangulates one point from (V, 2) pixels; views with NaN are ignored.
 
-    Returns None if fewer than two views see the point, or all see it along one ray.
+    Returns None if fewer than two views see the point; NaN if all see it along one ray.
     """
     seen = [view for view in range(len(cameras)) if np.isfinite(pixels[view]).all()]
     if len(seen) < 2:
         return None
     used = [cameras[view] for view in seen]
     poses = [T_base_camera[view] for view in seen]
-    try:
-        point, residual = triangulate(used, poses, pixels[seen])
-    except CalibrationError:  # parallel rays: as good as one view
-        return None
-    noise = max(float(residual), CENTROID_NOISE_PX)
+    point, residual = triangulate(used, poses, pixels[seen])
+    noise = max(residual, CENTROID_NOISE_PX)
     metres = [
         noise * _depth(pose, point) / camera.K[0, 0]
         for camera, pose in zip(used, poses, strict=True)
     ]
-    return Location(point=point, residual_px=float(residual), sigma_m=float(np.mean(metres)))
+    return Location(point=point, residual_px=residual, sigma_m=float(np.mean(metres)))
 
 
 def locate_all(
@@ -108,7 +104,7 @@ def lean(
     """Returns the horizontal part (2,) of the unit vector along an object's long axis, upwards.
 
     A mask's long axis and the camera span a plane that the axis lies in. Its lean is the least one
-    that fits the planes of all views; a round mask tells none.
+    that fits the planes of all views; a round mask determines none.
 
     Args:
         cameras: of the V views.

@@ -1,4 +1,4 @@
-"""Where objects go, and what they look like on the way.
+"""Rigid motions of objects, and the pictures that show them.
 
 V views, O objects, T frames, H W pixels.
 """
@@ -17,15 +17,15 @@ from mtv_world_ros.data_types import BoolArray, ByteArray, CameraModel, FloatArr
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot.model import RobotModel
 
-#: what moved or turned by less is taken to stand still
+#: smaller displacements and turns count as standing still
 _STILL_M, _STILL_RAD = 0.004, 0.08
-#: what is further away than this is just elsewhere; where turns are felt, from a centre
+#: largest distance that counts between two ends; lever arm by which turns count as distances
 _ELSEWHERE_M, _RADIUS_M = 0.05, 0.02
-#: how long pictures take to pass from one motion to another
+#: duration of the blend from one motion to another in the pictures
 _PASSAGE_S = 1.0
-#: what differs by less in a pose is the same pose
+#: entries of equal poses differ by less
 _SAME_POSE = 1e-4
-#: of two whose widths differ by less than this factor, neither can stand in the other
+#: least ratio of widths at which one object can stand in or on the other
 _AS_WIDE = 1.25
 
 
@@ -68,7 +68,7 @@ class ObjectMotion:
         return self._of([rows[frames] for rows in self._rows])
 
     def begun_at(self, last: ObjectMotion, steps: int) -> ObjectMotion:
-        """Returns the same, begun at the last row of another and as it is itself after steps."""
+        """Returns the motion blended from the last row of another into itself within `steps`."""
         left = np.clip(1 - np.arange(len(self.points)) / steps, 0.0, 1.0)
         way = np.nan_to_num(last.ways[-1] - self.ways[0])
         turns = Rotation.from_matrix(self.rotations[0].swapaxes(-1, -2) @ last.rotations[-1])
@@ -82,7 +82,7 @@ class ObjectMotion:
 
     @property
     def _rows(self) -> list[FloatArray]:
-        """What there is of every frame."""
+        """The arrays with a row a frame."""
         rows = [self.points, self.rotations]
         return rows if self.openings is None else [*rows, self.openings]
 
@@ -94,7 +94,7 @@ class ObjectMotion:
 
 
 class TrackedObjects(Protocol):
-    """Objects on their way; what one chunk hands to the next."""
+    """Tracked objects; the state that one chunk hands to the next."""
 
     @property
     def step_s(self) -> float:
@@ -118,12 +118,12 @@ class TrackedObjects(Protocol):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """What speaks against what is foreseen, in words."""
+        """Doubts about the foreseen motions, in words."""
         ...
 
     @property
     def refusal(self) -> str:
-        """Why what is foreseen allows no verdict; empty = it does."""
+        """Why the foreseen motions allow no verdict; empty = they do."""
         ...
 
     def advance(
@@ -131,8 +131,8 @@ class TrackedObjects(Protocol):
     ) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
         """Returns where they are at each of 1 + T steps, and then.
 
-        The first motion is the expected one; the others, if any, are of places and sizes within
-        the error of what the masks tell. Row 0 is where they are now.
+        The first motion is the expected one; the others, if any, start from poses and sizes within
+        the error of the masks. Row 0 is the present.
 
         Args:
             positions: (1 + T * `commands_a_step`, J) that are commanded [rad or m].
@@ -145,7 +145,7 @@ class TrackedObjects(Protocol):
 
 
 class ObjectMotionModel(Protocol):
-    """Says where objects go under commanded joints."""
+    """Foresees object motions under commanded joints."""
 
     def find(
         self,
@@ -165,7 +165,7 @@ class ObjectMotionModel(Protocol):
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
     ) -> tuple[TrackedObjects, BoolArray, BoolArray]:
-        """Returns the same, of objects that something may hide in part by now.
+        """Returns the objects where they may be partly hidden by now.
 
         Args:
             whole: what `find` returned on a frame in which nothing hid the objects.
@@ -175,8 +175,8 @@ class ObjectMotionModel(Protocol):
             poses: T_base_camera of each view, (4, 4) [m].
 
         Returns:
-            The objects; which of them (O,) are surely where they are said to be, as large as they
-            were; and which are hidden in part: their motions count from where they were whole.
+            The objects; which of them (O,) were found with certainty, at their former size; and
+            which are partly hidden: their motions count from the frame in which they were whole.
         """
         ...
 
@@ -246,7 +246,7 @@ class FoundObjects:
         return tuple(found)
 
     def medoid(self, among: BoolArray | None = None) -> int:
-        """Returns the motion whose end is most like those of all.
+        """Returns the index of the medoid motion: its end is closest to those of all.
 
         Args:
             among: (K,) which motions it may be, one or more; None = all.
@@ -331,11 +331,11 @@ def moved_pictures(
 ) -> ByteArray:
     """Returns the objects alone, (V, T, H, W, 4) uint8 RGB and cover, as they move rigidly.
 
-    Each object is moved as the picture of a plane through its centre that faces the camera:
-    shifted by the projected way, scaled by the ratio of depths, turned by the rotation about the
-    line of sight. Near ones lie over far ones, but a thing lies over what it stands in or on,
-    whose nearer wall hides it in part only. What is not known, or behind a camera, is held, as is
-    what stands still before a camera that does.
+    Each object is warped like a plane through its centre that faces the camera: shifted by the
+    projected displacement, scaled by the ratio of depths, turned about the line of sight. Near
+    objects cover far ones, but an object covers the one it stands in or on, whose nearer wall
+    hides it only in part. Objects of unknown pose, behind the camera, or at rest before a camera
+    at rest keep their picture.
 
     Args:
         cuts: (V, O, H, W, 4) of the reference, see `cut_outs`.
@@ -394,10 +394,7 @@ def _holders(motion: ObjectMotion, widths: FloatArray) -> BoolArray:
 
 
 def _from_behind(depths: FloatArray, holders: BoolArray) -> list[int]:
-    """Items in the order in which they are laid over each other.
-
-    Those of unknown depth come last: what is seen of them is not hidden, at least at first.
-    """
+    """Items in drawing order, far ones first; those of unknown depth last, on top."""
     far = np.nan_to_num(depths, nan=-np.inf)
     nearest = np.where(holders, far, np.inf).min(1, initial=np.inf)
     front, held = np.minimum(far, nearest), holders.sum(1)

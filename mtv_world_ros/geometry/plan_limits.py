@@ -1,4 +1,4 @@
-"""What a robot can follow of a plan: positions and speeds of joints, between points as well."""
+"""Limits of plans: positions and speeds of joints, at the points and between them."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def speed_limits(robot: RobotModel) -> FloatArray:
     """Returns (J,) the largest speeds that a plan may ask for [rad/s or m/s].
 
     They are `SPEED_RATIO` times those of the robot's description, or of `DEFAULT_TURN` and
-    `DEFAULT_SLIDE`. A gripper may be told to open or close from one row to the next, as policies
-    do: its speed has no limit.
+    `DEFAULT_SLIDE`. Policies command a gripper to open or close from one row to the next, so its
+    speed has no limit.
     """
     given = np.asarray(robot.velocity_limits)
     free = np.where(robot.slides, DEFAULT_SLIDE, DEFAULT_TURN)
@@ -40,7 +40,7 @@ def check_plan(
     *,
     tolerance: float = LIMIT_TOLERANCE,
 ) -> None:
-    """Checks what a plan asks for from now on; what lies before time 0 is over.
+    """Checks a plan from time 0 on; points before it are past.
 
     Args:
         robot: the robot.

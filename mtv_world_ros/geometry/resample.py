@@ -18,20 +18,15 @@ _NOW = 1e-9
 
 
 def match_joints(
-    trajectory: JointTrajectory,
-    robot: RobotModel,
-    current: FloatArray | None = None,
-    *,
-    allow_missing: bool = False,
+    trajectory: JointTrajectory, robot: RobotModel, current: FloatArray | None = None
 ) -> JointTrajectory:
     """Returns the trajectory with the robot's joints in the robot's order; extra ones dropped.
 
     Args:
         trajectory: joints in any order.
         robot: the robot.
-        current: (J,) positions that missing joints keep, with `allow_missing`.
-        allow_missing: whether missing joints are filled instead of refused, as long as all that
-            are named are the robot's: another name may be a misspelt one.
+        current: (J,) positions that missing joints keep, if all that are named are the robot's
+            (another name may be a misspelt one); None = missing joints are refused.
 
     Raises:
         TrajectoryError: joints named twice or missing, velocities that are not finite.
@@ -49,8 +44,7 @@ def match_joints(
         raise TrajectoryError(f'joints {doubled} are named more than once')
     missing = [name for name in robot.joint_names if name not in given]
     unknown = [name for name in given if name not in robot.joint_names]
-    is_partial = allow_missing and current is not None and not unknown
-    if missing and not is_partial:
+    if missing and (current is None or unknown):
         hint = f'; it has no {unknown}{nearest(unknown[0], missing)}' if unknown else ''
         raise TrajectoryError(
             f"joints {missing} of robot '{robot.name}' are missing{hint}; the trajectory has "
@@ -58,13 +52,13 @@ def match_joints(
         )
     if given == robot.joint_names:
         return trajectory
+    held, still = robot.lower if current is None else current, np.zeros(len(robot.joint_names))
+    rates = trajectory.velocities
     return JointTrajectory(
         joint_names=robot.joint_names,
         times=trajectory.times,
-        positions=_pick(trajectory.positions, given, robot, current),
-        velocities=None
-        if trajectory.velocities is None
-        else _pick(trajectory.velocities, given, robot, np.zeros(len(robot.joint_names))),
+        positions=_pick(trajectory.positions, given, robot, held),
+        velocities=None if rates is None else _pick(rates, given, robot, still),
     )
 
 
@@ -77,16 +71,14 @@ def _check_size(trajectory: JointTrajectory) -> None:
 
 
 def _pick(
-    values: FloatArray, given: tuple[str, ...], robot: RobotModel, default: FloatArray | None
+    values: FloatArray, given: tuple[str, ...], robot: RobotModel, default: FloatArray
 ) -> FloatArray:
-    out = np.empty((len(values), len(robot.joint_names)))
+    """Columns (T, J) of the robot's joints; of those not given the default (J,)."""
+    rows = np.tile(default, (len(values), 1))
     for column, name in enumerate(robot.joint_names):
         if name in given:
-            out[:, column] = values[:, given.index(name)]
-        else:
-            assert default is not None
-            out[:, column] = default[column]
-    return out
+            rows[:, column] = values[:, given.index(name)]
+    return rows
 
 
 def resample(
@@ -124,6 +116,11 @@ def resample(
         + s**2 * (3 - 2 * s) * values[right]
         + s * (1 - s) * ((1 - s) * slopes[left] - s * slopes[right]) * width
     )
+
+
+def interpolated(wanted: FloatArray, times: FloatArray, rows: FloatArray) -> FloatArray:
+    """Returns rows (T, J) of increasing times (T,) at wanted ones (N,); held before and after."""
+    return np.stack([np.interp(wanted, times, column) for column in rows.T], axis=1)
 
 
 def cut_off(

@@ -1,4 +1,4 @@
-"""Solids that look like objects: boxes and upright cylinders, from masks in calibrated views.
+"""Boxes and upright cylinders fitted to objects' masks in calibrated views.
 
 V views, H W pixels.
 """
@@ -27,28 +27,28 @@ _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 _PIXEL = np.abs(_DIRECTIONS).sum(1) / 2
 #: corners of outlines, for a size of 1
 _ROUND, _SQUARE = _DIRECTIONS / 2, np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
-#: turns to begin with [rad]; least size [m]; how well it is known that things stand [m]
+#: initial yaw angles [rad]; least size [m]; standard deviation of the height of what stands [m]
 _TURNS, _LEAST_M, _STANDS_M = (0.0, 0.4, 0.8, 1.2), 0.008, 0.002
-#: a box must fit by so much better than a cylinder, which has two numbers less, and what was
-#: turned by more than what was turned by less
+#: factor by which the cost of a box must be below that of a cylinder, which has two parameters
+#: less, and that of a larger turn below that of a smaller one
 _BETTER = 0.9
-#: further turns to begin with where a solid was moved [rad]
+#: further initial yaw angles where a solid was moved [rad]
 _FURTHER = (0.5, -0.5, 1.0, -1.0)
 #: a solid is found again where masks reach beyond it by no more than this, or so much more than
 #: they did when it was whole [px]; and where this share of its outline is as near to theirs
 _FOUND_PX, _FOUND, _SHOWN = 1.0, 1.5, 0.4
-#: what fills its outline by less than this share of what it did when it was whole, is hidden
+#: a mask that fills less than this share of the outline that it filled before is partly hidden
 _WHOLE = 0.9
-#: what fits so well from where it was has stayed there [px]
+#: largest residual of a solid that has not moved [px]
 _STAYED_PX = 1.0
 _MAX_EVALUATIONS = 60
-#: what fits so well fits best, whatever turn one begins with [px]
+#: residual below which no other initial turn is tried [px]
 _EXACT_PX = 0.35
 #: parts of a mask that are smaller than this share of its largest one are not the object's
 _PART = 0.2
 #: relative step of finite differences
 _DIFFERENCE = float(np.sqrt(np.finfo(float).eps))
-#: words for what is hollow and open at the top
+#: names of vessels: hollow and open at the top
 _VESSEL = re.compile(r'\b(basket|bin|bowl|bucket|cup|dish|glass|jar|mug|plate|pot|tray|vase)s?\b')
 
 
@@ -87,7 +87,7 @@ class Solid:
 
 
 def is_vessel(name: str) -> bool:
-    """Tells whether what is called so is hollow and open at the top, which no mask shows."""
+    """Returns whether a name is that of a vessel: hollow and open at the top."""
     return _VESSEL.search(name.lower()) is not None
 
 
@@ -145,7 +145,7 @@ def fit_solid(
                 error = float(np.sqrt(np.mean(found.fun[:-1] ** 2)))
                 best = found.cost, _solid(found.x, turn is None, error)
             if turn is not None and best[1].error_px < _EXACT_PX:
-                break  # no other turn fits better
+                break  # good enough
     assert best is not None
     solid = replace(best[1], is_open=is_open)
     return replace(solid, fills=_fills(solid, masks, cameras, poses))
@@ -159,9 +159,9 @@ def find_solid(
     poses: Sequence[FloatArray],
     floor: float = 0.0,
 ) -> Solid | None:
-    """Returns where a solid of known size is that something may hide in part.
+    """Returns the pose of a solid of known size that may be partly hidden.
 
-    Most of its outline is that of the masks; what is hidden is left out of account.
+    Most of its outline is that of the masks; a robust loss leaves the hidden part out.
 
     Args:
         solid: the object's solid from a frame in which nothing hid it.
@@ -196,7 +196,7 @@ def find_solid(
         least = [*[-np.inf] * (len(given) - 1), floor - _STANDS_M]
         scale = [0.01, 0.01, *([] if solid.is_round else [0.1]), 0.01]
         found = _nearest(misses, given, bounds=(least, np.inf), x_scale=scale, loss='cauchy')
-        # a square looks the same after a quarter turn: the least turn is believed
+        # a square looks the same after a quarter turn: the smallest turn is taken
         if best is None or found.cost < _BETTER * best.cost:
             best = found
         if np.abs(found.fun).max() < _STAYED_PX:
@@ -253,7 +253,7 @@ def _fills(
 
 
 def _starts(solid: Solid, point: FloatArray) -> Iterator[tuple[FloatArray, float]]:
-    """Where to look for it: where it was, then where it is seen, turned or not."""
+    """Initial guesses: where it was, then where it is seen, with several yaw angles."""
     yield solid.centre, 0.0
     if np.isfinite(point).all():
         for turn in (0.0,) if solid.is_round else (0.0, *_FURTHER):
@@ -287,7 +287,7 @@ class _Outlines:
 
 
 def _nearest(misses: Callable[[FloatArray], FloatArray], given: FloatArray, **how: Any) -> Any:
-    """The numbers (N,) that miss by least, from some on; all differences are taken at once."""
+    """Least squares from initial parameters (N,); finite differences in one batch."""
 
     def slopes(numbers: FloatArray) -> FloatArray:
         steps = _DIFFERENCE * np.maximum(1.0, np.abs(numbers))

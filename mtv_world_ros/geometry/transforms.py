@@ -20,14 +20,7 @@ def rotation(quaternion_xyzw: Sequence[float] | FloatArray) -> FloatArray:
     length = np.linalg.norm(quaternion)
     if quaternion.shape != (4,) or not np.isfinite(length) or length < 1e-9:
         raise ValueError(f'{quaternion_xyzw!r} is no quaternion: give x, y, z, w, not all zero')
-    x, y, z, w = quaternion / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.asarray(pin.Quaternion(quaternion / length).toRotationMatrix())
 
 
 def quaternion(R: FloatArray) -> FloatArray:

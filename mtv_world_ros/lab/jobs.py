@@ -19,7 +19,7 @@ from typing import Any, Protocol, TypeVar
 
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.files import plain
+from mtv_world_ros.files import content_digest, plain
 from mtv_world_ros.processes import StandStill, STILL_S
 
 #: between two looks of a pool at its workers, and of a worker at its parent [s]
@@ -302,6 +302,35 @@ def _ray() -> Any:
             "--ray needs Ray: pip install 'mtv_world_ros[rank]', or leave it out and use --workers"
         ) from error
     return ray
+
+
+def fingerprint(
+    checkpoint: str | Path,
+    *,
+    calibrated: bool = True,
+    adapter: Path | None = None,
+    task: str | None = None,
+) -> str:
+    """Returns the checkpoint's name and a hash of its files: other weights, other name.
+
+    Args:
+        checkpoint: folder, or `bundled`.
+        calibrated: the calibration counts too.
+        adapter: LoRA adapter that is used with it.
+        task: name or file of the task that is judged.
+    """
+    from mtv_world_ros.assembly import checkpoint_path
+    from mtv_world_ros.success.calibration import CALIBRATION, HORIZON
+
+    without = () if calibrated else (CALIBRATION, HORIZON)
+    parts = [f'{checkpoint} ({content_digest(checkpoint_path(checkpoint), without)[:8]})']
+    files = [] if adapter is None else [('adapter', adapter)]
+    if task is not None and not task.endswith(('.yaml', '.yml')):
+        parts.append(f'task {task}')
+    elif task is not None:
+        files += [('task', Path(task))]
+    parts += [f'{what} {path} ({content_digest(path)[:8]})' for what, path in files]
+    return ', '.join(parts)
 
 
 def check_same_settings(results: Path, settings: Mapping[str, Any], overwrite: bool) -> None:

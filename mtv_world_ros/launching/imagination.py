@@ -16,7 +16,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from mtv_world_ros.assembly import checkpoint_path, checkpoint_robot, policy_settings
+from mtv_world_ros.assembly import (
+    checkpoint_path,
+    checkpoint_robot,
+    policy_settings,
+)
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.episode import CALIBRATION_FILE
 from mtv_world_ros.data_types import CameraModel
@@ -37,7 +41,7 @@ from mtv_world_ros.processes import (
 
 #: of logs and bags, before anything is started
 ROOM_BYTES = 8 * 2**20
-#: what an episode starts from stays valid for as long as the policy thinks [s]
+#: the start images stay valid while the policy computes [s]
 _NO_AGE = 3600.0
 #: the address of its page, or its file
 _VIEWER_IS_ON = re.compile(r'^((?:open|written:) .+)\n', re.M)
@@ -92,7 +96,7 @@ def imagine_episodes(
         options: policy, episodes and settings of the nodes.
         out: folder of the results.
         overwrite: remove the episodes of an earlier run from it.
-        tell: is called with what the viewer says of where it is to be seen.
+        tell: called with the viewer's address or file.
 
     Returns:
         What `episodes.json` says, one entry for each episode that was begun.
@@ -145,7 +149,7 @@ def imagine_episodes(
 
 
 def check_same_cameras(episodes: Sequence[Path], views: Sequence[str]) -> None:
-    """Refuses episodes whose cameras stand elsewhere: one node draws them all with one.
+    """Refuses episodes of different camera poses: one node has one calibration for all.
 
     Raises:
         ConfigError: two differ.
@@ -189,7 +193,7 @@ def _check_policy(options: ImagineOptions) -> None:
 
 
 def _viewer_said(viewer: subprocess.Popen[bytes], logs: Path) -> str:
-    """What the viewer says as soon as it can be looked at; an error where it ends before."""
+    """The viewer's line once it is ready; EpisodeError where it ends before."""
     log, still = logs / 'viewer.log', StandStill()
     while not (found := _VIEWER_IS_ON.search(log.read_text(errors='replace'))):
         if viewer.poll() is not None:
@@ -206,7 +210,7 @@ def _count(options: ImagineOptions) -> int:
 
 
 def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path, bar: Any) -> None:
-    """Until the runner ends; before its first episode nobody else would notice a dead node."""
+    """Waits for the runner; before its first episode it does not notice dead nodes itself."""
     runner, still = processes['runner'], StandStill()
     while runner.poll() is None:
         time.sleep(0.2)
@@ -253,7 +257,7 @@ def _world_model_command(options: ImagineOptions, views: Sequence[str]) -> list[
         **_common(options, views),
         'mode': 'imagine',
         'pace': 'burst',
-        # imagined time stands still while the policy thinks: every answer must be to the newest
+        # imagined time stops while the policy computes: each answer must be to the newest frames
         'max_trajectory_age_s': 0.001,
         'device': options.device,
         'num_threads': options.num_threads,

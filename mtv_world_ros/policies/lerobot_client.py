@@ -25,7 +25,7 @@ _SERVICE = '/transport.AsyncInference/'
 
 
 class LeRobotPolicySettings(Schema):
-    """What the server loads."""
+    """The policy that the server loads."""
 
     type: str = Field(description='as LeRobot names it, e.g. `act`, `smolvla`, `pi0`')
     path: str = Field(description='folder or name of the pretrained policy, for the server')

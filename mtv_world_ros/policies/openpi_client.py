@@ -7,6 +7,7 @@ the byte keys `__ndarray__`, `data`, `dtype` and `shape`, a NumPy scalar one wit
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 import os
 import socket
@@ -147,9 +148,9 @@ class OpenPiPolicy:
                 compression=None,
                 max_size=limits().answer_bytes,
                 open_timeout=config.timeout_s,
-                # one that sends on and on does not say goodbye either
+                # a server that never stops sending does not close the connection either
                 close_timeout=min(config.timeout_s, _GOODBYE_S),
-                # a server that thinks does not answer pings
+                # a busy server does not answer pings
                 ping_interval=None,
                 additional_headers={'Authorization': f'Api-Key {key}'} if key else None,
             )
@@ -164,41 +165,36 @@ class OpenPiPolicy:
         self.metadata = self._receive()
 
     def _exchange(self, request: bytes) -> Any:
-        from websockets.exceptions import WebSocketException
-
-        try:
-            self._connection.send(request)
-        except (OSError, WebSocketException) as error:
-            self.close()
-            raise self._gone(error) from error
+        self._guarded(lambda: self._connection.send(request))
         return self._receive()
 
     def _receive(self) -> Any:
-        from websockets.exceptions import WebSocketException
-
-        try:
-            message = self._connection.recv(timeout=self._config.timeout_s)
-        except TimeoutError as error:
-            self.close()  # what comes later would be taken for the next answer
-            raise PolicyServerError(
-                f"the policy server '{self._config.server}' did not answer within "
-                f"{self._config.timeout_s:g} s ('timeout_s')"
-            ) from error
-        except (OSError, WebSocketException) as error:
-            self.close()
-            raise self._gone(error) from error
+        message = self._guarded(lambda: self._connection.recv(timeout=self._config.timeout_s))
         if isinstance(message, str):  # a traceback; the server closes the connection after it
             self.close()
             last = message.strip().splitlines()[-1] if message.strip() else 'no reason given'
             raise PolicyError(f'the policy server failed: {masked(last, self._key)}')
         return unpack(message)
 
-    def _gone(self, error: Exception) -> PolicyServerError:
-        return PolicyServerError(f"the policy server '{self._config.server}' is gone: {error}")
+    def _guarded(self, call: Callable[[], Any]) -> Any:
+        """Closes the connection at an error: a late answer would be taken for the next one."""
+        from websockets.exceptions import WebSocketException
+
+        server, timeout_s = self._config.server, self._config.timeout_s
+        try:
+            return call()
+        except (OSError, WebSocketException) as error:  # TimeoutError is an OSError
+            self.close()
+            if isinstance(error, TimeoutError):
+                raise PolicyServerError(
+                    f"the policy server '{server}' did not answer within {timeout_s:g} s "
+                    "('timeout_s')"
+                ) from error
+            raise PolicyServerError(f"the policy server '{server}' is gone: {error}") from error
 
 
 def limit_sending(connected: socket.socket, seconds: float) -> None:
-    """A server that stands still takes nothing: what is sent would wait for ever."""
+    """Sets a timeout for sending: a stopped server would block it for ever."""
     whole = int(seconds)
     value = struct.pack('ll', whole, int((seconds - whole) * 1e6))
     connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, value)

@@ -22,7 +22,7 @@ from mtv_world_ros.policies.openpi_client import OpenPiConfig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeOrigin:
-    """Where an episode comes from, for policies that know it instead of looking at it.
+    """Origin of an episode, for policies that use it in place of pictures.
 
     Attributes:
         task: its name; empty = not known.
@@ -86,7 +86,7 @@ def first_part(
 
 
 class RecordedPolicy:
-    """Answers with the commands that followed in the recording, by the time since the begin.
+    """Answers with the commands of the recording, by the time since the start.
 
     Args:
         commands: times count from the moment that the episode begins from [s].
@@ -106,29 +106,16 @@ class RecordedPolicy:
         self._first_ns = None
 
     def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
-        """Returns all commands from the observation on, or None where the episode is over.
-
-        Args:
-            observation: its stamp alone is looked at.
-            instruction: not looked at.
-        """
+        """Returns all commands after the observation's stamp; None = the episode is over."""
         if self._first_ns is None:
             self._first_ns = observation.stamp_ns
-        commands = self._commands
-        times = commands.times - (observation.stamp_ns - self._first_ns) / 1e9
+        times = self._commands.times - (observation.stamp_ns - self._first_ns) / 1e9
         rest = np.flatnonzero(times > SAME_S)
-        if not len(rest):
-            return None
-        return JointTrajectory(
-            joint_names=commands.joint_names,
-            times=times[rest],
-            positions=commands.positions[rest],
-            velocities=None if commands.velocities is None else commands.velocities[rest],
-        )
+        return self._commands.points(rest, times) if len(rest) else None
 
 
 class ScriptedPolicySettings(Schema):
-    """A policy of the simulator, which this layer does not know."""
+    """A scripted policy of the simulator."""
 
     kind: Literal['scripted'] = 'scripted'
     variant: str = Field(
@@ -140,7 +127,7 @@ class ScriptedPolicySettings(Schema):
 
 
 class RecordedPolicySettings(Schema):
-    """What was commanded in the episode that an imagined one begins from."""
+    """The recorded commands of the episode that an imagined one begins from."""
 
     kind: Literal['recorded'] = 'recorded'
     hold_s: Wait = Field(
@@ -197,12 +184,7 @@ def load_policy_config(path: Path, robot: RobotModel) -> PolicyConfig:
 
 
 def policy_config(values: Any, robot: RobotModel, where: str) -> PolicyConfig:
-    """Returns the policy that the values of such a file describe.
-
-    Args:
-        values: of the file.
-        robot: whose joints it moves.
-        where: beginning of error texts, e.g. the file.
+    """Returns the policy that a file's values describe; errors begin with `where`.
 
     Raises:
         ConfigError: a key is unknown or missing, a value is wrong.

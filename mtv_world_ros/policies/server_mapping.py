@@ -1,4 +1,4 @@
-"""What a policy server gets and gives: keys of images, state and prompt, columns of actions."""
+"""Inputs and outputs of a policy server: keys of images, state and prompt, action columns."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class StateInput(JointTable):
 
 
 class ActionOutput(JointTable):
-    """What the server answers."""
+    """The server's actions."""
 
     key: Key = Field(default=('actions',), description='where the actions (T, C) are')
     names: ListOf[str] = Field(default=(), description='of its columns; empty = they have none')
@@ -149,7 +149,7 @@ class ActionOutput(JointTable):
 
 
 class ServerMapping(Schema):
-    """What a server gets and gives: part of a policy file."""
+    """Inputs and outputs of a server: part of a policy file."""
 
     images: ListOf[ImageInput] = ()
     state: ListOf[StateInput] = ()

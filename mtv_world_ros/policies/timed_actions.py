@@ -1,4 +1,4 @@
-"""LeRobot's lists of timed actions, read out of pickles of a server that nobody needs to trust.
+"""LeRobot's lists of timed actions, read from the pickles of an untrusted server.
 
 A pickle is a program. This runs the few instructions that such lists consist of, on a stack of its
 own: nothing is imported or called but what stands here, keys of mappings are text or numbers (so
@@ -93,7 +93,7 @@ class _Tensors:
         if (module, name) == ('torch.storage', '_load_from_bytes'):
             return _Name(name, _storage)
         if (module, name) == ('collections', 'OrderedDict'):
-            return _Name(name, lambda *_: {})  # hooks, which nobody reads
+            return _Name(name, lambda *_: {})  # hooks, unused
         raise PolicyError(
             f"the answer names '{module}.{name}', which does not belong into a list of actions; "
             'it was not looked up'

@@ -224,19 +224,19 @@ def _draw_view(
     trails = [_trail_frames(camera, poses, motion, arm, config) for arm in range(num_arms)]
     colours = [arm_colour(arm, num_arms) for arm in range(num_arms)]
     paints = [_Paint(colour) for colour in colours]
-    links = _lines(camera, poses, arms, config.link_width_m)
-    fingers = _lines(camera, poses, motion.fingers, config.finger_width_m)
+    links = ArmLinks(camera, poses, arms, config.link_width_m)
+    fingers = ArmLinks(camera, poses, motion.fingers, config.finger_width_m)
     white = _Paint(_WHITE)
     # far arms first; one that is behind the camera cannot hide another
     orders = np.argsort(-np.where(depths > 0, depths, np.inf), axis=0, kind='stable').T.tolist()
     for image in frames:
         region(image, fills[0])[...] = fills[1]
-    painted = fills[0] if links is None else (0, camera.height, 0, camera.width)
+    painted = fills[0] if config.link_width_m is None else (0, camera.height, 0, camera.width)
     for k, (image, order, glows) in enumerate(
         zip(frames, orders, zip(*trails, strict=True), strict=True)
     ):
         for arm in order:
-            _draw_links(links, image, arm, k, colours[arm])
+            links.draw(image, arm, k, _LINK_SHARE * colours[arm])
         drawn = [painted]
         for arm in order:
             box, glow = glows[arm]
@@ -251,23 +251,9 @@ def _draw_view(
             image[...] = objects[k][..., :3] + (image * cover // 255).astype(np.uint8)
 
 
-def _lines(
-    camera: CameraModel, poses: FloatArray, points: Sequence[FloatArray], width_m: float | None
-) -> ArmLinks | None:
-    return None if width_m is None else ArmLinks(camera, poses, points, width_m)
-
-
-def _draw_links(
-    links: ArmLinks | None, image: ByteArray, arm: int, frame: int, colour: FloatArray
-) -> None:
-    if links is not None:
-        links.draw(image, arm, frame, _LINK_SHARE * colour)
-
-
-def _draw_fingers(fingers: ArmLinks | None, image: ByteArray, arm: int, frame: int) -> None:
-    if fingers is not None:
-        for side, colour in enumerate(_FINGER_COLOURS):
-            fingers.draw(image, 2 * arm + side, frame, colour)
+def _draw_fingers(fingers: ArmLinks, image: ByteArray, arm: int, frame: int) -> None:
+    for side, colour in enumerate(_FINGER_COLOURS):
+        fingers.draw(image, 2 * arm + side, frame, colour)
 
 
 def _sigmas(camera: CameraModel, depths: FloatArray, config: TrajectoryVideoConfig) -> FloatArray:
@@ -434,30 +420,29 @@ class ArmLinks:
         camera: the view.
         poses: (T, 4, 4) T_base_camera.
         arms: for each arm (N, T, 3) points along it, in the base frame [m].
-        width_m: of the lines [m].
+        width_m: of the lines [m]; None = nothing is drawn.
     """
 
     def __init__(
-        self, camera: CameraModel, poses: FloatArray, arms: Sequence[FloatArray], width_m: float
+        self,
+        camera: CameraModel,
+        poses: FloatArray,
+        arms: Sequence[FloatArray],
+        width_m: float | None,
     ) -> None:
         focal = (camera.K[0, 0] + camera.K[1, 1]) / 2
         size = np.array([camera.width, camera.height])
         self._pixels, self._widths = [], []
-        for points in arms:
+        for points in () if width_m is None else arms:
             pixels, depths = project(camera, poses, _in_pieces(points))
             far = np.any(np.abs(pixels - size / 2) > _FARTHEST * size, axis=-1, keepdims=True)
             self._pixels.append(np.where(far, np.nan, pixels))
-            self._widths.append(width_m * focal / np.maximum(depths, _NEAREST_SIZE_M))
+            self._widths.append((width_m or 0.0) * focal / np.maximum(depths, _NEAREST_SIZE_M))
 
     def draw(self, image: ByteArray, arm: int, frame: int, colour: FloatArray) -> None:
-        """Draws one arm onto an (H, W, 3) image; pieces behind the camera are not drawn.
-
-        Args:
-            image: drawn upon.
-            arm: index of the arm.
-            frame: of the T.
-            colour: (3,) RGB in 0 .. 1.
-        """
+        """Draws one arm onto an (H, W, 3) image; pieces behind the camera are not drawn."""
+        if not self._pixels:
+            return
         pixels, widths = self._pixels[arm][:, frame], self._widths[arm][:, frame]
         seen = np.isfinite(pixels).all(axis=-1)
         paint = [float(value) for value in np.rint(255 * colour)]

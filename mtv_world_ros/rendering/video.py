@@ -153,7 +153,7 @@ def _heading(comparison: Comparison, kind: str, view: int, frame: int) -> str:
 
 
 def write_video(
-    path: Path, frames: ByteArray, fps: float, *, crf: int = 20, max_bytes: int | None = None
+    path: Path, frames: ByteArray, fps: float, *, max_bytes: int | None = None
 ) -> None:
     """Writes (T, H, W, 3) uint8 RGB frames of even size as H.264 in MP4.
 
@@ -161,23 +161,16 @@ def write_video(
         path: ends in `.mp4`; written beside and renamed.
         frames: (T, H, W, 3) uint8 RGB.
         fps: frames a second.
-        crf: quality, 0 best to 51 worst.
         max_bytes: the quality is lowered until the file takes no more, down to a limit.
     """
-    data = encode_video(frames, fps, crf=crf)
+    data = encode_video(frames, fps)
     if max_bytes is not None and len(data) > max_bytes:
         data = encode_small_video(frames, fps, max_bytes)
     write_whole(path, data)
 
 
 def encode_small_video(frames: ByteArray, fps: float, max_bytes: int) -> bytes:
-    """Returns the first MP4 of falling quality that takes no more than `max_bytes`, or the last.
-
-    Args:
-        frames: (T, H, W, 3) uint8 RGB of even size.
-        fps: frames a second.
-        max_bytes: wanted size.
-    """
+    """Returns the first MP4 of falling quality within `max_bytes`, or the last of them."""
     data = b''
     for crf in _CRFS:
         data = encode_video(frames, fps, crf=crf)

@@ -22,20 +22,9 @@ from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.replay.prediction_writer import ERROR, OK, PredictionWriter
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReplayLimits:
-    """Beyond these a trajectory is rejected, as by the node.
-
-    Attributes:
-        image_age_s: age of the newest frames at the trajectory's start [s].
-        joint_state_age_s: age of the newest joint states at the trajectory's start [s].
-        view_skew_s: time between the views' frames [s].
-    """
-
-    image_age_s: float = 0.5
-    joint_state_age_s: float = 0.5
-    view_skew_s: float = 0.05
+#: beyond these a trajectory is rejected, as by the node: age of the newest frames and joint states
+#: at its start, and time between the views' frames [s]
+IMAGE_AGE_S, JOINT_STATE_AGE_S, VIEW_SKEW_S = 0.5, 0.5, 0.05
 
 
 @dataclass(slots=True, kw_only=True)
@@ -92,7 +81,6 @@ def replay_offline(
     source: EpisodeSource = DEFAULT,
     seed: int = 0,
     num_inference_steps: int = 0,
-    limits: ReplayLimits | None = None,
     overwrite: bool = False,
     show_progress: bool = True,
 ) -> ReplaySummary:
@@ -112,7 +100,6 @@ def replay_offline(
         source: topics and robot of an episode that is not in this package's format.
         seed: of the noise; the k-th trajectory uses `seed + 1000 k`.
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
-        limits: greatest age and spread of images and joint states.
         overwrite: replace an existing folder of predictions.
         show_progress: draw a progress bar, on a terminal.
 
@@ -133,17 +120,17 @@ def replay_offline(
         raise EpisodeError(f"'{episode_path}' holds no joint_trajectory message to imagine")
     summary = ReplaySummary(out=Path(out), warnings=episode.warnings)
     stored = episode.info.objects if pipeline.describer is None else ()
-    limits, observed = limits or ReplayLimits(), ObservedEpisode(pipeline)
+    observed = ObservedEpisode(pipeline)
     starts = [stamp for stamp, _ in episode.trajectories]
     bar = tqdm(total=len(starts), unit='trajectory', disable=None if show_progress else True)
     with bar, PredictionWriter(out, pipeline.robot.joint_names, overwrite=overwrite) as writer:
         for index, (stamp, trajectory) in enumerate(episode.trajectories):
             until = starts[index + 1] if index + 1 < len(starts) else None
             try:
-                observation = observe(episode, pipeline, stamp, limits)
+                observation = observe(episode, pipeline, stamp)
                 shifted = _shifted(trajectory, stamp, observation.stamp_ns)
                 before = starts[index - 1] if index else stamp
-                for seen in _seen_between(episode, pipeline, before, stamp, limits):
+                for seen in _seen_between(episode, pipeline, before, stamp):
                     observed.see(seen)
                 text = instruction_at(episode, stamp)
                 imagined = observed.begin(observation, instruction=text, objects=stored)
@@ -216,9 +203,7 @@ def _chunk_values(chunk: Prediction) -> dict[str, object]:
     }
 
 
-def observe(
-    episode: Episode, pipeline: Pipeline, stamp_ns: int, limits: ReplayLimits
-) -> Observation:
+def observe(episode: Episode, pipeline: Pipeline, stamp_ns: int) -> Observation:
     """Returns what was seen last before a moment.
 
     Raises:
@@ -232,41 +217,39 @@ def observe(
     common = min(int(episode.images[v].stamps_ns[i]) for v, i in zip(views, newest, strict=True))
     picked = [int(np.abs(episode.images[view].stamps_ns - common).argmin()) for view in views]
     stamps = [int(episode.images[v].stamps_ns[i]) for v, i in zip(views, picked, strict=True)]
-    _check('the newest frames are', stamp_ns - min(stamps), limits.image_age_s, 'old')
-    _check('the views are', max(stamps) - min(stamps), limits.view_skew_s, 'apart')
+    _check('the newest frames are', stamp_ns - min(stamps), IMAGE_AGE_S, 'old')
+    _check('the views are', max(stamps) - min(stamps), VIEW_SKEW_S, 'apart')
     return Observation(
         cameras=tuple(episode.camera(v, i) for v, i in zip(views, picked, strict=True)),
         frames=np.stack([episode.images[v].frames[i] for v, i in zip(views, picked, strict=True)]),
-        positions=_positions(episode, pipeline, stamp_ns, limits),
+        positions=_positions(episode, pipeline, stamp_ns),
         stamp_ns=min(stamps),
     )
 
 
 def _seen_between(
-    episode: Episode, pipeline: Pipeline, begin_ns: int, end_ns: int, limits: ReplayLimits
+    episode: Episode, pipeline: Pipeline, begin_ns: int, end_ns: int
 ) -> Iterator[Observation]:
     """What was seen between two moments, once a frame of the model."""
     period_ns = round(1e9 / pipeline.spec.fps)
     for stamp_ns in range(begin_ns + period_ns, end_ns, period_ns):
         with suppress(ObservationError):
-            yield observe(episode, pipeline, stamp_ns, limits)
+            yield observe(episode, pipeline, stamp_ns)
 
 
-def _positions(
-    episode: Episode, pipeline: Pipeline, stamp_ns: int, limits: ReplayLimits
-) -> FloatArray:
+def _positions(episode: Episode, pipeline: Pipeline, stamp_ns: int) -> FloatArray:
     states = episode.joint_states
     index = -1 if states is None else _last_before(states.stamps_ns, stamp_ns)
     if states is None or index < 0:
         raise ObservationError('there are no joint_states before the trajectory starts')
     age = stamp_ns - int(states.stamps_ns[index])
-    _check('the newest joint states are', age, limits.joint_state_age_s, 'old')
+    _check('the newest joint states are', age, JOINT_STATE_AGE_S, 'old')
     row = JointTrajectory(
         joint_names=states.joint_names,
         times=np.zeros(1),
         positions=states.positions[index][None],
     )
-    return match_joints(row, pipeline.robot, None).positions[0]
+    return match_joints(row, pipeline.robot).positions[0]
 
 
 def _last_before(stamps_ns: np.ndarray, stamp_ns: int) -> int:

@@ -19,6 +19,7 @@ NODE = '/world_model'
 FLOAT64 = 'std_msgs/msg/Float64'
 ARRAY = 'std_msgs/msg/Float32MultiArray'
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
+_JPEG_QUALITY = 90
 #: levels of diagnostic_msgs/DiagnosticStatus
 OK, ERROR = 0, 2
 
@@ -31,7 +32,6 @@ class PredictionWriter(BagWriter):
     Args:
         path: folder to make; written beside and renamed when the block ends.
         joint_names: J names, in the robot's order.
-        jpeg_quality: of the predicted images, 1 to 100.
         overwrite: replace an existing folder.
 
     Attributes:
@@ -43,12 +43,10 @@ class PredictionWriter(BagWriter):
         path: Path | str,
         joint_names: Sequence[str],
         *,
-        jpeg_quality: int = 90,
         overwrite: bool = False,
     ) -> None:
         super().__init__(path, overwrite=overwrite)
         self._joint_names = tuple(joint_names)
-        self._jpeg_quality = jpeg_quality
         self.frame_stamps: list[int] = []
 
     def write_chunk(self, prediction: Prediction, until_ns: int | None = None) -> int:
@@ -105,12 +103,7 @@ class PredictionWriter(BagWriter):
 
     def _write_jpeg(self, base: str, camera: CameraModel, stamp_ns: int, rgb: ByteArray) -> None:
         frame_id = optical_frame(camera.view)
-        image = messages.make(
-            messages.COMPRESSED_IMAGE,
-            header=messages.make_header(stamp_ns, frame_id),
-            format='rgb8; jpeg compressed bgr8',
-            data=np.frombuffer(encode_jpeg(rgb, self._jpeg_quality), np.uint8),
-        )
+        image = messages.make_compressed(stamp_ns, frame_id, encode_jpeg(rgb, _JPEG_QUALITY))
         topic = f'{base}/image_raw/compressed'
         self.write_message(topic, messages.COMPRESSED_IMAGE, stamp_ns, image)
         info = messages.make_camera_info(stamp_ns, camera, frame_id)
@@ -128,16 +121,7 @@ class PredictionWriter(BagWriter):
         labels = np.zeros(masks.masks.shape[-2:], np.uint8)
         for item, mask in enumerate(masks.masks[view, :, index], start=1):
             labels[mask] = item
-        image = messages.make(
-            messages.IMAGE,
-            header=messages.make_header(stamp_ns, optical_frame(camera.view)),
-            height=camera.height,
-            width=camera.width,
-            encoding='mono8',
-            is_bigendian=0,
-            step=camera.width,
-            data=labels.ravel(),
-        )
+        image = messages.make_image(stamp_ns, optical_frame(camera.view), labels)
         self.write_message(f'{base}/image_raw', messages.IMAGE, stamp_ns, image)
 
     def _write_estimate(self, prediction: Prediction, stamp_ns: int) -> None:

@@ -11,11 +11,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mtv_world_ros.data.stored_rollout import StoredRollout
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.viewing.scored_rollout import ScoredRollout
-from mtv_world_ros.viewing.streams import KINDS, Streams
+from mtv_world_ros.rendering.video import KINDS
+from mtv_world_ros.viewing.scored_rollout import ScoredRollout, StoredRollout
+from mtv_world_ros.viewing.streams import Streams
 
 APPLICATION = 'mtv_world'
 #: RGB of outlines, by number of the object
@@ -51,13 +51,9 @@ def log_any(stream: Any, shown: Streams | ScoredRollout, root: str) -> None:
 
 
 def log_streams(stream: Any, streams: Streams, root: str, begin: int | None = None) -> None:
-    """Logs everything that a bag or topics show, on a timeline in seconds.
+    """Logs streams under an entity path, on a timeline in seconds.
 
-    Args:
-        stream: of `recording`.
-        streams: frames, masks, joints and texts of a bag or of topics.
-        root: path of its entities.
-        begin: stamp of second 0 [ns]; None = that of the first frame.
+    Second 0 is the stamp `begin` [ns], by default that of the first frame.
     """
     import rerun
 
@@ -116,7 +112,7 @@ def escaped(path: str) -> str:
 
 
 def _style_curves(stream: Any, rollout: StoredRollout, root: str) -> None:
-    """Draws J in the colour of the object's outline, darker in each further view."""
+    """Colours the curves of J like the objects' outlines, darker in each further view."""
     import rerun
 
     for o, name in enumerate(rollout.objects):
@@ -204,7 +200,7 @@ def _tab(root: str, shown: Streams | ScoredRollout, rrb: Any) -> Any:
 
 
 def open_viewer(stream: Any, blueprint: Any, port: int, save: Path | None, is_native: bool) -> str:
-    """Opens the viewer for what is logged from here on; returns what to tell the user.
+    """Opens the viewer for what is logged from here on; returns a line for the user.
 
     Args:
         stream: of `recording`.

@@ -1,4 +1,4 @@
-"""Rollouts of evaluations and rankings, with what was said of them, for the viewer."""
+"""Rollouts of evaluations and rankings with their estimates, for the viewer."""
 
 from __future__ import annotations
 
@@ -7,9 +7,60 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mtv_world_ros.data.stored_rollout import StoredRollout
+import numpy as np
+
+from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray
 from mtv_world_ros.entry_points import load, registered, ROLLOUTS
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.rendering.video import KINDS
+
+MASKS = ('true_masks', 'masks')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredRollout:
+    """Predicted frames beside the recorded ones: V views, T frames, O objects.
+
+    Attributes:
+        views: V names.
+        objects: O names.
+        fps: frames a second.
+        stretches: (T,) int, number of the stretch that each frame belongs to; where it changes,
+            the imagination started anew from a recorded frame.
+        times: (T,) [s] since the episode's first frame.
+        real: (V, T, H, W, 3) uint8 RGB recorded frames.
+        trajectory: (V, T, H, W, 3) uint8 RGB trajectory video.
+        imagined: (V, T, H, W, 3) uint8 RGB predicted frames.
+        true_masks: (V, O, T, H, W) bool masks of the recorded frames.
+        masks: (V, O, T, H, W) bool masks of the predicted frames.
+        j: (V, O, T) J per frame, NaN = not scored.
+    """
+
+    views: tuple[str, ...]
+    objects: tuple[str, ...]
+    fps: float
+    stretches: np.ndarray
+    times: FloatArray
+    real: ByteArray
+    trajectory: ByteArray
+    imagined: ByteArray
+    true_masks: BoolArray
+    masks: BoolArray
+    j: FloatArray
+
+    def __post_init__(self) -> None:
+        num_views, num_objects, num_frames = len(self.views), len(self.objects), len(self.times)
+        size = self.real.shape[2:4]
+        wanted = {
+            **dict.fromkeys(KINDS, (num_views, num_frames, *size, 3)),
+            **dict.fromkeys(MASKS, (num_views, num_objects, num_frames, *size)),
+            'j': (num_views, num_objects, num_frames),
+            'stretches': (num_frames,),
+        }
+        for name, shape in wanted.items():
+            found = getattr(self, name).shape
+            if found != shape:
+                raise EpisodeError(f'rollout: {name} has shape {found}, expected {shape}')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

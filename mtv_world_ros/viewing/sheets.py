@@ -30,9 +30,7 @@ _BLANK = 225
 _REACH = 0.6
 
 
-def write_pictures(
-    bags: Sequence[Path], out: Path, title: str = '', *, has_video: bool = True
-) -> list[Path]:
+def write_pictures(bags: Sequence[Path], out: Path, *, has_video: bool = True) -> list[Path]:
     """Writes `contact_sheet.png` and `comparison.mp4` of predictions; returns their paths.
 
     A long video shows every second, third, ... frame, `MAX_VIDEO_FRAMES` at most, in its own
@@ -41,7 +39,6 @@ def write_pictures(
     Args:
         bags: predictions, and the episode that they are of, if it is at hand.
         out: folder of the pictures.
-        title: heading; empty = the first instruction.
         has_video: write the video as well.
 
     Raises:
@@ -49,13 +46,13 @@ def write_pictures(
     """
     streams = read_streams(bags)
     comparison = compared(streams)
-    told = [text for _, text in streams.words if text.startswith('instruction: ')]
+    instructions = [t for _, t in streams.words if t.startswith('instruction: ')]
     estimates = ', '.join(
         'abstains' if np.isnan(value) else f'{value:.2f}' for _, value in streams.success
     )
     notes = [f'success estimates: {estimates}'] if estimates else []
-    heading = title or (told[0] if told else '')
-    write_png(out / SHEET, contact_sheet(comparison, title=heading, notes=notes))
+    title = instructions[0] if instructions else ''
+    write_png(out / SHEET, contact_sheet(comparison, title=title, notes=notes))
     if not has_video:
         return [out / SHEET]
     period = float(np.median(np.diff(comparison.times))) if len(comparison.times) > 1 else 0.2

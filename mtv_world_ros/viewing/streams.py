@@ -1,4 +1,4 @@
-"""What a bag shows: real, drawn and imagined frames by view and time, masks, joints, words."""
+"""Contents of bags by time: real, drawn and imagined frames, masks, joints, reports."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.data.bag.image_decoding import compressed_to_ids, compressed_to_rgb, raw_to_rgb
+from mtv_world_ros.data.bag.image_decoding import to_ids, to_rgb
 from mtv_world_ros.data.bag.messages import (
     COMPRESSED_IMAGE,
     deserialize,
@@ -21,9 +21,8 @@ from mtv_world_ros.data.bag.messages import (
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
+from mtv_world_ros.rendering.video import KINDS
 
-#: kinds of frames, in the order in which they are shown
-KINDS = ('real', 'trajectory', 'imagined')
 #: no recording is this long [s]
 _APART_S = 86_400.0
 #: camera images of a view, or what the node publishes of it; also what imagination starts from
@@ -129,7 +128,7 @@ def take(streams: Streams, message: BagMessage) -> None:
         return
     read = deserialize(message.msgtype, message.data)
     if what[0] in ('image', 'mask'):
-        _take_image(streams, message, read, what)
+        _take_image(streams, read, what)
     elif what[0] == 'joints':
         row = np.asarray(read.position, np.float64)
         kind = 'imagined' if message.topic.endswith('/predicted/joint_states') else 'real'
@@ -153,17 +152,8 @@ def _reasons(status: Any) -> str:
     return ' · '.join(f'{key}: {values[key]}' for key in shown if values.get(key))
 
 
-def _take_image(streams: Streams, message: BagMessage, image: Any, what: tuple[str, ...]) -> None:
-    is_mask, data = what[0] == 'mask', np.asarray(image.data, np.uint8)
-    if message.msgtype == COMPRESSED_IMAGE:
-        read = compressed_to_ids if is_mask else compressed_to_rgb
-        frame = read(image.format, data)
-    elif is_mask:
-        if data.size != image.height * image.step:
-            raise EpisodeError(f'{data.size} bytes are no mask of {image.width}x{image.height}')
-        frame = data.reshape(image.height, image.step)[:, : image.width]
-    else:
-        size = {'height': image.height, 'width': image.width, 'step': image.step}
-        frame = raw_to_rgb(data, encoding=image.encoding, **size)
+def _take_image(streams: Streams, image: Any, what: tuple[str, ...]) -> None:
+    is_mask = what[0] == 'mask'
+    frame = to_ids(image) if is_mask else to_rgb(image)
     held = streams.masks if is_mask else streams.images
     held.setdefault((what[1], what[2]), []).append((header_stamp(image), frame))

@@ -13,7 +13,7 @@ from rosbags.typesys import get_typestore, Stores
 import yaml
 
 from mtv_world_ros.data.bag import messages
-from mtv_world_ros.data.bag.reader import iter_messages
+from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import EpisodeError
@@ -109,7 +109,7 @@ def test_ros_itself_reads_the_recorded_bytes(episode_path):
     types = {f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}': kind for kind in kinds}
     last = {
         message.topic: serialization.deserialize_message(message.data, types[message.msgtype])
-        for message in iter_messages(episode_path)
+        for message in BagReader(episode_path).messages()
     }
     assert last['/instruction'].data == 'stack the red block on the blue block'
     assert list(last['/joint_states'].position) == [7.0, 7 / 3, -7.0]

@@ -78,4 +78,4 @@ def test_who_refuses_a_plan(name, robot):
     with refused('node'):
         read = read_plan(message)
         check_plan_joints(read, robot, LIMIT_TOLERANCE)
-        check_plan(robot, match_joints(read, robot, HOME, allow_missing=True), HOME)
+        check_plan(robot, match_joints(read, robot, HOME), HOME)

@@ -3,6 +3,8 @@
 The table in docs/importing.md names the reports; every row of it has a test of its number here.
 """
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -72,12 +74,12 @@ def test_4_joints_that_a_plan_leaves_out_go_where_they_were_measured():
     measured = np.stack([np.zeros(20), np.linspace(0.0, 0.019, 20)], axis=1)
     states = JointStates(stamps_ns=stamps, joint_names=TwoJoints.joint_names, positions=measured)
     arm = JointTrajectory(joint_names=('arm',), times=np.array([1.0]), positions=np.array([[0.5]]))
-    found = complete_plans([(0, arm)], states, TwoJoints, 3.2)
-    assert found.taken == ('gripper',)
-    stamp, whole = found.plans[0]
+    plans, measured = complete_plans([(0, arm)], states, TwoJoints, 3.2)
+    assert measured == ('gripper',)
+    _, whole = plans[0]
     np.testing.assert_allclose(whole.positions[-1], [0.5, 0.01])
     np.testing.assert_allclose(whole.positions[:, 1], 0.01 * whole.times)
-    assert found.plans[1][1].positions[-1].tolist() == pytest.approx([0.5, 0.019])
+    assert plans[1][1].positions[-1].tolist() == pytest.approx([0.5, 0.019])
 
 
 def test_5_a_plan_that_ends_with_a_speed_holds_after_its_end():
@@ -100,7 +102,8 @@ def test_6_whatever_the_format_says_of_its_order_the_picture_is_rgb(layout):
 @pytest.mark.parametrize(('encoding', 'first'), [('rgb8', 200), ('bgr8', 10)])
 def test_7_raw_images_keep_red_where_the_encoding_has_it(encoding, first):
     data = np.tile(np.array([200, 50, 10], np.uint8), 4)
-    found = raw_to_rgb(data, encoding=encoding, height=2, width=2, step=6)
+    fields = {'height': 2, 'width': 2, 'step': 6, 'is_bigendian': 0}
+    found = raw_to_rgb(SimpleNamespace(data=data, encoding=encoding, **fields))
     assert found[0, 0].tolist() == [first, 50, 210 - first]
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.data.bag import messages
-from mtv_world_ros.data.episode_reader import in_order, LazyFrames, merge_joint_states
+from mtv_world_ros.data.episode import LazyFrames
+from mtv_world_ros.data.episode_reader import in_order, merge_joint_states
 from mtv_world_ros.errors import EpisodeError
 
 

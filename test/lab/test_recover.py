@@ -15,7 +15,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.data.bag.reader import BagReader, iter_messages
+from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.lab.importing.recover import find_damaged, recover
@@ -138,7 +138,7 @@ def test_what_was_flushed_survives_a_kill(tmp_path) -> None:
             'TRANSIENT_LOCAL'
         )
     assert (tmp_path / 'bag' / 'calibration.yaml').is_file()
-    assert [m.publish_ns for m in iter_messages(tmp_path / 'bag')] == list(range(100))
+    assert [m.publish_ns for m in BagReader(tmp_path / 'bag').messages()] == list(range(100))
     assert list(tmp_path.glob('.bag.*.tmp'))  # what was damaged is left alone
 
 
@@ -191,7 +191,7 @@ def test_an_empty_recording_does_not_keep_others_from_being_recovered(tmp_path, 
     said = capsys.readouterr()
     assert ".a.1.tmp', which has no whole message" in said.err
     assert '/noise 1' in said.out
-    assert [m.topic for m in iter_messages(tmp_path / 'b')] == ['/noise']
+    assert [m.topic for m in BagReader(tmp_path / 'b').messages()] == ['/noise']
 
 
 def test_flushing_costs_little_time(tmp_path) -> None:

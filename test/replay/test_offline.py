@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.data.bag import messages
-from mtv_world_ros.data.episode_reader import iter_messages, read_episode
+from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.replay.offline import replay_offline, ReplayLimits
+from mtv_world_ros.replay import offline
+from mtv_world_ros.replay.offline import replay_offline
 
 START_NS, PERIOD_NS = 1_700_000_000_000_000_000, 100_000_000
 
@@ -20,7 +22,7 @@ def replay(pipeline, episode, out, **options):
 def received(out, topic):
     return [
         (message.stamp_ns, messages.deserialize(message.msgtype, message.data))
-        for message in iter_messages(out)
+        for message in BagReader(out).messages()
         if message.topic == topic
     ]
 
@@ -34,7 +36,7 @@ def predictions(make_pipeline, episodes, oracle, tmp_path):
 def test_every_topic_of_the_node_is_recorded(predictions):
     out, summary = predictions
     assert (summary.num_trajectories, summary.num_chunks, summary.num_frames) == (1, 3, 9)
-    counts = Counter(message.topic for message in iter_messages(out))
+    counts = Counter(message.topic for message in BagReader(out).messages())
     for view in ('low', 'high'):
         for stream in ('predicted', 'trajectory'):
             assert counts[f'/world_model/{view}/{stream}/image_raw/compressed'] == 9
@@ -46,7 +48,7 @@ def test_every_topic_of_the_node_is_recorded(predictions):
 
 def test_the_foxglove_layout_of_recordings_shows_what_is_recorded(predictions):
     out, _ = predictions
-    recorded = {message.topic for message in iter_messages(out)}
+    recorded = {message.topic for message in BagReader(out).messages()}
     text = share_path('config', 'viewers', 'foxglove_recording.json').read_text()
     shown = set(re.findall(r'"(/[a-z_/]+)["\.]', text))
     assert len(shown) >= 14 and shown <= recorded, shown - recorded
@@ -124,9 +126,10 @@ def test_bad_trajectory_is_rejected_with_its_reason_and_the_next_is_imagined(
     assert 'rejected' in str(summary)
 
 
-def test_old_frames_are_rejected(make_pipeline, episodes, tmp_path):
+def test_old_frames_are_rejected(make_pipeline, episodes, tmp_path, monkeypatch):
+    monkeypatch.setattr(offline, 'IMAGE_AGE_S', -1)
     with pytest.raises(EpisodeError, match='frames are 0.000 s old; allowed are -1 s'):
-        replay(make_pipeline(), episodes[0], tmp_path / 'out', limits=ReplayLimits(image_age_s=-1))
+        replay(make_pipeline(), episodes[0], tmp_path / 'out')
 
 
 def test_bag_cut_in_the_middle_replays_up_to_the_cut_and_says_so(

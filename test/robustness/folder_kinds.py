@@ -230,7 +230,8 @@ def _read_evaluation(folder: Path) -> Any:
 
 def make_rollout(folder: Path) -> None:
     """The frames of a scored episode."""
-    from mtv_world_ros.data.stored_rollout import save_rollout, StoredRollout
+    from mtv_world_ros.lab.stored_rollout import save_rollout
+    from mtv_world_ros.viewing.scored_rollout import StoredRollout
 
     frames, masks = np.zeros((2, 3, 32, 48, 3), np.uint8), np.zeros((2, 1, 3, 32, 48), bool)
     rollout = StoredRollout(
@@ -242,7 +243,7 @@ def make_rollout(folder: Path) -> None:
 
 
 def _read_rollout(folder: Path) -> Any:
-    from mtv_world_ros.data.stored_rollout import load_rollout
+    from mtv_world_ros.lab.stored_rollout import load_rollout
 
     return load_rollout(folder / 'rollout.npz')
 

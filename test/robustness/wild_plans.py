@@ -34,14 +34,14 @@ def bundled() -> Any:
 def first_scene() -> tuple[Any, str]:
     """What is seen where the bundled episode's first trajectory starts, and what is asked for."""
     from mtv_world_ros.data.episode_reader import read_episode
-    from mtv_world_ros.replay.offline import instruction_at, observe, ReplayLimits
+    from mtv_world_ros.replay.offline import instruction_at, observe
 
     pipeline = bundled()
     episode = read_episode(
         share_path('resource', 'demo_episode'), views=pipeline.spec.views, with_masks=False
     )
     stamp_ns = episode.trajectories[0][0]
-    observation = observe(episode, pipeline, stamp_ns, ReplayLimits())
+    observation = observe(episode, pipeline, stamp_ns)
     return observation, instruction_at(episode, stamp_ns)
 
 

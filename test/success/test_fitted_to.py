@@ -4,7 +4,11 @@ from shutil import copytree
 import numpy as np
 import pytest
 
-from mtv_world_ros.assembly import checkpoint_cameras, checkpoint_robot, fitting_setting
+from mtv_world_ros.assembly import (
+    checkpoint_cameras,
+    checkpoint_robot,
+    fitting_setting,
+)
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration as load_cameras

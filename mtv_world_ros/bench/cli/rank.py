@@ -290,10 +290,10 @@ def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list
 
 def _settings(arguments: argparse.Namespace, name: str) -> dict[str, str]:
     """Settings that rollouts depend on: with other settings they are run again."""
-    from mtv_world_ros.assembly import fingerprint
     from mtv_world_ros.data.episode import NOMINAL
     from mtv_world_ros.files import share_path
     from mtv_world_ros.lab.importing.stored_objects import stage_key
+    from mtv_world_ros.lab.jobs import fingerprint
 
     settings = {
         'checkpoint': fingerprint(name),

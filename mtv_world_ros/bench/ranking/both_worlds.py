@@ -12,13 +12,14 @@ import numpy as np
 
 from mtv_world_ros.bench.ranking.rollout_jobs import COMMANDS_PART, Course, OBJECTS_PART
 from mtv_world_ros.bench.ranking.worlds import SeenChunk
-from mtv_world_ros.data.stored_rollout import rollout_bytes, StoredRollout
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.imagined_episode import ObservedChunk
 from mtv_world_ros.lab.evaluation.report.rollout_clips import make_clip
+from mtv_world_ros.lab.stored_rollout import rollout_bytes
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.success.estimator import verdict
+from mtv_world_ros.viewing.scored_rollout import StoredRollout
 from mtv_world_ros.vision.jaccard import jaccard
 
 #: number of frames in a row with too small an overlap after which an object has parted

@@ -17,7 +17,7 @@ from mtv_world_ros.bench.ranking.rollout_cards import (
 )
 from mtv_world_ros.bench.ranking.rollout_jobs import Result
 from mtv_world_ros.bench.ranking.run_jobs import read_results
-from mtv_world_ros.data.stored_rollout import load_rollout
+from mtv_world_ros.lab.stored_rollout import load_rollout
 from mtv_world_ros.viewing import rerun_log
 from mtv_world_ros.viewing.scored_rollout import ScoredRollout
 

@@ -216,7 +216,7 @@ class SimulatedWorld:
     def execute(self, answer: JointTrajectory) -> None:
         """Executes an answer; the arms hold up to a whole frame."""
         before = self.observation
-        matched = match_joints(answer, self._sim.robot, before.positions)
+        matched = match_joints(answer, self._sim.robot)
         # as in imagination
         check_plan(self._sim.robot, matched, before.positions)
         num_frames = max(1, ceil(float(matched.times[-1]) * self._fps - 1e-6))

@@ -50,8 +50,7 @@ _PLANAR = ('nv12', 'nv21')
 #: signatures at start and end of JPEG and PNG; decoders fill the rest of a cut file with grey
 _PNG = b'\x89PNG'
 _SIGNATURES = {b'\xff\xd8\xff': b'\xff\xd9', _PNG: b'IEND'}
-#: JPEG markers: frame headers, and a scan
-_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+#: JPEG marker of a scan
 _SCAN = b'\xff\xda'
 #: warning of a decoder that lost nothing
 _HARMLESS = 'extraneous bytes before marker 0xd9'
@@ -59,12 +58,61 @@ _HARMLESS = 'extraneous bytes before marker 0xd9'
 _MAX_PADDING = 4096
 
 
-def check_raw(*, encoding: str, height: int, width: int, step: int, num_bytes: int) -> None:
+def check_image(message: Any) -> None:
+    """Checks the fields of a sensor_msgs/Image or CompressedImage, without decoding it.
+
+    Raises:
+        ObservationError: see `check_raw` and `check_compressed`.
+    """
+    if _is_raw(message):
+        check_raw(message)
+    else:
+        check_compressed(message.format, _bytes(message))
+
+
+def to_rgb(message: Any) -> ByteArray:
+    """Returns (H, W, 3) RGB of a sensor_msgs/Image or CompressedImage.
+
+    Raises:
+        ObservationError: see `raw_to_rgb` and `compressed_to_rgb`.
+    """
+    if _is_raw(message):
+        return raw_to_rgb(message)
+    return compressed_to_rgb(message.format, _bytes(message))
+
+
+def to_ids(message: Any) -> ByteArray:
+    """Returns (H, W) object numbers of a sensor_msgs/Image (mono8) or CompressedImage.
+
+    Raises:
+        ObservationError: too little data, or see `compressed_to_ids`.
+    """
+    data = _bytes(message)
+    if not _is_raw(message):
+        return compressed_to_ids(message.format, data)
+    if data.size != message.height * message.step:
+        raise ObservationError(
+            f'{data.size} bytes are no mask of {message.width}x{message.height}'
+        )
+    return data.reshape(message.height, message.step)[:, : message.width]
+
+
+def _is_raw(message: Any) -> bool:
+    return hasattr(message, 'step')
+
+
+def _bytes(message: Any) -> NDArray[np.uint8]:
+    return np.frombuffer(message.data, np.uint8)
+
+
+def check_raw(message: Any) -> None:
     """Checks the fields of a sensor_msgs/Image.
 
     Raises:
         ObservationError: unknown encoding, rows shorter than the width, or too little data.
     """
+    encoding, step, num_bytes = message.encoding, message.step, len(message.data)
+    height, width = message.height, message.width
     if encoding not in ENCODINGS:
         raise ObservationError(
             f"image encoding '{encoding}' is not supported; supported are {', '.join(ENCODINGS)}"
@@ -92,40 +140,26 @@ def _data_rows(encoding: str, height: int) -> int:
     return height + (height + 1) // 2 if encoding in _PLANAR else height
 
 
-def raw_to_rgb(
-    data: NDArray[np.uint8],
-    *,
-    encoding: str,
-    height: int,
-    width: int,
-    step: int,
-    is_bigendian: int = 0,
-) -> ByteArray:
-    """(H, W, 3) RGB of the fields of a sensor_msgs/Image; `data` is flat uint8.
-
-    Of 16 bits the upper 8 are taken.
+def raw_to_rgb(message: Any) -> ByteArray:
+    """Returns (H, W, 3) RGB of a sensor_msgs/Image; of 16 bits the upper 8 are taken.
 
     Raises:
         ObservationError: an unknown encoding, or too little data; see `check_raw`.
     """
-    check_raw(encoding=encoding, height=height, width=width, step=step, num_bytes=len(data))
-    channels, conversion = ENCODINGS[encoding]
-    num_rows = _data_rows(encoding, height)
+    check_raw(message)
+    channels, conversion = ENCODINGS[message.encoding]
+    num_rows, width = _data_rows(message.encoding, message.height), message.width
     rows = np.lib.stride_tricks.as_strided(
-        data, (num_rows, width * channels), (step, 1), writeable=False
+        _bytes(message), (num_rows, width * channels), (message.step, 1), writeable=False
     )
-    if encoding.endswith('16'):
-        rows = rows.reshape(num_rows, -1, 2)[..., 0 if is_bigendian else 1]
+    if message.encoding.endswith('16'):
+        rows = rows.reshape(num_rows, -1, 2)[..., 0 if message.is_bigendian else 1]
     image = np.array(rows).reshape(num_rows, width, -1)
     return image if conversion is None else np.asarray(cv2.cvtColor(image, conversion), np.uint8)
 
 
 def check_compressed(layout: str, data: NDArray[np.uint8]) -> None:
     """Checks the fields of a sensor_msgs/CompressedImage by the data's signature and header.
-
-    Args:
-        layout: the message's `format`, e.g. `rgb8; jpeg compressed bgr8`.
-        data: flat uint8.
 
     Raises:
         ObservationError: neither a JPEG nor a PNG of 8 bits, whatever `format` says, or cut.
@@ -212,13 +246,16 @@ def _check_size(layout: str, data: NDArray[np.uint8]) -> None:
     try:
         check_limit('image_bytes', len(data), 'the file')
         content = data.tobytes()
-        width, height = (_png_size if content.startswith(_PNG) else _jpeg_size)(content)
+        if content.startswith(_PNG):
+            width, height = _png_size(content)
+        else:
+            height, width, *_ = simplejpeg.decode_jpeg_header(content)
         check_limit('image_pixels', width * height, f'an image of {width}x{height}')
         if not content.startswith(_PNG):
             check_limit('jpeg_scans', content.count(_SCAN), 'the file')
     except LimitError as error:
         raise ObservationError(f"compressed image of format '{layout}': {error}") from error
-    except (struct.error, IndexError) as error:
+    except (struct.error, IndexError, ValueError) as error:
         raise _damaged(layout, data, ': it has no header') from error
 
 
@@ -233,19 +270,3 @@ def _png_size(content: bytes) -> tuple[int, int]:
             raise IndexError(kind)
         position = end + 4
     return struct.unpack_from('>II', content, 16)
-
-
-def _jpeg_size(content: bytes) -> tuple[int, int]:
-    """Width and height [px] of the frame header."""
-    position = 2
-    while True:
-        marker = content[position + 1]
-        if content[position] != 0xFF:
-            raise IndexError(position)
-        if marker in _FRAMES:
-            height, width = struct.unpack_from('>HH', content, position + 5)
-            return width, height
-        if marker == 0xFF:  # fill
-            position += 1
-        else:
-            position += 2 + struct.unpack_from('>H', content, position + 2)[0]

@@ -30,6 +30,8 @@ POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
 POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
 TF_MESSAGE = 'tf2_msgs/msg/TFMessage'
 
+#: `format` of compressed images, as image_transport writes it
+JPEG, PNG_LABELS = 'rgb8; jpeg compressed bgr8', 'mono8; png compressed mono8'
 NANO = 1_000_000_000
 #: what the reader of generated code raises for bytes that are no such message
 _UNREADABLE = (
@@ -132,6 +134,27 @@ def _make_time(stamp_ns: int, kind: str) -> Any:
     if not 0 <= sec < 2**31:
         raise EpisodeError(f'stamp {stamp_ns} ns does not fit a ROS time (0 to 2^31 s)')
     return make(f'builtin_interfaces/msg/{kind}', sec=sec, nanosec=nanosec)
+
+
+def make_image(stamp_ns: int, frame_id: str, pixels: NDArray[np.uint8]) -> Any:
+    """sensor_msgs/Image of (H, W, 3) uint8 RGB as rgb8, or of (H, W) uint8 as mono8."""
+    height, width = pixels.shape[:2]
+    return make(
+        IMAGE,
+        header=make_header(stamp_ns, frame_id),
+        height=height,
+        width=width,
+        encoding='rgb8' if pixels.ndim == 3 else 'mono8',
+        is_bigendian=0,
+        step=pixels[0].size,
+        data=np.ascontiguousarray(pixels).ravel(),
+    )
+
+
+def make_compressed(stamp_ns: int, frame_id: str, data: bytes, layout: str = JPEG) -> Any:
+    """sensor_msgs/CompressedImage of a JPEG or PNG file; `layout` is its `format`."""
+    header, content = make_header(stamp_ns, frame_id), np.frombuffer(data, np.uint8)
+    return make(COMPRESSED_IMAGE, header=header, format=layout, data=content)
 
 
 def make_camera_info(stamp_ns: int, camera: CameraModel, frame_id: str) -> Any:

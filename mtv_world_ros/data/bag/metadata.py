@@ -48,7 +48,7 @@ class TopicRecord:
 
 def dump_qos(qos: Qos) -> str:
     """The profile list as the MCAP channel's metadata holds it."""
-    return _dump([_qos_entry(qos)]).strip()
+    return dump([_qos_entry(qos)]).strip()
 
 
 def parse_qos(text: str) -> Qos:
@@ -91,16 +91,6 @@ def bag_information(
     }
 
 
-def dump_information(information: Mapping[str, Any]) -> str:
-    """Text of the `rosbag2` metadata record in the MCAP file."""
-    return _dump(dict(information))
-
-
-def dump_metadata_yaml(information: Mapping[str, Any]) -> str:
-    """Text of metadata.yaml."""
-    return _dump({'rosbag2_bagfile_information': dict(information)})
-
-
 def _qos_entry(qos: Qos) -> dict[str, Any]:
     return {
         'history': qos.history,
@@ -135,5 +125,6 @@ class _Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):  # type: ignore[mi
         return True
 
 
-def _dump(content: Any) -> str:
+def dump(content: Any) -> str:
+    """Returns the YAML text of metadata, without anchors."""
     return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=1000)

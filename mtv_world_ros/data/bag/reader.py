@@ -295,31 +295,6 @@ class BagReader:
         return fits
 
 
-def iter_messages(
-    path: Path | str,
-    topics: Collection[str] | None = None,
-    *,
-    problems: list[str] | None = None,
-) -> Iterator[BagMessage]:
-    """Yields the raw messages of a bag in the order they were recorded.
-
-    Args:
-        path: rosbag2 folder or .mcap file.
-        topics: topics to yield; None = all.
-        problems: receives a line for each problem found, including a cut.
-
-    Raises:
-        EpisodeError: there is no such bag; or the bag is cut off and `problems` is None, once
-            the messages before the cut were yielded.
-    """
-    reader = BagReader(path)
-    yield from reader.messages(topics)
-    if problems is not None:
-        problems.extend(([reader.truncated] if reader.truncated else []) + reader.problems)
-    elif reader.truncated:
-        raise EpisodeError(reader.truncated)
-
-
 def _is_storage(file: Path) -> bool:
     return Path(file.name.removesuffix('.zstd')).suffix in ('.mcap', '.db3')
 

@@ -8,9 +8,9 @@ from typing import Any
 import av
 from av.video.codeccontext import VideoCodecContext
 import numpy as np
-from numpy.typing import NDArray
 
 from mtv_world_ros.bounded_input import check_limit, LimitError
+from mtv_world_ros.data.episode import LazyFrames
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import EpisodeError, ObservationError
 
@@ -76,8 +76,8 @@ def from_first_key(messages: Sequence[tuple[int, Any]]) -> list[tuple[int, Any]]
     return list(messages[first:])
 
 
-class VideoFrames:
-    """Frames of packets, decoded when asked for, in order best (`episode.Frames`).
+class VideoFrames(LazyFrames):
+    """Frames of packets, decoded when asked for, in order best.
 
     Args:
         topic: of the packets, for error texts.
@@ -85,36 +85,22 @@ class VideoFrames:
     """
 
     def __init__(self, topic: str, packets: Sequence[Any]) -> None:
-        self._topic, self._packets = topic, packets
+        self._topic, self._messages = topic, packets
         self._codec = codec_of(packets[0].encoding)
         self._keys = [i for i, packet in enumerate(packets) if packet.flags & _KEY]
         self._ahead: Iterator[tuple[int, ByteArray]] = iter(())
         self._last: tuple[int, ByteArray] | None = None
 
-    def __len__(self) -> int:
-        return len(self._packets)
-
-    def __getitem__(self, index: Any) -> ByteArray:
-        chosen = np.arange(len(self))[index]
-        if chosen.ndim == 0:
-            return self._frame(int(chosen))
-        frames = [self._frame(int(i)) for i in chosen]
-        return np.stack(frames) if frames else np.empty((0, 0, 0, 3), np.uint8)
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        frames = self[:]
-        return frames if dtype is None else frames.astype(dtype, copy=False)
-
-    def _frame(self, wanted: int) -> ByteArray:
-        key = max(i for i in self._keys if i <= wanted)
-        if self._last is None or not key <= self._last[0] <= wanted:
+    def _frame(self, index: int) -> ByteArray:
+        key = max(i for i in self._keys if i <= index)
+        if self._last is None or not key <= self._last[0] <= index:
             self._ahead, self._last = self._decoded(key), None
-        while self._last is None or self._last[0] < wanted:
+        while self._last is None or self._last[0] < index:
             self._last = next(self._ahead, None)
             if self._last is None:
-                raise EpisodeError(f"'{self._topic}', frame {wanted}: its packet gives no image")
-        if self._last[0] != wanted:
-            raise EpisodeError(f"'{self._topic}', frame {wanted}: its packet gives no image")
+                break
+        if self._last is None or self._last[0] != index:
+            raise EpisodeError(f"'{self._topic}', frame {index}: its packet gives no image")
         return self._last[1]
 
     def _decoded(self, key: int) -> Iterator[tuple[int, ByteArray]]:
@@ -122,15 +108,14 @@ class VideoFrames:
         context = av.CodecContext.create(self._codec, 'r')
         assert isinstance(context, VideoCodecContext)
         try:
-            for number in range(key, len(self._packets)):
-                packet = av.Packet(bytes(self._packets[number].data))
+            for number in range(key, len(self._messages)):
+                packet = av.Packet(bytes(self._messages[number].data))
                 packet.pts = packet.dts = number
-                for frame in context.decode(packet):
-                    yield (
-                        int(frame.pts or 0),
-                        np.asarray(frame.to_ndarray(format='rgb24'), np.uint8),
-                    )
-            for frame in context.decode(None):
-                yield int(frame.pts or 0), np.asarray(frame.to_ndarray(format='rgb24'), np.uint8)
+                yield from map(_numbered, context.decode(packet))
+            yield from map(_numbered, context.decode(None))
         except av.FFmpegError as error:
             raise EpisodeError(f"'{self._topic}': a video packet is damaged ({error})") from error
+
+
+def _numbered(frame: av.VideoFrame) -> tuple[int, ByteArray]:
+    return int(frame.pts or 0), np.asarray(frame.to_ndarray(format='rgb24'), np.uint8)

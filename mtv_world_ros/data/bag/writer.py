@@ -17,8 +17,7 @@ from mcap.writer import CompressionType, Writer
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.metadata import (
     bag_information,
-    dump_information,
-    dump_metadata_yaml,
+    dump,
     dump_qos,
     Qos,
     TopicRecord,
@@ -83,13 +82,8 @@ class BagWriter:
     ) -> None:
         """Adds a topic, with the QoS profile that `ros2 bag play` will offer.
 
-        Topics that are not declared get a reliable profile of depth 10 at their first message.
-
-        Args:
-            topic: absolute topic name.
-            msgtype: e.g. `sensor_msgs/msg/Image`.
-            qos: the profile.
-            definition: `.msg` text of a type that is not in the standard packages.
+        `definition` is the `.msg` text of a type outside of the standard packages. Topics that are
+        not declared get a reliable profile of depth 10 at their first message.
 
         Raises:
             EpisodeError: the type is unknown, or the topic has another type already.
@@ -276,16 +270,14 @@ class BagWriter:
         )
         for name, values in self._metadata.items():
             self._writer.add_metadata(name, values)
-        self._writer.add_metadata(
-            'rosbag2', {'serialized_metadata': dump_information(information)}
-        )
+        self._writer.add_metadata('rosbag2', {'serialized_metadata': dump(information)})
         self._file.release()
         self._writer.finish()
         self._file.flush()
         self._file.sync()
         self._file.close()
         (self._folder / 'metadata.yaml').write_text(
-            dump_metadata_yaml(information), encoding='utf-8'
+            dump({'rosbag2_bagfile_information': information}), encoding='utf-8'
         )
 
     def _take_name(self) -> None:

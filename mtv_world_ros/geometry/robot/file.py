@@ -8,7 +8,7 @@ from copy import deepcopy
 import os
 from pathlib import Path
 import re
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, Self
 from xml.etree import ElementTree
 
 import numpy as np
@@ -38,24 +38,11 @@ _LARGEST_TURN = 0.2
 _NUM_CONFIGURATIONS = 64
 
 
-class DescribedRobot(NamedTuple):
-    """A robot read from its description.
+def described_robot(expected: RobotModel, urdf: str) -> tuple[RobotModel, float]:
+    """Returns an expected robot with the lengths, offsets and limits of its description (URDF).
 
-    Attributes:
-        robot: with the joints and tools that were expected, and the described kinematics.
-        offset_m: most that a tool point is off the expected one, over the joints' range [m].
-    """
-
-    robot: RobotModel
-    offset_m: float
-
-
-def described_robot(expected: RobotModel, urdf: str) -> DescribedRobot:
-    """Reads the description of an expected robot: its own lengths, offsets and limits.
-
-    Args:
-        expected: names the joints, tools and base link.
-        urdf: the description.
+    With it comes how far its tool points are off the expected ones, at most over the joints'
+    range [m].
 
     Raises:
         RobotError: it is no URDF, or it describes another robot: joints or links are missing, or
@@ -87,7 +74,7 @@ def described_robot(expected: RobotModel, urdf: str) -> DescribedRobot:
             f'rad elsewhere; a calibration explains {_LARGEST_OFFSET:g} m and {_LARGEST_TURN:g} '
             'rad'
         )
-    return DescribedRobot(robot, offset_m)
+    return robot, offset_m
 
 
 def _tool_differences(one: RobotModel, other: RobotModel) -> tuple[float, float]:
@@ -293,7 +280,7 @@ def save_robot(file: Path, folder: Path) -> Path:
     """Copies a robot file, its URDF and the shapes in it; the copy can be moved anywhere.
 
     Meshes are stored as their convex hulls, which is all that drawing a robot uses; what touches
-    things in a gripper as convex pieces, made here once. A mesh that is not there stays a name.
+    things in a gripper as convex pieces, made here once. The name of a missing mesh is kept.
 
     Args:
         file: robot YAML.
@@ -337,14 +324,7 @@ def _with_hulls(urdf: Path, folder: Path, grips: set[str]) -> Any:
 
 
 def _split_collisions(link: Any, urdf: Path, folder: Path, first: int) -> list[str]:
-    """Puts convex pieces in the place of the meshes with which a link touches; their files.
-
-    Args:
-        link: of the URDF.
-        urdf: its file.
-        folder: of the copy.
-        first: number of the first piece.
-    """
+    """Replaces a link's collision meshes by convex pieces, numbered from `first`; their files."""
     made: list[str] = []
     if not link.findall('collision'):  # then what is drawn is what touches
         for drawn in map(deepcopy, link.findall('visual')):
@@ -395,11 +375,7 @@ def read_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:
 
 
 def parse_urdf(text: str, what: str) -> tuple[pin.Model, list[Mimic], str]:
-    """Returns a URDF's model, its mimic joints (kept as joints of their own), and the root link.
-
-    Args:
-        text: the URDF.
-        what: kind of file, for error texts.
+    """Returns what `read_urdf` does of a URDF's text; errors begin with `what`.
 
     Raises:
         RobotError: the file is not a usable URDF.

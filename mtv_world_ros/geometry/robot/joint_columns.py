@@ -118,7 +118,7 @@ class JointTable(Schema):
     @model_validator(mode='after')
     def _fits_the_robot(self, info: ValidationInfo) -> Self:
         robot: RobotModel | None = info.context and info.context.get('robot')
-        if robot is not None:  # else its own error is told
+        if robot is not None:  # else the robot's own error is reported
             self._columns, self._joint_names = self._of(robot), robot.joint_names
         return self
 

@@ -111,7 +111,6 @@ class RobotModel:
         self.pinocchio_model = model
         self.joint_names = tuple(joint_names)
         self.tools = tuple(tools)
-        self.mimics = tuple(mimics)
         self.base_link = base_link
         self.mimics = tuple(mimics)
         _check_places(name, model)
@@ -388,12 +387,7 @@ def check_can_move(joint: str, lower: float, upper: float, where: str) -> None:
 def check_positions(
     robot: RobotModel, positions: FloatArray, *, tolerance: float = LIMIT_TOLERANCE
 ) -> None:
-    """Checks positions (T, J) against the joint limits.
-
-    Args:
-        robot: the robot.
-        positions: (T, J) in its joint order [rad or m].
-        tolerance: excess over a limit that is still accepted [rad or m].
+    """Checks positions (T, J) against the joint limits, with a tolerance [rad or m].
 
     Raises:
         TrajectoryError: names the first joint outside or not finite, its value and the limits.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -120,10 +121,8 @@ def load_shape(robot: RobotModel) -> RobotShape:
 
 def moving_links(robot: RobotModel) -> set[str]:
     """Returns the links that move against the base link, by the robot's kinematics."""
-    model = robot.pinocchio_model
-    frames = {f.name: f for f in model.frames if f.type == pin.FrameType.BODY}
-    base = frames[robot.base_link].parentJoint
-    return {name for name, frame in frames.items() if frame.parentJoint != base}
+    joints = _joint_frames(robot)
+    return {name for name, joint in joints.items() if joint != joints[robot.base_link]}
 
 
 def grip_links(robot: RobotModel) -> set[str]:
@@ -193,32 +192,25 @@ def _rod(link: str, start: FloatArray, end: FloatArray) -> LinkShape | None:
 def link_shapes(
     link: ElementTree.Element, urdf: Path, *, sliced: bool = False
 ) -> tuple[list[LinkShape], list[str]]:
-    """Returns a link's shapes, and why there are none; collisions stand in for visuals."""
+    """Returns a link's shapes, and why there are none; collisions stand in for visuals.
+
+    With `sliced`, a mesh that is far from convex is given in slices.
+
+    Raises:
+        RobotError: see `load_shape`.
+    """
     missing: list[str] = []
+    name, cut = link.attrib['name'], slices if sliced else None
     for kind in ('visual', 'collision'):
         try:
-            shapes = list(shapes_of(link, kind, urdf, sliced=sliced))
+            found = [element_shapes(one, name, urdf, cut) for one in link.findall(kind)]
+            shapes = list(chain.from_iterable(found))
         except FileNotFoundError as error:
             missing.append(str(error))
             continue
         if shapes:
             return shapes, []
     return [], missing
-
-
-def shapes_of(
-    link: ElementTree.Element, kind: str, urdf: Path, *, sliced: bool = False
-) -> Iterator[LinkShape]:
-    """Yields the shapes of a link's elements of a kind, `visual` or `collision`.
-
-    With `sliced`, a mesh that is far from convex is given in slices.
-
-    Raises:
-        FileNotFoundError: a mesh is not there.
-        RobotError: see `load_shape`.
-    """
-    for element in link.findall(kind):
-        yield from element_shapes(element, link.attrib['name'], urdf, slices if sliced else None)
 
 
 def element_shapes(

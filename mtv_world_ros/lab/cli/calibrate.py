@@ -104,7 +104,11 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 
 def _fitted_to(arguments: argparse.Namespace, selection: Selection) -> FittedTo:
     """Robot, foresight and cameras of the episodes; of those only that can be read."""
-    from mtv_world_ros.assembly import checkpoint_path, checkpoint_robot, fitting_setting
+    from mtv_world_ros.assembly import (
+        checkpoint_path,
+        checkpoint_robot,
+        fitting_setting,
+    )
     from mtv_world_ros.data.episode_reader import read_episode
     from mtv_world_ros.model.card import read_card
     from mtv_world_ros.success.fitted_to import FittedTo
@@ -153,10 +157,11 @@ def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
 
 def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[EvaluationSummary]:
     """Imagines and scores the episodes once a seed."""
-    from mtv_world_ros.assembly import fingerprint, load_pipeline
+    from mtv_world_ros.assembly import load_pipeline
     from mtv_world_ros.imagined_episode import SEED_STEP
     from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel
     from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
+    from mtv_world_ros.lab.jobs import fingerprint
 
     load = partial(
         load_pipeline,

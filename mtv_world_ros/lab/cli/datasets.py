@@ -145,10 +145,13 @@ def _boxed_stage(
 
 
 def _object_stage(arguments: argparse.Namespace) -> ObjectStage:
-    from mtv_world_ros.assembly import asked_describer, assemble_segmenter
+    from mtv_world_ros.assembly import asked_describer
     from mtv_world_ros.lab.importing.stored_objects import ObjectStage, stage_key
+    from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
-    segmenter = arguments.segmenter and assemble_segmenter(arguments.segmenter, arguments.device)
+    segmenter = arguments.segmenter and choose_segmenter(
+        arguments.segmenter, device=arguments.device
+    )
     return ObjectStage(
         describer=asked_describer(arguments.describer),
         segmenter=segmenter or None,

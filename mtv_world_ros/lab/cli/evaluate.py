@@ -223,10 +223,11 @@ def _slug(label: str) -> str:
 def _score(
     arguments: argparse.Namespace, entry: Entry, selection: Selection, truth: str, out: Path
 ) -> EvaluationSummary:
-    from mtv_world_ros.assembly import asked_describer, fingerprint, load_pipeline
+    from mtv_world_ros.assembly import asked_describer, load_pipeline
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel
     from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
+    from mtv_world_ros.lab.jobs import fingerprint
 
     load = partial(
         load_pipeline,

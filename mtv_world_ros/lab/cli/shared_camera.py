@@ -116,9 +116,32 @@ def _estimate(
         _write(arguments, estimate, episodes, robot, parts)
 
 
+def recorded_robot(episode: Path, name: str) -> Path:
+    """Returns the YAML of the robot that an episode shows.
+
+    Args:
+        episode: its folder; an imported data set has its robot in `robot/` beside the episodes.
+        name: of the robot, by the episode's metadata.
+
+    Raises:
+        ConfigError: there is no file of that name.
+    """
+    from mtv_world_ros.assembly import robot_path
+    from mtv_world_ros.geometry.robot.file import load_robot, ROBOT_YAML
+    from mtv_world_ros.model.card import ROBOT_FOLDER
+
+    for folder in (episode, *list(episode.resolve().parents)[:2]):
+        file = folder / ROBOT_FOLDER / ROBOT_YAML
+        if file.is_file() and load_robot(file).name == name:
+            return file
+    if not name:
+        raise ConfigError(f"'{episode}' does not say which robot it shows; name it with --robot")
+    return robot_path(name)
+
+
 def robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, EpisodeSource]:
     """Returns the robot's YAML (`--robot`, the mapping's, the episode's), and the source."""
-    from mtv_world_ros.assembly import recorded_robot, robot_path
+    from mtv_world_ros.assembly import robot_path
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.data.episode_reader import read_info
 

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     import torch
 
     from mtv_world_ros.data.bag_mapping import EpisodeSource
-    from mtv_world_ros.data.stored_rollout import StoredRollout
     from mtv_world_ros.lab.training.training_config import TrainingConfig
     from mtv_world_ros.lab.training.training_run import HeldOut, Judge
+    from mtv_world_ros.viewing.scored_rollout import StoredRollout
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -135,11 +135,11 @@ def _train(arguments: argparse.Namespace) -> int:
         )
     from mtv_world_ros.assembly import (
         asked_describer,
-        assemble_segmenter,
         checkpoint_path,
         robot_path,
     )
     from mtv_world_ros.model.card import read_card
+    from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
     # importing torch takes seconds: what is often mistyped is checked before
     if not arguments.dataset.is_dir():
@@ -172,7 +172,7 @@ def _train(arguments: argparse.Namespace) -> int:
     folder = train(
         run,
         robot=load_robot(robot_path(config.video.robot)),
-        segmenter=assemble_segmenter(arguments.segmenter, device=arguments.device),
+        segmenter=choose_segmenter(arguments.segmenter, device=arguments.device),
         describer=asked_describer(arguments.describer),
         held_out=_held_out(arguments, paths, dtype, source),
     )
@@ -302,10 +302,10 @@ def _judge(
     import torch
 
     from mtv_world_ros.assembly import asked_describer, load_pipeline
-    from mtv_world_ros.data.stored_rollout import load_rollout
     from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
     from mtv_world_ros.lab.evaluation.results import rollout_path
     from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
+    from mtv_world_ros.lab.stored_rollout import load_rollout
     from mtv_world_ros.lab.training.training_run import HeldOutScores
     from mtv_world_ros.model.lora import ADAPTER
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.assembly import assemble_segmenter, checkpoint_path, checkpoint_robot
+from mtv_world_ros.assembly import checkpoint_path, checkpoint_robot
 from mtv_world_ros.data.bag.image_decoding import raw_to_rgb
 from mtv_world_ros.data.bag.messages import deserialize, header_stamp
 from mtv_world_ros.data.bag.reader import BagReader
@@ -35,6 +35,7 @@ from mtv_world_ros.rendering.video import (
     side_by_side,
     write_video,
 )
+from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
 
 def run_demo(
@@ -83,7 +84,7 @@ def _score(
     recording: Recording, chunks: Sequence[RecordedChunk], views: tuple[str, ...]
 ) -> tuple[Comparison, list[ScoreRow]]:
     """The frames that are both recorded and imagined, and their J."""
-    segmenter = assemble_segmenter('colour')
+    segmenter = choose_segmenter('colour')
     rows: list[ScoreRow] = []
     shown: list[tuple[np.ndarray, ...]] = []
     for index, chunk in enumerate(chunks):
@@ -255,7 +256,7 @@ def read_predictions(bag: Path, views: Sequence[str]) -> Predictions:
         if name.endswith('/image_raw'):
             decoded = deserialize(message.msgtype, message.data)
             key = (name.removesuffix('/image_raw'), header_stamp(decoded))
-            images.setdefault(key, []).append(_pixels(decoded))
+            images.setdefault(key, []).append(raw_to_rgb(decoded))
         elif name.endswith('/predicted/camera_info'):
             num_infos += 1
         elif name == 'report':
@@ -269,16 +270,6 @@ def read_predictions(bag: Path, views: Sequence[str]) -> Predictions:
         reports=tuple(reports),
         num_frames=sum(len(v) for k, v in images.items() if k[0].endswith('/predicted')),
         num_infos=num_infos,
-    )
-
-
-def _pixels(message: Any) -> ByteArray:
-    return raw_to_rgb(
-        np.asarray(message.data, np.uint8),
-        encoding=message.encoding,
-        height=message.height,
-        width=message.width,
-        step=message.step,
     )
 
 

@@ -12,7 +12,6 @@ import time
 import numpy as np
 
 from mtv_world_ros.data.recording import load_recording, Recording
-from mtv_world_ros.data.stored_rollout import join, save_rollout, StoredRollout
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.geometry.robot.shape import load_shape, RobotShape
@@ -44,8 +43,10 @@ from mtv_world_ros.lab.evaluation.metrics.scores import (
 from mtv_world_ros.lab.evaluation.references import Reconstruct, with_actions
 from mtv_world_ros.lab.evaluation.results import EpisodeResult, rollout_path, stored_stretch
 from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
+from mtv_world_ros.lab.stored_rollout import join, save_rollout
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
+from mtv_world_ros.viewing.scored_rollout import StoredRollout
 from mtv_world_ros.vision.jaccard import object_scores, ObjectScores
 
 #: what the time of an episode goes into

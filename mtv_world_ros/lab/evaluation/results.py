@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.data.stored_rollout import StoredRollout
 from mtv_world_ros.data_types import ByteArray, FloatArray, ObjectMasks
 from mtv_world_ros.lab.evaluation.imagined_stretches import Stretch
 from mtv_world_ros.lab.evaluation.metrics.scores import episode_means, QUALITY, ScoreRow
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.rendering.video import Comparison
+from mtv_world_ros.viewing.scored_rollout import StoredRollout
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,10 +6,9 @@ from collections.abc import Iterator
 from math import isfinite
 from pathlib import Path
 
-from mtv_world_ros.data.stored_rollout import StoredRollout
 from mtv_world_ros.lab.evaluation.report.read_back import read_evaluations
 from mtv_world_ros.lab.evaluation.results import EpisodeResult
-from mtv_world_ros.viewing.scored_rollout import ScoredRollout
+from mtv_world_ros.viewing.scored_rollout import ScoredRollout, StoredRollout
 
 #: says that a folder is an evaluation's
 FILE = 'metrics.json'

@@ -118,7 +118,7 @@ def load_scene(
         plan = JointTrajectory(
             joint_names=names, times=np.array(file.times), positions=file.rows(len(names))
         )
-        plan = match_joints(plan, robot, np.zeros(len(robot.joint_names)))
+        plan = match_joints(plan, robot)
         check_positions(robot, plan.positions)
     except TrajectoryError as error:
         raise TrajectoryError(f"'{path}': {error}") from error

@@ -26,21 +26,12 @@ def check(message: Image | CompressedImage) -> None:
     Raises:
         Rejection: unsupported encoding or format, wrong `step`, short data.
     """
-    data = np.frombuffer(message.data, np.uint8)
     if isinstance(message, CompressedImage):
         known = any(word in message.format.lower() for word in _FORMATS)
-        with rejected_as(Reason.IMAGE_DATA if known else Reason.IMAGE_ENCODING):
-            image_decoding.check_compressed(message.format, data)
-        return
-    known = message.encoding in image_decoding.ENCODINGS
+    else:
+        known = message.encoding in image_decoding.ENCODINGS
     with rejected_as(Reason.IMAGE_DATA if known else Reason.IMAGE_ENCODING):
-        image_decoding.check_raw(
-            encoding=message.encoding,
-            height=message.height,
-            width=message.width,
-            step=message.step,
-            num_bytes=len(data),
-        )
+        image_decoding.check_image(message)
 
 
 def to_rgb(message: Image | CompressedImage) -> ByteArray:
@@ -50,18 +41,8 @@ def to_rgb(message: Image | CompressedImage) -> ByteArray:
         Rejection: see `check`; or a compressed image is damaged.
     """
     check(message)
-    data = np.frombuffer(message.data, np.uint8)
     with rejected_as(Reason.IMAGE_DATA):
-        if isinstance(message, CompressedImage):
-            return image_decoding.compressed_to_rgb(message.format, data)
-        return image_decoding.raw_to_rgb(
-            data,
-            encoding=message.encoding,
-            height=message.height,
-            width=message.width,
-            step=message.step,
-            is_bigendian=message.is_bigendian,
-        )
+        return image_decoding.to_rgb(message)
 
 
 def _bytes(pixels: ByteArray) -> array[int]:
@@ -123,7 +104,7 @@ def windowed_camera_info(info: CameraInfo, camera: CameraModel) -> CameraInfo:
         return info
     K = np.reshape(info.k, (3, 3))
     full = replace(camera, width=info.width, height=info.height, K=K)
-    to_image = windowed_pixels(full, camera.width, camera.height, window).to_image
+    to_image, _ = windowed_pixels(full, camera.width, camera.height, window)
     return CameraInfo(
         header=info.header,
         width=camera.width,

@@ -16,7 +16,11 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
-from mtv_world_ros.assembly import assemble_policy, checkpoint_robot, PolicyMaker
+from mtv_world_ros.assembly import (
+    assemble_policy,
+    checkpoint_robot,
+    PolicyMaker,
+)
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.geometry.robot.model import RobotModel

@@ -77,7 +77,7 @@ class RobotDescription:
             return
         self._seen = digest
         try:
-            found = described_robot(self._expected, message.data)
+            robot, offset_m = described_robot(self._expected, message.data)
         except RobotError as error:
             self._offset_m = None
             self._problem = (
@@ -85,11 +85,11 @@ class RobotDescription:
                 'topic, if it is meant for somebody else'
             )
             raise Rejection(Reason.ROBOT_DESCRIPTION, self._problem) from error
-        self._problem, self._offset_m = '', found.offset_m
-        self._on_robot(found.robot)
+        self._problem, self._offset_m = '', offset_m
+        self._on_robot(robot)
         self._log.info(
-            f"{self._topic}: robot '{found.robot.name}'; its tools are up to "
-            f"{1000 * found.offset_m:.1f} mm off those of the checkpoint's description"
+            f"{self._topic}: robot '{robot.name}'; its tools are up to "
+            f"{1000 * offset_m:.1f} mm off those of the checkpoint's description"
         )
 
 

@@ -160,7 +160,7 @@ class FollowJointTrajectory:
         if goal.start is None:
             goal.start = prediction.start.positions
         offset_s = (request.stamp_ns - prediction.stamp_ns) / NANO if request.stamp_ns else 0.0
-        path = match_joints(request.trajectory, self._robot, goal.start, allow_missing=True)
+        path = match_joints(request.trajectory, self._robot, goal.start)
         path = replace(path, times=path.times + offset_s)
         times, actual = prediction.video.times, prediction.positions
         if prediction.chunk == 0:  # where the robot is when the plan begins

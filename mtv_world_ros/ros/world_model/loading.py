@@ -12,7 +12,11 @@ from typing import Protocol, runtime_checkable, TYPE_CHECKING
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from mtv_world_ros.assembly import checkpoint_cameras, checkpoint_path, load_pipeline
+from mtv_world_ros.assembly import (
+    checkpoint_cameras,
+    checkpoint_path,
+    load_pipeline,
+)
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.errors import CalibrationError, CheckpointError, MtvWorldError
 from mtv_world_ros.geometry.calibration_file import load_calibration

@@ -138,7 +138,7 @@ class RequestMaker:
         """From (J,) measured positions on, none is to be quicker than it can."""
         robot = self.robot
         positions = np.clip(positions, robot.lower, robot.upper)
-        whole = match_joints(trajectory, robot, positions, allow_missing=True)
+        whole = match_joints(trajectory, robot, positions)
         with rejected_as(Reason.JOINT_SPEEDS):
             check_plan(robot, whole, positions, tolerance=tolerance)
 

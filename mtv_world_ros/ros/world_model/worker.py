@@ -392,7 +392,7 @@ class RolloutWorker:
             request.trajectory, request.stamp_ns, start.stamp_ns, request.limits
         )
         robot = self._pipeline.robot
-        trajectory = match_joints(trajectory, robot, start.positions, allow_missing=True)
+        trajectory = match_joints(trajectory, robot, start.positions)
         for prediction in episode.extend(trajectory):
             ready_s = time.monotonic()
             chunk = Chunk(request=request, scene=scene, prediction=prediction, ready_s=ready_s)

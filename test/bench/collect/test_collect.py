@@ -23,7 +23,8 @@ from mtv_world_ros.bench.world.recorded_scene import SCENE, scene_of
 from mtv_world_ros.bench.world.simulator import situation_of
 from mtv_world_ros.bench.world.workcell import workcell_of
 from mtv_world_ros.cli import main
-from mtv_world_ros.data.episode_reader import iter_messages, read_episode, read_info
+from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.errors import EpisodeError, SimulatorError
 from mtv_world_ros.success.task import ever_and_final
 
@@ -61,7 +62,9 @@ def _same(one: Path, other: Path):
     """Every message byte for byte with its stamp, the metadata, the calibration, the cards."""
     assert _names(one) == _names(other)
     for name in _names(one):
-        assert list(iter_messages(one / name)) == list(iter_messages(other / name)), name
+        assert list(BagReader(one / name).messages()) == list(
+            BagReader(other / name).messages()
+        ), name
         for file in ('metadata.yaml', 'calibration.yaml'):
             assert (one / name / file).read_bytes() == (other / name / file).read_bytes()
     for file in ('dataset.json', 'README.md', 'contact_sheet.png'):
@@ -150,7 +153,9 @@ def test_a_set_that_was_killed_in_the_middle_is_completed_by_the_same_command(da
     finished = {path.name: path.stat().st_mtime_ns for path in _finished(out)}
     assert 1 <= len(finished) < 4
     for name in finished:
-        assert list(iter_messages(out / name)) == list(iter_messages(data_set / name))
+        assert list(BagReader(out / name).messages()) == list(
+            BagReader(data_set / name).messages()
+        )
     _collect(out)
     _same(data_set, out)
     assert all((out / name).stat().st_mtime_ns == at for name, at in finished.items())
@@ -193,7 +198,9 @@ def test_episodes_that_fit_stay_when_the_disk_is_full_and_the_rest_follows(data_
     assert [entry['name'] for entry in card['episodes']] == ['stack_blocks_two_00000']
     assert len(_collect(out, episodes=1)) == 2
     for name in _names(out):
-        assert list(iter_messages(out / name)) == list(iter_messages(data_set / name)), name
+        assert list(BagReader(out / name).messages()) == list(
+            BagReader(data_set / name).messages()
+        ), name
 
 
 def test_asking_for_a_part_leaves_the_rest_in_the_card(data_set, tmp_path):

@@ -13,7 +13,7 @@ from mtv_world_ros.bench.ranking.rollout_cards import curves, verdict, when_they
 from mtv_world_ros.bench.ranking.rollout_jobs import Course, make_jobs, Result
 from mtv_world_ros.bench.ranking.rollout_runner import ComparisonRunner
 from mtv_world_ros.bench.ranking.run_jobs import RankedCheckpoint, read_results, run_jobs
-from mtv_world_ros.data.stored_rollout import load_rollout
+from mtv_world_ros.lab.stored_rollout import load_rollout
 from mtv_world_ros.rendering.video import decode_video
 
 NAN = float('nan')

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
 
-from mtv_world_ros.data.bag.image_decoding import compressed_to_ids, compressed_to_rgb, raw_to_rgb
+from mtv_world_ros.data.bag import image_decoding
+from mtv_world_ros.data.bag.image_decoding import compressed_to_ids, compressed_to_rgb
 from mtv_world_ros.errors import ObservationError
 
 RED, GREEN = (200, 10, 20), (30, 150, 40)
@@ -15,6 +18,11 @@ ROWS = {
     'rgba8': [200, 10, 20, 255, 30, 150, 40, 0],
     'bgra8': [20, 10, 200, 255, 40, 150, 30, 0],
 }
+
+
+def raw_to_rgb(data, **fields):
+    message = SimpleNamespace(**{'is_bigendian': 0, 'data': data, **fields})
+    return image_decoding.raw_to_rgb(message)
 
 
 @pytest.mark.parametrize('padding', [0, 1, 5])

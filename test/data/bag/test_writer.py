@@ -12,7 +12,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from mtv_world_ros.data.bag.metadata import LATCHED, Qos
-from mtv_world_ros.data.bag.reader import iter_messages
+from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.errors import EpisodeError
@@ -56,7 +56,7 @@ def test_an_existing_episode_is_kept_unless_overwritten(make_episode, tmp_path):
     assert (path / 'metadata.yaml').read_bytes() == before
     with _writer(path, overwrite=True) as writer:
         writer.write_instruction(5)
-    assert [m.topic for m in iter_messages(path)] == ['/instruction']
+    assert [m.topic for m in BagReader(path).messages()] == ['/instruction']
     assert [left.name for left in tmp_path.iterdir()] == ['kept']
 
 
@@ -102,7 +102,7 @@ def test_what_cannot_be_recorded_is_refused_with_a_reason(write, reason, tmp_pat
         writer.write_instruction(0)
         with pytest.raises(EpisodeError, match=reason):
             write(writer)
-    assert [m.topic for m in iter_messages(tmp_path / 'episode')] == ['/instruction']
+    assert [m.topic for m in BagReader(tmp_path / 'episode').messages()] == ['/instruction']
 
 
 def test_any_standard_topic_can_be_recorded_as_raw_bytes(tmp_path):
@@ -122,7 +122,8 @@ def test_any_standard_topic_can_be_recorded_as_raw_bytes(tmp_path):
                 f'/topic{index}', msgtype, 100 + index, b'\x00\x01\x00\x00' + b'\0' * 64
             )
     found = [
-        (m.topic, m.msgtype, m.stamp_ns, len(m.data)) for m in iter_messages(tmp_path / 'bag')
+        (m.topic, m.msgtype, m.stamp_ns, len(m.data))
+        for m in BagReader(tmp_path / 'bag').messages()
     ]
     assert found == [(f'/topic{i}', t, 100 + i, 68) for i, t in enumerate(types)]
     with Reader(tmp_path / 'bag') as reader:
@@ -145,7 +146,7 @@ def test_an_empty_bag_is_a_valid_bag(tmp_path):
         pass
     with Reader(tmp_path / 'bag') as reader:
         assert reader.message_count == 0
-    assert list(iter_messages(tmp_path / 'bag')) == []
+    assert list(BagReader(tmp_path / 'bag').messages()) == []
 
 
 def test_threads_may_record_at_once(tmp_path):

@@ -23,27 +23,27 @@ def with_joint(name, pattern, text):
 
 
 def test_the_same_description_is_the_same_robot():
-    found = described_robot(YAM, URDF)
-    assert found.offset_m == 0.0
+    robot, offset_m = described_robot(YAM, URDF)
+    assert offset_m == 0.0
     positions = np.clip(np.zeros((1, len(YAM.joint_names))), YAM.lower, YAM.upper)
-    np.testing.assert_array_equal(found.robot.tool_poses(positions), YAM.tool_poses(positions))
+    np.testing.assert_array_equal(robot.tool_poses(positions), YAM.tool_poses(positions))
 
 
 def test_a_calibrated_offset_moves_the_tool_by_as_much():
     moved = with_joint(
         'left_joint1', r'(<origin xyz=")([^ ]+)', lambda m: f'{m[1]}{float(m[2]) + 0.01}'
     )
-    found = described_robot(YAM, moved)
-    assert found.offset_m == pytest.approx(0.01)
+    robot, offset_m = described_robot(YAM, moved)
+    assert offset_m == pytest.approx(0.01)
     positions = np.clip(np.zeros((1, len(YAM.joint_names))), YAM.lower, YAM.upper)
-    way = found.robot.tool_poses(positions)[:, 0, :3, 3] - YAM.tool_poses(positions)[:, 0, :3, 3]
+    way = robot.tool_poses(positions)[:, 0, :3, 3] - YAM.tool_poses(positions)[:, 0, :3, 3]
     np.testing.assert_allclose(np.linalg.norm(way, axis=-1), [0.01, 0], atol=1e-9)
-    assert (found.robot.name, found.robot.joint_names) == (YAM.name, YAM.joint_names)
+    assert (robot.name, robot.joint_names) == (YAM.name, YAM.joint_names)
 
 
 def test_limits_are_the_described_ones():
-    found = described_robot(YAM, with_joint('left_joint2', 'upper="3.66519"', 'upper="2.0"'))
-    assert found.robot.upper[1] == 2.0
+    robot, _ = described_robot(YAM, with_joint('left_joint2', 'upper="3.66519"', 'upper="2.0"'))
+    assert robot.upper[1] == 2.0
 
 
 @pytest.mark.parametrize(

@@ -4,17 +4,17 @@ import json
 import numpy as np
 import pytest
 
-from mtv_world_ros.data import stored_rollout
-from mtv_world_ros.data.stored_rollout import (
+from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.lab import stored_rollout
+from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
+from mtv_world_ros.lab.evaluation.results import rollout_path
+from mtv_world_ros.lab.stored_rollout import (
     join,
     load_rollout,
     MAX_SIDE,
     save_rollout,
-    StoredRollout,
 )
-from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
-from mtv_world_ros.lab.evaluation.results import rollout_path
+from mtv_world_ros.viewing.scored_rollout import StoredRollout
 
 VIDEOS = ('real', 'trajectory', 'imagined')
 

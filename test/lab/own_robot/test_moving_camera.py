@@ -19,7 +19,7 @@ from mtv_world_ros.geometry.transforms import inverse
 from mtv_world_ros.lab.inspection.inspect import Inspector
 from mtv_world_ros.lab.inspection.motion_residual import ResidualSearch
 from mtv_world_ros.lab.recordings import cached_recording, cut_clip
-from mtv_world_ros.replay.offline import observe, ReplayLimits
+from mtv_world_ros.replay.offline import observe
 
 NUM = 30
 SEARCH = ResidualSearch(max_pairs=4, lags_s=(0.0,))
@@ -113,7 +113,7 @@ def test_clips_and_observations_have_the_camera_where_it_is(bag, robot, tmp_path
     pipeline = Pipeline()
     pipeline.spec, pipeline.robot = SPEC, robot
     stamp = int(episode.images['door'].stamps_ns[9])
-    seen = observe(episode, pipeline, stamp, ReplayLimits())
+    seen = observe(episode, pipeline, stamp)
     np.testing.assert_allclose(seen.cameras[0].T_mount_camera, truth()[9], atol=1e-6)
 
 

@@ -16,7 +16,7 @@ from sources import make_source
 import torch
 
 from mtv_world_ros.data.bag import messages
-from mtv_world_ros.data.bag.reader import BagMessage, iter_messages
+from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.errors import TrainingError
@@ -38,7 +38,7 @@ Change = Callable[[BagMessage], list[bytes]]
 def rewrite(episode: Path, path: Path, change: Change) -> None:
     """Copies a bag with some messages left out or replaced."""
     with BagWriter(path) as writer:
-        for message in iter_messages(episode):
+        for message in BagReader(episode).messages():
             for data in change(message):
                 writer.write_raw(message.topic, message.msgtype, message.stamp_ns, data)
     (path / 'calibration.yaml').write_bytes((episode / 'calibration.yaml').read_bytes())

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mtv_world_ros.data.stored_rollout import StoredRollout
 from mtv_world_ros.data_types import BoolArray, ByteArray
 from mtv_world_ros.rendering.video import (
     Comparison,
@@ -15,6 +14,7 @@ from mtv_world_ros.rendering.video import (
     encode_small_video,
     side_by_side,
 )
+from mtv_world_ros.viewing.scored_rollout import StoredRollout
 from mtv_world_ros.vision.jaccard import mean_of_known
 
 #: of objects, one after the other: bright ones that few real things have

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.data.stored_rollout import load_rollout
 from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.lab.evaluation.evaluate_episodes import DEFAULTS, evaluate
 from mtv_world_ros.lab.evaluation.report.charts import (
@@ -25,6 +24,7 @@ from mtv_world_ros.lab.evaluation.report.html import write_report
 from mtv_world_ros.lab.evaluation.report.rollout_clips import make_clip, outlined, OUTLINES
 from mtv_world_ros.lab.evaluation.results import rollout_path
 from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
+from mtv_world_ros.lab.stored_rollout import load_rollout
 
 EVIL_NAME = '<script>alert("name")<x onload=y>'
 EVIL_EPISODE = 'b"><script>alert(1)<img src=x onerror=e>'

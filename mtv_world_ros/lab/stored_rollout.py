@@ -7,7 +7,7 @@ per frame.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from io import BytesIO
 import math
 from pathlib import Path
@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.bounded_input import read_arrays
-from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.rendering.images import resize_frames, resize_labels
-from mtv_world_ros.rendering.video import decode_video, encode_video
+from mtv_world_ros.rendering.video import decode_video, encode_video, KINDS
+from mtv_world_ros.viewing.scored_rollout import MASKS, StoredRollout
 
 #: frames are shrunk until neither side is longer [px]; with `MAX_FRAMES` it bounds a file's size
 MAX_SIDE = 320
@@ -28,54 +28,6 @@ MAX_SIDE = 320
 MAX_FRAMES = 600
 #: of x264; at 96x72 the mean error is 0.4 of 255
 _CRF = 10
-_VIDEOS = ('real', 'trajectory', 'imagined')
-_MASKS = ('true_masks', 'masks')
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StoredRollout:
-    """Predicted frames beside the recorded ones: V views, T frames, O objects.
-
-    Attributes:
-        views: V names.
-        objects: O names.
-        fps: frames a second.
-        stretches: (T,) int, number of the stretch that each frame belongs to; where it changes,
-            the imagination started anew from a recorded frame.
-        times: (T,) [s] since the episode's first frame.
-        real: (V, T, H, W, 3) uint8 RGB recorded frames.
-        trajectory: (V, T, H, W, 3) uint8 RGB trajectory video.
-        imagined: (V, T, H, W, 3) uint8 RGB predicted frames.
-        true_masks: (V, O, T, H, W) bool masks of the recorded frames.
-        masks: (V, O, T, H, W) bool masks of the predicted frames.
-        j: (V, O, T) J per frame, NaN = not scored.
-    """
-
-    views: tuple[str, ...]
-    objects: tuple[str, ...]
-    fps: float
-    stretches: np.ndarray
-    times: FloatArray
-    real: ByteArray
-    trajectory: ByteArray
-    imagined: ByteArray
-    true_masks: BoolArray
-    masks: BoolArray
-    j: FloatArray
-
-    def __post_init__(self) -> None:
-        num_views, num_objects, num_frames = len(self.views), len(self.objects), len(self.times)
-        size = self.real.shape[2:4]
-        wanted = {
-            **dict.fromkeys(_VIDEOS, (num_views, num_frames, *size, 3)),
-            **dict.fromkeys(_MASKS, (num_views, num_objects, num_frames, *size)),
-            'j': (num_views, num_objects, num_frames),
-            'stretches': (num_frames,),
-        }
-        for name, shape in wanted.items():
-            found = getattr(self, name).shape
-            if found != shape:
-                raise EpisodeError(f'rollout: {name} has shape {found}, expected {shape}')
 
 
 def join(stretches: Sequence[StoredRollout]) -> StoredRollout:
@@ -91,8 +43,8 @@ def join(stretches: Sequence[StoredRollout]) -> StoredRollout:
         same = (first.views, first.objects, first.fps, first.real.shape[2:])
         if (other.views, other.objects, other.fps, other.real.shape[2:]) != same:
             raise EpisodeError('the stretches of a rollout differ in views, objects, rate or size')
-    axes = {'stretches': 0, 'times': 0, **dict.fromkeys(_VIDEOS, 1), 'j': 2}
-    axes |= dict.fromkeys(_MASKS, 2)
+    axes = {'stretches': 0, 'times': 0, **dict.fromkeys(KINDS, 1), 'j': 2}
+    axes |= dict.fromkeys(MASKS, 2)
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(stretch, name) for stretch in stretches], axis=axis)
         for name, axis in axes.items()
@@ -118,11 +70,11 @@ def rollout_bytes(rollout: StoredRollout) -> bytes:
         'times': kept.times.astype(np.float64),
         'j': kept.j.astype(np.float32),
     }
-    for name in _VIDEOS:
+    for name in KINDS:
         stacked = np.concatenate(list(getattr(kept, name)), axis=1)
         data = encode_video(stacked, kept.fps, crf=_CRF, full_colour=True)
         held[name] = np.frombuffer(data, np.uint8)
-    for name in _MASKS:
+    for name in MASKS:
         held[name] = np.packbits(getattr(kept, name))
     archive = BytesIO()
     np.savez_compressed(archive, **held)
@@ -149,12 +101,12 @@ def _unpacked(held: dict[str, Any]) -> StoredRollout:
     masks = (num_views, len(objects), num_frames, height, width)
     read: dict[str, Any] = {name: held[name] for name in ('stretches', 'times')}
     read['j'] = held['j'].astype(np.float64)
-    for name in _VIDEOS:
+    for name in KINDS:
         stacked = decode_video(held[name].tobytes())
         frames = stacked.reshape(num_frames, num_views, height, width, 3)
         read[name] = frames.swapaxes(0, 1)
     num_bits = math.prod(masks)
-    for name in _MASKS:
+    for name in MASKS:
         if min(masks) < 0 or held[name].size != math.ceil(num_bits / 8):
             raise ValueError(f"'{name}' has {held[name].size} bytes for masks of shape {masks}")
         bits = np.unpackbits(held[name], count=num_bits)
@@ -169,9 +121,9 @@ def _bounded(rollout: StoredRollout) -> StoredRollout:
     height, width = rollout.real.shape[2:4]
     factor = min(1.0, MAX_SIDE / max(height, width))
     size = max(round(width * factor), 1), max(round(height * factor), 1)
-    for name in _VIDEOS:
+    for name in KINDS:
         kept[name] = np.stack([resize_frames(v[:MAX_FRAMES], *size) for v in kept[name]])
-    for name in _MASKS:
+    for name in MASKS:
         masks = kept[name][:, :, :MAX_FRAMES]
         flat = masks.reshape(-1, height, width).astype(np.uint8)
         small = resize_labels(flat, *size) if len(flat) else np.zeros((0, *size[::-1]), np.uint8)
