@@ -23,7 +23,7 @@ import numpy as np
 from page import table
 from scipy.stats import binomtest
 
-from mtv_world_ros.assembly import recorded_robot, robot_path
+from mtv_world_ros.assembly import robot_path
 from mtv_world_ros.config import read_yaml
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
@@ -32,6 +32,7 @@ from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import load_shape, RobotShape
+from mtv_world_ros.lab.cli.shared_camera import recorded_robot
 from mtv_world_ros.lab.inspection.clocks import JointTrack
 from mtv_world_ros.lab.inspection.shared_camera import (
     estimate_shared,

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.data.stored_rollout import load_rollout, StoredRollout
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.lab.evaluation.metrics.horizon import by_chunk, Curve, curve
 from mtv_world_ros.lab.evaluation.metrics.picture_scores import (
@@ -28,6 +27,8 @@ from mtv_world_ros.lab.evaluation.metrics.scores import (
 from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate, METHOD, summarise
 from mtv_world_ros.lab.evaluation.metrics.success_agreement import agreement, Judgement
 from mtv_world_ros.lab.evaluation.results import EpisodeResult, rollout_path
+from mtv_world_ros.lab.stored_rollout import load_rollout
+from mtv_world_ros.viewing.scored_rollout import StoredRollout
 
 #: what a set of episodes that the model was trained for is called beside zero-shot sets
 SEEN = 'seen'
