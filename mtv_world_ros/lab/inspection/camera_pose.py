@@ -76,22 +76,23 @@ def aligned(
     def cost(values: NDArray[np.floating]) -> float:
         return float(np.log1p((values / outlier) ** 2).mean())
 
-    now = errors(T)
+    now, slopes = errors(T), None
     for _ in range(iterations):
         middle = T[:3, 3] if centre is None else centre
-        slopes = np.stack(
-            [(errors(moved(T, s, middle)) - errors(moved(T, -s, middle))) / 2
-             for s in np.diag(UNITS)]
-        )  # fmt: skip
-        weighted = slopes / (1 + (now / outlier) ** 2)
-        normal, gradient = weighted @ slopes.T, weighted @ now
+        if slopes is None:  # a step that was refused changes nothing
+            slopes = np.stack(
+                [(errors(moved(T, s, middle)) - errors(moved(T, -s, middle))) / 2
+                 for s in np.diag(UNITS)]
+            )  # fmt: skip
+            weighted = slopes / (1 + (now / outlier) ** 2)
+            normal, gradient = weighted @ slopes.T, weighted @ now
         damped = normal + damping * np.diag(np.diag(normal)) + 1e-9 * np.eye(6)
         step = -np.linalg.solve(damped, gradient)
         step *= min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-9))
         tried = moved(T, np.asarray(step * UNITS, np.float64), middle)
         there = errors(tried)
         if cost(there) < cost(now):
-            T, now, damping = tried, there, damping / 3
+            T, now, damping, slopes = tried, there, damping / 3, None
         else:
             damping *= 10
         if float(np.abs(step).max()) < 0.01:

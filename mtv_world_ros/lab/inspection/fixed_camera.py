@@ -90,12 +90,14 @@ class Changes:
         pairs: (P, 2) rows of the frames.
         seen: (P, H, W) how much each pixel changed, 0 .. 1.
         blur: standard deviation [px].
+        deviation: length of `seen` without its mean.
     """
 
     camera: CameraModel
     pairs: np.ndarray
     seen: NDArray[np.float32]
     blur: float
+    deviation: float
 
 
 class FixedCamera:
@@ -227,18 +229,22 @@ class FixedCamera:
             cv2.resize(frame, size, interpolation=cv2.INTER_AREA).astype(np.float32)
             for frame in self._frames
         ]
-        seen = []
+        found = []
         for i, j in self.pairs:
             apart = _colour_distance(colours[i], colours[j], reading.brightness)
             changed = np.interp(apart, (reading.may, reading.surely), (0.0, 1.0))
             changed = cv2.medianBlur(changed.astype(np.float32), 3)  # noise is single pixels
-            seen.append(cv2.GaussianBlur(changed, (0, 0), blur))
-        return Changes(camera=small, pairs=self.pairs, seen=np.stack(seen), blur=blur)
+            found.append(cv2.GaussianBlur(changed, (0, 0), blur))
+        seen = np.stack(found)
+        deviation = float(seen.std(dtype=np.float64) * np.sqrt(seen.size))
+        return Changes(camera=small, pairs=self.pairs, seen=seen, blur=blur, deviation=deviation)
 
     def fit(self, T: FloatArray, changes: Changes) -> float:
         """Correlation of drawn and seen changes, -1 .. 1."""
-        drawn = self._drawn(T, changes)
-        return float(np.corrcoef(drawn.ravel(), changes.seen.ravel())[0, 1])
+        drawn = self._drawn(T, changes).ravel().astype(np.float64)
+        drawn -= drawn.mean()
+        along = np.dot(drawn, changes.seen.ravel().astype(np.float64))
+        return float(along / (np.linalg.norm(drawn) * changes.deviation))
 
     def _drawn(self, T: FloatArray, changes: Changes) -> NDArray[np.float32]:
         """(P, H, W) where the pictures of each pair should differ, 0 .. 1."""

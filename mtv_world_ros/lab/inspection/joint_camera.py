@@ -379,14 +379,14 @@ class JointCamera:
     def _aligned(
         self, state: JointState, changes: Mapping[int, Changes], iterations: int
     ) -> JointState:
-        damping, cost = 1e-3, self._cost(state, changes)
+        damping, cost, steps = 1e-3, self._cost(state, changes), None
         for _ in range(iterations):
-            steps = self._steps(state, changes)
+            steps = steps or self._steps(state, changes)  # a step that was refused changes nothing
             tried = self._moved(state, steps, damping)
             there = self._cost(tried, changes)
             if there < cost:
                 gain = (cost - there) / cost
-                state, cost, damping = tried, there, damping / 4
+                state, cost, damping, steps = tried, there, damping / 4, None
                 if gain < 1e-4:
                     break
             else:
