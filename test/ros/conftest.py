@@ -378,8 +378,61 @@ class NodeProcess:
         return self._log.read()
 
 
+class Forks:
+    """Nodes that end by themselves, forked from a process that has imported them already.
+
+    Args:
+        code: defines `start(words) -> status`; modules of this folder can be imported.
+    """
+
+    def __init__(self, code):
+        environment = {**ENVIRONMENT, 'PYTHONPATH': f'{FAKE.parent}:{ENVIRONMENT["PYTHONPATH"]}'}
+        self._process = subprocess.Popen(
+            [sys.executable, '-c', code + FORKING], env=environment, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        )  # fmt: skip
+
+    def run(self, *words):
+        """Returns the exit status and all that was said."""
+        self._process.stdin.write(json.dumps(words) + '\n')
+        self._process.stdin.flush()
+        return json.loads(self._process.stdout.readline())
+
+    def close(self):
+        self._process.stdin.close()
+        assert self._process.wait(60) == 0
+        self._process.stdout.close()
+
+
+FORKING = """
+import json, os, sys, tempfile, traceback
+for line in sys.stdin:
+    with tempfile.TemporaryFile() as said:
+        child, status = os.fork(), 1
+        if not child:
+            os.dup2(said.fileno(), 1)
+            os.dup2(said.fileno(), 2)
+            try:
+                status = start(json.loads(line))
+            except BaseException:
+                traceback.print_exc()
+            sys.stdout.flush()
+            os._exit(status)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        said.seek(0)
+        print(json.dumps([status, said.read().decode()]), flush=True)
+"""
+
+
 def start_node(folder, *parameters, program=(str(FAKE),), remaps=()):
     """Starts the node with `name:=value` parameters and remappings."""
+    command = [sys.executable, *program, '--ros-args', *node_options(folder, *parameters)]
+    command += [part for rule in remaps for part in ('-r', rule)]
+    return NodeProcess(command, folder / 'node.log')
+
+
+def node_options(folder, *parameters):
+    """Words for `name:=value` parameters and those that all nodes get here."""
     calibration = make_calibration(folder / 'calibration.yaml')
     values = (
         f'calibration_file:={calibration}',
@@ -389,10 +442,7 @@ def start_node(folder, *parameters, program=(str(FAKE),), remaps=()):
         'max_joint_state_age_s:=10.0',
         *parameters,
     )
-    options = [part for value in values for part in ('-p', value)]
-    options += [part for rule in remaps for part in ('-r', rule)]
-    command = [sys.executable, *program, '--ros-args', *options]
-    return NodeProcess(command, folder / 'node.log')
+    return [part for value in values for part in ('-p', value)]
 
 
 def make_checkpoint(folder):

@@ -1,37 +1,33 @@
 """Values of parameters that ROS reads otherwise than it is written, on the line and in files."""
 
-import subprocess
-import sys
-
 import pytest
 import yaml
 
 NODE = """
-import sys
 from rclpy.node import Node
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.policy.loop import PolicySettings
 from mtv_world_ros.ros.run_node import run
 
-kind = {'world_model': parameters.Settings, 'policy': PolicySettings}[sys.argv[1]]
 
+def start(words):
+    kind = {'world_model': parameters.Settings, 'policy': PolicySettings}[words[0]]
 
-def make():
-    node = Node(sys.argv[1])
-    parameters.declare(node, kind)
-    print(parameters.read(node, kind).model_dump_json())
-    return node
+    def make():
+        node = Node(words[0])
+        parameters.declare(node, kind)
+        print(parameters.read(node, kind).model_dump_json())
+        return node
 
-
-sys.exit(run(make, sys.argv[1:], spin=lambda node: None))
+    return run(make, words, spin=lambda node: None)
 """
 
 
-def ask(ros, node, *arguments):
-    return subprocess.run(
-        [sys.executable, '-c', NODE, node, '--ros-args', *arguments],
-        env=ros.ENVIRONMENT, capture_output=True, text=True, timeout=180,
-    )  # fmt: skip
+@pytest.fixture(scope='module')
+def forks(ros):
+    forks = ros.Forks(NODE)
+    yield forks
+    forks.close()
 
 
 def lists(kind):
@@ -39,7 +35,7 @@ def lists(kind):
 
 
 @pytest.mark.parametrize('in_file', [False, True])
-def test_an_empty_list_is_an_empty_list(ros, tmp_path, in_file):
+def test_an_empty_list_is_an_empty_list(forks, tmp_path, in_file):
     from mtv_world_ros.ros.parameters import Settings
     from mtv_world_ros.ros.policy.loop import PolicySettings
 
@@ -49,9 +45,8 @@ def test_an_empty_list_is_an_empty_list(ros, tmp_path, in_file):
             file = tmp_path / f'{node}.yaml'
             file.write_text(yaml.safe_dump({node: {'ros__parameters': {name: []}}}))
             given = ['--params-file', str(file)] if in_file else ['-p', f'{name}:=[]']
-            done = ask(ros, node, *given)
-            assert done.returncode == 0, done.stderr
-            assert f'"{name}":[]' in done.stdout
+            status, out = forks.run(node, '--ros-args', *given)
+            assert status == 0 and f'"{name}":[]' in out, out
             asked += 1
     assert asked
 
@@ -69,8 +64,8 @@ def test_an_empty_list_is_an_empty_list(ros, tmp_path, in_file):
         ('seed:={a: 1}', 'expected -p NAME:=VALUE'),
     ],
 )
-def test_what_cannot_be_a_value_is_one_line_that_says_what_can(ros, given, said):
-    done = ask(ros, 'world_model', '-p', given)
-    assert done.returncode == 1
-    assert said in done.stderr and 'Traceback' not in done.stderr
-    assert done.stderr.splitlines()[-1].startswith('ConfigError: ')
+def test_what_cannot_be_a_value_is_one_line_that_says_what_can(forks, given, said):
+    status, out = forks.run('world_model', '--ros-args', '-p', given)
+    assert status == 1
+    assert said in out and 'Traceback' not in out
+    assert out.splitlines()[-1].startswith('ConfigError: ')
