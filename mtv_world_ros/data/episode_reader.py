@@ -43,7 +43,7 @@ from mtv_world_ros.data.episode import (
 from mtv_world_ros.data.joint_plans import complete_plans, following, join_streams, read_plan
 from mtv_world_ros.data.tool_targets import joints_of_tools, ToolTrack
 from mtv_world_ros.data.transform_tree import Mount, pose_track, read_tree, TransformTree
-from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
+from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.camera import unknown_camera, with_camera_info
@@ -200,7 +200,7 @@ class _EpisodeReader:
 
     def _receive(self) -> None:
         wanted = self.topics.names(with_masks=self.with_masks) | set(TF_TOPICS)
-        wanted |= {self._camera_info(view, names) for view, names in self.topics.views.items()}
+        wanted |= {self._camera_info(view) for view in self.topics.views}
         wanted |= {self.mapping.topic(tool.topic) for tool in self.mapping.tools.values()}
         for message in self.bag.messages(wanted):
             try:
@@ -261,6 +261,18 @@ class _EpisodeReader:
                 self._refuse(topic, EpisodeError(f'it holds {kind}, expected {msgtype}'))
         return taken
 
+    def _parsed(
+        self, topic: str, msgtype: str, parse: Callable[[Any], Item]
+    ) -> list[tuple[int, Item]]:
+        """What messages of a topic are parsed to, by stamp; those that cannot be are refused."""
+        good = []
+        for stamp, message in self._take(topic, msgtype):
+            try:
+                good.append((stamp, parse(message)))
+            except (ValueError, MtvWorldError) as error:
+                self._refuse(topic, error)
+        return in_order(topic, good, self.warnings)
+
     def _states(self) -> JointStates | None:
         topic = self.topics.joint_states
         taken = self._own_states(topic, self._take(topic, messages.JOINT_STATE))
@@ -315,13 +327,7 @@ class _EpisodeReader:
 
     def _tool_poses(self, arm: str, tool: ToolTopic, robot: RobotModel) -> ToolTrack:
         topic = self.mapping.topic(tool.topic)
-        good: Stamped = []
-        for stamp, message in self._take(topic, messages.POSE_STAMPED):
-            try:
-                good.append((stamp, (message.header.frame_id, messages.parse_pose(message.pose))))
-            except ValueError as error:
-                self._refuse(topic, EpisodeError(str(error)))
-        ordered = in_order(topic, good, self.warnings)
+        ordered = self._parsed(topic, messages.POSE_STAMPED, _framed_pose)
         if not ordered:
             raise EpisodeError(
                 f"'{self.path}' has no poses of arm '{arm}' at '{topic}'; its topics of "
@@ -358,16 +364,14 @@ class _EpisodeReader:
                 return []
             named = replace(leader, joint_names=self._renamed(leader.joint_names))
             return following(named, self.mapping.chunk_s, self.seen_ns)
-        good: Stamped = []
-        for stamp, message in self._take(topic, messages.JOINT_TRAJECTORY):
-            try:
-                plan = read_plan(message)
-                good.append((stamp, replace(plan, joint_names=self._renamed(plan.joint_names))))
-            except MtvWorldError as error:
-                self._refuse(topic, error)
+        plans = self._parsed(topic, messages.JOINT_TRAJECTORY, self._plan)
         if topic not in self.types and (others := self._topics_of(messages.JOINT_TRAJECTORY)):
             self._warn_once(f"no trajectories at '{topic}'; there are some at {_listed(others)}")
-        return self._whole_plans(topic, in_order(topic, good, self.warnings), states)
+        return self._whole_plans(topic, plans, states)
+
+    def _plan(self, message: Any) -> JointTrajectory:
+        plan = read_plan(message)
+        return replace(plan, joint_names=self._renamed(plan.joint_names))
 
     def _whole_plans(self, topic: str, plans: Stamped, states: JointStates | None) -> Stamped:
         """Plans of all joints of the robot; those of one point are joined."""
@@ -389,17 +393,12 @@ class _EpisodeReader:
         return whole
 
     def _object_poses(self, num_objects: int) -> ObjectPoses | None:
-        topic = self.topics.object_poses
-        good: Stamped = []
-        for stamp, message in self._take(topic, messages.POSE_ARRAY):
-            if len(message.poses) == num_objects:
-                good.append((stamp, messages.parse_pose_array(message)))
-            else:
-                self._refuse(
-                    topic,
-                    EpisodeError(f'{len(message.poses)} poses for {num_objects} objects'),
-                )
-        ordered = in_order(topic, good, self.warnings)
+        def parse(message: Any) -> FloatArray:
+            if len(message.poses) != num_objects:
+                raise ValueError(f'{len(message.poses)} poses for {num_objects} objects')
+            return messages.parse_pose_array(message)
+
+        ordered = self._parsed(self.topics.object_poses, messages.POSE_ARRAY, parse)
         if not ordered:
             return None
         stamps = np.array([stamp for stamp, _ in ordered], np.int64)
@@ -424,11 +423,11 @@ class _EpisodeReader:
                 )
         known = load_calibration(file) if tree is None else {}
         cameras = {}
-        for view, names in self.topics.views.items():
+        for view in self.topics.views:
             if tree is not None:
-                known[view] = self._from_tree(tree, view, names, unknown_mount, images[view])
+                known[view] = self._from_tree(tree, view, unknown_mount, images[view])
             elif view not in known and unknown_mount:
-                known[view] = self._placeholder(view, names, unknown_mount, images[view])
+                known[view] = self._placeholder(view, unknown_mount, images[view])
             elif view not in known:
                 raise CalibrationError(
                     f"'{file}' has no view '{view}'; it has {', '.join(known) or 'none'}; "
@@ -437,8 +436,8 @@ class _EpisodeReader:
             elif not calibration:
                 known[view] = self._moving(known[view], images[view])
             is_given = tree is None and view not in self.unknown
-            size = (images[view].frames[0].shape[1], images[view].frames[0].shape[0])
-            cameras[view] = self._at_images(known[view], view, names, size, is_given=is_given)
+            height, width = images[view].frames[0].shape[:2]
+            cameras[view] = self._at_images(known[view], (width, height), is_given=is_given)
         return cameras
 
     def _moving(self, camera: CameraModel, track: Track) -> CameraModel:
@@ -459,24 +458,19 @@ class _EpisodeReader:
         return tree
 
     def _from_tree(
-        self,
-        tree: TransformTree,
-        view: str,
-        names: ViewTopics,
-        unknown_mount: str,
-        images: Track,
+        self, tree: TransformTree, view: str, unknown_mount: str, images: Track
     ) -> CameraModel:
         """The camera's pose by TF; its intrinsics come from CameraInfo."""
-        topic = self._camera_info(view, names)
-        infos = [message for _, message in self._take(topic, messages.CAMERA_INFO)]
+        infos = self._camera_infos(view)
         if not infos and unknown_mount:
-            return self._placeholder(view, names, unknown_mount, images)
+            return self._placeholder(view, unknown_mount, images)
         if not infos:
             raise CalibrationError(
-                f"'{self.path}', view '{view}': '{topic}' has no CameraInfo, which intrinsics "
-                f'come from where there is no calibration file; {_estimate(self.path, view)}'
+                f"'{self.path}', view '{view}': '{self._camera_info(view)}' has no CameraInfo, "
+                'which intrinsics come from where there is no calibration file; '
+                f'{_estimate(self.path, view)}'
             )
-        of_images = self.received[names.image][0][1][1].header.frame_id
+        of_images = self.received[self.topics.views[view].image][0][1][1].header.frame_id
         of_info = infos[0].header.frame_id
         if of_images and of_info and of_images != of_info:
             self._warn_once(
@@ -508,40 +502,37 @@ class _EpisodeReader:
             T_mount_camera=mount.T_link_frame,
         )
 
-    def _placeholder(self, view: str, names: ViewTopics, mount: str, images: Track) -> CameraModel:
+    def _placeholder(self, view: str, mount: str, images: Track) -> CameraModel:
         """A camera of which nothing is known but, perhaps, a CameraInfo."""
-        informed = bool(self._take(self._camera_info(view, names), messages.CAMERA_INFO))
-        self.unknown[view] = 'pose' if informed else 'pose and intrinsics'
+        self.unknown[view] = 'pose' if self._camera_infos(view) else 'pose and intrinsics'
         height, width = images.frames[0].shape[:2]
         return unknown_camera(view, width, height, mount)
 
-    def _camera_info(self, view: str, names: ViewTopics) -> str:
+    def _camera_info(self, view: str) -> str:
+        """The topic of a view's CameraInfo."""
         row = self.mapping.views.get(view)
         given = row.camera_info if row else ''
-        return self.mapping.topic(given) if given else names.camera_info
+        return self.mapping.topic(given) if given else self.topics.views[view].camera_info
+
+    def _camera_infos(self, view: str) -> list[Any]:
+        return [m for _, m in self._take(self._camera_info(view), messages.CAMERA_INFO)]
 
     def _at_images(
-        self,
-        camera: CameraModel,
-        view: str,
-        names: ViewTopics,
-        size: tuple[int, int],
-        *,
-        is_given: bool,
+        self, camera: CameraModel, size: tuple[int, int], *, is_given: bool
     ) -> CameraModel:
         """The camera for images of a size, by CameraInfo where a file has not given others."""
-        topic = self._camera_info(view, names)
-        infos = [message for _, message in self._take(topic, messages.CAMERA_INFO)]
+        view = camera.view
+        infos = self._camera_infos(view)
         if not infos:
             return self._windowed(camera, size)
-        rectified = '/image_rect' in names.image
-        infos = [_rectified(info) for info in infos] if rectified else infos
+        if '/image_rect' in self.topics.views[view].image:
+            infos = [_rectified(info) for info in infos]
         first = _intrinsics(infos[0])
         for index, info in enumerate(infos):
             if _intrinsics(info) != first:
                 raise CalibrationError(
-                    f"'{self.path}': '{topic}' changes at message {index}, from {first} to "
-                    f'{_intrinsics(info)}; cut the episode there'
+                    f"'{self.path}': '{self._camera_info(view)}' changes at message {index}, from "
+                    f'{first} to {_intrinsics(info)}; cut the episode there'
                 )
         width, height, k, model, distortion, window = first
         informed = with_camera_info(
@@ -574,7 +565,7 @@ class _EpisodeReader:
             self._warn_once(note)
         return sized
 
-    def _refuse(self, topic: str, error: MtvWorldError) -> None:
+    def _refuse(self, topic: str, error: Exception) -> None:
         self.refused.setdefault(topic, []).append(str(error))
 
     def _warn_once(self, text: str) -> None:
@@ -588,6 +579,11 @@ class _EpisodeReader:
             for topic, reasons in self.refused.items()
         ]
         return (*cut, *self.bag.problems, *self.warnings, *refused)
+
+
+def _framed_pose(message: Any) -> tuple[str, FloatArray]:
+    """Frame and (4, 4) pose of a PoseStamped."""
+    return message.header.frame_id, messages.parse_pose(message.pose)
 
 
 def _info(bag: BagReader, instructions: Sequence[tuple[int, str]]) -> EpisodeInfo:

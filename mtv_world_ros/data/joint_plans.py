@@ -249,7 +249,8 @@ class _Measured:
 
     def at(self, stamp_ns: int, seconds: FloatArray) -> FloatArray:
         """(N, J) at times after a stamp [s]."""
-        return interpolated(seconds, (self._stamps - stamp_ns) * 1e-9, self._rows)
+        known = np.asarray((self._stamps - stamp_ns) * 1e-9, np.float64)
+        return interpolated(seconds, known, self._rows)
 
     def times(self, stamp_ns: int, begin_s: float, end_s: float) -> FloatArray:
         """Times of samples after a stamp [s], no denser than needed."""

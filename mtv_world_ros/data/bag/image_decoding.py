@@ -249,7 +249,7 @@ def _check_size(layout: str, data: NDArray[np.uint8]) -> None:
         if content.startswith(_PNG):
             width, height = _png_size(content)
         else:
-            height, width, *_ = simplejpeg.decode_jpeg_header(content)
+            height, width = map(int, simplejpeg.decode_jpeg_header(content)[:2])
         check_limit('image_pixels', width * height, f'an image of {width}x{height}')
         if not content.startswith(_PNG):
             check_limit('jpeg_scans', content.count(_SCAN), 'the file')

@@ -86,6 +86,7 @@ def read(path: Path, **options: Any):
 
 
 IMAGE, STATE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/JointState'
+COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 
 
 def test_the_frames_before_a_cut_are_all_there(tmp_path):
@@ -109,17 +110,24 @@ def test_the_frames_before_a_cut_are_all_there(tmp_path):
     assert len(set(counts)) >= 5
 
 
-def test_an_unknown_encoding_is_named_with_its_topic(foreign_bag):
-    path = foreign_bag(('/low/image_raw', IMAGE, 5, image(5, encoding='32FC1')))
-    with pytest.raises(EpisodeError, match=r"view 'low'.*/low/image_raw.*32FC1.*rgb8"):
-        read(path)
+def compressed(stamp_ns: int, layout: str, data: np.ndarray | None = None) -> Any:
+    """By default a grey PNG of value 9."""
+    if data is None:
+        data = cv2.imencode('.png', np.full((2, 3, 3), 9, np.uint8))[1].ravel()
+    return STORE.types[COMPRESSED](header=header(stamp_ns), format=layout, data=data)
 
 
-def test_an_unknown_compression_is_named_with_its_topic(foreign_bag):
-    kind = 'sensor_msgs/msg/CompressedImage'
-    message = STORE.types[kind](header=header(5), format='h264', data=np.zeros(9, np.uint8))
-    path = foreign_bag(('/low/image_raw/compressed', kind, 5, message))
-    with pytest.raises(EpisodeError, match=r"/low/image_raw/compressed.*'h264' is not supported"):
+@pytest.mark.parametrize(
+    ('topic', 'kind', 'message', 'says'),
+    [
+        ('/low/image_raw', IMAGE, image(5, encoding='32FC1'), "view 'low'.*TOPIC.*32FC1.*rgb8"),
+        ('/low/image_raw/compressed', COMPRESSED, compressed(5, 'h264', np.zeros(9, np.uint8)),
+         "TOPIC.*'h264' is not supported"),
+    ],
+)  # fmt: skip
+def test_an_unknown_encoding_is_named_with_its_topic(foreign_bag, topic, kind, message, says):
+    path = foreign_bag((topic, kind, 5, message))
+    with pytest.raises(EpisodeError, match=says.replace('TOPIC', topic)):
         read(path)
 
 
@@ -188,19 +196,13 @@ def test_topics_of_other_robots_are_mapped(foreign_bag):
 
 @pytest.mark.parametrize('named', ['/cam/image', '/cam/image/compressed'])
 def test_a_mapped_topic_may_be_compressed(foreign_bag, named):
-    kind = 'sensor_msgs/msg/CompressedImage'
-    data = cv2.imencode('.png', np.full((2, 3, 3), 9, np.uint8))[1].ravel()
-    message = STORE.types[kind](header=header(5), format='png', data=data)
-    path = foreign_bag(('/cam/image/compressed', kind, 5, message))
+    path = foreign_bag(('/cam/image/compressed', COMPRESSED, 5, compressed(5, 'png')))
     assert read(path, topics={'low': named}).images['low'].frames[0][0, 0, 0] == 9
 
 
 def test_raw_images_are_preferred_to_compressed_ones(foreign_bag):
-    kind = 'sensor_msgs/msg/CompressedImage'
-    data = cv2.imencode('.png', np.full((2, 3, 3), 9, np.uint8))[1].ravel()
-    message = STORE.types[kind](header=header(5), format='png', data=data)
     path = foreign_bag(
-        ('/low/image_raw/compressed', kind, 5, message),
+        ('/low/image_raw/compressed', COMPRESSED, 5, compressed(5, 'png')),
         ('/low/image_raw', IMAGE, 5, image(5, 7)),
     )
     assert read(path).images['low'].frames[0][0, 0, 0] == 7
