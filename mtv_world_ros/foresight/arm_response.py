@@ -24,7 +24,7 @@ import numpy as np
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import TrajectoryError
-from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
+from mtv_world_ros.foresight.mechanics import RobotMechanics
 from mtv_world_ros.geometry.robot.model import RobotModel
 
 #: between commands, after which the inertia is computed again [s]

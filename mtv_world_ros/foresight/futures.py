@@ -13,7 +13,7 @@ import numpy as np
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.foresight.arms import Drives
 from mtv_world_ros.foresight.contact_settings import ContactSettings
-from mtv_world_ros.geometry.solids import Solid
+from mtv_world_ros.foresight.solids import Solid
 
 #: what is found as near to the table stands on it [m]
 STANDS_M = 0.01

@@ -17,7 +17,7 @@ from mtv_world_ros.errors import RobotError
 from mtv_world_ros.foresight.arms import Arms, PATCH_M, set_drives, SOLIDS
 from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.library import mujoco
-from mtv_world_ros.geometry.solids import Solid
+from mtv_world_ros.foresight.solids import Solid
 
 #: of the engine [s]
 STEP_S = 0.004

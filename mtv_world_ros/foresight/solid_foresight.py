@@ -17,10 +17,10 @@ from mtv_world_ros.foresight.arms import Arms
 from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.engine import Batch, BatchState, Engine
 from mtv_world_ros.foresight.futures import draw_futures, Future, STANDS_M
+from mtv_world_ros.foresight.solids import find_solid, fit_solid, is_vessel, Solid
 from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.geometry.solids import find_solid, fit_solid, is_vessel, Solid
 
 #: positions that are commanded in a step of a motion, and its length [s]
 COMMANDS_A_STEP = 5

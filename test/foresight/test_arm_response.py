@@ -12,8 +12,8 @@ from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.foresight.arm_response import ArmResponse, PERIOD_S
 from mtv_world_ros.foresight.loading import load_response
+from mtv_world_ros.foresight.mechanics import RobotMechanics
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
 from mtv_world_ros.lab.training.object_motion.response_fit import (
     fit_response,
     found_response,

@@ -16,7 +16,7 @@ from mtv_world_ros.foresight.course import SUBSTEPS
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import draw_futures
 from mtv_world_ros.foresight.solid_foresight import SolidForesight, TrackedSolids
-from mtv_world_ros.geometry.solids import Solid
+from mtv_world_ros.foresight.solids import Solid
 
 SETTINGS = ContactSettings(
     finger_stiffness=400.0,

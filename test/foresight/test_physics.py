@@ -11,7 +11,7 @@ from mtv_world_ros.foresight.arms import Arms
 from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import draw_futures
-from mtv_world_ros.geometry.solids import Solid
+from mtv_world_ros.foresight.solids import Solid
 
 G = 9.81
 SETTINGS = ContactSettings(

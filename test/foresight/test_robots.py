@@ -16,8 +16,8 @@ from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import draw_futures
 from mtv_world_ros.foresight.robot_parts import load_parts
+from mtv_world_ros.foresight.solids import Solid
 from mtv_world_ros.geometry.robot.file import load_robot, save_robot
-from mtv_world_ros.geometry.solids import Solid
 
 SETTINGS = ContactSettings(
     finger_stiffness=400.0,

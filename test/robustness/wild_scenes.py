@@ -23,7 +23,7 @@ def samples() -> list[Any]:
 
 
 def _solid(centre: Any, size: Any, yaw: float, is_round: bool, is_open: bool) -> Any:
-    from mtv_world_ros.geometry.solids import Solid
+    from mtv_world_ros.foresight.solids import Solid
 
     return Solid(centre=centre, size=size, yaw=yaw, is_round=is_round, is_open=is_open)
 

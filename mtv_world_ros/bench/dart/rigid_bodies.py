@@ -27,9 +27,9 @@ from mtv_world_ros.errors import RobotError
 from mtv_world_ros.foresight.arm_response import ArmResponse
 from mtv_world_ros.foresight.arms import finger_travels
 from mtv_world_ros.foresight.contact_settings import ContactSettings
+from mtv_world_ros.foresight.solids import Solid
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import urdf_path
-from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.geometry.transforms import about_z
 
 #: what is at least this wide, and wider than high by this factor, is hollow: a dish, a tray [m]

@@ -17,8 +17,8 @@ from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.foresight.arm_response import ArmResponse, ArmState, PERIOD_S
 from mtv_world_ros.foresight.contact_settings import ContactSettings
+from mtv_world_ros.foresight.solids import Solid
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.geometry.solids import Solid
 
 #: steps of the engine in a period of commands, N
 _SUBSTEPS = 5

@@ -14,8 +14,8 @@ from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.foresight.arm_response import ArmResponse
 from mtv_world_ros.foresight.contact_settings import ContactSettings
+from mtv_world_ros.foresight.solids import Solid
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.geometry.solids import Solid
 
 if TYPE_CHECKING:
     from mtv_world_ros.bench.dart.stepped_world import SteppedWorld

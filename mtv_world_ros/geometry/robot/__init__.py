@@ -1,1 +1,1 @@
-"""Robots: their files and descriptions, kinematics, mechanics and shapes."""
+"""Robots: their files and descriptions, kinematics and shapes."""

@@ -25,11 +25,11 @@ from mtv_world_ros.foresight.solid_foresight import (
     STEP_S,
     TrackedSolids,
 )
+from mtv_world_ros.foresight.solids import is_vessel, Solid
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot.file import Position
 from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
-from mtv_world_ros.geometry.solids import is_vessel, Solid
 
 #: of a picture, and where its camera looks from
 _WIDTH, _HEIGHT, _DISTANCE, _ELEVATION = 480, 360, 0.9, -30.0

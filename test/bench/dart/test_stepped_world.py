@@ -15,10 +15,10 @@ from mtv_world_ros.bench.dart.stepped_world import STEP_S, SteppedWorld
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.foresight.contact_settings import ContactSettings
+from mtv_world_ros.foresight.mechanics import RobotMechanics
+from mtv_world_ros.foresight.solids import Solid
 from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
-from mtv_world_ros.geometry.solids import Solid
 from mtv_world_ros.lab.training.object_motion.contact_fit import _Trial, read_contact
 
 SETTINGS = ContactSettings(

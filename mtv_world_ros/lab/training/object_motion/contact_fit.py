@@ -30,9 +30,9 @@ from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import Future
 from mtv_world_ros.foresight.scene import Scene
 from mtv_world_ros.foresight.solid_foresight import COMMANDS_A_STEP, STEP_S
+from mtv_world_ros.foresight.solids import fit_solid, is_vessel, Solid
 from mtv_world_ros.geometry.resample import nearest_rows
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.geometry.solids import fit_solid, is_vessel, Solid
 from mtv_world_ros.lab.training.object_motion.tracks import (
     fine_commands,
     first_frame,

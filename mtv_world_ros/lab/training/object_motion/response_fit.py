@@ -21,8 +21,8 @@ from mtv_world_ros.data.recording import measured_positions, stitched_commands
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.foresight.arm_response import ArmResponse, PERIOD_S
+from mtv_world_ros.foresight.mechanics import RobotMechanics
 from mtv_world_ros.geometry.resample import resample
-from mtv_world_ros.geometry.robot.mechanics import RobotMechanics
 from mtv_world_ros.geometry.robot.model import RobotModel
 
 #: commands and measured positions of an episode, both (T, J), `PERIOD_S` apart

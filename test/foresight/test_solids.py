@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.data_types import CameraModel
+from mtv_world_ros.foresight.solids import find_solid, fit_solid
 from mtv_world_ros.geometry.camera import project
-from mtv_world_ros.geometry.solids import find_solid, fit_solid
 
 
 def looking_at(origin: np.ndarray, target: np.ndarray) -> tuple[CameraModel, np.ndarray]:
