@@ -21,7 +21,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 PARENT_VARIABLE = 'MTV_WORLD_PARENT'
 _STOP_S = 30.0
 #: time after which a stopped process (SIGSTOP) is given up [s]
-STILL_S = 5.0
+STOPPED_S = 5.0
 #: longer gaps between two looks mean that this process was stopped as well [s]
 _LONGEST_GAP_S = 2.0
 _TAIL_BYTES = 4000
@@ -175,7 +175,7 @@ def how_it_ended(name: str, process: subprocess.Popen[bytes], logs: Path) -> str
     return f"'{name}' ended with status {process.returncode}: {text} (logs are in '{logs}')"
 
 
-class StandStill:
+class StoppedProcesses:
     """Detects stopped processes (SIGSTOP), which never end; to be polled many times a second."""
 
     def __init__(self) -> None:
@@ -183,20 +183,20 @@ class StandStill:
         self._looked_s = 0.0
 
     def find(self, pids: Iterable[int]) -> int | None:
-        """Returns the number of a process that has been stopped for `STILL_S`, or None."""
+        """Returns the number of a process that has been stopped for `STOPPED_S`, or None."""
         now_s = time.monotonic()
         if now_s - self._looked_s > _LONGEST_GAP_S:  # a terminal stopped this process as well
             self._since.clear()
         self._looked_s = now_s
         self._since = {pid: self._since.get(pid, now_s) for pid in pids if _is_stopped(pid)}
-        still = (pid for pid, since_s in self._since.items() if now_s - since_s > STILL_S)
-        return next(still, None)
+        found = (pid for pid, since_s in self._since.items() if now_s - since_s > STOPPED_S)
+        return next(found, None)
 
-    def said(self, processes: Mapping[str, subprocess.Popen[bytes]]) -> str:
-        """Returns which of named processes has been stopped for `STILL_S`, in words; or empty."""
+    def report(self, processes: Mapping[str, subprocess.Popen[bytes]]) -> str:
+        """Returns which named process has been stopped for `STOPPED_S`, in words; or empty."""
         found = self.find(process.pid for process in processes.values())
         names = [name for name, process in processes.items() if process.pid == found]
-        return f"'{names[0]}' was stopped and stood still for {STILL_S:g} s" if names else ''
+        return f"'{names[0]}' was stopped and stood still for {STOPPED_S:g} s" if names else ''
 
 
 def _is_stopped(pid: int) -> bool:

@@ -14,7 +14,7 @@ from worker_jobs import LongJobs, make_held_back, make_stopping
 from mtv_world_ros.errors import MtvWorldError, TrainingError
 from mtv_world_ros.lab.jobs import run_all, run_job, WorkerPool
 from mtv_world_ros.lab.training.clips.batches import ClipWorkers
-from mtv_world_ros.processes import StandStill, STILL_S, stop_process
+from mtv_world_ros.processes import stop_process, STOPPED_S, StoppedProcesses
 
 
 @pytest.fixture
@@ -28,16 +28,16 @@ def child():
 
 
 def test_one_that_stands_still_is_named_and_one_at_work_is_not(child):
-    still = StandStill()
+    stopped = StoppedProcesses()
     child.send_signal(signal.SIGSTOP)
     begin_s = time.monotonic()
-    while not (said := still.said({'child': child, 'self': child})):
-        assert time.monotonic() - begin_s < 12 * STILL_S
+    while not (said := stopped.report({'child': child, 'self': child})):
+        assert time.monotonic() - begin_s < 12 * STOPPED_S
         time.sleep(0.1)
-    assert "'child' was stopped" in said and time.monotonic() - begin_s >= STILL_S
+    assert "'child' was stopped" in said and time.monotonic() - begin_s >= STOPPED_S
     child.send_signal(signal.SIGCONT)
     time.sleep(0.3)
-    assert not still.said({'child': child})
+    assert not stopped.report({'child': child})
 
 
 def test_one_that_stands_still_hears_that_it_is_to_end(child):
@@ -70,7 +70,7 @@ def test_forked_workers_that_note_sigterm_as_training_does_end_with_a_broken_poo
         begin_s = time.monotonic()
         workers.close()
         signal.signal(signal.SIGTERM, before)
-    assert time.monotonic() - begin_s < 12 * STILL_S
+    assert time.monotonic() - begin_s < 12 * STOPPED_S
 
 
 #: the pool of OpenCV's threads has been used before clips are made

@@ -20,7 +20,7 @@ from typing import Any, Protocol, TypeVar
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.files import content_digest, plain
-from mtv_world_ros.processes import StandStill, STILL_S
+from mtv_world_ros.processes import STOPPED_S, StoppedProcesses
 
 #: between two looks of a pool at its workers, and of a worker at its parent [s]
 _LOOK_S = 0.5
@@ -96,8 +96,8 @@ def _in_processes(
     except BrokenProcessPool as error:
         raise MtvWorldError(
             f'one of {workers} workers died, most likely of lack of memory (one that is stopped '
-            f'for {STILL_S:g} s is ended, too); what is done is kept: run the command again, with '
-            'fewer --workers'
+            f'for {STOPPED_S:g} s is ended, too); what is done is kept: run the command again, '
+            'with fewer --workers'
         ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
@@ -122,7 +122,7 @@ class WorkerPool(ProcessPoolExecutor):
         arguments = (make_run, threads, os.getpid())
         super().__init__(workers, multiprocessing.get_context(method), _start_worker, arguments)
         self._closed = threading.Event()
-        threading.Thread(target=self._kill_still, daemon=True).start()
+        threading.Thread(target=self._kill_stopped, daemon=True).start()
 
     def submit(self, *job: Any, **options: Any) -> Future[Any]:
         """Starts processes; none of them gets a Ctrl-C that it does not ignore yet."""
@@ -143,15 +143,15 @@ class WorkerPool(ProcessPoolExecutor):
         super().shutdown(wait, cancel_futures=cancel_futures)
         self._closed.set()
 
-    def _kill_still(self) -> None:
-        still, broken_s = StandStill(), float('inf')
+    def _kill_stopped(self) -> None:
+        stopped, broken_s = StoppedProcesses(), float('inf')
         while not self._closed.wait(_LOOK_S):
             workers = dict(self._processes or {})
-            found = still.find(workers)
+            found = stopped.find(workers)
             if self._broken:
                 broken_s = min(broken_s, time.monotonic())
             for pid, worker in workers.items():
-                if pid == found or time.monotonic() > broken_s + STILL_S:
+                if pid == found or time.monotonic() > broken_s + STOPPED_S:
                     worker.kill()
 
 

@@ -34,9 +34,9 @@ from mtv_world_ros.processes import (
     module_command,
     private_domain,
     ros_arguments,
-    StandStill,
     start_process,
     stop_process,
+    StoppedProcesses,
 )
 
 #: of logs and bags, before anything is started
@@ -194,11 +194,11 @@ def _check_policy(options: ImagineOptions) -> None:
 
 def _viewer_said(viewer: subprocess.Popen[bytes], logs: Path) -> str:
     """The viewer's line once it is ready; EpisodeError where it ends before."""
-    log, still = logs / 'viewer.log', StandStill()
+    log, stopped = logs / 'viewer.log', StoppedProcesses()
     while not (found := _VIEWER_IS_ON.search(log.read_text(errors='replace'))):
         if viewer.poll() is not None:
             raise EpisodeError(how_it_ended('viewer', viewer, logs))
-        if said := still.said({'viewer': viewer}):
+        if said := stopped.report({'viewer': viewer}):
             raise EpisodeError(f"{said} (logs are in '{logs}')")
         time.sleep(0.1)
     return found[1]
@@ -211,12 +211,12 @@ def _count(options: ImagineOptions) -> int:
 
 def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path, bar: Any) -> None:
     """Waits for the runner; before its first episode it does not notice dead nodes itself."""
-    runner, still = processes['runner'], StandStill()
+    runner, stopped = processes['runner'], StoppedProcesses()
     while runner.poll() is None:
         time.sleep(0.2)
         bar.n = episodes_done(logs.parent)
         bar.refresh()
-        if said := still.said(processes):
+        if said := stopped.report(processes):
             raise EpisodeError(f"{said} (logs are in '{logs}')")
         dead = [n for n, p in processes.items() if p is not runner and p.poll() is not None]
         if dead and not (logs.parent / 'episodes.json').is_file():

@@ -13,7 +13,7 @@ import time
 import weakref
 
 from mtv_world_ros.errors import PolicyServerError
-from mtv_world_ros.processes import last_line, StandStill, start_process
+from mtv_world_ros.processes import last_line, start_process, StoppedProcesses
 
 #: stands for the port in a command
 PORT = '{port}'
@@ -91,7 +91,7 @@ class ServerProcess:
 
     def _wait(self, process: subprocess.Popen[bytes]) -> None:
         """Waits until the server listens."""
-        deadline, still = time.monotonic() + self._start_timeout_s, StandStill()
+        deadline, stopped = time.monotonic() + self._start_timeout_s, StoppedProcesses()
         while time.monotonic() < deadline:
             status = process.poll()
             if status is not None:
@@ -99,7 +99,7 @@ class ServerProcess:
                     f"the server of policy '{self._name}' ended with status {status} when it was "
                     f"started: {last_line(self._log, 'its log is empty')} ('{self._log}')"
                 )
-            if said := still.said({f'{self._name}, its server': process}):
+            if said := stopped.report({f'{self._name}, its server': process}):
                 self.stop()
                 raise PolicyServerError(f"{said}; its log is '{self._log}'")
             if _listens(self.port):

@@ -20,9 +20,9 @@ from mtv_world_ros.processes import (
     module_command,
     private_domain,
     ros_arguments,
-    StandStill,
     start_process,
     stop_process,
+    StoppedProcesses,
 )
 
 STREAMS = ('predicted/image_raw', 'predicted/camera_info', 'trajectory/image_raw')
@@ -112,7 +112,7 @@ def _wait(
     logs: Path,
     bar: Any,
 ) -> None:
-    still = StandStill()
+    stopped = StoppedProcesses()
     while player.poll() is None:
         bar.n = (logs / 'player.log').read_bytes().count(b'trajectory is answered: ')
         bar.refresh()
@@ -120,7 +120,7 @@ def _wait(
             if process.poll() is not None:
                 stop_process(player)
                 raise EpisodeError(how_it_ended(name, process, logs))
-        if said := still.said({'player': player, **others}):
+        if said := stopped.report({'player': player, **others}):
             stop_process(player)
             raise EpisodeError(f"{said} (logs are in '{logs}')")
         time.sleep(0.2)

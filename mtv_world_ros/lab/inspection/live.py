@@ -18,9 +18,9 @@ from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.processes import (
     last_line,
     module_command,
-    StandStill,
     start_process,
     stop_process,
+    StoppedProcesses,
 )
 
 
@@ -39,10 +39,10 @@ def record_topics(
     if not seconds > 0:
         raise ConfigError(f'--seconds is {seconds}, must be positive')
     log = out.with_suffix('.log')
-    process, still = _start(views, out, log, seconds, wait_s), StandStill()
+    process, stopped = _start(views, out, log, seconds, wait_s), StoppedProcesses()
     try:
         while process.poll() is None:
-            if said := still.said({'recorder': process}):
+            if said := stopped.report({'recorder': process}):
                 raise EpisodeError(f"{said}; its log is '{log}'")
             time.sleep(0.1)
     finally:

@@ -26,9 +26,9 @@ from mtv_world_ros.files import write_whole
 from mtv_world_ros.processes import (
     last_line,
     module_command,
-    StandStill,
     start_process,
     stop_process,
+    StoppedProcesses,
 )
 from mtv_world_ros.ros.episodes.start import EpisodeStart, LiveCameras, recorded_start
 from mtv_world_ros.ros.messages.conversions import values_of
@@ -62,7 +62,7 @@ class RecorderProcess:
         self._out, self._peers = out, peers
         self._process: subprocess.Popen[bytes] | None = None
         self._bag: Path | None = None
-        self._still = StandStill()
+        self._stopped = StoppedProcesses()
 
     def start(self, topics: Sequence[str]) -> None:
         """Starts the recorder and waits until it is connected to every topic.
@@ -99,7 +99,7 @@ class RecorderProcess:
         if self._process.poll() is not None:
             status, text = self._process.returncode, last_line(self._log, 'its log is empty')
             raise EpisodeError(f'the recorder ended with status {status}: {text}')
-        if said := self._still.said({'recorder': self._process}):
+        if said := self._stopped.report({'recorder': self._process}):
             raise EpisodeError(f"{said}; its log is '{self._log}'")
 
     def end(self) -> None:
