@@ -67,7 +67,7 @@ class ToolTargets(Schema):
         return replace(tools[arm], link=self.link, T_link_tool=np.eye(4))
 
 
-def led_joints(tools: Mapping[str, ToolTargets], robot: RobotModel) -> set[str]:
+def tool_joints(tools: Mapping[str, ToolTargets], robot: RobotModel) -> set[str]:
     """Returns the joints whose positions follow from tool poses.
 
     Raises:
@@ -186,7 +186,7 @@ def joints_of_tools(
         )
     measured = states.at(stamps, robot)
     positions, warnings = measured.copy(), []
-    led = led_joints({arm: track.targets for arm, track in tools.items()}, robot)
+    led = tool_joints({arm: track.targets for arm, track in tools.items()}, robot)
     free = [name for name in robot.joint_names if name not in led]
     uncommanded = _add_others(positions, robot, free, stamps, others)
     if uncommanded:

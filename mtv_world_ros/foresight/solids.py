@@ -64,7 +64,7 @@ class Solid:
         is_open: it is hollow, and open at the top.
         is_hidden: something hid a part of it when it was found again.
         fills: (V,) how much of its outline its mask fills in each view, 0 = not seen.
-        error_px: by how much its outline misses those of the masks, root mean square.
+        error_px: root mean square distance of its outline from those of the masks.
     """
 
     centre: FloatArray
@@ -120,9 +120,9 @@ def fit_solid(
         return None
     outlines = _Outlines.of(masks, cameras, poses)
 
-    def misses(numbers: FloatArray, outline: FloatArray) -> FloatArray:
+    def residuals(numbers: FloatArray, outline: FloatArray) -> FloatArray:
         stands = (numbers[..., -1:] - floor) / _STANDS_M
-        return np.concatenate([outlines.misses(_in_space(numbers, outline)), stands], -1)
+        return np.concatenate([outlines.residuals(_in_space(numbers, outline)), stands], -1)
 
     height = max(2 * (float(point[2]) - floor), 2 * _LEAST_M)
     best = None
@@ -133,8 +133,8 @@ def fit_solid(
             sizes = slice(2 if turn is None else 3, -1)
             least = np.full(len(given), -np.inf)
             least[sizes] = _LEAST_M
-            found = _nearest(
-                partial(misses, outline=outline),
+            found = _least_squares(
+                partial(residuals, outline=outline),
                 given,
                 bounds=(least, np.inf),
                 x_scale=np.where(np.isfinite(least), 0.01, 0.1),
@@ -182,10 +182,10 @@ def find_solid(
     if solid.is_round:
         outline, size = _ROUND, np.array([wide, height])
 
-    def misses(places: FloatArray) -> FloatArray:
+    def residuals(places: FloatArray) -> FloatArray:
         sizes = np.broadcast_to(size, (*places.shape[:-1], len(size)))
         numbers = np.concatenate([places[..., :-1], sizes, places[..., -1:]], -1)
-        return outlines.misses(_in_space(numbers, outline))
+        return outlines.residuals(_in_space(numbers, outline))
 
     is_known = bool(np.isfinite(point).all())
     likely = point if is_known else _at_size(solid, masks, cameras, poses)
@@ -195,7 +195,9 @@ def find_solid(
         given = np.array([*centre[:2], *given, max(centre[2] - height / 2, floor)])
         least = [*[-np.inf] * (len(given) - 1), floor - _STANDS_M]
         scale = [0.01, 0.01, *([] if solid.is_round else [0.1]), 0.01]
-        found = _nearest(misses, given, bounds=(least, np.inf), x_scale=scale, loss='cauchy')
+        found = _least_squares(
+            residuals, given, bounds=(least, np.inf), x_scale=scale, loss='cauchy'
+        )
         # a square looks the same after a quarter turn: the smallest turn is taken
         if best is None or found.cost < _BETTER * best.cost:
             best = found
@@ -280,22 +282,24 @@ class _Outlines:
         reach = np.concatenate([_reach(_corners(masks[view])) + _PIXEL for view in seen])
         return cls(tuple((cameras[view], poses[view]) for view in seen), reach)
 
-    def misses(self, corners: FloatArray) -> FloatArray:
+    def residuals(self, corners: FloatArray) -> FloatArray:
         """(..., N) how far the outline of points (..., M, 3) reaches beyond them [px]."""
         found = [_reach(project(camera, pose, corners)[0]) for camera, pose in self.views]
         return np.nan_to_num(np.concatenate(found, -1) - self.reach, nan=1e3)
 
 
-def _nearest(misses: Callable[[FloatArray], FloatArray], given: FloatArray, **how: Any) -> Any:
+def _least_squares(
+    residuals: Callable[[FloatArray], FloatArray], given: FloatArray, **how: Any
+) -> Any:
     """Least squares from initial parameters (N,); finite differences in one batch."""
 
     def slopes(numbers: FloatArray) -> FloatArray:
         steps = _DIFFERENCE * np.maximum(1.0, np.abs(numbers))
-        rows = misses(np.concatenate([numbers[None], numbers + np.diag(steps)]))
+        rows = residuals(np.concatenate([numbers[None], numbers + np.diag(steps)]))
         return ((rows[1:] - rows[0]) / steps[:, None]).T
 
     return least_squares(
-        misses,
+        residuals,
         given,
         jac=slopes,  # type: ignore[arg-type]
         max_nfev=_MAX_EVALUATIONS,

@@ -51,10 +51,10 @@ class ObjectMotion:
     def moves(self) -> BoolArray:
         """Returns (T, O) whether an object is elsewhere than at first, by more than an error."""
         turned = np.einsum('toii->to', self.rotations) < 1 + 2 * np.cos(_STILL_RAD)
-        return (np.linalg.norm(self.ways, axis=-1) > _STILL_M) | turned
+        return (np.linalg.norm(self.displacements, axis=-1) > _STILL_M) | turned
 
     @property
-    def ways(self) -> FloatArray:
+    def displacements(self) -> FloatArray:
         """(T, O, 3) from where they were at the reference [m]."""
         return self.points - self.reference
 
@@ -67,10 +67,10 @@ class ObjectMotion:
         """Returns some of the frames, with the same reference."""
         return self._of([rows[frames] for rows in self._rows])
 
-    def begun_at(self, last: ObjectMotion, steps: int) -> ObjectMotion:
+    def blended_from(self, last: ObjectMotion, steps: int) -> ObjectMotion:
         """Returns the motion blended from the last row of another into itself within `steps`."""
         left = np.clip(1 - np.arange(len(self.points)) / steps, 0.0, 1.0)
-        way = np.nan_to_num(last.ways[-1] - self.ways[0])
+        way = np.nan_to_num(last.displacements[-1] - self.displacements[0])
         turns = Rotation.from_matrix(self.rotations[0].swapaxes(-1, -2) @ last.rotations[-1])
         parts = left[:, None, None] * turns.as_rotvec()
         turned = Rotation.from_rotvec(parts.reshape(-1, 3)).as_matrix()
@@ -270,7 +270,7 @@ class FoundObjects:
         motion = self.motions[self.shown][self.part_row :]
         if self.shown != self.shown_before:
             last = self.motions[self.shown_before][: self.part_row + 1]
-            motion = motion.begun_at(last, round(_PASSAGE_S / self.tracked.step_s))
+            motion = motion.blended_from(last, round(_PASSAGE_S / self.tracked.step_s))
         rows = np.rint(times / self.tracked.step_s).astype(int)
         shown = motion[np.minimum(rows, len(motion.points) - 1)]
         return moved_pictures(self.cuts, shown, cameras, self.poses, poses)
@@ -304,7 +304,7 @@ class FoundObjects:
 def _apart(motions: Sequence[ObjectMotion]) -> FloatArray:
     """(K, K, O) how far poses are apart at the ends of motions [m]; those not known are not."""
     turns = np.stack([motion.rotations[-1].reshape(-1, 9) for motion in motions])
-    ways = np.stack([motion.ways[-1] for motion in motions])
+    ways = np.stack([motion.displacements[-1] for motion in motions])
     ends = np.concatenate([ways, _RADIUS_M * turns], axis=-1)
     apart = np.linalg.norm(ends[:, None] - ends[None], axis=-1)
     return np.nan_to_num(np.minimum(apart, _ELSEWHERE_M))

@@ -235,18 +235,18 @@ def test_pictures_pass_gradually_from_one_motion_to_another(camera):
     np.testing.assert_allclose(np.array(at) - at[-1], [16, 8, 0, 0], atol=0.1)
 
 
-def test_a_motion_begun_at_another_one_turns_to_what_it_is():
+def test_a_motion_blended_from_another_one_turns_to_what_it_is():
     points, half = np.zeros((5, 1, 3)), about_z(np.pi / 2)
     still = ObjectMotion(
         reference=points[0], points=points, rotations=np.tile(np.eye(3), (5, 1, 1, 1))
     )
     turned = replace(still, points=points + 0.1, rotations=np.tile(half, (5, 1, 1, 1)))
-    passing = still.begun_at(turned, 2)
+    passing = still.blended_from(turned, 2)
     np.testing.assert_allclose(passing.points[:, 0, 0], [0.1, 0.05, 0, 0, 0])
     turns = [about_z(np.pi / 2), about_z(np.pi / 4), *[np.eye(3)] * 3]
     np.testing.assert_allclose(passing.rotations[:, 0], turns, atol=1e-9)
     unknown = replace(still, points=np.full_like(points, np.nan))
-    np.testing.assert_array_equal(still.begun_at(unknown, 2).points, points)
+    np.testing.assert_array_equal(still.blended_from(unknown, 2).points, points)
 
 
 def test_pictures_are_those_of_the_motion_that_is_shown(camera):

@@ -19,7 +19,7 @@ from pydantic import (
 from mtv_world_ros.config import ListOf, read_yaml, validated, wrong
 from mtv_world_ros.data.bag_mapping import Written
 from mtv_world_ros.data.episode import check_outcome
-from mtv_world_ros.data.tool_targets import add_tool_poses, led_joints
+from mtv_world_ros.data.tool_targets import add_tool_poses, tool_joints
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import ConfigError, nearest
 from mtv_world_ros.files import bundled
@@ -56,7 +56,7 @@ class ActionStream(Stream):
     )
 
     def _needed(self, robot: RobotModel) -> Sequence[str]:
-        led = led_joints(self.tools, robot)
+        led = tool_joints(self.tools, robot)
         both = sorted(led & set(self.joints or ()))
         if both:
             raise ValueError(f'joints {both} follow from the poses of `tools`; give one of both')
