@@ -27,6 +27,7 @@ import time
 import numpy as np
 
 from mtv_world_ros.assembly import checkpoint_path
+from mtv_world_ros.cli.shared_options import machine
 from mtv_world_ros.files import content_digest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -149,14 +150,9 @@ def old_checkout() -> Iterator[Path]:
 
 
 def machine_line() -> str:
-    """Processor, cores and versions."""
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path('/proc/cpuinfo')
-    if cpuinfo.is_file():
-        names = [row for row in cpuinfo.read_text().splitlines() if row.startswith('model name')]
-        model = names[0].split(':', 1)[1].strip() if names else model
+    """Processor, cores, system, load and version of Python."""
     load = f', load {os.getloadavg()[0]:.1f}' if hasattr(os, 'getloadavg') else ''
-    return f'{model}, {os.cpu_count()} cores{load}; Python {platform.python_version()}'
+    return f'{machine()}{load}; Python {platform.python_version()}'
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mtv_world_ros.bench.expert.faults.edited_move import ring, UP
 from mtv_world_ros.bench.expert.faults.second_arm import Visit
 from mtv_world_ros.bench.expert.faults.variant_faults import WayPointFaults
 from mtv_world_ros.bench.expert.way_points import WayPoint
@@ -15,7 +16,7 @@ from mtv_world_ros.bench.tasks.tasks import Move, PickPlace, Shake, Task
 from mtv_world_ros.bench.world.physics import physics_named
 from mtv_world_ros.bench.world.placement import side_of
 from mtv_world_ros.bench.world.scene import Place, Scene, SceneObject
-from mtv_world_ros.bench.world.workcell import Workcell, workcell_of
+from mtv_world_ros.bench.world.workcell import workcell_of
 from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import SimulatorError, TrajectoryError
@@ -80,60 +81,6 @@ def tool_offset(subject: SceneObject, yaw: float) -> FloatArray:
     out = grasp.offset(subject.size, side_of(subject))
     height = (grasp.height - 0.5) * subject.size[2]
     return np.array([out * np.cos(yaw), out * np.sin(yaw), height])
-
-
-def pick_of(subject: SceneObject, arm: str, max_gap: float, config: PickingConfig) -> Pick:
-    """Returns how an object is taken.
-
-    Args:
-        subject: what is taken, where it lies.
-        arm: that takes it.
-        max_gap: way of one finger from closed to open [m].
-        config: gaps.
-    """
-    yaw, grasp = tool_yaw(subject), grasp_of(subject)
-    gap = grasp.width(subject.size) / 2 + config.release
-    return Pick(
-        arm=arm,
-        position=np.asarray(subject.position) + tool_offset(subject, yaw),
-        yaw=yaw,
-        opening=grasp.opening,
-        released=min(1.0, gap / max_gap),
-    )
-
-
-def miss_shift(
-    subject: SceneObject,
-    others: Sequence[SceneObject],
-    max_gap: float,
-    workcell: Workcell,
-    config: PickingConfig,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """Returns the sideways shift (3,) [m] with which the closing fingers miss the subject.
-
-    Past a rim it goes outwards, past anything else across the fingers' travel, to the side with
-    more room.
-    """
-    yaw, grasp = tool_yaw(subject), grasp_of(subject)
-    margin = float(rng.uniform(*config.miss_margin))
-    if grasp.rim_m is not None:
-        side = np.sign(grasp.offset(subject.size, side_of(subject)))
-        inner = grasp.opening * max_gap + workcell.finger_thickness_m
-        return side * (grasp.rim_m / 2 + inner + margin) * _direction(yaw)
-    distance = min(subject.size[1] / 2 + workcell.finger_width_m / 2 + margin, config.max_miss)
-    across = distance * _direction(yaw + np.pi / 2)
-    place = np.asarray(subject.position)
-
-    def room(shift: FloatArray) -> float:
-        gaps = [np.linalg.norm((place + shift - item.position)[:2]) for item in others]
-        return float(min(gaps, default=1.0))
-
-    return max((across, -across), key=room)
-
-
-def _direction(yaw: float) -> FloatArray:
-    return np.array([np.cos(yaw), np.sin(yaw), 0.0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,10 +148,6 @@ def home_positions(robot: RobotModel) -> FloatArray:
         if tool.gripper_joint is not None:
             positions[robot.joint_names.index(tool.gripper_joint)] = tool.gripper_open
     return positions
-
-
-def _rise(height: float) -> FloatArray:
-    return np.array([0.0, 0.0, height])
 
 
 def _missed_move(task: Task, rng: np.random.Generator) -> int:
@@ -319,14 +262,51 @@ class Expert:
         self, now: dict[str, SceneObject], move: Move, rng: np.random.Generator, *, miss: bool
     ) -> Pick:
         subject, config = now[move.subject], self._config.picking
-        arm = self.workcell.arm_at(subject.position[0])
-        gap = self._max_gap[arm]
-        pick = pick_of(subject, arm, gap, config)
-        if not miss:
-            return pick
-        others = [item for item in now.values() if item is not subject]
-        shift = miss_shift(subject, others, gap, self.workcell, config, rng)
-        return replace(pick, position=pick.position + shift)
+        arm, yaw, grasp = (
+            self.workcell.arm_at(subject.position[0]),
+            tool_yaw(subject),
+            grasp_of(subject),
+        )
+        position = np.asarray(subject.position) + tool_offset(subject, yaw)
+        if miss:
+            others = [item for item in now.values() if item is not subject]
+            position = position + self._miss_shift(subject, others, self._max_gap[arm], rng)
+        gap = grasp.width(subject.size) / 2 + config.release
+        return Pick(
+            arm=arm,
+            position=position,
+            yaw=yaw,
+            opening=grasp.opening,
+            released=min(1.0, gap / self._max_gap[arm]),
+        )
+
+    def _miss_shift(
+        self,
+        subject: SceneObject,
+        others: Sequence[SceneObject],
+        max_gap: float,
+        rng: np.random.Generator,
+    ) -> FloatArray:
+        """The sideways shift (3,) [m] with which the closing fingers miss the subject.
+
+        Past a rim it goes outwards, past anything else across the fingers' travel, to the side
+        with more room.
+        """
+        yaw, grasp, config = tool_yaw(subject), grasp_of(subject), self._config.picking
+        margin = float(rng.uniform(*config.miss_margin))
+        if grasp.rim_m is not None:
+            side = np.sign(grasp.offset(subject.size, side_of(subject)))
+            inner = grasp.opening * max_gap + self.workcell.finger_thickness_m
+            return side * (grasp.rim_m / 2 + inner + margin) * ring(yaw)
+        distance = subject.size[1] / 2 + self.workcell.finger_width_m / 2 + margin
+        across = min(distance, config.max_miss) * ring(yaw + np.pi / 2)
+        place = np.asarray(subject.position)
+
+        def room(shift: FloatArray) -> float:
+            gaps = [np.linalg.norm((place + shift - item.position)[:2]) for item in others]
+            return float(min(gaps, default=1.0))
+
+        return max((across, -across), key=room)
 
     def _stops(
         self,
@@ -338,7 +318,7 @@ class Expert:
     ) -> list[WayPoint]:
         config, place, yaw, wide = self._config, pick.position, pick.yaw, pick.opening
         heights = config.lift if isinstance(move, PickPlace) else move.lift
-        above, lift = (_rise(rng.uniform(*r)) for r in (config.above_grasp, heights))
+        above, lift = (rng.uniform(*r) * UP for r in (config.above_grasp, heights))
         start = [
             WayPoint('above', place + above, yaw, wide),
             WayPoint('grasp', place, yaw, wide),
@@ -346,12 +326,11 @@ class Expert:
         ]
         if isinstance(move, Shake):
             middle = self._swings(move, pick, place + lift, -side_of(now[move.subject]))
-            down, turned = place + _rise(0.002), yaw
+            down, turned = place + 0.002 * UP, yaw
         else:
             down, turned = self._place(pick, move, now, goal)
-            pre_place = down + _rise(
-                config.above_place if move.rest != 'in' else config.above_drop
-            )
+            above_goal = config.above_place if move.rest != 'in' else config.above_drop
+            pre_place = down + above_goal * UP
             lifted = np.array([*place[:2], max(place[2] + lift[2], pre_place[2])])
             middle = [
                 WayPoint('lift', lifted, yaw, 0.0),
@@ -363,7 +342,7 @@ class Expert:
             *middle,
             WayPoint('lower', down, turned, 0.0),
             WayPoint('open', down, turned, pick.released, config.open_s),
-            WayPoint('retreat', down + _rise(config.retreat), turned, 1.0),
+            WayPoint('retreat', down + config.retreat * UP, turned, 1.0),
             WayPoint('home', home, 0.0, 1.0),
         ]
 
@@ -393,7 +372,7 @@ class Expert:
             if move.rest == 'in':
                 top = reference.position[2] + reference.size[2] / 2
                 rest = np.array([*goal[:2], top + self._config.drop + subject.size[2] / 2])
-        return rest + tool_offset(subject, turned) + _rise(0.002), turned
+        return rest + tool_offset(subject, turned) + 0.002 * UP, turned
 
     def _timed(self, stops: list[WayPoint], home: FloatArray) -> list[float]:
         """Time of each segment before scaling [s]."""

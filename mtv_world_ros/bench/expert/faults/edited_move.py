@@ -127,7 +127,8 @@ class EditedMove:
 OfMove = Callable[[EditedMove], FloatArray]
 
 
-def _ring(angle: float) -> FloatArray:
+def ring(angle: float) -> FloatArray:
+    """Returns the unit vector (3,) in the plane at an angle [rad] from x."""
     return np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
@@ -140,19 +141,19 @@ def _between(move: EditedMove, begin: str, end: str) -> FloatArray:
 
 
 def _drawn(move: EditedMove) -> FloatArray:
-    return _ring(move.draws.play.uniform(0.0, 2 * np.pi))
+    return ring(move.draws.play.uniform(0.0, 2 * np.pi))
 
 
 def _anywhere(move: EditedMove) -> FloatArray:
-    return _ring(move.draws.angle)
+    return ring(move.draws.angle)
 
 
 def _along(move: EditedMove) -> FloatArray:
-    return move.draws.sign * _ring(move.draws.yaw)
+    return move.draws.sign * ring(move.draws.yaw)
 
 
 def _across(move: EditedMove) -> FloatArray:
-    return move.draws.sign * _left(_ring(move.draws.yaw))
+    return move.draws.sign * _left(ring(move.draws.yaw))
 
 
 def _anew(move: EditedMove) -> float:
