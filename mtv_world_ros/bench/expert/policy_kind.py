@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 from mtv_world_ros.bench.expert.expert import Expert
-from mtv_world_ros.bench.expert.faults.catalogue import parse_variant, refuse_kinds
+from mtv_world_ros.bench.expert.faults.catalogue import parse_variant, refuse_test_kinds
 from mtv_world_ros.bench.expert.scripted_policy import policy_of_recording, scripted_policy
 from mtv_world_ros.errors import PolicyError
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.policies.policy import EpisodeOrigin, Policy, ScriptedPolicySettings
+
+__all__ = ['check', 'fault_kinds', 'policy_maker', 'refuse_test_kinds']
 
 
 def check(settings: ScriptedPolicySettings) -> None:
@@ -49,16 +51,3 @@ def fault_kinds(variant: str) -> tuple[str, ...]:
         PolicyError: it has an unknown fault.
     """
     return parse_variant(variant).kinds
-
-
-def refuse_test_kinds(variants: Iterable[str], what: str) -> None:
-    """Refuses variants with faults of the split `test`.
-
-    Args:
-        variants: names of policies.
-        what: purpose that they are refused for, e.g. `training`.
-
-    Raises:
-        PolicyError: names the policies and their kinds.
-    """
-    refuse_kinds(variants, 'test', what)

@@ -18,7 +18,7 @@ from mtv_world_ros.bench.expert.faults.variant_faults import (
 from mtv_world_ros.bench.shapes import SHAPES
 from mtv_world_ros.bench.tasks.tasks import Move, PickPlace, START, Task, task_named
 from mtv_world_ros.bench.world.placement import goals_of
-from mtv_world_ros.bench.world.randomize import draw_scene, instruction_of, RandomizationConfig
+from mtv_world_ros.bench.world.randomize import draw_scene, instruction_of
 from mtv_world_ros.bench.world.recorded_scene import recorded_scene
 from mtv_world_ros.bench.world.scene import Place, Scene
 from mtv_world_ros.bench.world.simulator import scene_generator
@@ -240,7 +240,6 @@ def scripted_policy(
     task: str,
     seed: int,
     expert: Expert,
-    randomization: RandomizationConfig | None = None,
     hold_s: float = HOLD_S,
 ) -> ScriptedPolicy:
     """Returns the policy of a name, for the scene that the simulator draws for a task and a seed.
@@ -250,7 +249,6 @@ def scripted_policy(
         task: name of a task.
         seed: of the episode, as `SimEpisode.reset` takes it and a recorded episode has it.
         expert: the scripted expert, which plans.
-        randomization: as the simulator's.
         hold_s: from the end of the plan to the end of the episode [s].
 
     Raises:
@@ -258,7 +256,7 @@ def scripted_policy(
         SimulatorError: no such task, or no scene for this seed.
     """
     variant, kind = parse_variant(name), task_named(task)
-    scene = draw_scene(kind, scene_generator(seed), expert.workcell, randomization)
+    scene = draw_scene(kind, scene_generator(seed), expert.workcell)
     return ScriptedPolicy(variant, expert, kind, scene, hold_s)
 
 

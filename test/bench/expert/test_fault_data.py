@@ -14,7 +14,7 @@ from mtv_world_ros.bench.expert.faults.catalogue import (
     parse_variant,
     policies_of,
     PolicyVariant,
-    refuse_kinds,
+    refuse_test_kinds,
 )
 from mtv_world_ros.bench.expert.faults.commands import COMMANDS
 from mtv_world_ros.bench.expert.faults.drawn import NUM_DRAWN
@@ -175,7 +175,7 @@ def test_kinds_drawn_from_a_seed_are_of_the_split_test_and_their_name_gives_them
     assert FAULTS[names[0]] == FAULTS['drawn_5_0'] != FAULTS['drawn_6_0']
     assert {FAULTS[name].split for name in names} == {'test'}
     with pytest.raises(PolicyError, match='split test are not for training'):
-        refuse_kinds(['expert-drawn_5_0-1'], 'test', 'training')
+        refuse_test_kinds(['expert-drawn_5_0-1'], 'training')
     assert not {*names} & {*kinds_of('test')}
     assert len(policies_of('drawn:5')) == 1 + 2 * NUM_DRAWN
     with pytest.raises(PolicyError, match='known are .* drawn:SEED'):

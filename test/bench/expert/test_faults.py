@@ -18,7 +18,7 @@ from mtv_world_ros.bench.expert.faults.catalogue import (
     kinds_of,
     parse_variant,
     PolicyVariant,
-    refuse_kinds,
+    refuse_test_kinds,
     SPLITS,
 )
 from mtv_world_ros.bench.expert.faults.variant_faults import WayPointFaults, with_faults
@@ -534,10 +534,10 @@ def test_random_policies_are_of_the_kinds_asked_for():
 
 
 def test_test_kinds_are_refused_by_name():
-    refuse_kinds(['expert', 'expert-high-0.02'], 'test', 'training')
+    refuse_test_kinds(['expert', 'expert-high-0.02'], 'training')
     said = r"split test are not for training: 'expert-high-0.1-shed-0.03' has shaken_off_over_goal"
     with pytest.raises(PolicyError, match=said):
-        refuse_kinds(['expert', 'expert-high-0.1-shed-0.03'], 'test', 'training')
+        refuse_test_kinds(['expert', 'expert-high-0.1-shed-0.03'], 'training')
 
 
 def test_unknown_kinds_and_splits_name_the_nearest():

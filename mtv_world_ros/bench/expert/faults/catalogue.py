@@ -289,27 +289,27 @@ def policies_of(split: str) -> tuple[str, ...]:
     return (EXPERT, *(PolicyVariant.of({kind: size}).name for kind, size in faults))
 
 
-def refuse_kinds(names: Iterable[str], split: str, what: str) -> None:
-    """Refuses policies with faults of a split.
+def refuse_test_kinds(names: Iterable[str], what: str) -> None:
+    """Refuses policies with faults of the split `test`.
 
     Args:
         names: names of policies.
-        split: split whose kinds are refused.
         what: purpose that they are refused for, e.g. `training`.
 
     Raises:
         PolicyError: names the policies and their kinds.
     """
+    test, *others = SPLITS[::-1]
     found = {
         name: bad
         for name in names
-        if (bad := [k for k in parse_variant(name).kinds if FAULTS[k].split == split])
+        if (bad := [k for k in parse_variant(name).kinds if FAULTS[k].split == test])
     }
     if found:
         listed = '; '.join(f"'{name}' has {', '.join(kinds)}" for name, kinds in found.items())
         raise PolicyError(
-            f'fault kinds of the split {split} are not for {what}: {listed}; choose kinds of '
-            f'{", ".join(s for s in SPLITS if s != split)} (config/faults)'
+            f'fault kinds of the split {test} are not for {what}: {listed}; choose kinds of '
+            f'{", ".join(others[::-1])} (config/faults)'
         )
 
 
