@@ -358,11 +358,106 @@ def make_trajectory(*, stamp_ns=0, names=JOINTS, seconds=CHUNK_S, times=None, po
     return message
 
 
+class Forks:
+    """Starts nodes as forks of a process that has imported them: imports take most of a start.
+
+    Args:
+        code: defines `start(words) -> status`; modules of this folder can be imported.
+    """
+
+    def __init__(self, code):
+        environment = {**ENVIRONMENT, 'PYTHONPATH': f'{FAKE.parent}:{ENVIRONMENT["PYTHONPATH"]}'}
+        self._process = subprocess.Popen(
+            [sys.executable, '-c', f'print(flush=True)\n{code}{FORKING}'], env=environment,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        self._process.stdout.readline()  # from now on it has its own name in /proc
+
+    def ask(self, **asked):
+        self._process.stdin.write(json.dumps(asked) + '\n')
+        self._process.stdin.flush()
+        return json.loads(self._process.stdout.readline())
+
+    def start(self, words, log):
+        return Fork(self, self.ask(words=words, log=str(log), environment=ENVIRONMENT))
+
+    def run(self, folder, *words):
+        """Returns the exit status of a node that ends by itself, and all that it said."""
+        log = folder / f'{time.monotonic_ns()}.log'
+        return self.start(words, log).wait(120), log.read_text()
+
+    def close(self):
+        self._process.stdin.close()
+        assert self._process.wait(60) == 0
+        self._process.stdout.close()
+
+
+FORKING = """
+import json, os, sys
+for line in sys.stdin:
+    asked = json.loads(line)
+    if 'words' in asked:
+        answer = os.fork()
+        if not answer:
+            log = os.open(asked['log'], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+            os.dup2(log, 1)
+            os.dup2(log, 2)
+            os.environ.update(asked['environment'])
+            sys.exit(start(asked['words']))
+    else:
+        pid, status = os.waitpid(asked['pid'], os.WNOHANG)
+        answer = os.waitstatus_to_exitcode(status) if pid else None
+    print(json.dumps(answer), flush=True)
+"""
+
+
+class Fork:
+    """A forked node, with what tests use of `Popen`."""
+
+    def __init__(self, forks, pid):
+        self._forks, self.pid, self.returncode = forks, pid, None
+
+    def poll(self):
+        if self.returncode is None:
+            self.returncode = self._forks.ask(pid=self.pid)
+        return self.returncode
+
+    def wait(self, timeout):
+        end = time.monotonic() + timeout
+        while self.poll() is None:
+            if time.monotonic() > end:
+                raise subprocess.TimeoutExpired(f'node {self.pid}', timeout)
+            time.sleep(0.02)
+        return self.returncode
+
+    def send_signal(self, number):
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self):
+        self.send_signal(signal.SIGKILL)
+
+
+#: forks nodes with the fake world model while tests run
+FORKS = []
+
+
+@pytest.fixture(scope='session', autouse=True)
+def forks_of_the_fake():
+    FORKS.append(Forks('import fake_world_model as f\nstart = lambda w: f.main(w, load=f.load)\n'))
+    yield
+    FORKS.pop().close()
+
+
 class NodeProcess:
     """The node as its own process."""
 
     def __init__(self, command, log):
         self._log = log.open('w+')
+        if FORKS and command[1] == str(FAKE):
+            self.process = FORKS[0].start(command[1:], log)
+            return
         self.process = subprocess.Popen(
             command, stdout=self._log, stderr=subprocess.STDOUT, env=ENVIRONMENT
         )
@@ -376,52 +471,6 @@ class NodeProcess:
     def output(self):
         self._log.seek(0)
         return self._log.read()
-
-
-class Forks:
-    """Nodes that end by themselves, forked from a process that has imported them already.
-
-    Args:
-        code: defines `start(words) -> status`; modules of this folder can be imported.
-    """
-
-    def __init__(self, code):
-        environment = {**ENVIRONMENT, 'PYTHONPATH': f'{FAKE.parent}:{ENVIRONMENT["PYTHONPATH"]}'}
-        self._process = subprocess.Popen(
-            [sys.executable, '-c', code + FORKING], env=environment, text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        )  # fmt: skip
-
-    def run(self, *words):
-        """Returns the exit status and all that was said."""
-        self._process.stdin.write(json.dumps(words) + '\n')
-        self._process.stdin.flush()
-        return json.loads(self._process.stdout.readline())
-
-    def close(self):
-        self._process.stdin.close()
-        assert self._process.wait(60) == 0
-        self._process.stdout.close()
-
-
-FORKING = """
-import json, os, sys, tempfile, traceback
-for line in sys.stdin:
-    with tempfile.TemporaryFile() as said:
-        child, status = os.fork(), 1
-        if not child:
-            os.dup2(said.fileno(), 1)
-            os.dup2(said.fileno(), 2)
-            try:
-                status = start(json.loads(line))
-            except BaseException:
-                traceback.print_exc()
-            sys.stdout.flush()
-            os._exit(status)
-        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        said.seek(0)
-        print(json.dumps([status, said.read().decode()]), flush=True)
-"""
 
 
 def start_node(folder, *parameters, program=(str(FAKE),), remaps=()):

@@ -45,7 +45,7 @@ def test_an_empty_list_is_an_empty_list(forks, tmp_path, in_file):
             file = tmp_path / f'{node}.yaml'
             file.write_text(yaml.safe_dump({node: {'ros__parameters': {name: []}}}))
             given = ['--params-file', str(file)] if in_file else ['-p', f'{name}:=[]']
-            status, out = forks.run(node, '--ros-args', *given)
+            status, out = forks.run(tmp_path, node, '--ros-args', *given)
             assert status == 0 and f'"{name}":[]' in out, out
             asked += 1
     assert asked
@@ -64,8 +64,8 @@ def test_an_empty_list_is_an_empty_list(forks, tmp_path, in_file):
         ('seed:={a: 1}', 'expected -p NAME:=VALUE'),
     ],
 )
-def test_what_cannot_be_a_value_is_one_line_that_says_what_can(forks, given, said):
-    status, out = forks.run('world_model', '--ros-args', '-p', given)
+def test_what_cannot_be_a_value_is_one_line_that_says_what_can(forks, tmp_path, given, said):
+    status, out = forks.run(tmp_path, 'world_model', '--ros-args', '-p', given)
     assert status == 1
     assert said in out and 'Traceback' not in out
     assert out.splitlines()[-1].startswith('ConfigError: ')

@@ -30,13 +30,6 @@ def start(tmp_path, ros):
         process.stop()
 
 
-@pytest.fixture(scope='module')
-def forks(ros):
-    forks = ros.Forks('import fake_world_model as f\nstart = lambda w: f.main(w, load=f.load)\n')
-    yield forks
-    forks.close()
-
-
 @pytest.fixture
 def new_client(ros):
     client = ros.Client()
@@ -173,9 +166,10 @@ def test_qos_overrides_and_latched_instruction(start, new_client, ros):
         (f'qos_overrides.{PREDICTED}.publisher.reliability:=maybe', 'maybe'),
     ],
 )
-def test_wrong_parameter_at_start_is_one_clear_line(ros, forks, tmp_path, parameter, said):
-    status, output = forks.run('node', '--ros-args', *ros.node_options(tmp_path, parameter))
-    assert status == 1
+def test_wrong_parameter_at_start_is_one_clear_line(start, parameter, said):
+    process = start(parameter)
+    assert process.process.wait(timeout=120) == 1
+    output = process.output()
     assert said in output
     assert 'Traceback' not in output
 
