@@ -24,7 +24,9 @@ from mtv_world_ros.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.geometry.camera import camera_poses, scaled
+from mtv_world_ros.geometry.mask_geometry import centroids
+from mtv_world_ros.geometry.object_tracks import track_points
 from mtv_world_ros.geometry.resample import match_joints, nearest_rows
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.rendering.images import resize_frames, resize_labels
@@ -56,7 +58,8 @@ class Recording:
         positions: (N, J) measured joint positions at `times`.
         commands: the policy's joint commands; times on the same clock.
         stamp_ns: stamp of the first frame.
-        object_poses: (N, O, 4, 4) T_base_object [m] at `times`; None where not recorded.
+        object_poses: (N, O, 4, 4) T_base_object [m] at `times`: recorded, or of masks in two
+            views, then NaN until seen; None where neither is there.
         warnings: problems found and how the reader handled them.
         recorded: V views as they were recorded, and their cameras; empty = from a cache.
     """
@@ -182,6 +185,7 @@ def load_recording(
         raise EpisodeError(f"episode '{path}' has no frames of view '{spec.views[0]}'")
     frames = [_on_clock(episode, view, stamps, spec) for view in spec.views]
     origin = int(stamps[0])
+    positions = measured_positions(episode, robot, stamps)
     return Recording(
         path=Path(path),
         task=episode.info.task,
@@ -194,10 +198,10 @@ def load_recording(
         times=np.asarray((stamps - origin) * 1e-9, np.float64),
         frames=np.stack(frames),
         object_ids=_object_ids(episode, stamps, spec),
-        positions=measured_positions(episode, robot, stamps),
+        positions=positions,
         commands=stitched_commands(episode, robot, origin),
         stamp_ns=origin,
-        object_poses=_object_poses(episode, stamps),
+        object_poses=_object_poses(episode, robot, spec.views, stamps, positions),
         masks_by=episode.info.metadata.get(MASKS_BY, ''),
         camera_tracks={
             view: track[nearest_rows(np.asarray(episode.images[view].stamps_ns), stamps)]
@@ -227,12 +231,39 @@ def _object_ids(episode: Episode, stamps: np.ndarray, spec: WorldModelSpec) -> B
     return np.stack(rows)
 
 
-def _object_poses(episode: Episode, stamps: np.ndarray) -> FloatArray | None:
-    """(N, O, 4, 4) of the instants nearest to the frames."""
+def _object_poses(
+    episode: Episode,
+    robot: RobotModel,
+    views: Sequence[str],
+    stamps: np.ndarray,
+    positions: FloatArray,
+) -> FloatArray | None:
+    """(N, O, 4, 4) of the instants nearest to the frames; not turned where masks alone tell."""
     found = episode.object_poses
-    if found is None or len(found.stamps_ns) == 0:
+    if found is not None and len(found.stamps_ns):
+        return found.T_base_object[nearest_rows(found.stamps_ns, stamps)]
+    still = [view for view in views if view not in episode.camera_tracks]
+    seen = [view for view in still if episode.masks and view in episode.masks]
+    if len(seen) < 2 or not episode.info.objects:
         return None
-    return found.T_base_object[nearest_rows(found.stamps_ns, stamps)]
+    cameras = [episode.cameras[view] for view in seen]
+    poses = np.stack([camera_poses(camera, robot, positions) for camera in cameras])
+    pixels = np.stack([_middles(episode, view, stamps) for view in seen])
+    points = track_points(cameras, poses, pixels)
+    if not np.isfinite(points).any():
+        return None
+    tracked = np.tile(np.eye(4), (*points.shape[:2], 1, 1))
+    tracked[..., :3, 3] = points
+    return tracked
+
+
+def _middles(episode: Episode, view: str, stamps: np.ndarray) -> FloatArray:
+    """(N, O, 2) middles of a view's masks at the frames [px], NaN = not seen."""
+    assert episode.masks is not None
+    own_stamps, ids = episode.masks[view]
+    numbers = np.arange(len(episode.info.objects))[:, None, None] + 1
+    rows = nearest_rows(np.asarray(own_stamps), stamps)
+    return np.stack([centroids(np.asarray(ids[row]) == numbers) for row in rows])
 
 
 def stitched_commands(episode: Episode, robot: RobotModel, origin_ns: int) -> JointTrajectory:

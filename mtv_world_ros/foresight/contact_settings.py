@@ -50,6 +50,18 @@ class ContactSettings(Schema):
     rim_m: Thickness = Field(default=0.01, description='thickness of the rim of plates and bowls')
     wall_m: Thickness = Field(default=0.005, description='of the walls of cups and of boxes')
     table_m: Metres = Field(default=0.0, description='its height in the base frame [m]')
+    table_varies: bool = Field(
+        default=False,
+        description='it stands at another height in each recording: it is where objects of the '
+        'first frame end below, and arms do not touch it',
+    )
+    squeeze: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description='share of its travel by which a gripper that is not open closes further than '
+        'it is told: measured positions that stand for commands stop at what is held',
+    )
     delay_s: float = Field(
         default=0.0, ge=0, le=1, description='by which commands take effect later [s]'
     )

@@ -16,6 +16,8 @@ from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.library import mujoco, Rollout
 from mtv_world_ros.foresight.scene import Scene, STEP_S
 
+#: a gripper that is closed by this share of its travel squeezes in full
+_CLOSED = 0.2
 #: steps of the engine in a period of commands
 SUBSTEPS = round(PERIOD_S / STEP_S)
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
@@ -92,7 +94,7 @@ class CoursePlanner:
     """
 
     def __init__(self, scene: Scene, settings: ContactSettings) -> None:
-        self._scene = scene
+        self._scene, self._squeeze = scene, settings.squeeze
         self._model = scene.model_of(settings, ())
         self._data = mujoco.MjData(self._model)
         self._rollout = Rollout(nthread=0)
@@ -114,7 +116,8 @@ class CoursePlanner:
     def plan(self, commands: FloatArray, state: ArmsState) -> tuple[Course, ArmsState]:
         """Returns what the arms do at commands (1 + N, J), `PERIOD_S` apart, and then."""
         scene, drives = self._scene, self._scene.arms.drives
-        rows = drives.spread(np.concatenate([state.commands[None], commands[1:]]))
+        told = np.concatenate([state.commands[None], commands[1:]])
+        rows = drives.spread(self._squeezed(told))
         led = rows[1:] + drives.lead * np.diff(rows, axis=0) / PERIOD_S
         controls = np.repeat(led, SUBSTEPS, axis=0)
         pushes = np.zeros_like(controls)
@@ -142,6 +145,22 @@ class CoursePlanner:
             velocities=physics[:, 1 + nq + scene.arm_dofs],
         )
         return course, then
+
+    def _squeezed(self, commands: FloatArray) -> FloatArray:
+        """Commands (N, J) with grippers that are not open closed further."""
+        if not self._squeeze:
+            return commands
+        robot, closer = self._scene.arms.robot, commands.copy()
+        for tool, opening in zip(robot.tools, robot.gripper_openings(commands), strict=True):
+            if tool.gripper_joint is None:
+                continue
+            column = robot.joint_names.index(tool.gripper_joint)
+            share = self._squeeze * np.clip((1 - opening) / _CLOSED, 0.0, 1.0)
+            ends = tool.gripper_closed, tool.gripper_open
+            closer[:, column] = np.clip(
+                commands[:, column] + share * (ends[0] - ends[1]), min(ends), max(ends)
+            )
+        return closer
 
     def _finger_controls(
         self, led: FloatArray, state: FloatArray, fingers: np.ndarray

@@ -419,7 +419,8 @@ class _Nearby:
         fingers = of_arms & (self._model.geom_priority > 0)
         self._model.geom_contype[:] = np.where(of_arms, 2, 0) + np.where(fingers, 4, 0)
         self._model.geom_conaffinity[:] = np.where(of_solids, 2, 0)
-        self._model.geom_conaffinity[0] = 4  # the table
+        # the table, where arms touch it
+        self._model.geom_conaffinity[0] = 4 if model.geom_conaffinity[0] < 0 else 0
         self._model.geom_margin[of_solids], self._model.geom_margin[0] = _NEAR_M, _NEAR_TABLE_M
         self._data = mujoco.MjData(self._model)
 

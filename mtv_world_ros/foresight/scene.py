@@ -150,6 +150,7 @@ class Scene:
         model.geom_friction[is_finger, 0] = settings.grip_friction
         model.geom_friction[:, 1] = PATCH_M
         model.geom_pos[0, 2] = settings.table_m
+        model.geom_conaffinity[0] = SOLIDS if settings.table_varies else -1
         model.eq_active0[:] = not settings.fingers_swing
         for number, solid in enumerate(solids):
             _set_pieces(model, self._bodies[number], self._geoms[number],

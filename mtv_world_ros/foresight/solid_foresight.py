@@ -17,7 +17,14 @@ from mtv_world_ros.foresight.arms import Arms
 from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.engine import Batch, BatchState, Engine
 from mtv_world_ros.foresight.futures import draw_futures, Future, STANDS_M
-from mtv_world_ros.foresight.solids import find_solid, fit_solid, is_vessel, Solid
+from mtv_world_ros.foresight.solids import (
+    bottom_of,
+    find_solid,
+    fit_solid,
+    is_box,
+    is_vessel,
+    Solid,
+)
 from mtv_world_ros.geometry.mask_geometry import centroids, locate_all
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.robot.model import RobotModel
@@ -32,6 +39,8 @@ _OVERLAP_M = 0.01
 #: solids whose bottoms differ by less stand on one table; it is where the numbers of contact say
 #: if it is as near, and corrected if it is no further away [m]
 _LEVEL_M, _SAME_TABLE_M, _NEAR_TABLE_M = 0.004, 0.003, 0.03
+#: a table of unknown height is looked for so far under the middle of objects, in so many fits [m]
+_HALF_M, _FITS = 0.02, 3
 #: what is further from the robot's base was not found on its table [m]
 _TABLE_REACH_M = 2.0
 
@@ -88,6 +97,10 @@ class SolidForesight:
             poses: V of T_base_camera (4, 4).
         """
         given, unknown = (names, masks, cameras, poses), [None] * len(names)
+        if self.settings.table_varies:
+            height = table_in(*given)
+            here = self._on_table(height if np.isfinite(height) else self.settings.table_m)
+            return here._found(*given, unknown)
         found, told = self._found(*given, unknown), self.settings.table_m
         table = _table_under(found.solids)
         if not _SAME_TABLE_M < abs(table - told) < _NEAR_TABLE_M:
@@ -151,7 +164,13 @@ class SolidForesight:
         solids = tuple(
             solid
             or fit_solid(
-                masks[:, item], points[item], cameras, poses, floor, is_vessel(names[item])
+                masks[:, item],
+                points[item],
+                cameras,
+                poses,
+                floor,
+                is_vessel(names[item]),
+                is_box(names[item]),
             )
             for item, solid in enumerate(known)
         )
@@ -304,6 +323,25 @@ class TrackedSolids:
         solids = [solid for solid in self.solids if solid is not None]
         drives = self.foresight.engine.arms.drives
         return draw_futures(self.foresight.settings, solids, drives, self.foresight.camera_m)
+
+
+def table_in(
+    names: Sequence[str],
+    masks: BoolArray,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray],
+) -> float:
+    """Returns the height of a table that nothing is known of [m]; NaN = no object tells.
+
+    It is the middle one of where objects end below; see `SolidForesight.find`.
+    """
+    points = locate_all(cameras, poses, centroids(masks))
+    bottoms = [
+        bottom_of(masks[:, item], point, cameras, poses, names[item], point[2] - _HALF_M, _FITS)
+        for item, point in enumerate(points)
+        if np.isfinite(point).all()
+    ]
+    return float(np.median(bottoms)) if bottoms else float('nan')
 
 
 def _too_many(state: BatchState, count: int) -> bool:

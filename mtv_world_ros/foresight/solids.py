@@ -42,13 +42,16 @@ _WHOLE = 0.9
 #: largest residual of a solid that has not moved [px]
 _STAYED_PX = 1.0
 _MAX_EVALUATIONS = 60
+#: what is fitted: a cylinder, and boxes of several turns
+_OUTLINES = ((_ROUND, (None,)), (_SQUARE, _TURNS))
 #: residual below which no other initial turn is tried [px]
 _EXACT_PX = 0.35
 #: parts of a mask that are smaller than this share of its largest one are not the object's
 _PART = 0.2
 #: relative step of finite differences
 _DIFFERENCE = float(np.sqrt(np.finfo(float).eps))
-#: names of vessels: hollow and open at the top
+#: names of boxes, and of vessels: hollow and open at the top
+_BOX = re.compile(r'\b(block|book|box|brick|cube|laptop)\b')
 _VESSEL = re.compile(r'\b(basket|bin|bowl|bucket|cup|dish|glass|jar|mug|plate|pot|tray|vase)s?\b')
 
 
@@ -91,6 +94,39 @@ def is_vessel(name: str) -> bool:
     return _VESSEL.search(name.lower()) is not None
 
 
+def is_box(name: str) -> bool:
+    """Tells whether what is called so has edges, which small masks hardly show."""
+    return _BOX.search(name.lower()) is not None
+
+
+def bottom_of(
+    masks: BoolArray,
+    point: FloatArray,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray],
+    name: str,
+    floor: float = 0.0,
+    fits: int = 2,
+) -> float:
+    """Returns where an object ends below [m]; NaN = two views do not see it.
+
+    Args:
+        masks: see `fit_solid`; so are the others.
+        point: (3,) where it is, roughly [m].
+        cameras: V.
+        poses: V of T_base_camera (4, 4).
+        name: of the object.
+        floor: where it may stand [m]; a fit is drawn to it.
+        fits: each is drawn to where the one before ended.
+    """
+    for _ in range(fits):
+        solid = fit_solid(masks, point, cameras, poses, floor, is_vessel(name), is_box(name))
+        if solid is None:
+            return float('nan')
+        floor = solid.bottom
+    return floor
+
+
 def fit_solid(
     masks: BoolArray,
     point: FloatArray,
@@ -98,6 +134,7 @@ def fit_solid(
     poses: Sequence[FloatArray],
     floor: float = 0.0,
     is_open: bool = False,
+    is_box: bool = False,
 ) -> Solid | None:
     """Returns the solid whose outlines are nearest to those of an object.
 
@@ -111,6 +148,7 @@ def fit_solid(
         poses: V of T_base_camera (4, 4).
         floor: height on which things stand, most of them [m].
         is_open: see `Solid`.
+        is_box: it is no cylinder.
 
     Returns:
         None where no two views see it.
@@ -126,7 +164,7 @@ def fit_solid(
 
     height = max(2 * (float(point[2]) - floor), 2 * _LEAST_M)
     best = None
-    for outline, turns in ((_ROUND, (None,)), (_SQUARE, _TURNS)):
+    for outline, turns in _OUTLINES[is_box:]:
         for turn in turns:
             first = [0.05, height, floor] if turn is None else [turn, 0.05, 0.04, height, floor]
             given = np.array([point[0], point[1], *first])

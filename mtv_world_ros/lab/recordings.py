@@ -38,7 +38,7 @@ from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 
 #: to be increased when the stored data or their computation change
-_VERSION = 2
+_VERSION = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,11 +76,13 @@ class Origin:
         frames: (V, H, W, 3) uint8 RGB.
         positions: (J,) measured joint positions.
         object_poses: (O, 4, 4) T_base_object [m].
+        object_ids: (V, H, W) uint8 like those of the clip, or None.
     """
 
     frames: ByteArray
     positions: FloatArray
     object_poses: FloatArray
+    object_ids: ByteArray | None
 
 
 def clip_starts(recording: Recording, spec: WorldModelSpec) -> np.ndarray:
@@ -129,7 +131,13 @@ def cut_clip(
 def _origin(recording: Recording) -> Origin | None:
     if recording.object_poses is None:
         return None
-    return Origin(recording.frames[:, 0], recording.positions[0], recording.object_poses[0])
+    ids = recording.object_ids
+    return Origin(
+        recording.frames[:, 0],
+        recording.positions[0],
+        recording.object_poses[0],
+        None if ids is None else ids[:, 0],
+    )
 
 
 def commanded(recording: Recording, start: int, times: FloatArray) -> FloatArray:

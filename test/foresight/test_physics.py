@@ -102,6 +102,37 @@ def test_fingers_hold_what_weighs_less_than_their_friction(lift, share, holds):
         assert motion.joints[0, -1, 1] == pytest.approx(wide / 2, abs=0.002)
 
 
+@pytest.mark.parametrize(('squeeze', 'holds'), [(0.0, False), (0.3, True)])
+def test_fingers_whose_commands_are_measured_positions_hold_by_their_squeeze(lift, squeeze, holds):
+    """Measured positions end where the object stops the fingers: they press by nothing."""
+    wide = 0.04
+    held = Solid(centre=np.array([0.0, 0.0, 0.02]), size=np.array([0.02, wide, 0.04]))
+    times = np.arange(0, 2.0, 0.02)
+    rise = 0.02 + 0.1 * np.clip((times - 0.6) / 0.8, 0, 1)
+    commands = np.stack([rise, np.where(times < 0.05, 0.04, wide / 2)], -1)
+    motion = moved(batch_of(lift, held, squeeze=squeeze), 2.0, commands)
+    height = motion.points[0, -1, 0, 2] - 0.02
+    assert (height > 0.09) if holds else (height < 0.02)
+
+
+def test_an_open_gripper_squeezes_nothing(lift):
+    commands = np.repeat(REST[None], 26, 0)
+    found = [moved(batch_of(lift, BLOCK, squeeze=one), 0.5, commands).joints for one in (0.0, 0.3)]
+    assert (found[0] == found[1]).all()
+
+
+@pytest.mark.parametrize('varies', [False, True])
+def test_a_table_of_unknown_height_holds_objects_alone(lift, varies):
+    commands = np.stack([np.linspace(0.3, 0.02, 51), np.full(51, 0.04)], -1)
+    commands = np.concatenate([commands, np.repeat(commands[-1:], 50, 0)])
+    block = replace(BLOCK, centre=np.array([0.5, 0.0, 0.07]))
+    motion = moved(batch_of(lift, block, table_m=0.05, table_varies=varies), 2.0, commands)
+    # fingers reach 15 mm below the hand
+    lowest = motion.joints[0, -1, 0] - 0.015
+    assert lowest == pytest.approx(0.005, abs=1e-3) if varies else lowest > 0.03
+    assert motion.points[0, -1, 0, 2] == pytest.approx(0.07, abs=1e-3)
+
+
 def test_what_is_held_stays_where_it_is_held(lift):
     """Friction holds, it does not creep: within 2 mm in 3 s at a third of its limit."""
     held = Solid(centre=np.array([0.0, 0.0, 0.02]), size=np.array([0.02, 0.03, 0.04]))

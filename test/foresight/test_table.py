@@ -75,3 +75,18 @@ def test_one_object_alone_does_not_tell(foresight, recording):
     names, masks, *where = raised(recording, 0.012)
     found = foresight.find(names[:1], masks[:, :1], *where)
     assert found.foresight is foresight and not found.reasons
+
+
+@pytest.mark.parametrize('off_m', [-0.06, 0.11])
+def test_a_table_that_varies_is_where_objects_of_the_first_frame_end_below(
+    foresight, recording, off_m
+):
+    settings = foresight.settings.model_copy(update={'table_varies': True})
+    anywhere = SolidForesight(foresight.robot, foresight.response, settings)
+    found = anywhere.find(*raised(recording, off_m))
+    assert found.foresight.settings.table_m == pytest.approx(off_m, abs=2e-3)
+    # they stand, and the arm moves as if the table was not there
+    still = np.repeat(recording.positions[:1], 21, axis=0)
+    motions, after = found.advance(still)
+    assert np.abs(np.diff(motions[0].points[..., 2], axis=0)).max() < 2e-3
+    assert not after.doubts and not after.reasons

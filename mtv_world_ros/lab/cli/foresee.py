@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from mtv_world_ros.foresight.solid_foresight import SolidForesight, TrackedSolids
 
 
+#: suffixes of scenes without an episode
+_FILES = ('.yaml', '.yml')
+
+
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
@@ -59,7 +63,11 @@ def _foresight(arguments: argparse.Namespace) -> SolidForesight:
     from mtv_world_ros.foresight.loading import load_foresight
     from mtv_world_ros.foresight.solid_foresight import SolidForesight
     from mtv_world_ros.geometry.robot.file import load_robot
-    from mtv_world_ros.lab.training.object_motion.contact_fit import first_settings
+    from mtv_world_ros.lab.training.object_motion.contact_fit import (
+        first_settings,
+        read_contact,
+        settings_of_place,
+    )
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
     from mtv_world_ros.processes import threads_each
 
@@ -68,6 +76,9 @@ def _foresight(arguments: argparse.Namespace) -> SolidForesight:
     if arguments.contact is None:
         print("numbers of contact are guessed: 'fit-contact' finds them, '--contact' takes them")
         settings = first_settings(Arms(robot, None)).replace(**count)
+        if arguments.scene.suffix not in _FILES:  # nothing is known of its table
+            recording = read_contact(arguments.scene, robot, arguments.views)
+            settings = settings_of_place(settings.replace(table_varies=True), [recording], print)
         return SolidForesight(robot, None, settings, threads)
     found = load_foresight(
         checkpoint_path(arguments.contact) / OBJECT_MOTION_FOLDER, robot, threads
@@ -90,7 +101,7 @@ def _scene(
     from mtv_world_ros.lab.inspection.foreseen_scene import load_scene
     from mtv_world_ros.lab.training.object_motion.tracks import fine_commands, first_frame
 
-    if arguments.scene.suffix in ('.yaml', '.yml'):
+    if arguments.scene.suffix in _FILES:
         named, solids, commands = load_scene(arguments.scene, foresight.robot)
         return TrackedSolids(foresight=foresight, names=named, solids=solids), commands
     episode = read_episode(arguments.scene, views=tuple(arguments.views))

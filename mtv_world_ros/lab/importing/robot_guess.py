@@ -229,7 +229,8 @@ class _Hand:
         spans = {value: self._span(value) for value in (low, high)}
         self.open, self.closed = (high, low) if spans[high] >= spans[low] else (low, high)
         slides = _slides(model, self.joint)
-        self.travel_m = round(abs(self.open - self.closed), 5) if slides else None
+        travel_m = abs(self.open - self.closed) if slides else self._way()
+        self.travel_m = round(travel_m, 5)
 
     def tool_pose(self) -> FloatArray:
         """A frame near the finger tips: z away from the arm, y the way of a finger."""
@@ -246,6 +247,12 @@ class _Hand:
         place[2] = max(place[2], float(ends[..., 2].max()) - _TIP_M)
         T[:3, 3] = T[:3, :3] @ place
         return T
+
+    def _way(self) -> float:
+        """How far tips that turn go along the tool's y [m]; how they lean does not count."""
+        y = self.tool_pose()[:3, 1]
+        pairs = zip(*self._tips(), strict=True)
+        return float(np.mean([abs((wide - shut).mean(axis=0) @ y) for shut, wide in pairs]))
 
     def _tips(self) -> tuple[list[FloatArray], list[FloatArray]]:
         """Points of the finger links that reach farthest, shut and open."""

@@ -30,8 +30,10 @@ from mtv_world_ros.errors import (
 )
 from mtv_world_ros.files import write_whole
 from mtv_world_ros.geometry.calibration_file import save_calibration
+from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot.file import save_robot
 from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
+from mtv_world_ros.geometry.robot.shape import moving_links
 from mtv_world_ros.lab.recordings import cached_recording, clip_starts, described_objects
 from mtv_world_ros.lab.training.base import load_base, needs_base
 from mtv_world_ros.lab.training.clips.batches import BatchSource
@@ -46,9 +48,10 @@ from mtv_world_ros.lab.training.resume import (
     STATE,
 )
 from mtv_world_ros.lab.training.trainer import Trainer
-from mtv_world_ros.lab.training.training_config import OptimizerConfig, TrainingRun
+from mtv_world_ros.lab.training.training_config import TrainingConfig, TrainingRun
 from mtv_world_ros.model.card import CAMERAS, CARD, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.runtime import check_device, choose_dtype
+from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
@@ -126,16 +129,22 @@ _LIMIT_TOLERANCE = 0.05
 _MOVES, _SAME_PICTURE = 0.02, 0.02
 #: share of the frames in which joints move that may stay as they were
 _MOST_FROZEN = 0.5
+#: joints so far beside the picture may still show their links [share of its size]
+_MARGIN = 0.1
+#: episodes that are named with the reason why they were left out
+_NAMED = 3
 
 
 def check_recording(recording: Recording, robot: RobotModel) -> None:
-    """Refuses what would teach nonsense: joints in another unit, pictures that are frozen.
+    """Refuses what would teach nonsense: joints in another unit, views that show no robot.
 
     Raises:
         TrajectoryError: measured joints are far outside their limits.
-        EpisodeError: a view hardly changes while the joints move.
+        EpisodeError: a view never has the arm in its picture, or hardly changes while the joints
+            move.
     """
     check_positions(robot, recording.positions, tolerance=_LIMIT_TOLERANCE)
+    _check_arm_is_seen(recording, robot)
     moves = np.abs(np.diff(recording.positions, axis=0)).max(axis=1) > _MOVES
     if moves.sum() < 3:
         return
@@ -148,6 +157,23 @@ def check_recording(recording: Recording, robot: RobotModel) -> None:
             raise EpisodeError(
                 f"view '{view}': {share:.0%} of the frames in which joints move are the same as "
                 'the one before: frozen, or no view of this robot (see mtv-world doctor)'
+            )
+
+
+def _check_arm_is_seen(recording: Recording, robot: RobotModel) -> None:
+    moving = moving_links(robot)
+    points = np.concatenate(robot.arm_points(recording.positions))
+    for camera in recording.cameras:
+        if camera.mount_link in moving or camera.view in recording.camera_tracks:
+            continue
+        poses = camera_poses(camera, robot, recording.positions)
+        pixels, _ = project(camera, poses, points)
+        size = np.array([camera.width, camera.height])
+        if not ((pixels > -_MARGIN * size) & (pixels < (1 + _MARGIN) * size)).all(-1).any():
+            raise EpisodeError(
+                f"view '{camera.view}' never sees the arm, by its calibration: no joint is ever "
+                'in the picture; leave the view out with --views, or calibrate it anew '
+                '(mtv-world calibrate-camera)'
             )
 
 
@@ -261,7 +287,8 @@ def train(
             f'{processes.count} processes'
         )
         left_out = [f'left out: {line}' for line in counted(skipped)]
-        for line in [*left_out, *notes(trainer.config.optimizer, recordings)]:
+        told = notes(trainer.config, recordings, None if resumed else run.initial)
+        for line in [*left_out, *told]:
             tqdm.write(line)
     ideal = None
     if run.peak_tflops is not None and processes.is_main:
@@ -288,9 +315,19 @@ def _save_robot(
             save_calibration(folder / CAMERAS, {camera.view: camera for camera in cameras})
 
 
-def notes(optimizer: OptimizerConfig, recordings: Sequence[Recording]) -> list[str]:
-    """What a user should know of a training before it runs."""
-    found = []
+def notes(
+    config: TrainingConfig, recordings: Sequence[Recording], initial: Path | None = None
+) -> list[str]:
+    """What a user should know of a training before it runs.
+
+    Args:
+        config: of the training.
+        recordings: it learns from.
+        initial: checkpoint whose weights it starts from.
+    """
+    found, optimizer = [], config.optimizer
+    if initial is not None:
+        found += _drawn_otherwise(config.rendering, read_card(initial).rendering)
     if optimizer.warmup < optimizer.warmup_steps:
         found.append(
             f'the learning rate warms up over {optimizer.warmup} steps, a fifth of the training, '
@@ -304,6 +341,21 @@ def notes(optimizer: OptimizerConfig, recordings: Sequence[Recording]) -> list[s
             "'calibration_file'"
         )
     return found
+
+
+def _drawn_otherwise(now: TrajectoryVideoConfig, before: Mapping[str, Any]) -> list[str]:
+    """What a checkpoint was trained to read in trajectory videos and will not be shown."""
+    other = [
+        f'rendering.{name}={json.dumps(value)}'
+        for name, value in before.items()
+        if value != now.model_dump().get(name)
+    ]
+    if not other:
+        return []
+    return [
+        'the weights that it starts from were trained with ' + ', '.join(other) + ', which is '
+        'drawn otherwise here: give --set for each to go on with what they know'
+    ]
 
 
 def common_cameras(recordings: Sequence[Recording]) -> tuple[CameraModel, ...] | None:
@@ -418,12 +470,21 @@ def check_clips(recording: Recording, spec: WorldModelSpec) -> None:
 
 
 def counted(skipped: Mapping[str, str]) -> list[str]:
-    """Returns a line for each of the reasons (by path), without paths, the most frequent first."""
-    reasons = Counter(
-        reason.replace(path, '...').replace(Path(path).name, '...')
-        for path, reason in skipped.items()
-    )
-    return [f'{count} x {reason}' for reason, count in reasons.most_common()]
+    """Returns a line for each reason with the names of its first episodes, the frequent first.
+
+    Args:
+        skipped: reasons by the episode's path.
+    """
+    episodes: dict[str, list[str]] = {}
+    for path, reason in skipped.items():
+        name = Path(path).name
+        said = reason.replace(path, '...').replace(name, '...')
+        episodes.setdefault(said, []).append(name)
+    frequent = sorted(episodes.items(), key=lambda item: -len(item[1]))
+    return [
+        f'{len(names)} x {reason} ({", ".join(names[:_NAMED])}{", ..." * (len(names) > _NAMED)})'
+        for reason, names in frequent
+    ]
 
 
 def num_dropped(recordings: Sequence[Recording], spec: WorldModelSpec) -> int:

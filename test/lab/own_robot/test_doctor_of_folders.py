@@ -21,7 +21,7 @@ from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data_types import JointTrajectory, WorldModelSpec
-from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.lab.inspection.folder import folder_text, inspect_folder
@@ -232,3 +232,17 @@ def test_training_leaves_out_what_would_teach_nonsense(folder):
             reasons[name] = str(error)
     assert set(reasons) == {'degrees', 'frozen'}
     assert 'its limits are' in reasons['degrees'] and "view 'door'" in reasons['frozen']
+
+
+def test_training_leaves_out_a_view_that_never_sees_the_arm(folder):
+    robot, data = folder
+    spec = WorldModelSpec(
+        views=('door',), width=64, height=48, num_frames=4, fps=5.0, robot='crane'
+    )
+    recording = load_recording(data / 'good0', spec, robot)
+    check_recording(recording, robot)
+    (camera,) = recording.cameras
+    about = camera.T_mount_camera @ np.diag([-1.0, 1.0, -1.0, 1.0])  # it looks away
+    turned = replace(recording, cameras=(replace(camera, T_mount_camera=about),))
+    with pytest.raises(EpisodeError, match="'door' never sees the arm.*--views"):
+        check_recording(turned, robot)

@@ -15,6 +15,7 @@ import pytest
 from sources import make_source
 import torch
 
+from mtv_world_ros.assembly import checkpoint_path
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
@@ -28,8 +29,10 @@ from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.resume import DiskError
 from mtv_world_ros.lab.training.trainer import Trainer
 from mtv_world_ros.lab.training.training_config import TrainingConfig, TrainingRun
-from mtv_world_ros.lab.training.training_run import load_recordings, train
+from mtv_world_ros.lab.training.training_run import load_recordings, notes, train
+from mtv_world_ros.model.card import read_card
 from mtv_world_ros.model.checkpoint import load_checkpoint
+from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 Change = Callable[[BagMessage], list[bytes]]
@@ -92,6 +95,8 @@ def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
     lines = [line for line in (printed.out + printed.err).splitlines() if 'left out:' in line]
     assert len(lines) == 4
     assert 'left out: 2 x ' in lines[0] and 'joint_states' in lines[0]
+    assert lines[0].endswith('(stateless_a, stateless_b)')
+    assert all(any(f'({name})' in line for line in lines) for name in ('viewless', 'moved'))
     for name in reasons:
         (data / name).rename(tmp_path / name)
     rewrite(episode, tmp_path / 'only' / 'bad', without('/joint_states'))
@@ -101,6 +106,16 @@ def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
     said = "of robot 'yam_bimanual', and video.robot is 'franka'; give --set video.robot="
     with pytest.raises(TrainingError, match=said):
         load_recordings([episode], tiny.spec, franka, tmp_path / 'cache')
+
+
+def test_weights_that_know_other_drawings_are_told(
+    tiny: TrainingConfig, recording: Recording
+) -> None:
+    bundled = checkpoint_path('bundled')
+    said = ' '.join(notes(tiny, [recording], bundled))
+    assert 'rendering.object_motion=true' in said and 'rendering.finger_width_m=0.008' in said
+    alike = tiny.replace(rendering=TrajectoryVideoConfig(**read_card(bundled).rendering))
+    assert 'starts from' not in ' '.join(notes(alike, [recording], bundled))
 
 
 def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(

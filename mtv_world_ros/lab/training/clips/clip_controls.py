@@ -110,13 +110,16 @@ class ControlMaker:
     def _start_masks(self, clip: Clip, names: tuple[str, ...]) -> BoolArray:
         """(V, O, H, W) of a clip's start frame."""
         ids = clip.object_ids
-        if (
-            ids is None
-            or clip.masks_by != self.segmenter.name
-            or not set(names) <= set(clip.objects)
-        ):
-            return self._masks(clip.frames[:, 0], names)
-        return masks_from_ids(ids[:, :1], clip.objects, names).masks[:, :, 0]
+        return self._stored(clip, names, clip.frames[:, 0], None if ids is None else ids[:, 0])
+
+    def _stored(
+        self, clip: Clip, names: tuple[str, ...], frames: ByteArray, ids: ByteArray | None
+    ) -> BoolArray:
+        """(V, O, H, W) of ids (V, H, W) that this segmenter made, or else of their frames."""
+        by_other = clip.masks_by != self.segmenter.name
+        if ids is None or by_other or not set(names) <= set(clip.objects):
+            return self._masks(frames, names)
+        return masks_from_ids(ids[:, None], clip.objects, names).masks[:, :, 0]
 
     def _masks(self, frames: ByteArray, names: tuple[str, ...]) -> BoolArray:
         """(V, O, H, W) of frames (V, H, W, 3)."""
@@ -142,7 +145,7 @@ class ControlMaker:
         )
         at_first = origin.positions[None]
         return moved_pictures(
-            cut_outs(origin.frames, self._masks(origin.frames, names)),
+            cut_outs(origin.frames, self._stored(clip, names, origin.frames, origin.object_ids)),
             motion,
             clip.cameras,
             np.stack([camera_poses(camera, self.robot, at_first) for camera in clip.cameras]),

@@ -29,8 +29,8 @@ from mtv_world_ros.foresight.course import CoursePlanner, SUBSTEPS
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import Future
 from mtv_world_ros.foresight.scene import Scene
-from mtv_world_ros.foresight.solid_foresight import COMMANDS_A_STEP, STEP_S
-from mtv_world_ros.foresight.solids import fit_solid, is_vessel, Solid
+from mtv_world_ros.foresight.solid_foresight import COMMANDS_A_STEP, STEP_S, table_in
+from mtv_world_ros.foresight.solids import bottom_of, fit_solid, is_box, is_vessel, Solid
 from mtv_world_ros.geometry.resample import nearest_rows
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.object_motion.tracks import (
@@ -179,6 +179,11 @@ _SAYS = 0.5
 _DELAYS = np.arange(0.0, 0.31, PERIOD_S)
 #: outlines of masks are no more exact than this, however many there are [m]
 _EXACT_M = 0.0005
+#: heights that differ by more are of several tables [m]
+_ONE_TABLE_M = 0.03
+#: commands that are as near to measured positions are these [rad or m]; then fingers are told to
+#: close further, by a share of their travel
+_SAME_RAD, _SQUEEZE = 1e-6, 0.1
 #: recordings whose table is looked for
 _MOST_TABLES = 8
 #: objects of which less is shown than this share of the first frame's are hidden in part
@@ -209,6 +214,11 @@ class ContactRecording:
     recorded: FloatArray
     displacements: FloatArray
     grippers: FreeGrippers
+
+    def table(self) -> float:
+        """Returns the height of its own table [m]; NaN = no object tells."""
+        frame = self.frame
+        return table_in(self.names, frame.masks, frame.cameras, frame.poses)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -349,6 +359,7 @@ def fit_contact(
     report(str(table))
     report(str(delay))
     first = first.model_copy(update={'table_m': table.value, 'delay_s': delay.value})
+    first = settings_of_place(first, recordings, report)
     engine = Engine(arms, threads)
     trials = [_Trial.of(one, first) for one in recordings]
     factors, likelihoods, weights = _populations(engine, trials, first, report, progress)
@@ -383,6 +394,37 @@ def fit_contact(
             'are too narrow'
         )
     return first.model_copy(update={**values, 'spread': spread}), [table, delay, *found, hold]
+
+
+def settings_of_place(
+    first: ContactSettings,
+    recordings: Sequence[ContactRecording],
+    report: Callable[[str], None],
+) -> ContactSettings:
+    """Returns settings for recordings on several tables, or without commands of their own.
+
+    Args:
+        first: settings otherwise.
+        recordings: E.
+        report: is told what differs.
+    """
+    changed: dict[str, bool | float] = {}
+    each = recordings[:: max(1, len(recordings) // _MOST_TABLES)]
+    heights = np.array([recording.table() for recording in each])
+    heights = heights[np.isfinite(heights)]
+    if len(heights) and np.ptp(heights) > _ONE_TABLE_M:
+        changed['table_varies'] = True
+        report(
+            f'tables are between {heights.min():.3f} and {heights.max():.3f} m high: each is '
+            'looked for in the first frame'
+        )
+    if all(np.allclose(r.positions, r.recorded, atol=_SAME_RAD) for r in recordings):
+        changed['squeeze'] = _SQUEEZE
+        report(
+            'commands are measured positions, which stop at what is held: grippers close further '
+            f'by {_SQUEEZE:.0%} of their travel'
+        )
+    return first.model_copy(update=changed)
 
 
 def _scales(first: ContactSettings) -> dict[str, float]:
@@ -531,20 +573,24 @@ class _Trial:
         solids: of the O objects that two views see at first.
         positions: (1 + T * n, J) commanded.
         displacements: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
+        table_m: height of its table.
     """
 
     solids: tuple[Solid, ...]
     positions: FloatArray
     displacements: FloatArray
+    table_m: float
 
     @classmethod
     def of(cls, recording: ContactRecording, settings: ContactSettings) -> _Trial:
         """Returns the trial of a recording on a table as high as the settings say."""
-        frame, points = recording.frame, recording.frame.points()
+        frame, points, table = recording.frame, recording.frame.points(), settings.table_m
+        if settings.table_varies and np.isfinite(own := recording.table()):
+            table = own
         found = [
             fit_solid(
-                frame.masks[:, item], points[item], frame.cameras, frame.poses, settings.table_m,
-                is_vessel(name),
+                frame.masks[:, item], points[item], frame.cameras, frame.poses, table,
+                is_vessel(name), is_box(name),
             )
             for item, name in enumerate(recording.names)
         ]  # fmt: skip
@@ -553,13 +599,19 @@ class _Trial:
             solids=tuple(solid for solid in found if solid is not None),
             positions=recording.positions,
             displacements=recording.displacements[:, known],
+            table_m=table,
         )
 
     def likelihoods(self, engine: Engine, settings: Sequence[ContactSettings]) -> FloatArray:
         """Returns (N,) log likelihoods of where masks show the objects."""
         still = np.zeros(len(engine.arms.drives.names))
         futures = [
-            Future(settings=one, solids=self.solids, zeros=still, delay_s=one.delay_s)
+            Future(
+                settings=one.model_copy(update={'table_m': self.table_m}),
+                solids=self.solids,
+                zeros=still,
+                delay_s=one.delay_s,
+            )
             for one in settings
         ]
         motion, state = engine.begin(futures).advance(self.positions, COMMANDS_A_STEP)
@@ -606,24 +658,14 @@ def find_table(recordings: Sequence[ContactRecording]) -> Finding:
     """Returns the height at which what stands on a table ends below."""
     bottoms = []
     for recording in recordings[:: max(1, len(recordings) // _MOST_TABLES)]:
-        points = recording.frame.points()
+        frame, points = recording.frame, recording.frame.points()
         for item, name in enumerate(recording.names):
-            bottoms.append(_bottom_in(recording.frame, item, points[item], is_vessel(name)))
+            seen = frame.masks[:, item], points[item], frame.cameras, frame.poses
+            bottoms.append(bottom_of(*seen, name))
     known = np.array(bottoms)[np.isfinite(bottoms)]
     # the middle one: some stand in others
     found = _resampled('table_m', known, len(bottoms), 'objects', np.median)
     return replace(found, low=found.low - _EXACT_M, high=found.high + _EXACT_M)
-
-
-def _bottom_in(frame: FirstFrame, item: int, point: FloatArray, is_open: bool) -> float:
-    """Where an object ends below [m]; NaN = two views do not see it."""
-    floor = 0.0
-    for _ in range(2):  # a fit is drawn to the height that is told
-        solid = fit_solid(frame.masks[:, item], point, frame.cameras, frame.poses, floor, is_open)
-        if solid is None:
-            return float('nan')
-        floor = solid.bottom
-    return floor
 
 
 def _resampled(

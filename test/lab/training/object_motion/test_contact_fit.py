@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 import json
 from pathlib import Path
+import re
 import shutil
 
 import numpy as np
@@ -169,6 +170,26 @@ def test_the_table_is_found_where_objects_stand(recording):
     found = find_table([replace(recording, frame=frame)])
     assert found.value == pytest.approx(0.012, abs=5e-4)
     assert found.low < 0.012 < found.high
+
+
+def test_several_tables_and_measured_commands_are_told(recording, settings):
+    def of(*recordings):
+        said: list[str] = []
+        return contact_fit.settings_of_place(settings, recordings, said.append), said
+
+    changed, said = of(recording)
+    assert changed == settings and not said
+    poses = [np.array(pose) for pose in recording.frame.poses]
+    for pose in poses:
+        pose[2, 3] += 0.06
+    raised = replace(recording, frame=replace(recording.frame, poses=tuple(poses)))
+    changed, said = of(recording, raised)
+    assert changed.table_varies and changed.squeeze == 0
+    low, high = map(float, re.findall(r'\d\.\d+', said[0]))
+    assert low == pytest.approx(0, abs=2e-3) and high == pytest.approx(0.06, abs=2e-3)
+    assert contact_fit._Trial.of(raised, changed).table_m == pytest.approx(0.06, abs=2e-3)
+    changed, said = of(replace(recording, positions=recording.recorded))
+    assert changed.squeeze > 0 and 'measured positions' in said[0]
 
 
 @pytest.mark.filterwarnings('error')
