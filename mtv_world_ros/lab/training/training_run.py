@@ -333,12 +333,26 @@ def notes(
             f'the learning rate warms up over {optimizer.warmup} steps, a fifth of the training, '
             f'instead of optimizer.warmup_steps = {optimizer.warmup_steps}'
         )
-    if common_cameras(recordings) is None:
+    common = common_cameras(recordings)
+    if common is None:
         kinds = len({tuple(_camera_key(camera) for camera in r.cameras) for r in recordings})
         found.append(
             f'the episodes have {kinds} different calibrations, none of them that of more than '
             'half: the checkpoint gets no default calibration, and the node needs '
             "'calibration_file'"
+        )
+        return found
+    usual = tuple(_camera_key(camera) for camera in common)
+    others = [
+        recording.path.name
+        for recording in recordings
+        if tuple(_camera_key(camera) for camera in recording.cameras) != usual
+    ]
+    if others:
+        more = ', ...' * (len(others) > _NAMED)
+        found.append(
+            f'episodes of other calibrations than most: {len(others)} '
+            f'({", ".join(others[:_NAMED])}{more}); each is drawn by its own'
         )
     return found
 
@@ -478,7 +492,7 @@ def counted(skipped: Mapping[str, str]) -> list[str]:
     episodes: dict[str, list[str]] = {}
     for path, reason in skipped.items():
         name = Path(path).name
-        said = reason.replace(path, '...').replace(name, '...')
+        said = reason.replace(path, '...').replace(f"'{name}'", "'...'")
         episodes.setdefault(said, []).append(name)
     frequent = sorted(episodes.items(), key=lambda item: -len(item[1]))
     return [

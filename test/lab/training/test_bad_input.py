@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 import json
 import multiprocessing
 import os
@@ -116,6 +117,20 @@ def test_weights_that_know_other_drawings_are_told(
     assert 'rendering.object_motion=true' in said and 'rendering.finger_width_m=0.008' in said
     alike = tiny.replace(rendering=TrajectoryVideoConfig(**read_card(bundled).rendering))
     assert 'starts from' not in ' '.join(notes(alike, [recording], bundled))
+
+
+def test_episodes_of_other_cameras_than_most_are_named(
+    tiny: TrainingConfig, recording: Recording
+) -> None:
+    first, *rest = recording.cameras
+    pose = first.T_mount_camera.copy()
+    pose[0, 3] += 0.1
+    moved = replace(
+        recording, path=Path('moved'), cameras=(replace(first, T_mount_camera=pose), *rest)
+    )
+    said = ' '.join(notes(tiny, [recording, moved, recording]))
+    assert 'other calibrations than most: 1 (moved)' in said
+    assert 'other calibrations' not in ' '.join(notes(tiny, [recording, recording]))
 
 
 def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(
