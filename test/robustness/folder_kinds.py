@@ -412,7 +412,7 @@ def make_camera_file(folder: Path) -> None:
 
 
 def _read_camera_file(folder: Path) -> Any:
-    from mtv_world_ros.lab.importing.camera_parameters import camera_model, CameraSource
+    from mtv_world_ros.lab.importing.camera_parameters import camera_track, CameraSource
 
     source = CameraSource.model_validate(
         {
@@ -427,7 +427,7 @@ def _read_camera_file(folder: Path) -> Any:
             },
         }
     )
-    return camera_model(source, folder, 0, {}, (64, 48))
+    return camera_track(source, folder, 0, {}, (64, 48)).camera
 
 
 #: kind -> makes the folder, which files are damaged, reads it

@@ -14,7 +14,7 @@ pytest.importorskip('pyarrow', reason='pyarrow is not installed (pip install .[i
 from mtv_world_ros.config import validated
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import CalibrationError, ConfigError
-from mtv_world_ros.lab.importing.camera_parameters import camera_model, camera_track, CameraSource
+from mtv_world_ros.lab.importing.camera_parameters import camera_track, CameraSource
 from mtv_world_ros.lab.importing.convert import import_dataset
 
 #: looks down from 2 m: x right, y down, z ahead in the camera
@@ -33,7 +33,7 @@ def model(folder: Path, document: object, size=(64, 48), **changes):
     row['camera'] = {key: value for key, value in row['camera'].items() if value is not None}
     (folder / 'camera_000003.json').write_text(json.dumps(document))
     source = source_of(row, folder)
-    return camera_model(source, folder, 3, {}, size)
+    return camera_track(source, folder, 3, {}, size).camera
 
 
 def test_matrices_are_read_by_their_path(tmp_path):
@@ -80,7 +80,7 @@ def test_k_is_for_another_size_than_the_video(tmp_path):
     row = {**BASE, 'distortion': 'head.d', 'size': [64, 48]}
     (tmp_path / 'camera_000003.json').write_text(json.dumps(document))
     source = source_of({'feature': 'x', 'camera': row}, tmp_path)
-    camera = camera_model(source, tmp_path, 3, {}, (128, 96))
+    camera = camera_track(source, tmp_path, 3, {}, (128, 96)).camera
     assert (camera.width, camera.K[0, 0], camera.K[0, 2]) == (128, 140, 63.5)
     assert camera.distortion_model == 'plumb_bob'
     assert camera.distortion == pytest.approx([-0.1, 0.01, 0, 0, 0])
@@ -128,7 +128,7 @@ def test_a_pose_that_changes_within_the_episode_is_refused(tmp_path):
     poses[2, 0, 3] += 0.1
     values = {'K': np.repeat(np.array(K)[None], 4, axis=0), 'T': poses}
     with pytest.raises(CalibrationError, match="'T' changes at frame 2; a camera that moves"):
-        camera_model(source, tmp_path, 0, values, (64, 48))
+        camera_track(source, tmp_path, 0, values, (64, 48))
 
 
 def test_a_camera_that_moves_has_a_pose_a_row(tmp_path):

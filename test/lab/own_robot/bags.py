@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from crane import FPS, render, START_NS, URDF
+from crane import FPS, JOINTS, make_cameras, render, START_NS, URDF
 import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
@@ -19,6 +19,26 @@ from mtv_world_ros.rendering.images import encode_jpeg
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 FRAMES = {'door': 'door_optical', 'palm': 'palm_optical'}
+#: with which these recordings are imported
+MAPPING = {
+    'namespace': 'cell',
+    'action': 'state',
+    'joints': {f'lab_{name}': name for name in JOINTS},
+    'instruction': 'wave',
+}
+
+
+def bag_cameras() -> dict[str, CameraModel]:
+    """The cameras of these recordings."""
+    return {view: camera for view, camera in make_cameras().items() if view in FRAMES}
+
+
+def grey_frames(count: int) -> dict[str, ByteArray]:
+    """Pictures of all views for tests that look at none."""
+    return {
+        view: np.full((count, camera.height, camera.width, 3), 90, np.uint8)
+        for view, camera in bag_cameras().items()
+    }
 
 
 class Bag:

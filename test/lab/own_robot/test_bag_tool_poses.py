@@ -1,7 +1,7 @@
 """`mtv-world import-bag` of recordings whose commands are poses of the tool."""
 
-from bags import Bag, record
-from crane import FPS, load, make_cameras, make_positions, START_NS
+from bags import Bag, bag_cameras, grey_frames, MAPPING, record
+from crane import FPS, make_positions, START_NS
 import numpy as np
 import pytest
 import yaml
@@ -12,12 +12,6 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.geometry.transforms import quaternion
 
 NUM = 20
-LAB = {f'lab_{name}': name for name in ('yaw', 'shoulder', 'elbow', 'roll', 'nod')}
-
-
-@pytest.fixture(scope='module')
-def robot(tmp_path_factory):
-    return load(tmp_path_factory.mktemp('robot'))
 
 
 @pytest.fixture(scope='module')
@@ -50,14 +44,9 @@ def poses_of(poses, frame='plinth'):
 
 
 def run(folder, robot, positions, more, **tool):
-    cameras = make_cameras()
-    del cameras['window']
-    frames = {v: np.full((NUM, c.height, c.width, 3), 90, np.uint8) for v, c in cameras.items()}
-    bag = record(folder / 'wave', robot, cameras, positions, frames=frames, more=more)
-    mapping = {
-        'namespace': 'cell', 'action': 'state', 'joints': {**LAB, 'lab_jaw_left': 'jaw_left'},
-        'instruction': 'wave', 'tools': {'arm': {'topic': 'target', **tool}},
-    }  # fmt: skip
+    frames = grey_frames(NUM)
+    bag = record(folder / 'wave', robot, bag_cameras(), positions, frames=frames, more=more)
+    mapping = {**MAPPING, 'tools': {'arm': {'topic': 'target', **tool}}}
     (folder / 'bag.yaml').write_text(yaml.safe_dump(mapping))
     command = ['import-bag', str(bag), '--topics', str(folder / 'bag.yaml')]
     status = main([*command, '--robot', str(robot.file), '--out', str(folder / 'out')])

@@ -4,8 +4,8 @@ from dataclasses import replace
 import re
 import shlex
 
-from bags import record
-from crane import FPS, load, make_cameras, make_positions, render, START_NS, URDF
+from bags import bag_cameras, MAPPING, record
+from crane import FPS, make_positions, render, START_NS, URDF
 import numpy as np
 import pytest
 import yaml
@@ -17,28 +17,26 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.lab.importing.bags import guess_views
 
-MAPPING = {
-    'namespace': 'cell',
-    'action': 'state',
-    'joints': {f'lab_{name}': name for name in ('yaw', 'shoulder', 'elbow', 'roll', 'nod')}
-    | {'lab_jaw_left': 'jaw_left'},
-    'instruction': 'wave',
-}  # fmt: skip
 NUM = 25
-
-
-@pytest.fixture(scope='module')
-def robot(tmp_path_factory):
-    return load(tmp_path_factory.mktemp('robot'))
 
 
 @pytest.fixture(scope='module')
 def scene(robot):
     """Cameras, positions, and what the cameras see."""
-    cameras = make_cameras()
-    del cameras['window']
-    positions = make_positions(NUM / FPS)
+    cameras, positions = bag_cameras(), make_positions(NUM / FPS)
     return cameras, positions, {v: render(robot, c, positions) for v, c in cameras.items()}
+
+
+@pytest.fixture
+def make_bag(robot, scene, tmp_path):
+    """Records the scene, changed in some way, as a bag of a name."""
+    cameras, positions, frames = scene
+
+    def make(name='wave', **how):
+        how = {'cameras': cameras, 'positions': positions, 'frames': frames, **how}
+        return record(tmp_path / name, robot, **how)
+
+    return make
 
 
 def run(folder, *bags, mapping=MAPPING, more=()):
@@ -52,11 +50,10 @@ def run(folder, *bags, mapping=MAPPING, more=()):
     [(True, 'none'), (True, 'file'), (True, 'message'), (False, 'file'), (False, 'message')],
 )
 def test_views_joints_cameras_and_robot_come_from_the_bag(
-    robot, scene, tmp_path, capsys, sqlite, compression
+    robot, scene, make_bag, tmp_path, capsys, sqlite, compression
 ):
     cameras, positions, frames = scene
-    bag = record(tmp_path / 'wave', robot, cameras, positions, sqlite=sqlite, frames=frames,
-                 compression=compression)  # fmt: skip
+    bag = make_bag(sqlite=sqlite, compression=compression)
     assert run(tmp_path, bag) == 0, capsys.readouterr().err
     episode = read_episode(tmp_path / 'out' / 'wave')
     assert episode.info.robot == 'crane' and episode.info.instruction == 'wave'
@@ -76,9 +73,8 @@ def test_views_joints_cameras_and_robot_come_from_the_bag(
     assert guessed.tools[0].gripper_joint == 'jaw_left' and guessed.base_link == 'plinth'
 
 
-def test_the_look_at_the_robot_that_is_printed_runs(robot, scene, tmp_path, capsys, monkeypatch):
-    cameras, positions, frames = scene
-    bag = record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
+def test_the_look_at_the_robot_that_is_printed_runs(make_bag, tmp_path, capsys, monkeypatch):
+    bag = make_bag()
     assert run(tmp_path, bag) == 0
     words = shlex.split(capsys.readouterr().out.partition('look at it with: ')[2].split('\n')[0])
     assert words[:2] == ['mtv-world', 'robot']
@@ -87,9 +83,8 @@ def test_the_look_at_the_robot_that_is_printed_runs(robot, scene, tmp_path, caps
     assert (tmp_path / 'out' / 'robot' / 'crane.png').is_file()
 
 
-def test_again_keeps_what_is_there_and_another_mapping_is_named(robot, scene, tmp_path, capsys):
-    cameras, positions, frames = scene
-    bag = record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
+def test_again_keeps_what_is_there_and_another_mapping_is_named(make_bag, tmp_path, capsys):
+    bag = make_bag()
     assert run(tmp_path, bag) == 0
     assert run(tmp_path, bag) == 0
     assert '0 made, 1 kept, 0 failed' in capsys.readouterr().out
@@ -98,13 +93,10 @@ def test_again_keeps_what_is_there_and_another_mapping_is_named(robot, scene, tm
 
 
 def test_what_is_wrong_with_a_bag_is_named_and_the_others_are_imported(
-    robot, scene, tmp_path, capsys
+    scene, make_bag, tmp_path, capsys
 ):
-    cameras, positions, frames = scene
-    good = record(tmp_path / 'good', robot, cameras, positions, frames=frames)
-    degrees = record(tmp_path / 'degrees', robot, cameras, np.degrees(positions), frames=frames)
-    other = record(tmp_path / 'other', robot, cameras, positions, frames=frames, prefix='ur_')
-    cut = record(tmp_path / 'cut', robot, cameras, positions, frames=frames, sqlite=False)
+    good, degrees = make_bag('good'), make_bag('degrees', positions=np.degrees(scene[1]))
+    other, cut = make_bag('other', prefix='ur_'), make_bag('cut', sqlite=False)
     file = next(cut.glob('*.mcap'))
     file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3])
     assert run(tmp_path, good, degrees, other, cut) == 1
@@ -115,18 +107,16 @@ def test_what_is_wrong_with_a_bag_is_named_and_the_others_are_imported(
     assert 5 < len(read_episode(tmp_path / 'out' / 'cut').images['door'].frames) < NUM
 
 
-def test_a_bag_without_commands_says_how_to_take_the_measured_ones(robot, scene, tmp_path, capsys):
-    cameras, positions, frames = scene
-    bag = record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
+def test_a_bag_without_commands_says_how_to_take_the_measured_ones(make_bag, tmp_path, capsys):
+    bag = make_bag()
     assert run(tmp_path, bag, mapping={**MAPPING, 'action': 'joint_trajectory'}) == 1
     assert "set 'action: state'" in capsys.readouterr().err
 
 
-def test_a_bag_with_plans_elsewhere_says_where(robot, scene, tmp_path, capsys):
-    cameras, positions, frames = scene
+def test_a_bag_with_plans_elsewhere_says_where(robot, scene, make_bag, tmp_path, capsys):
     point = messages.make(
         'trajectory_msgs/msg/JointTrajectoryPoint',
-        positions=positions[-1], velocities=np.empty(0), accelerations=np.empty(0),
+        positions=scene[1][-1], velocities=np.empty(0), accelerations=np.empty(0),
         effort=np.empty(0),
         time_from_start=messages.make('builtin_interfaces/msg/Duration', sec=1, nanosec=0),
     )  # fmt: skip
@@ -138,17 +128,16 @@ def test_a_bag_with_plans_elsewhere_says_where(robot, scene, tmp_path, capsys):
     def write(bag):
         bag.write('/arm_controller/plan', messages.JOINT_TRAJECTORY, START_NS, plan)
 
-    bag = record(tmp_path / 'plan', robot, cameras, positions, frames=frames, more=write)
+    bag = make_bag('plan', more=write)
     assert run(tmp_path, bag, mapping={**MAPPING, 'action': 'joint_trajectory'}) == 1
     said = capsys.readouterr().err
     assert "at '/cell/joint_trajectory'; there are some at /arm_controller/plan" in said
 
 
 def test_without_commands_the_measured_ones_are_taken_if_the_command_line_says_so(
-    robot, scene, tmp_path, capsys
+    make_bag, tmp_path, capsys
 ):
-    cameras, positions, frames = scene
-    bag = record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
+    bag = make_bag()
     mapping = {**MAPPING, 'action': 'joint_trajectory'}
     assert run(tmp_path, bag, mapping=mapping, more=['--action', 'state']) == 0
     episode = read_episode(tmp_path / 'out' / 'wave')
@@ -156,28 +145,24 @@ def test_without_commands_the_measured_ones_are_taken_if_the_command_line_says_s
     assert load_bag_mapping(tmp_path / 'out' / 'mapping.yaml').action == 'state'
 
 
-def test_commands_made_of_states_start_when_every_view_has_an_image(robot, scene, tmp_path):
-    cameras, positions, frames = scene
-
+def test_commands_made_of_states_start_when_every_view_has_an_image(
+    robot, scene, make_bag, tmp_path
+):
     def before(bag):
         names = ['lab_' + name for name in robot.joint_names]
         for k in range(1, 4):
             stamp = START_NS - k * 10_000_000
-            state = messages.make_joint_state(stamp, names, positions[0])
+            state = messages.make_joint_state(stamp, names, scene[1][0])
             bag.write('/cell/joint_states', messages.JOINT_STATE, stamp, state)
 
-    bag = record(tmp_path / 'early', robot, cameras, positions, frames=frames, more=before)
-    assert run(tmp_path, bag) == 0
+    assert run(tmp_path, make_bag('early', more=before)) == 0
     episode = read_episode(tmp_path / 'out' / 'early')
     assert len(episode.joint_states.positions) == NUM + 3
     assert episode.trajectories[0][0] == START_NS
 
 
-def test_of_an_sqlite_bag_that_was_cut_off_what_comes_before_is_kept(
-    robot, scene, tmp_path, capsys
-):
-    cameras, positions, frames = scene
-    bag = record(tmp_path / 'cut', robot, cameras, positions, frames=frames)
+def test_of_an_sqlite_bag_that_was_cut_off_what_comes_before_is_kept(make_bag, tmp_path, capsys):
+    bag = make_bag('cut')
     file = next(bag.glob('*.db3'))
     size = file.stat().st_size
     file.write_bytes(file.read_bytes()[: size * 2 // 3 + 100])
@@ -187,9 +172,7 @@ def test_of_an_sqlite_bag_that_was_cut_off_what_comes_before_is_kept(
     assert NUM // 2 < kept < NUM
 
 
-def test_another_robot_in_the_same_bag_is_named_and_left_out(robot, scene, tmp_path, capsys):
-    cameras, positions, frames = scene
-
+def test_another_robot_in_the_same_bag_is_named_and_left_out(robot, make_bag, tmp_path, capsys):
     def other(bag):
         urdf = re.sub(' name="|link="', r'\g<0>ur_', URDF)
         text = messages.make(messages.STRING, data=urdf)
@@ -198,8 +181,7 @@ def test_another_robot_in_the_same_bag_is_named_and_left_out(robot, scene, tmp_p
             state = messages.make_joint_state(START_NS + k, ['ur_yaw', 'ur_elbow'], np.zeros(2))
             bag.write('/cell/joint_states', messages.JOINT_STATE, START_NS + k, state)
 
-    bag = record(tmp_path / 'two', robot, cameras, positions, frames=frames, more=other)
-    assert run(tmp_path, bag) == 0, capsys.readouterr().err
+    assert run(tmp_path, make_bag('two', more=other)) == 0, capsys.readouterr().err
     printed = capsys.readouterr()
     assert 'the bag describes 2 robots' in printed.out and f'({NUM} of {NUM + 5}' in printed.out
     assert '5 messages without a joint of the robot were left out' in printed.err
@@ -222,10 +204,9 @@ def test_another_robot_in_the_same_bag_is_named_and_left_out(robot, scene, tmp_p
     ],
 )  # fmt: skip
 def test_a_description_that_is_no_robot_is_named_by_its_topic(
-    urdf, reason, robot, scene, tmp_path, capfd
+    urdf, reason, make_bag, tmp_path, capfd
 ):
-    cameras, positions, frames = scene
-    bag = record(tmp_path / 'bag', robot, cameras, positions, frames=frames, urdf=urdf)
+    bag = make_bag('bag', urdf=urdf)
     assert run(tmp_path, bag) == 1
     said = capfd.readouterr().err.splitlines()
     assert len(said) == 1, said  # urdfdom prints lines of its own
@@ -233,9 +214,8 @@ def test_a_description_that_is_no_robot_is_named_by_its_topic(
     assert "robot.urdf'" not in said[0] and '--robot' in said[0]
 
 
-def test_bags_are_read_as_they_are_with_the_mapping(robot, scene, tmp_path, capsys):
-    cameras, positions, frames = scene
-    bag = record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
+def test_bags_are_read_as_they_are_with_the_mapping(make_bag, tmp_path, capsys):
+    bag = make_bag()
     assert run(tmp_path, bag) == 0
     mapping = tmp_path / 'out' / 'mapping.yaml'
     assert load_bag_mapping(mapping).robot == str(tmp_path / 'out' / 'robot' / 'robot.yaml')
@@ -247,12 +227,12 @@ def test_bags_are_read_as_they_are_with_the_mapping(robot, scene, tmp_path, caps
     assert 'not checked' in printed and 'hand.stl' in printed
 
 
-def test_a_fisheye_and_a_moving_mount_are_told_apart(robot, scene, tmp_path, capsys):
-    cameras, positions, frames = scene
+def test_a_fisheye_keeps_its_model(scene, make_bag, tmp_path, capsys):
+    cameras, _, _ = scene
     bent = replace(
         cameras['door'], distortion_model='equidistant', distortion=np.array([0.1, 0, 0, 0])
     )
-    bag = record(tmp_path / 'bent', robot, {**cameras, 'door': bent}, positions, frames=frames)
+    bag = make_bag('bent', cameras={**cameras, 'door': bent})
     assert run(tmp_path, bag) == 0, capsys.readouterr().err
     camera = read_episode(tmp_path / 'out' / 'bent').cameras['door']
     assert camera.distortion_model == 'equidistant'

@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-from bags import record
-from crane import FPS, load, make_cameras, make_positions, URDF, write_episode, write_robot
+from bags import bag_cameras, grey_frames, MAPPING, record
+from crane import FPS, JOINTS, make_cameras, make_positions, URDF, write_episode, write_robot
 import numpy as np
 import pytest
 import yaml
@@ -23,23 +23,11 @@ from mtv_world_ros.replay.offline import observe
 
 NUM = 30
 SEARCH = ResidualSearch(max_pairs=4, lags_s=(0.0,))
-JOINTS = ('yaw', 'shoulder', 'elbow', 'roll', 'nod', 'jaw_left')
-MAPPING = {
-    'namespace': 'cell',
-    'action': 'state',
-    'joints': {f'lab_{name}': name for name in JOINTS},
-    'instruction': 'wave',
-}
 SPEC = WorldModelSpec(
     views=('door', 'palm'), fps=FPS, num_frames=4, width=80, height=60, robot='crane'
 )
 CEILING = np.diag([1.0, -1, -1, 1])
 CEILING[:3, 3] = 0.4, 0.1, 2.0
-
-
-@pytest.fixture(scope='module')
-def robot(tmp_path_factory):
-    return load(tmp_path_factory.mktemp('robot'))
 
 
 def cart_poses():
@@ -54,13 +42,14 @@ def cart_poses():
     return poses
 
 
+def record_cart(path, robot, poses):
+    positions, frames = make_positions(NUM / FPS)[:NUM], grey_frames(NUM)
+    return record(path, robot, bag_cameras(), positions, frames=frames, cart=poses)
+
+
 @pytest.fixture
 def bag(robot, tmp_path):
-    cameras = make_cameras()
-    del cameras['window']
-    positions = make_positions(NUM / FPS)[:NUM]
-    frames = {v: np.full((NUM, c.height, c.width, 3), 90, np.uint8) for v, c in cameras.items()}
-    path = record(tmp_path / 'wave', robot, cameras, positions, frames=frames, cart=cart_poses())
+    path = record_cart(tmp_path / 'wave', robot, cart_poses())
     (tmp_path / 'bag.yaml').write_text(yaml.safe_dump(MAPPING))
     return path
 
@@ -129,13 +118,9 @@ def test_the_doctor_says_that_it_is_not_checked(bag, robot):
 
 
 def test_a_gap_in_tf_is_named(robot, tmp_path, bag, capsys):
-    cameras = make_cameras()
-    del cameras['window']
-    positions = make_positions(NUM / FPS)[:NUM]
-    frames = {v: np.full((NUM, c.height, c.width, 3), 90, np.uint8) for v, c in cameras.items()}
     poses = cart_poses()
     poses[8:20, :3, :3] = np.nan  # no poses: twelve images at 10 Hz
-    broken = record(tmp_path / 'gap', robot, cameras, positions, frames=frames, cart=poses)
+    broken = record_cart(tmp_path / 'gap', robot, poses)
     command = ['import-bag', str(broken), '--topics', str(tmp_path / 'bag.yaml')]
     assert main([*command, '--out', str(tmp_path / 'out')]) == 1
     assert (

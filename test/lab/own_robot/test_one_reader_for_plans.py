@@ -1,10 +1,9 @@
 """What the live node accepts as a plan the importer accepts, and the reverse."""
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 
-from bags import record
-from crane import FPS, load, make_cameras, make_positions, render, START_NS
+from bags import bag_cameras, grey_frames, record
+from crane import FPS, JOINTS, make_positions, render, START_NS
 import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message
@@ -23,22 +22,14 @@ from mtv_world_ros.ros.world_model.rollouts import RequestMaker
 
 NUM = 25
 TOPIC = '/cell/joint_trajectory'
-ALL = ('yaw', 'shoulder', 'elbow', 'roll', 'nod', 'jaw_left')
-ARM = ALL[:5]
+ARM = JOINTS[:5]
 HOME = {'yaw': 0.1, 'shoulder': 0.2, 'elbow': 0.3, 'roll': 0.4, 'nod': 0.5, 'jaw_left': 0.02}
-
-
-@pytest.fixture(scope='module')
-def robot(tmp_path_factory):
-    return load(tmp_path_factory.mktemp('robot'))
 
 
 @pytest.fixture(scope='module')
 def scene(robot):
     """Cameras, positions whose gripper closes, and what the cameras see."""
-    cameras = make_cameras()
-    del cameras['window']
-    positions = make_positions(NUM / FPS)
+    cameras, positions = bag_cameras(), make_positions(NUM / FPS)
     positions[:, 5] = np.linspace(0.04, 0.0, len(positions))
     return cameras, positions, {v: render(robot, c, positions) for v, c in cameras.items()}
 
@@ -56,7 +47,7 @@ class Case:
     """
 
     says: str = ''
-    names: tuple[str, ...] = ALL
+    names: tuple[str, ...] = JOINTS
     rows: tuple[tuple[float, ...], ...] | None = None
     velocities: tuple[tuple[float, ...], ...] | None = None
     times: tuple[float, ...] = (0.5, 1.0)
@@ -94,8 +85,8 @@ def changed(value):
 
 CASES = {
     'all joints': Case(),
-    'in another order': Case(names=ALL[::-1]),
-    'more joints than the robot has': Case(names=(*ALL, 'lift')),
+    'in another order': Case(names=JOINTS[::-1]),
+    'more joints than the robot has': Case(names=(*JOINTS, 'lift')),
     'the arm without its gripper': Case(names=ARM),
     'one joint': Case(names=('elbow',)),
     'with velocities': Case(velocities=((0.0,) * 6, (0.1,) * 6)),
@@ -107,7 +98,7 @@ CASES = {
     'a joint of another robot beside the arm': Case('ur_elbow', names=(*ARM, 'ur_elbow')),
     'no joints': Case('0 joint names', names=()),
     'no points': Case('0 points', times=()),
-    'a name twice': Case('more than once', names=(*ALL, 'yaw')),
+    'a name twice': Case('more than once', names=(*JOINTS, 'yaw')),
     'not a number': Case('must be finite', rows=changed(float('nan'))),
     'infinite velocity': Case('must be finite', velocities=((0.0,) * 6, (float('inf'),) * 6)),
     'too few positions': Case('5 positions for 6 joints', rows=((0.1,) * 5, (0.1,) * 5)),
@@ -138,18 +129,24 @@ def ask_node(case, robot):
     return ''
 
 
-def ask_importer(case, robot, scene, folder):
-    """Why the importer refuses the message, or leaves it out; empty = it does not."""
+def converted(folder, robot, scene, plans):
+    """What is said of a bag of the scene with these plans, imported to `folder/episode`."""
     cameras, positions, frames = scene
 
-    def plan(bag):
-        bag.write(TOPIC, messages.JOINT_TRAJECTORY, START_NS, case.message(START_NS))
+    def write(bag):
+        for stamp, message in plans:
+            bag.write(TOPIC, messages.JOINT_TRAJECTORY, stamp, message)
 
-    bag = record(folder / 'bag', robot, cameras, positions, frames=frames, prefix='', more=plan)
+    bag = record(folder / 'bag', robot, cameras, positions, frames=frames, prefix='', more=write)
     views = {view: f'/cell/{view}/color/image_raw' for view in cameras}
     mapping = BagMapping.model_validate({'namespace': 'cell', 'views': views})
+    return convert_bag(bag, folder / 'episode', mapping, robot, None)
+
+
+def ask_importer(case, robot, scene, folder):
+    """Why the importer refuses the message, or leaves it out; empty = it does not."""
     try:
-        convert_bag(bag, folder / 'episode', mapping, robot, None)
+        converted(folder, robot, scene, [(START_NS, case.message(START_NS))])
     except MtvWorldError as error:
         return str(error)
     return ''
@@ -164,19 +161,11 @@ def test_node_and_importer_take_and_refuse_the_same_plans(name, robot, scene, tm
 
 
 def test_joints_that_a_plan_leaves_out_have_the_measured_positions(robot, scene, tmp_path):
-    cameras, positions, frames = scene
-    case = Case(names=ARM, times=(0.2, 1.0))
-    late = Case(names=ARM, times=(0.1, 0.3))
-
-    def plans(bag):
-        for seconds, one in ((0.0, case), (2.0, late)):
-            stamp = START_NS + round(seconds * 1e9)
-            bag.write(TOPIC, messages.JOINT_TRAJECTORY, stamp, one.message(stamp))
-
-    bag = record(tmp_path / 'bag', robot, cameras, positions, frames=frames, prefix='', more=plans)
-    views = {view: f'/cell/{view}/color/image_raw' for view in cameras}
-    mapping = BagMapping.model_validate({'namespace': 'cell', 'views': views})
-    said = convert_bag(bag, tmp_path / 'episode', mapping, robot, None)
+    _, positions, _ = scene
+    cases = {0: Case(names=ARM, times=(0.2, 1.0)), 2: Case(names=ARM, times=(0.1, 0.3))}
+    stamps = {START_NS + seconds * 10**9: case for seconds, case in cases.items()}
+    plans = [(stamp, case.message(stamp)) for stamp, case in stamps.items()]
+    said = converted(tmp_path, robot, scene, plans)
     assert any('leave out joints jaw_left; their measured positions' in text for text in said)
     episode = read_episode(tmp_path / 'episode')
     measured = np.arange(len(positions)) / FPS
@@ -197,25 +186,16 @@ def test_joints_that_a_plan_leaves_out_have_the_measured_positions(robot, scene,
 
 def test_a_stream_of_one_point_plans_becomes_plans_of_the_chunks_length(robot, tmp_path):
     """6 s of MoveIt Servo at 30 Hz: each target is reached a period after its message."""
-    cameras = make_cameras()
-    del cameras['window']
-    positions = make_positions(6.5)
-    frames = {v: np.zeros((len(positions), c.height, c.width, 3), np.uint8)
-              for v, c in cameras.items()}  # fmt: skip
+    cameras, positions = bag_cameras(), make_positions(6.5)
+    frames = grey_frames(len(positions))
     period = 1 / 30
     targets = np.stack([np.linspace(0.0, 0.3, 180)] * 6, axis=1) * [1, 1, 1, 1, 1, 0.1]
 
-    def servo(bag):
-        for k, row in enumerate(targets):
-            stamp = START_NS + round(k * period * 1e9)
-            case = SimpleNamespace(names=ALL, rows=(tuple(row),), velocities=None, times=(period,))
-            message = Case.message(case, stamp)
-            bag.write(TOPIC, messages.JOINT_TRAJECTORY, stamp, message)
-
-    bag = record(tmp_path / 'bag', robot, cameras, positions, frames=frames, prefix='', more=servo)
-    views = {view: f'/cell/{view}/color/image_raw' for view in cameras}
-    mapping = BagMapping.model_validate({'namespace': 'cell', 'views': views})
-    said = convert_bag(bag, tmp_path / 'episode', mapping, robot, None)
+    servo = []
+    for k, row in enumerate(targets):
+        stamp = START_NS + round(k * period * 1e9)
+        servo.append((stamp, Case(rows=(tuple(row),), times=(period,)).message(stamp)))
+    said = converted(tmp_path, robot, (cameras, positions, frames), servo)
     assert any('180 trajectories of one point are a stream' in text for text in said)
     plans = read_episode(tmp_path / 'episode').trajectories
     assert [(s - START_NS) / 1e9 for s, _ in plans] == pytest.approx([0.0, 3.2], abs=period)

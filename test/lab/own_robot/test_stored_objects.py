@@ -3,9 +3,9 @@
 from dataclasses import replace
 import json
 
-from bags import record
+from bags import bag_cameras, MAPPING, record
 from chat_server import ChatServer, completion
-from crane import FPS, load, make_cameras, make_positions, render
+from crane import FPS, make_positions, render
 import numpy as np
 import pytest
 import yaml
@@ -23,13 +23,6 @@ from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 pytest.importorskip('openai')
 NUM = 40
-MAPPING = {
-    'namespace': 'cell',
-    'action': 'state',
-    'joints': {f'lab_{name}': name for name in ('yaw', 'shoulder', 'elbow', 'roll', 'nod')}
-    | {'lab_jaw_left': 'jaw_left'},
-    'instruction': 'tidy up',
-}  # fmt: skip
 SPEC = WorldModelSpec(
     views=('door', 'palm'), fps=FPS, num_frames=4, width=80, height=60, robot='crane'
 )
@@ -44,17 +37,10 @@ def answer(*names):
     return completion(json.dumps({'objects': objects}))
 
 
-@pytest.fixture(scope='module')
-def robot(tmp_path_factory):
-    return load(tmp_path_factory.mktemp('robot'))
-
-
 @pytest.fixture
 def bag(robot, tmp_path):
     """A bag of 40 frames in which a red patch goes to the right and a blue one stays."""
-    cameras = make_cameras()
-    del cameras['window']
-    positions = make_positions(NUM / FPS)[:NUM]
+    cameras, positions = bag_cameras(), make_positions(NUM / FPS)[:NUM]
     frames = {view: render(robot, c, positions).copy() for view, c in cameras.items()}
     for video in frames.values():
         for k, frame in enumerate(video):
@@ -80,7 +66,7 @@ def ask(tmp_path, monkeypatch):
 
 def run(bag, *more):
     folder = bag.parent
-    (folder / 'bag.yaml').write_text(yaml.safe_dump(MAPPING))
+    (folder / 'bag.yaml').write_text(yaml.safe_dump({**MAPPING, 'instruction': 'tidy up'}))
     command = ['import-bag', str(bag), '--topics', str(folder / 'bag.yaml')]
     return main([*command, '--out', str(folder / 'out'), *map(str, more)])
 

@@ -1,10 +1,10 @@
 """Recordings of which nothing is known but images and joints, and mappings with more views."""
 
-from bags import record
-from crane import FPS, load, make_cameras, make_positions, render
+from bags import bag_cameras, MAPPING, record
+from crane import FPS, make_positions, render
 import numpy as np
 import pytest
-from test_import_bag import MAPPING, run
+from test_import_bag import run
 import yaml
 
 from mtv_world_ros.cli import main
@@ -14,12 +14,9 @@ from mtv_world_ros.errors import CalibrationError
 
 
 @pytest.fixture
-def bag(tmp_path):
+def bag(robot, tmp_path):
     """A bag without the door's transform; the palm's camera_info is left out by the mapping."""
-    robot = load(tmp_path / 'made')
-    cameras = make_cameras()
-    del cameras['window']
-    positions = make_positions(20 / FPS)
+    cameras, positions = bag_cameras(), make_positions(20 / FPS)
     frames = {view: render(robot, camera, positions) for view, camera in cameras.items()}
     return record(tmp_path / 'wave', robot, cameras, positions, frames=frames)
 

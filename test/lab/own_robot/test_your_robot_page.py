@@ -13,11 +13,10 @@ import signal
 import subprocess
 import sys
 
-from bags import record
+from bags import MAPPING, record
 from crane import FPS, load, make_cameras, make_positions, render, tool_pixels
 import numpy as np
 import pytest
-from test_import_bag import MAPPING
 from test_own_checkpoint import TINY
 import yaml
 

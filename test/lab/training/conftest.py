@@ -5,24 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from sources import make_source
+from sources import make_source, TINY_MODEL
 
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.files import share_path
 from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
 
-TINY = {
-    'transformer.num_attention_heads': 2,
-    'transformer.attention_head_dim': 12,
-    'transformer.ffn_dim': 32,
-    'transformer.num_layers': 1,
-    'transformer.stem_widths': [8, 16, 16],
+TINY = TINY_MODEL | {
     'transformer.frames_per_token': 2,
-    'transformer.freq_dim': 16,
     'video.num_frames': 2,
-    'video.width': 48,
-    'video.height': 40,
-    'optimizer.batch_size': 1,
     'optimizer.warmup_steps': 1,
     'optimizer.steps': 4,
     'optimizer.learning_rate': 2e-3,

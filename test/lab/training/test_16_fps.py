@@ -4,24 +4,18 @@ import json
 from pathlib import Path
 
 import pytest
+from sources import set_options, TINY_MODEL
 
 from mtv_world_ros.bench.world.opengl import missing_opengl
 from mtv_world_ros.cli import main
 
 #: everything small but time: 80 frames at 16 fps after the observed one, 5 s
-MINIATURE = {
+MINIATURE = TINY_MODEL | {
     'video.fps': 16,
     'video.num_frames': 80,
     'video.width': 64,
     'video.height': 48,
-    'transformer.num_attention_heads': 2,
-    'transformer.attention_head_dim': 12,
-    'transformer.ffn_dim': 32,
-    'transformer.num_layers': 1,
-    'transformer.stem_widths': [8, 16, 16],
     'transformer.frames_per_token': 8,
-    'transformer.freq_dim': 16,
-    'optimizer.batch_size': 1,
     'optimizer.steps': 1,
 }
 
@@ -32,8 +26,7 @@ def test_episodes_of_16_fps_are_collected_trained_on_and_scored(tmp_path):
     collect = ['collect', '--task', 'place_block_a2b_left', '--episodes', '1', '--fps', '16']
     assert main([*collect, '--width', '64', '--height', '48', '--out', data]) == 0
     few = ['--threads', '1', '--dtype', 'float32']
-    preset = [f'--set={key}={value}' for key, value in MINIATURE.items()]
-    assert main(['train', data, '--out', run, *few, *preset]) == 0
+    assert main(['train', data, '--out', run, *few, *set_options(MINIATURE)]) == 0
     checkpoint = f'{run}/checkpoint'
     card = json.loads(Path(checkpoint, 'world_model.json').read_text())
     assert (card['fps'], card['num_frames']) == (16.0, 80)

@@ -13,23 +13,19 @@ import signal
 
 import numpy as np
 import pytest
-from sources import make_source
+from sources import make_source, make_trainer
 import torch
 
 from mtv_world_ros.assembly import checkpoint_path
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
-from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.cli.train import set_overrides
-from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.resume import DiskError
-from mtv_world_ros.lab.training.trainer import Trainer
-from mtv_world_ros.lab.training.training_config import TrainingConfig, TrainingRun
+from mtv_world_ros.lab.training.training_config import TrainingRun
 from mtv_world_ros.lab.training.training_run import load_recordings, notes, train
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.model.checkpoint import load_checkpoint
@@ -70,12 +66,8 @@ def other_robot(message: BagMessage) -> list[bytes]:
 
 
 def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
-    episode: Path,
-    tiny: TrainingConfig,
-    robot: RobotModel,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture,
-) -> None:
+    episode, tiny, robot, tmp_path, capsys
+):
     data = tmp_path / 'data'
     rewrite(episode, data / 'good', lambda message: [message.data])
     for name in ('stateless_a', 'stateless_b'):
@@ -83,18 +75,21 @@ def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
     rewrite(episode, data / 'viewless', without('/high/image_raw/compressed'))
     rewrite(episode, data / 'other_robot', other_robot)
     rewrite(episode, data / 'moved', moving_camera)
+    (data / 'broken').mkdir()
+    (data / 'broken' / 'metadata.yaml').write_text('rosbag2_bagfile_information: {}')
     out = tmp_path / 'run'
     run = TrainingRun(config=tiny, dataset=data, out=out)
     train(run, robot=robot, segmenter=ColourSegmenter())
     reasons = {Path(k).name: v for k, v in json.loads((out / 'skipped.json').read_text()).items()}
-    assert sorted(reasons) == ['moved', 'other_robot', 'stateless_a', 'stateless_b', 'viewless']
+    bad = ['broken', 'moved', 'other_robot', 'stateless_a', 'stateless_b', 'viewless']
+    assert sorted(reasons) == bad
     assert 'joint_states' in reasons['stateless_a']
     assert "'high'" in reasons['viewless']
     assert 'panda_joint0' in reasons['other_robot']
     assert '/low/camera_info' in reasons['moved'] and 'changes' in reasons['moved']
     printed = capsys.readouterr()
     lines = [line for line in (printed.out + printed.err).splitlines() if 'left out:' in line]
-    assert len(lines) == 4
+    assert len(lines) == 5
     assert 'left out: 2 x ' in lines[0] and 'joint_states' in lines[0]
     assert lines[0].endswith('(stateless_a, stateless_b)')
     assert all(any(f'({name})' in line for line in lines) for name in ('viewless', 'moved'))
@@ -109,9 +104,7 @@ def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
         load_recordings([episode], tiny.spec, franka, tmp_path / 'cache')
 
 
-def test_weights_that_know_other_drawings_are_told(
-    tiny: TrainingConfig, recording: Recording
-) -> None:
+def test_weights_that_know_other_drawings_are_told(tiny, recording):
     bundled = checkpoint_path('bundled')
     said = ' '.join(notes(tiny, [recording], bundled))
     assert 'rendering.object_motion=true' in said and 'rendering.finger_width_m=0.008' in said
@@ -119,9 +112,7 @@ def test_weights_that_know_other_drawings_are_told(
     assert 'starts from' not in ' '.join(notes(alike, [recording], bundled))
 
 
-def test_episodes_of_other_cameras_than_most_are_named(
-    tiny: TrainingConfig, recording: Recording
-) -> None:
+def test_episodes_of_other_cameras_than_most_are_named(tiny, recording):
     first, *rest = recording.cameras
     pose = first.T_mount_camera.copy()
     pose[0, 3] += 0.1
@@ -133,11 +124,9 @@ def test_episodes_of_other_cameras_than_most_are_named(
     assert 'other calibrations' not in ' '.join(notes(tiny, [recording, recording]))
 
 
-def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(
-    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
-) -> None:
+def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(tiny, source, tmp_path):
     """Files may not grow beyond a limit here, which fails at the same calls as a full disk."""
-    trainer = Trainer(tiny, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})
+    trainer = make_trainer(tiny, tmp_path)
     reports = trainer.run(
         source, save_every=1, on_save=lambda _: trainer.export(tmp_path / 'checkpoint')
     )
@@ -151,14 +140,14 @@ def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert sorted(path.name for path in tmp_path.iterdir()) == ['checkpoint', 'state']
-    resumed = Trainer(tiny, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})
+    resumed = make_trainer(tiny, tmp_path)
     assert resumed.load_state() and resumed.step == 1
     assert load_checkpoint(tmp_path / 'checkpoint').card.trained_on['steps'] == 1
 
 
 def test_a_killed_data_process_is_said_and_others_make_the_same_clips(
-    recording: Recording, tiny: TrainingConfig, robot: RobotModel, source: BatchSource
-) -> None:
+    recording, tiny, robot, source
+):
     others = set(multiprocessing.active_children())
     workers = make_source([recording], tiny, robot, workers=2)
     for step in range(3):

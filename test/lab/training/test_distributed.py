@@ -13,11 +13,11 @@ from types import SimpleNamespace
 
 import pytest
 from safetensors.torch import load_file
+from sources import make_trainer
 import torch
 import yaml
 
 from mtv_world_ros.errors import TrainingError
-from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.distributed import Processes
 from mtv_world_ros.lab.training.trainer import Trainer
 from mtv_world_ros.lab.training.training_config import TrainingConfig
@@ -35,9 +35,7 @@ def preset(config: TrainingConfig, folder: Path, steps: int = 3) -> Path:
     return file
 
 
-def test_two_processes_make_the_steps_of_one(
-    tiny: TrainingConfig, episode: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_processes_make_the_steps_of_one(tiny, episode, tmp_path, monkeypatch):
     arguments = [str(episode.parent), str(preset(tiny, tmp_path))]
     two, one = tmp_path / 'two', tmp_path / 'one'
     launcher = ['-m', 'torch.distributed.run', '--standalone', '--nproc-per-node', '2']
@@ -72,9 +70,7 @@ def test_two_processes_make_the_steps_of_one(
     assert len((two / 'log.jsonl').read_text().splitlines()) == 1  # one process writes
 
 
-def test_accumulated_parts_have_the_gradients_of_the_whole(
-    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
-) -> None:
+def test_accumulated_parts_have_the_gradients_of_the_whole(tiny, source, tmp_path):
     source._numbers = range(3)
     batch = source.batch(0)
     whole = gradients(tiny, batch, tmp_path)
@@ -89,12 +85,12 @@ def test_accumulated_parts_have_the_gradients_of_the_whole(
 
 
 def gradients(config: TrainingConfig, batch, folder: Path) -> dict[str, torch.Tensor]:
-    trainer = Trainer(config, folder, seed=0, device='cpu', dtype=torch.float32, trained_on={})
+    trainer = make_trainer(config, folder)
     trainer.gradients(batch)
     return {n: p.grad for n, p in trainer.weights.master.items() if p.grad is not None}
 
 
-def test_shares_are_even_and_leave_nothing_out() -> None:
+def test_shares_are_even_and_leave_nothing_out():
     processes = Processes('cpu')
     shares = []
     for number in range(3):
@@ -104,9 +100,7 @@ def test_shares_are_even_and_leave_nothing_out() -> None:
     assert sorted(map(len, shares)) == [2, 3, 3]
 
 
-def test_processes_wait_for_the_main_one_longer_than_nccl_does(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_processes_wait_for_the_main_one_longer_than_nccl_does(monkeypatch):
     given = {}
 
     def state(**options: object) -> SimpleNamespace:
@@ -118,24 +112,14 @@ def test_processes_wait_for_the_main_one_longer_than_nccl_does(
     assert given['timeout'] > 10 * timedelta(minutes=10) and given['cpu'] is False
 
 
-def test_fewer_clips_than_processes_are_refused(tiny: TrainingConfig, tmp_path: Path) -> None:
+def test_fewer_clips_than_processes_are_refused(tiny, tmp_path):
     processes = Processes('cpu')
     processes.count = 2
     with pytest.raises(TrainingError, match=r'batch_size is 1, less than 2 processes'):
-        Trainer(
-            tiny,
-            tmp_path,
-            seed=0,
-            device='cpu',
-            dtype=torch.float32,
-            trained_on={},
-            processes=processes,
-        )
+        make_trainer(tiny, tmp_path, processes=processes)
 
 
-def test_a_process_whose_sister_was_killed_says_so_and_the_state_is_whole(
-    tiny: TrainingConfig, episode: Path, tmp_path: Path
-) -> None:
+def test_a_process_whose_sister_was_killed_says_so_and_the_state_is_whole(tiny, episode, tmp_path):
     file = preset(tiny, tmp_path, steps=10**6)
     arguments = [str(tmp_path), str(episode.parent), str(file)]
     ended = subprocess.run(

@@ -1,6 +1,7 @@
 """What a step takes: counted on shapes, against a step that is really computed."""
 
 import pytest
+from sources import TINY_MODEL
 import torch
 
 from mtv_world_ros.cli import main
@@ -10,18 +11,7 @@ from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 
 def test_counts_what_a_real_step_does():
-    config = load_training_config(
-        'small',
-        {
-            'transformer.num_attention_heads': 2,
-            'transformer.attention_head_dim': 12,
-            'transformer.num_layers': 1,
-            'transformer.stem_widths': [8, 16, 16],
-            'transformer.freq_dim': 16,
-            'video.width': 48,
-            'video.height': 40,
-        },
-    )
+    config = load_training_config('small', TINY_MODEL)
     fake = step_cost(config, dtype=torch.float32)
     assert fake == step_cost(config, dtype=torch.float32, fake=False)
     model = MultiViewWanTransformer(**config.transformer)

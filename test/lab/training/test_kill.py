@@ -9,10 +9,9 @@ import subprocess
 import sys
 
 from safetensors.torch import load_file
+from sources import make_trainer
 import torch
 import yaml
-
-from mtv_world_ros.lab.training.trainer import Trainer
 
 SCRIPT = Path(__file__).with_name('train_killed.py')
 ROOT = Path(__file__).parents[3]
@@ -45,15 +44,12 @@ def test_kill_9_changes_neither_curve_nor_weights(tiny, episode, tmp_path):
 
 
 def test_a_kill_between_the_two_renames_leaves_the_old_state(tiny, tmp_path):
-    def trainer() -> Trainer:
-        return Trainer(tiny, tmp_path, seed=0, device='cpu', dtype=torch.float32, trained_on={})
-
-    first = trainer()
+    first = make_trainer(tiny, tmp_path)
     first.step = 7
     first.save_state()
     (tmp_path / 'state').rename(tmp_path / 'state.old')
     (tmp_path / 'state.partial').mkdir()
-    resumed = trainer()
+    resumed = make_trainer(tiny, tmp_path)
     assert resumed.load_state() and resumed.step == 7
     resumed.save_state()
     assert sorted(path.name for path in tmp_path.iterdir()) == ['state']

@@ -4,25 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 import json
-from pathlib import Path
 import re
 import sys
 
 import numpy as np
 import pytest
-from sources import make_source
+from sources import losses_of, make_source, make_trainer
 import torch
 
 from mtv_world_ros.assembly import load_pipeline
-from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.errors import ConfigError, TrainingError
-from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.lab.training.clips.batches import BatchSource
-from mtv_world_ros.lab.training.trainer import learning_rate, Trainer
+from mtv_world_ros.lab.training.trainer import learning_rate
 from mtv_world_ros.lab.training.training_config import (
     load_training_config,
     OptimizerConfig,
-    TrainingConfig,
     TrainingRun,
 )
 from mtv_world_ros.lab.training.training_run import find_episodes, train
@@ -30,29 +25,17 @@ from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
-def make(config: TrainingConfig, folder: Path, seed: int = 0, device: str = 'cpu') -> Trainer:
-    dtype = torch.float32 if device == 'cpu' else torch.bfloat16
-    return Trainer(config, folder, seed=seed, device=device, dtype=dtype, trained_on={})
-
-
-def run(trainer: Trainer, source: BatchSource, save_every: int = 1000) -> list[float]:
-    reports = trainer.run(source, save_every=save_every, on_save=lambda _: None)
-    return [report.loss for report in reports]
-
-
-def test_a_killed_run_continues_as_if_nothing_had_happened(
-    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
-) -> None:
-    whole = make(tiny, tmp_path / 'whole')
-    losses = run(whole, source)
-    cut = make(tiny, tmp_path / 'cut')
+def test_a_killed_run_continues_as_if_nothing_had_happened(tiny, source, tmp_path):
+    whole = make_trainer(tiny, tmp_path / 'whole')
+    losses = losses_of(whole, source)
+    cut = make_trainer(tiny, tmp_path / 'cut')
     reports = cut.run(source, save_every=2, on_save=lambda _: None)
     first = [next(reports).loss, next(reports).loss, next(reports).loss]
     reports.close()  # the third step is lost: the state is that of the second
-    resumed = make(tiny, tmp_path / 'cut')
+    resumed = make_trainer(tiny, tmp_path / 'cut')
     assert resumed.load_state()
     assert resumed.step == 2
-    assert first[:2] + run(resumed, source) == losses
+    assert first[:2] + losses_of(resumed, source) == losses
     for one, other in zip(whole.weights.parameters, resumed.weights.parameters, strict=True):
         assert torch.equal(one, other)
     for one, other in zip(
@@ -61,9 +44,7 @@ def test_a_killed_run_continues_as_if_nothing_had_happened(
         assert torch.equal(one, other)
 
 
-def test_a_compiled_run_learns_as_a_plain_one(
-    tiny: TrainingConfig, source: BatchSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_compiled_run_learns_as_a_plain_one(tiny, source, tmp_path, monkeypatch):
     """`eager` traces as inductor does, and leaves the minute that g++ takes to the benchmark."""
     compiles, calls = MultiViewWanTransformer.compile_repeated_blocks, []
 
@@ -76,49 +57,44 @@ def test_a_compiled_run_learns_as_a_plain_one(
     for checkpointing in (False, True):
         chosen = tiny.optimizer.replace(gradient_checkpointing=checkpointing)
         compiled = tiny.replace(optimizer=chosen.replace(compile=True))
-        trainer = make(compiled, tmp_path / f'compiled{checkpointing}')
-        plain = make(tiny.replace(optimizer=chosen), tmp_path / f'plain{checkpointing}')
-        assert run(trainer, source) == pytest.approx(run(plain, source), rel=1e-4)
+        trainer = make_trainer(compiled, tmp_path / f'compiled{checkpointing}')
+        plain = make_trainer(tiny.replace(optimizer=chosen), tmp_path / f'plain{checkpointing}')
+        assert losses_of(trainer, source) == pytest.approx(losses_of(plain, source), rel=1e-4)
         trainer.export(tmp_path / f'checkpoint{checkpointing}')
     assert len(calls) == 2
 
 
 @pytest.mark.gpu
-def test_a_killed_run_continues_on_a_gpu(
-    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
-) -> None:
+def test_a_killed_run_continues_on_a_gpu(tiny, source, tmp_path):
     config = tiny.replace(optimizer=tiny.optimizer.replace(gradient_checkpointing=True))
-    reports = make(config, tmp_path, device='cuda').run(
+    reports = make_trainer(config, tmp_path, device='cuda').run(
         source, save_every=2, on_save=lambda _: None
     )
     first = [next(reports).loss for _ in range(3)]
     reports.close()
-    resumed = make(config, tmp_path, device='cuda')
+    resumed = make_trainer(config, tmp_path, device='cuda')
     assert resumed.load_state() and resumed.step == 2
-    assert run(resumed, source)[0] == pytest.approx(first[2], rel=0.01)
+    assert losses_of(resumed, source)[0] == pytest.approx(first[2], rel=0.01)
     resumed.export(tmp_path / 'checkpoint')
     assert {p.device.type for p in resumed.weights.parameters} == {'cuda'}
 
 
-def test_a_lack_of_memory_says_what_to_set(
-    tiny: TrainingConfig, source: BatchSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lack_of_memory_says_what_to_set(tiny, source, tmp_path, monkeypatch):
     def fail(*_: object) -> None:
         raise torch.OutOfMemoryError('CUDA out of memory. Tried to allocate 2.00 GiB.')
 
-    trainer = make(tiny, tmp_path)
+    trainer = make_trainer(tiny, tmp_path)
     monkeypatch.setattr(trainer, 'gradients', fail)
     with pytest.raises(TrainingError, match=r'out of memory on cpu: .*accumulation.*2\.00 GiB'):
-        run(trainer, source)
+        losses_of(trainer, source)
 
 
-def test_learns_one_clip(recording: Recording, tiny: TrainingConfig, robot: RobotModel,
-                         tmp_path: Path) -> None:  # fmt: skip
+def test_learns_one_clip(recording, tiny, robot, tmp_path):
     """The loss on the first frames of one episode halves within 60 steps."""
     config = tiny.replace(optimizer=tiny.optimizer.replace(steps=60))
     augment = config.augment.replace(start_noise=0.0, colour_permutation=0.0)
     source = make_source([recording], config.replace(augment=augment), robot)
-    trainer = make(config, tmp_path)
+    trainer = make_trainer(config, tmp_path)
     batch = source.batch(0)
     before = trainer.loss(batch).mean.item()
     for step in range(60):
@@ -128,10 +104,8 @@ def test_learns_one_clip(recording: Recording, tiny: TrainingConfig, robot: Robo
     assert trainer.loss(batch).mean.item() < 0.5 * before
 
 
-def test_a_loss_that_is_not_finite_stops_and_leaves_the_last_state(
-    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
-) -> None:
-    trainer = make(tiny, tmp_path)
+def test_a_loss_that_is_not_finite_stops_and_leaves_the_last_state(tiny, source, tmp_path):
+    trainer = make_trainer(tiny, tmp_path)
     reports = trainer.run(source, save_every=1, on_save=lambda _: None)
     next(reports)
     next(reports)
@@ -141,20 +115,18 @@ def test_a_loss_that_is_not_finite_stops_and_leaves_the_last_state(
         next(reports)
     state = json.loads((tmp_path / 'state' / 'state.json').read_text())
     assert state['step'] == 1 or state['step'] == 2
-    resumed = make(tiny, tmp_path)
+    resumed = make_trainer(tiny, tmp_path)
     assert resumed.load_state()
     assert all(torch.isfinite(p).all() for p in resumed.weights.parameters)
 
 
-def test_a_state_of_another_seed_is_refused(
-    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
-) -> None:
-    run(make(tiny, tmp_path), source)
+def test_a_state_of_another_seed_is_refused(tiny, source, tmp_path):
+    losses_of(make_trainer(tiny, tmp_path), source)
     with pytest.raises(TrainingError, match='trained with seed 0, this run has 1'):
-        make(tiny, tmp_path, seed=1).load_state()
+        make_trainer(tiny, tmp_path, seed=1).load_state()
 
 
-def test_the_same_step_gives_the_same_batch(source: BatchSource) -> None:
+def test_the_same_step_gives_the_same_batch(source):
     first, again, other = source.batch(3), source.batch(3), source.batch(4)
     assert torch.equal(first.frames, again.frames)
     assert torch.equal(first.start_frame, again.start_frame)
@@ -162,7 +134,7 @@ def test_the_same_step_gives_the_same_batch(source: BatchSource) -> None:
     assert not torch.equal(first.frames, other.frames)
 
 
-def test_the_learning_rate_warms_up_holds_and_falls_to_zero() -> None:
+def test_the_learning_rate_warms_up_holds_and_falls_to_zero():
     config = OptimizerConfig(learning_rate=1.0, warmup_steps=4, steps=100, decay_share=0.2)
     assert [learning_rate(step, config) for step in (0, 3, 50, 79, 90)] == pytest.approx(
         [0.25, 1.0, 1.0, 1.0, 0.5]
@@ -170,9 +142,7 @@ def test_the_learning_rate_warms_up_holds_and_falls_to_zero() -> None:
     assert 0 < learning_rate(99, config) <= 0.05
 
 
-def test_trains_from_a_folder_to_a_checkpoint_that_serves(
-    episode: Path, tiny: TrainingConfig, robot: RobotModel, tmp_path: Path
-) -> None:
+def test_trains_from_a_folder_to_a_checkpoint_that_serves(episode, tiny, robot, tmp_path):
     out = tmp_path / 'run'
     run = TrainingRun(config=tiny, dataset=episode.parent, out=out, save_every=2)
     folder = train(run, robot=robot, segmenter=ColourSegmenter())
@@ -183,24 +153,7 @@ def test_trains_from_a_folder_to_a_checkpoint_that_serves(
     assert len((out / 'log.jsonl').read_text().splitlines()) == 1
 
 
-def test_episodes_that_cannot_be_used_are_named(
-    episode: Path, tiny: TrainingConfig, robot: RobotModel, tmp_path: Path
-) -> None:
-    dataset = tmp_path / 'dataset'
-    (dataset / 'broken').mkdir(parents=True)
-    (dataset / 'broken' / 'metadata.yaml').write_text('rosbag2_bagfile_information: {}')
-    (dataset / 'good').symlink_to(episode)
-    copied = dataset / 'copy'
-    copied.mkdir()
-    for file in episode.iterdir():
-        (copied / file.name).write_bytes(file.read_bytes())
-    run = TrainingRun(config=tiny, dataset=dataset, out=tmp_path / 'run')
-    train(run, robot=robot, segmenter=ColourSegmenter())
-    skipped = json.loads((tmp_path / 'run' / 'skipped.json').read_text())
-    assert [Path(path).name for path in skipped] == ['broken']
-
-
-def test_a_folder_without_episodes_says_how_to_get_some(tmp_path: Path) -> None:
+def test_a_folder_without_episodes_says_how_to_get_some(tmp_path):
     with pytest.raises(TrainingError, match='mtv-world collect'):
         find_episodes(tmp_path)
 
@@ -215,25 +168,23 @@ def test_a_folder_without_episodes_says_how_to_get_some(tmp_path: Path) -> None:
         ({'sampling.num_inference_steps': 0}, 'num_inference_steps is 0; it must be at least 1'),
     ],
 )
-def test_a_wrong_setting_names_the_nearest(override: dict, message: str) -> None:
+def test_a_wrong_setting_names_the_nearest(override, message):
     with pytest.raises(ConfigError, match=message):
         load_training_config('small', override)
 
 
 @pytest.mark.parametrize(('preset', 'steps'), [('small', 1), ('wan-1.3b', 50), ('wan-14b', 50)])
-def test_a_checkpoint_says_how_many_steps_it_is_made_for(preset: str, steps: int) -> None:
+def test_a_checkpoint_says_how_many_steps_it_is_made_for(preset, steps):
     assert load_training_config(preset).card({}).num_inference_steps == steps
     changed = load_training_config(preset, {'sampling.num_inference_steps': 7})
     assert changed.spec.num_inference_steps == 7
 
 
-def test_a_run_may_start_from_the_weights_of_a_checkpoint(
-    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
-) -> None:
-    first = make(tiny, tmp_path / 'first')
-    run(first, source)
+def test_a_run_may_start_from_the_weights_of_a_checkpoint(tiny, source, tmp_path):
+    first = make_trainer(tiny, tmp_path / 'first')
+    losses_of(first, source)
     first.export(tmp_path / 'checkpoint', dtype=torch.float32)
-    second = make(tiny, tmp_path / 'second', seed=1)
+    second = make_trainer(tiny, tmp_path / 'second', seed=1)
     second.start_from(tmp_path / 'checkpoint')
     assert second.step == 0
     for averaged, weight, worker in zip(
@@ -247,17 +198,13 @@ def test_a_run_may_start_from_the_weights_of_a_checkpoint(
 
 @pytest.mark.parametrize('name', ['yam_bimanual', 'franka'])
 def test_the_object_motion_network_comes_along_to_the_same_robot_alone(
-    name: str,
-    tiny: TrainingConfig,
-    source: BatchSource,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    first = make(tiny, tmp_path / 'first')
+    name, tiny, source, tmp_path, capsys
+):
+    first = make_trainer(tiny, tmp_path / 'first')
     first.export(tmp_path / 'checkpoint')
     (tmp_path / 'checkpoint' / 'object_motion').mkdir()
     (tmp_path / 'checkpoint' / 'object_motion' / 'config.json').write_text('{}')
-    second = make(tiny.replace(video=tiny.video.replace(robot=name)), tmp_path / 'second')
+    second = make_trainer(tiny.replace(video=tiny.video.replace(robot=name)), tmp_path / 'second')
     second.start_from(tmp_path / 'checkpoint')
     second.export(tmp_path / 'exported')
     is_same = tiny.video.robot == name
@@ -265,21 +212,17 @@ def test_the_object_motion_network_comes_along_to_the_same_robot_alone(
     assert ("left out: it is of robot 'yam_bimanual'" in capsys.readouterr().out) != is_same
 
 
-def test_weights_of_another_architecture_are_refused(
-    tiny: TrainingConfig, source: BatchSource, tmp_path: Path
-) -> None:
-    first = make(tiny, tmp_path / 'first')
+def test_weights_of_another_architecture_are_refused(tiny, source, tmp_path):
+    first = make_trainer(tiny, tmp_path / 'first')
     first.export(tmp_path / 'checkpoint')
     layers = int(tiny.transformer['num_layers']) + 1
     deeper = tiny.replace(transformer={**tiny.transformer, 'num_layers': layers})
     said = f'num_layers is {layers - 1} there and {layers} here. Give --preset'
     with pytest.raises(TrainingError, match=re.escape(said)):
-        make(deeper, tmp_path / 'second').start_from(tmp_path / 'checkpoint')
+        make_trainer(deeper, tmp_path / 'second').start_from(tmp_path / 'checkpoint')
 
 
-def test_failed_episodes_are_drawn_as_often_as_asked(
-    recording: Recording, tiny: TrainingConfig, robot: RobotModel
-) -> None:
+def test_failed_episodes_are_drawn_as_often_as_asked(recording, tiny, robot):
     failed = replace(recording, outcome='failure', frames=np.zeros_like(recording.frames))
     augment = tiny.augment.replace(start_noise=0.0, failure_share=0.5)
     drawn = tiny.replace(augment=augment, video=tiny.video.replace(object_mask=False))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.torch import load_file
-from sources import make_source
+from sources import losses_of, make_source, make_trainer
 import torch
 from wan_base import make_base, tiny_preset
 
@@ -17,7 +17,6 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.errors import CheckpointError, TrainingError
 from mtv_world_ros.lab.training.base import load_base
-from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.trainer import Trainer
 from mtv_world_ros.lab.training.training_config import (
     load_training_config,
@@ -61,20 +60,8 @@ def batches(clips, config, robot):
 
 def make(config: TrainingConfig, folder: Path, base: Path, device: str = 'cpu') -> Trainer:
     dtype = torch.float32 if device == 'cpu' else torch.bfloat16
-    return Trainer(
-        config,
-        folder,
-        seed=0,
-        device=device,
-        dtype=dtype,
-        trained_on={},
-        base=load_base(config, base, torch.device(device), dtype, seed=0),
-    )
-
-
-def run(trainer: Trainer, source: BatchSource) -> list[float]:
-    reports = trainer.run(source, save_every=1000, on_save=lambda _: None)
-    return [report.loss for report in reports]
+    loaded = load_base(config, base, torch.device(device), dtype, seed=0)
+    return make_trainer(config, folder, device=device, base=loaded)
 
 
 def predict(model: DiffusionWorldModel, clip: np.ndarray) -> np.ndarray:
@@ -92,17 +79,8 @@ def test_the_command_trains_an_adapter_that_changes_the_prediction(
     preset, base, episode, clips, tmp_path, capsys
 ):
     command = ['train', str(episode.parent), '--preset', str(preset), '--init', str(base)]
-    options = [
-        '--out',
-        str(tmp_path),
-        '--dtype',
-        'float32',
-        '--threads',
-        '1',
-        '--set',
-        'optimizer.steps=2',
-    ]
-    assert main([*command, *options]) == 0
+    options = ['--dtype', 'float32', '--threads', '1', '--set', 'optimizer.steps=2']
+    assert main([*command, '--out', str(tmp_path), *options]) == 0
     adapter = tmp_path / 'adapter'
     assert f'adapter for {base}: {adapter}' in capsys.readouterr().out
     assert not (tmp_path / 'checkpoint').exists()
@@ -152,14 +130,14 @@ def test_a_killed_run_continues_to_the_bit_and_exports_the_averages(
     config, base, batches, tmp_path
 ):
     whole = make(config, tmp_path / 'whole', base)
-    losses = run(whole, batches)
+    losses = losses_of(whole, batches)
     cut = make(config, tmp_path / 'cut', base)
     reports = cut.run(batches, save_every=2, on_save=lambda _: None)
     first = [next(reports).loss, next(reports).loss, next(reports).loss]
     reports.close()  # the third step is lost: the state is that of the second
     resumed = make(config, tmp_path / 'cut', base)
     assert resumed.load_state() and resumed.step == 2
-    assert first[:2] + run(resumed, batches) == losses
+    assert first[:2] + losses_of(resumed, batches) == losses
     for trainer in (whole, resumed):
         trainer.export(trainer.result)
     stored, again = (
@@ -183,7 +161,7 @@ def test_an_adapter_trains_and_continues_on_a_gpu(config, base, batches, tmp_pat
     reports.close()
     resumed = make(config, tmp_path, base, 'cuda')
     assert resumed.load_state() and resumed.step == 2
-    assert run(resumed, batches)[0] == pytest.approx(first[2], rel=0.01)
+    assert losses_of(resumed, batches)[0] == pytest.approx(first[2], rel=0.01)
     resumed.export(resumed.result)
     assert load_file(resumed.result / 'pytorch_lora_weights.safetensors')
 
@@ -211,11 +189,7 @@ def test_an_adapter_of_another_clock_is_refused_when_it_is_loaded(config, base, 
 @pytest.mark.parametrize(
     ('section', 'changes', 'message'),
     [
-        (
-            'video',
-            {'fps': 2.5},
-            r'says fps 5.0 in .*, the preset 2.5; set video.fps',
-        ),
+        ('video', {'fps': 2.5}, r'says fps 5.0 in .*, the preset 2.5; set video.fps'),
         ('rendering', {'half_life_s': 0.9}, 'set rendering to the same'),
         ('transformer', {'num_layers': 3}, 'has num_layers 2, the preset 3; give --preset'),
     ],

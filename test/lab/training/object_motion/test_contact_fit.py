@@ -58,11 +58,11 @@ def test_objects_are_where_masks_show_them_and_no_recorded_pose_is_read(recordin
     episode = read_episode(DEMO, views=VIEWS)
     assert episode.object_poses is not None
     true = episode.object_poses.T_base_object[:, :, :3, 3]
-    carried = recording.ways[-1, 0]
+    carried = recording.displacements[-1, 0]
     assert carried == pytest.approx(true[-1, 0] - true[0, 0], abs=0.006)
     # the block below it is hidden in part by then: its masks no longer say where it is
-    assert np.isnan(recording.ways[-1, 1]).all()
-    assert np.isfinite(recording.ways[:5]).all()
+    assert np.isnan(recording.displacements[-1, 1]).all()
+    assert np.isfinite(recording.displacements[:5]).all()
 
 
 def test_slippery_fingers_are_unlikely_where_a_block_was_carried(
@@ -84,7 +84,7 @@ def test_the_search_finds_what_made_the_motions(robot, response, settings, recor
         recording.names, frame.masks, frame.cameras, frame.poses
     )
     (motion,), _ = tracked.advance(recording.positions)
-    made = replace(recording, ways=motion.points - motion.points[0])
+    made = replace(recording, displacements=motion.points - motion.points[0])
     told = list[str]()
     found, numbers = fit_contact([made] * 4, Arms(robot, response), settings, report=told.append)
     by_name = {one.name: one for one in numbers}
@@ -115,7 +115,7 @@ def test_numbers_that_make_up_for_each_other_are_within_their_intervals(
         recording.names, frame.masks, frame.cameras, frame.poses
     )
     (motion,), _ = tracked.advance(recording.positions)
-    made = replace(recording, ways=motion.points - motion.points[0])
+    made = replace(recording, displacements=motion.points - motion.points[0])
     found, all_found = fit_contact([made] * 3, Arms(robot, response), settings)
     by_name = {one.name: one for one in all_found}
     for name, value in numbers.items():
@@ -141,9 +141,9 @@ def test_intervals_of_many_alike_recordings_rest_on_enough_draws():
     told = -20 * (draws - 0.3) ** 2 * 40  # as if a deviation of .025 were known
     weights, share = contact_fit._weights(told, np.zeros(192))
     assert weights.sum() == pytest.approx(1) and share < 0.5
-    assert 16 <= contact_fit._worth(weights) < 22
+    assert 16 <= contact_fit._effective_draws(weights) < 22
     few, whole = contact_fit._weights(-0.5 * draws**2, np.zeros(192))
-    assert whole == 1 and contact_fit._worth(few) > 50
+    assert whole == 1 and contact_fit._effective_draws(few) > 50
 
 
 def test_how_late_commands_arrive_is_found(recording, robot, response):
@@ -205,7 +205,7 @@ def test_numbers_of_which_nothing_tells_say_so():
 def test_recordings_that_say_nothing_are_refused(robot, response, recording, tmp_path):
     recordings, skipped = read_recordings([DEMO, tmp_path], robot, VIEWS)
     assert len(recordings) == 1 and list(skipped) == [str(tmp_path)]
-    unseen = replace(recording, ways=np.full_like(recording.ways, np.nan))
+    unseen = replace(recording, displacements=np.full_like(recording.displacements, np.nan))
     for nothing in ([], [unseen]):
         with pytest.raises(TrainingError, match='no episode says where an object went'):
             fit_contact(nothing, Arms(robot, response))

@@ -1,0 +1,9 @@
+"""The robot that `config/` knows nothing of, for the tests of its recordings."""
+
+from crane import load
+import pytest
+
+
+@pytest.fixture(scope='module')
+def robot(tmp_path_factory):
+    return load(tmp_path_factory.mktemp('robot'))
