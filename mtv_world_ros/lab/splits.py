@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, ValidationError
+
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.episode import EpisodeInfo, NOMINAL, PHYSICS
 from mtv_world_ros.data.episode_reader import list_episodes, read_info
@@ -124,15 +126,14 @@ def select(
             "some with 'ros2 bag record -s mcap' or 'mtv-world collect'"
         )
     card = _card(dataset)
-    splits = card.get('splits', {})
-    _check_siblings(dataset, card.get('episodes', []), splits)
+    _check_siblings(dataset, card)
     if split is None:
-        split = default if splits.get(default) else EVERY
-    names = _names(dataset, splits, split)
+        split = default if card.splits.get(default) else EVERY
+    names = _names(dataset, card.splits, split)
     paths = [path for path in found if names is None or path.name in names][:limit]
     if not paths:
         raise EpisodeError(f"split '{split}' of '{dataset}' has no episodes in the folder")
-    marks = {entry['name']: entry.get('zero_shot') or '' for entry in card.get('episodes', [])}
+    marks = {entry.name: entry.zero_shot or '' for entry in card.episodes}
     return Selection(
         paths=paths,
         split=split,
@@ -171,60 +172,57 @@ def _physics(info: EpisodeInfo) -> str:
     return info.metadata.get(PHYSICS, usual)
 
 
-def _card(dataset: Path) -> dict[str, Any]:
+class _Entry(BaseModel):
+    """An episode in `dataset.json`: its name, what is zero-shot in it, scene and seed if any."""
+
+    name: str
+    scene: str | None = None
+    zero_shot: str | None = None
+    seed: Any = None
+
+
+class _Card(BaseModel):
+    """What is read of `dataset.json`; it has more."""
+
+    splits: dict[str, list[str]] = {}
+    episodes: list[_Entry] = []
+
+
+def _card(dataset: Path) -> _Card:
     file = dataset / CARD_FILE
     if not file.is_file():
-        return {}
+        return _Card()
     try:
         card = read_json(file)
-        splits = card.get('splits', {})
-        entries = card.get('episodes', [])
-        if not (_are_splits(splits) and _are_entries(entries)):
-            raise TypeError("'splits' or 'episodes' are not as 'mtv-world collect' writes them")
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+    except (OSError, ValueError) as error:
         raise ConfigError(f"'{file}' is not a data set card: {error}") from error
-    return card
+    try:
+        return _Card.model_validate(card)
+    except ValidationError as error:
+        raise ConfigError(
+            f"'{file}' is not a data set card: 'splits' or 'episodes' are not as 'mtv-world "
+            "collect' writes them"
+        ) from error
 
 
-def _are_splits(splits: Any) -> bool:
-    """Whether these are lists of names by name."""
-    return isinstance(splits, dict) and all(
-        isinstance(names, list) and all(isinstance(name, str) for name in names)
-        for names in splits.values()
-    )
-
-
-def _are_entries(entries: Any) -> bool:
-    """Whether these are episodes with a name, and the name of a scene if any."""
-    return isinstance(entries, list) and all(
-        isinstance(entry, dict)
-        and isinstance(entry.get('name'), str)
-        and isinstance(entry.get('scene') or '', str)
-        for entry in entries
-    )
-
-
-def _check_siblings(
-    dataset: Path, entries: Sequence[Mapping[str, Any]], splits: Mapping[str, Sequence[str]]
-) -> None:
+def _check_siblings(dataset: Path, card: _Card) -> None:
     """Refuses siblings of different scenes, and of different splits."""
-    places = {name: split for split, names in splits.items() for name in names}
-    firsts: dict[str, Mapping[str, Any]] = {}
-    for entry in entries:
-        scene = entry.get('scene')
-        if not scene:
+    places = {name: split for split, names in card.splits.items() for name in names}
+    firsts: dict[str, _Entry] = {}
+    for entry in card.episodes:
+        if not entry.scene:
             continue
-        first = firsts.setdefault(scene, entry)
-        names = f"'{first['name']}' and '{entry['name']}' of '{dataset}'"
-        if first.get('seed') != entry.get('seed'):
+        first = firsts.setdefault(entry.scene, entry)
+        names = f"'{first.name}' and '{entry.name}' of '{dataset}'"
+        if first.seed != entry.seed:
             raise ConfigError(
-                f'{names} are called siblings of scene {scene}, but their scenes are drawn from '
-                f'the seeds {first.get("seed")} and {entry.get("seed")}; siblings share a seed'
+                f'{names} are called siblings of scene {entry.scene}, but their scenes are drawn '
+                f'from the seeds {first.seed} and {entry.seed}; siblings share a seed'
             )
-        if places.get(first['name']) != places.get(entry['name']):
+        if places.get(first.name) != places.get(entry.name):
             raise ConfigError(
-                f'{names} are siblings, but in the splits {places.get(first["name"])} and '
-                f'{places.get(entry["name"])}; keep the siblings of a scene in one split'
+                f'{names} are siblings, but in the splits {places.get(first.name)} and '
+                f'{places.get(entry.name)}; keep the siblings of a scene in one split'
             )
 
 

@@ -23,17 +23,18 @@ def _demo(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.files import check_free, share_path
 
     check_free(arguments.out, arguments.overwrite)
+    from mtv_world_ros.lab.demo.node_processes import DemoOptions
     from mtv_world_ros.lab.demo.run_demo import run_demo
 
-    text = run_demo(
-        arguments.episode or share_path('resource', 'demo_episode'),
-        arguments.out,
+    episode = arguments.episode or share_path('resource', 'demo_episode')
+    options = DemoOptions(
         checkpoint=arguments.checkpoint,
+        calibration=episode / 'calibration.yaml',
         robot=arguments.robot,
         device=arguments.device,
         num_threads=arguments.threads,
         num_inference_steps=arguments.steps,
         seed=arguments.seed,
     )
-    print(text)
+    print(run_demo(episode, arguments.out, options))
     return 0

@@ -38,17 +38,7 @@ from mtv_world_ros.rendering.video import (
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
 
-def run_demo(
-    episode: Path,
-    out: Path,
-    *,
-    checkpoint: str,
-    robot: str | None,
-    device: str,
-    num_threads: int,
-    num_inference_steps: int,
-    seed: int,
-) -> str:
+def run_demo(episode: Path, out: Path, options: DemoOptions) -> str:
     """Replays an episode through the node and returns the printed table.
 
     Writes `contact_sheet.png`, `comparison.mp4`, `predictions/` and `report.json` into `out`.
@@ -56,17 +46,9 @@ def run_demo(
     Raises:
         EpisodeError: the episode cannot be used or a process failed.
     """
-    spec = read_card(checkpoint_path(checkpoint)).spec
-    recording = load_recording(episode, spec, checkpoint_robot(checkpoint, robot))
-    options = DemoOptions(
-        checkpoint=checkpoint,
-        calibration=episode / 'calibration.yaml',
-        robot=robot,
-        device=device,
-        num_threads=num_threads,
-        num_inference_steps=num_inference_steps,
-        seed=seed,
-    )
+    spec = read_card(checkpoint_path(options.checkpoint)).spec
+    robot = checkpoint_robot(options.checkpoint, options.robot)
+    recording = load_recording(episode, spec, robot)
     record_through_node(episode, spec.views, out, options)
     predictions = read_predictions(out / 'predictions', spec.views)
     comparison, rows = _score(recording, predictions.chunks, spec.views)

@@ -162,7 +162,7 @@ def test_no_usable_episode_is_an_error(make_pipeline, tmp_path):
 
 
 def test_unknown_mode_or_option_is_an_error(make_pipeline, episodes, tmp_path):
-    with pytest.raises(ConfigError, match='mode'):
+    with pytest.raises(ConfigError, match='mode .*observe, imagine'):
         run(make_pipeline(), episodes[:1], tmp_path, mode='observed')
     with pytest.raises(ConfigError, match='sed'):
         run(make_pipeline(), episodes[:1], tmp_path, sed=1)

@@ -2,9 +2,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
-from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.lab.evaluation.imagined_stretches import (
     imagine_stretch,
     observe_stretch,
@@ -54,11 +52,6 @@ def test_last_stretch_of_at_least_half_a_chunk_is_kept(recordings, make_pipeline
 def test_imagined_stretch_is_the_whole_episode(recordings, make_pipeline):
     found = stretches(recordings[0], make_pipeline().spec, 'imagine')
     assert [(s.start, s.num_frames) for s in found] == [(0, 9)]
-
-
-def test_unknown_mode_is_an_error(recordings, make_pipeline):
-    with pytest.raises(ConfigError, match='observe, imagine'):
-        stretches(recordings[0], make_pipeline().spec, 'observed')
 
 
 def test_rollout_has_as_many_frames_as_the_stretch(recordings, make_pipeline, oracle):

@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 from pathlib import Path
-import struct
 
+from crane import write_cuboid
 import cv2
 import numpy as np
 import pytest
@@ -186,20 +186,8 @@ def lamp(folder: Path, geometry: str):
     return robot, load_shape(robot)
 
 
-def write_cuboid_stl(path: Path, size: tuple[float, float, float]) -> None:
-    """A binary STL of 12 triangles round the origin."""
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size / 2
-    faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
-             (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]  # fmt: skip
-    with path.open('wb') as file:
-        file.write(bytes(80) + struct.pack('<I', len(faces)))
-        for face in faces:
-            rows = np.concatenate([np.zeros(3), *corners[list(face)]])
-            file.write(struct.pack('<12fH', *rows, 0))
-
-
 def test_boxes_and_meshes_are_drawn_where_a_pinhole_sees_them(tmp_path):
-    write_cuboid_stl(tmp_path / 'cuboid.stl', np.array([0.4, 0.2, 0.2]))
+    write_cuboid(tmp_path / 'cuboid.stl', np.array([0.4, 0.2, 0.2]))
     # looks down from 1.1 m on the top face at 0.2 m: 180 px focal length, 0.9 m away
     camera = CameraModel(
         view='top', width=200, height=160,

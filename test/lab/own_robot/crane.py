@@ -74,13 +74,14 @@ URDF = '\n'.join(
 def write_robot(folder: Path) -> Path:
     """Writes `crane.yaml`, its URDF and its one mesh; returns the YAML."""
     (folder / 'crane' / 'meshes').mkdir(parents=True, exist_ok=True)
-    _write_cuboid(folder / 'crane' / 'meshes' / 'hand.stl', np.array([0.05, 0.12, 0.08]))
+    write_cuboid(folder / 'crane' / 'meshes' / 'hand.stl', np.array([0.05, 0.12, 0.08]))
     (folder / 'crane' / 'crane.urdf').write_text(URDF)
     (folder / 'crane' / 'crane.yaml').write_text(YAML)
     return folder / 'crane' / 'crane.yaml'
 
 
-def _write_cuboid(path: Path, size: FloatArray) -> None:
+def write_cuboid(path: Path, size: FloatArray) -> None:
+    """A binary STL of 12 triangles round the origin."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size / 2
     faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
              (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]  # fmt: skip

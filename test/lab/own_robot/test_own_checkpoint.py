@@ -5,6 +5,7 @@ import shutil
 
 from crane import load, make_cameras, make_positions, write_episode
 import pytest
+from sources import set_options, TINY_MODEL
 
 from mtv_world_ros.assembly import checkpoint_cameras, checkpoint_robot
 from mtv_world_ros.cli import main
@@ -13,13 +14,15 @@ from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.robot.shape import load_shape
 
-TINY = [
-    'transformer.num_attention_heads=2', 'transformer.attention_head_dim=12',
-    'transformer.ffn_dim=32', 'transformer.num_layers=1', 'transformer.stem_widths=[8, 16, 16]',
-    'transformer.frames_per_token=2', 'transformer.freq_dim=16', 'video.num_frames=2',
-    'video.width=48', 'video.height=40', 'optimizer.batch_size=1', 'optimizer.warmup_steps=1',
-    'optimizer.steps=2',
-]  # fmt: skip
+TINY = set_options(
+    {
+        **TINY_MODEL,
+        'transformer.frames_per_token': 2,
+        'video.num_frames': 2,
+        'optimizer.warmup_steps': 1,
+        'optimizer.steps': 2,
+    }
+)
 
 
 @pytest.fixture(scope='module')
@@ -30,10 +33,8 @@ def trained(tmp_path_factory):
     del cameras['palm']
     write_episode(folder / 'dataset' / 'one', robot, cameras, make_positions(3.0))
     command = ['train', str(folder / 'dataset'), '--out', str(folder / 'run')]
-    command += ['--views', 'door,window', '--threads', '1']
-    for item in [*TINY, f'video.robot={robot.file}']:
-        command += ['--set', item]
-    assert main(command) == 0
+    command += ['--views', 'door,window', '--threads', '1', f'--set=video.robot={robot.file}']
+    assert main([*command, *TINY]) == 0
     shutil.move(folder / 'run' / 'checkpoint', folder / 'elsewhere')
     shutil.rmtree(folder / 'run')
     shutil.rmtree(folder / 'crane')

@@ -31,7 +31,7 @@ NAMES = {'my_robot': 'crane', 'first_bag': 'wave', 'front,side': 'door,palm'}
 VIDEO_NAMES = {'my_robot': 'crane', 'front,side': 'door,window'}
 #: keep the commands small
 SMALL = {
-    'train': ['--threads', '1', *(word for item in TINY for word in ('--set', item))],
+    'train': ['--threads', '1', *TINY],
     'evaluate': ['--no-ceiling', '--actions', 'true', '--threads', '1', '--no-report'],
     'imagine': ['--max-chunks', '2', '--threads', '1'],
 }

@@ -234,7 +234,7 @@ def _frames(scores: ObjectScores | None, view: int, item: int) -> tuple[float, .
 
 def _values(
     scores: Mapping[str, ObjectScores], value: Callable[[ObjectScores], float]
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """`j_<name>` of every video beside the prediction, NaN where it was not scored."""
     return {
         f'j_{name}': float(value(scores[name])) if name in scores else np.nan

@@ -99,24 +99,14 @@ def test_no_interval_leaves_the_range_of_its_number():
 
 
 @pytest.mark.parametrize('num', [4, 8, 20, 60])
-@pytest.mark.parametrize('longest', [8, 16])
-def test_95_percent_intervals_of_means_cover_the_truth(num, longest):
-    """4,000 sets of episodes of 8 or more values, whose J is spread as a Beta of mean .6."""
+def test_95_percent_intervals_of_means_cover_where_episodes_differ_in_length(num):
+    """4,000 sets of episodes of 8 to 16 values, whose J is spread as a Beta of mean .6."""
     rng = np.random.default_rng(num)
-    counts = rng.integers(8, longest + 1, (num, 4000)).astype(float)
+    counts = rng.integers(8, 17, (num, 4000)).astype(float)
     values = rng.beta(6, 4, (num, 4000))
     means, (low, high) = mean_interval(values * counts, counts)
     assert 0.93 <= ((low <= 0.6) & (high >= 0.6)).mean() <= 0.97
     assert means.mean() == pytest.approx(0.6, abs=0.01)
-
-
-@pytest.mark.parametrize('num', [4, 8, 20, 60])
-def test_95_percent_intervals_of_shares_cover_the_truth(num):
-    rng = np.random.default_rng(num)
-    share = rng.uniform(0.05, 0.95, 2000)
-    ends = [wilson(int(hits), num) for hits in rng.binomial(num, share)]
-    covered = [low <= p <= high for (low, high), p in zip(ends, share, strict=True)]
-    assert 0.93 <= np.mean(covered) <= 0.97
 
 
 @pytest.mark.parametrize('num', [8, 20, 60])
