@@ -351,20 +351,25 @@ def judge_folder(dataset: Path, options: argparse.Namespace, kept: Kept) -> Iter
     file = recorded_robot(paths[0], read_info(paths[0]).robot)
     robot = load_robot(file)
     inspector = load_inspector(file)
-    episodes = {path: fixed_views(inspector, path, options.width) for path in paths}
+    whole = {path: fixed_views(inspector, path, options.width) for path in paths}
+
+    def seen(episode: Episode) -> Episode:
+        return replace(episode, views=episode.views[: options.views])
+
+    episodes = {path: seen(episode) for path, episode in whole.items()}
     inspector = Remembering(robot, load_shape(robot), episodes.values())
     with tempfile.TemporaryDirectory() as place:
         wrong = longer(file, Path(place))
-        other = Remembering(wrong, load_shape(wrong), episodes.values())
+        other = Remembering(wrong, load_shape(wrong), ())
     for path in paths:
         for name, (fault, word) in RECORDINGS.items():
             by = other if 'URDF' in name else inspector
-            changed = fault(episodes[path], robot) if fault else episodes[path]
+            shown = {path: episodes[path]} if 'URDF' in name else dict(episodes)
+            if fault is not None:
+                shown[path] = seen(fault(whole[path], robot))
             kept.verdict(
                 (robot.name, path.name, 'folder', name),
-                lambda shown={**episodes, path: changed}, at=path, by=by, word=word: _in_folder(
-                    by, shown, at, word
-                ),
+                lambda shown=shown, at=path, by=by, word=word: _in_folder(by, shown, at, word),
             )
         yield
 
@@ -402,6 +407,7 @@ def main() -> None:
         parser.add_argument('--right-only', action='store_true')
 
         parser.add_argument('--folders', action='store_true')
+        parser.add_argument('--views', type=int, default=1, help='of each recording in a folder')
         parser.add_argument('--kept', type=Path, help='file of verdicts; is continued')
 
     options = parse_arguments(__doc__, 20, more)

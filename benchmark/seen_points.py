@@ -5,9 +5,13 @@
 POINTS is what `mtv-world calibrate-camera --click` saves. Cameras are estimated from the first
 points of each recording, in different ways; the others judge them. The error that a way states
 from the others of all recordings but one is compared with those of that one. `recorded` judges
-the calibrations of the episodes as they are. The points of a Franka with a Robotiq
-(`seen_points_droid_lab.json`) were read by eye from enlarged frames of 320x192 with a grid,
-2026-11-27: the middle between the ends of the finger tips; rows are of 5 Hz.
+the calibrations of the episodes as they are. Last but one comes by how much later the joint
+states are at which points that move are nearest to the pictures. --bend estimates k1 however near
+the middle of the image the points are.
+
+The points of a Franka with a Robotiq (`seen_points_droid_lab.json`) were read by eye from enlarged
+frames of 320x192 with a grid, 2026-11-27: the middle between the ends of the finger tips; rows are
+of 5 Hz.
 """
 
 from __future__ import annotations
@@ -33,6 +37,7 @@ from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import load_shape, RobotShape
 from mtv_world_ros.lab.cli.shared_camera import recorded_robot
+from mtv_world_ros.lab.inspection import joint_camera
 from mtv_world_ros.lab.inspection.clocks import JointTrack
 from mtv_world_ros.lab.inspection.shared_camera import (
     estimate_shared,
@@ -52,8 +57,12 @@ HEAD = (
     "the doctor's match",
     'doubted',
     'others within the 95 % that those of other recordings state',
+    'joint states late by [s], standard error, moving points',
     'time [s]',
 )
+
+#: time after which points are drawn anew [s], and speed from which on they move [px/s]
+_STEP_S, _MOVES = 0.05, 10.0
 
 Points = dict[str, dict[str, list[Any]]]
 
@@ -74,15 +83,47 @@ class Recordings:
     robot: RobotModel
     shape: RobotShape
 
-    def apart(self, cameras: Sequence[CameraModel], points: Mapping[str, Any]) -> list[FloatArray]:
-        """Of each recording, how far its points are drawn from where they were seen [px]."""
-        seen = seen_points(points, self.episodes, self.tracks, self.robot, self.shape.parts)
-        found: list[list[float]] = [[] for _ in cameras]
+    def beside(
+        self, cameras: Sequence[CameraModel], points: Mapping[str, Any], late_s: float = 0.0
+    ) -> list[FloatArray]:
+        """Of each recording, (N, 2) from where its points are drawn to where they were seen [px].
+
+        They are drawn as they are by the joint states `late_s` after they were seen.
+        """
+        ends = {
+            episode.info.path.name: 1e-9 * float(track.stamps_ns[-1] - track.stamps_ns[0])
+            for episode, track in zip(self.episodes, self.tracks, strict=True)
+        }
+        moved = {
+            name: [(min(seconds + late_s, max(seconds, ends[name])), x, y)
+                   for seconds, x, y in rows]
+            for name, rows in points.items() if name in ends
+        }  # fmt: skip
+        seen = seen_points(moved, self.episodes, self.tracks, self.robot, self.shape.parts)
+        found: list[list[FloatArray]] = [[] for _ in cameras]
         for point in seen:
             camera = cameras[point.recording]
             pixel, _ = project(camera, camera.T_mount_camera[None], point.position[None])
-            found[point.recording].append(float(np.linalg.norm(pixel[0] - point.pixel)))
-        return [np.array(one) for one in found]
+            found[point.recording].append(point.pixel - pixel[0])
+        return [np.array(one).reshape(-1, 2) for one in found]
+
+    def apart(self, cameras: Sequence[CameraModel], points: Mapping[str, Any]) -> list[FloatArray]:
+        """Of each recording, how far its points are drawn from where they were seen [px]."""
+        return [np.linalg.norm(one, axis=1) for one in self.beside(cameras, points)]
+
+    def delay(self, cameras: Sequence[CameraModel], points: Mapping[str, Any]) -> str:
+        """By how much later the joint states fit the pictures, by points that move."""
+        here, later = (
+            np.concatenate(self.beside(cameras, points, late_s)) for late_s in (0.0, _STEP_S)
+        )
+        speed = (here - later) / _STEP_S  # of what is drawn [px/s]
+        moves = np.linalg.norm(speed, axis=1) > _MOVES
+        if moves.sum() < 3:
+            return f'{int(moves.sum())} points move'
+        square = float((speed[moves] ** 2).sum())
+        delay = float((here[moves] * speed[moves]).sum()) / square
+        rest = here[moves] - delay * speed[moves]
+        return f'{delay:+.3f}, {np.sqrt((rest**2).mean() / square):.3f}, {int(moves.sum())}'
 
 
 def main() -> None:
@@ -95,8 +136,11 @@ def main() -> None:
     parser.add_argument('--ways', default='points,same-focal', help=', '.join(WAYS))
     parser.add_argument('--fitted', type=int, default=2, help='points of each recording')
     parser.add_argument('--robot', help='default: that of the episodes')
+    parser.add_argument('--bend', action='store_true', help='estimate k1 in any case')
     parser.add_argument('--seed', type=int, default=0)
     options = parser.parse_args()
+    if options.bend:
+        joint_camera.LEAST_REACH = 0.0
     points: Points = read_yaml(options.points, 'points file', 'POINTS')
     fitted, others = (
         {view: {name: rows[part] for name, rows in of.items()} for view, of in points.items()}
@@ -139,7 +183,8 @@ def judged(
         for view in views:
             cameras = [episode.cameras[view] for episode in read.episodes]
             yield [way, view, '–', *_distances(read, view, cameras, fitted, others), '–', '–',
-                   _covered(read.apart(cameras, others[view])), '–']  # fmt: skip
+                   _covered(read.apart(cameras, others[view])),
+                   _delay(read, cameras, view, fitted, others), '–']  # fmt: skip
         return
     unknown = [e.unknown.get(view, '') for e in read.episodes for view in views]
     for group in [views] if way == 'same-focal' else [[view] for view in views]:
@@ -159,7 +204,14 @@ def judged(
             yield [way, view, str(len(set(one.places.place.tolist()))),
                    *_distances(read, view, one.cameras, fitted, others),
                    *_matches(one), _covered(read.apart(one.cameras, others[view])),
-                   f'{seconds:.0f}']  # fmt: skip
+                   _delay(read, one.cameras, view, fitted, others), f'{seconds:.0f}']  # fmt: skip
+
+
+def _delay(
+    read: Recordings, cameras: Sequence[CameraModel], view: str, fitted: Points, others: Points
+) -> str:
+    rows = {name: [*fitted[view][name], *others[view][name]] for name in fitted[view]}
+    return read.delay(cameras, rows)
 
 
 def _distances(

@@ -42,12 +42,18 @@ Row = Annotated[
 ]
 
 
+def _named(name: str) -> str:
+    if not name.strip():
+        raise wrong('the name of an object')
+    return name
+
+
 class ObjectBoxes(Schema):
     """A file of boxes, in pixels of the recorded images."""
 
     section: ClassVar = ''
 
-    boxes: dict[str, dict[str, dict[str, ListOf[Row]]]] = Field(
+    boxes: dict[str, dict[str, dict[Annotated[str, AfterValidator(_named)], ListOf[Row]]]] = Field(
         description='by view, recording and object: rows of seconds from the first frame of the '
         'view on, left, top, right, bottom [px]'
     )

@@ -54,7 +54,7 @@ _LENS_UNITS = np.array([0.02, 0.02, 0.02])
 _LENS_KNOWN, _LENS_GUESSED = np.array([0.003, 0.001, 0.001]), np.array([0.35, 0.1, 0.1])
 #: with so many points, a tenth of which are this far from the middle of the image, k1 is estimated
 #: [share of the width]: one of -.1 shifts them by 1 % of the width, where fx is .4 of it
-_LEAST_POINTS, _LEAST_REACH = 8, 0.25
+LEAST_POINTS, LEAST_REACH = 8, 0.25
 
 
 def through(camera: CameraModel, lens: FloatArray) -> CameraModel:
@@ -201,11 +201,6 @@ class JointCamera:
         stage, numbers = _STAGES[0], range(len(self._recordings))
         return self._cost(state, {n: self._read(n, state, stage) for n in numbers})
 
-    @property
-    def bent(self) -> bool:
-        """Whether the points last taken show k1."""
-        return 2 in self._free
-
     def _take(self, points: Sequence[SeenPoint]) -> None:
         """Takes the seen points; where enough of them are far out, k1 is estimated, too."""
         self._points = {}
@@ -217,7 +212,7 @@ class JointCamera:
             for point, camera in zip(points, cameras, strict=True)
         ]
         bends = all(camera.distortion_model != 'equidistant' for camera in cameras)
-        shown = len(away) >= _LEAST_POINTS and np.quantile(away, 0.9) >= _LEAST_REACH
+        shown = len(away) >= LEAST_POINTS and np.quantile(away, 0.9) >= LEAST_REACH
         self._free = [0, 1, 2] if shown and bends and not self._known else [0, 1]
 
     def from_points(

@@ -168,9 +168,7 @@ def estimate_shared(
     if any(view.left_out for view in each):
         states = together.fitted([tested], [[*view.points, *view.left_out] for view in each])
     return tuple(
-        _judged(
-            view, state, without, episodes, robot, shapes, tracks, guess=guess, bent=together.bent
-        )
+        _judged(view, state, without, episodes, robot, shapes, tracks, guess=guess)
         for view, state, without in zip(each, states, tested, strict=True)
     )
 
@@ -232,11 +230,6 @@ class _Together:
                 intrinsics_known=focal_known,
                 views=[number for number, view in enumerate(each) for _ in view.numbers],
             )
-
-    @property
-    def bent(self) -> bool:
-        """Whether k1 was estimated in the last fit."""
-        return self._joint.bent
 
     def _with_places(self) -> Iterator[tuple[_View, int]]:
         """Each view with the number of its first place."""
@@ -307,7 +300,6 @@ def _judged(
     tracks: Sequence[JointTrack],
     *,
     guess: bool,
-    bent: bool,
 ) -> SharedEstimate:
     """The better of guess and result by the doctor's measure.
 
@@ -339,7 +331,7 @@ def _judged(
         guess_measures=before,
         kept_guess=kept,
         focal_px=float(best[0].K[0, 0]),
-        bent=bent and not kept,
+        bent=bool(state.lens[2]) and not kept,
         fits=view.joint.fits(view.given if kept else state),
         apart_px=np.array([_apart(point, tested[point.recording]) for point in view.left_out]),
     )

@@ -124,6 +124,10 @@ def test_imported_episodes_get_masks_by_a_second_import(raw, capsys):
         ({'rows': [(0.0, 28, 58, 56)]}, '5 numbers'),
         ({'rows': ()}, "'boxes' is empty|draw one"),
         ({'boxs': {}}, "'boxs'.*boxes"),
+        (
+            {'boxes': {'front': {'a': {' ': [[0.0, 28, 58, 56, 82]]}}}},
+            "' '.*name of an obj",
+        ),
     ],
 )
 def test_what_is_wrong_with_the_file_is_said_and_nothing_is_imported(raw, capsys, change, says):
