@@ -44,19 +44,23 @@ class Physics(Schema):
     contact_time: Annotated[float, Field(ge=1, le=1000)] = Field(
         default=1.0, description='factor of the time constant of contacts'
     )
-    delay_s: Wait = Field(default=0.0, description='commands reach the joints so late [s]')
+    delay_s: Wait = Field(
+        default=0.0, description='delay of commands on their way to the joints [s]'
+    )
     joint_zero_deg: _Degrees = Field(
         default=0.0,
-        description='each turning joint but grippers is off by this, either way [degrees]',
+        description='error of the zero of each turning joint but grippers, either sign [degrees]',
     )
     table_m: Annotated[float, Field(ge=-0.05, le=0.05)] = Field(
         default=0.0, description='height of the table [m]'
     )
     object_size: Annotated[float, Field(ge=0.7, le=1.2)] = Field(default=1.0, description='factor')
     camera_m: float = Field(
-        default=0.0, ge=0, le=100, description='told place of each camera is off by [m]'
+        default=0.0, ge=0, le=100, description='error of the calibrated place of each camera [m]'
     )
-    camera_deg: _Degrees = Field(default=0.0, description='told direction is off by [degrees]')
+    camera_deg: _Degrees = Field(
+        default=0.0, description='error of its calibrated direction [degrees]'
+    )
     blur_px: float = Field(
         default=0.0, ge=0, le=1000, description='standard deviation of the blur [px]'
     )
@@ -64,7 +68,7 @@ class Physics(Schema):
         default=0.0, ge=0, le=255, description='standard deviation of the noise [grey levels]'
     )
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None = Field(
-        default=None, description='pictures are compressed; none = they are not'
+        default=None, description='quality of JPEG compression; none = not compressed'
     )
 
     def workcell(self, workcell: Workcell) -> Workcell:
@@ -109,9 +113,9 @@ class Physics(Schema):
         if not (self.camera_m or self.camera_deg):
             return tuple(cameras)
         rng = _generator(seed)
-        return tuple(self._told(camera, rng) for camera in cameras)
+        return tuple(self._miscalibrated(camera, rng) for camera in cameras)
 
-    def _told(self, camera: CameraModel, rng: np.random.Generator) -> CameraModel:
+    def _miscalibrated(self, camera: CameraModel, rng: np.random.Generator) -> CameraModel:
         way, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
         pose = np.array(camera.T_mount_camera)
         pose[:3, :3] = cv2.Rodrigues(axis * np.deg2rad(self.camera_deg))[0] @ pose[:3, :3]
