@@ -170,7 +170,8 @@ def whole_folder(folder: Path) -> Iterator[Path]:
         yield partial
         for file in partial.rglob('*'):
             if file.is_file():
-                _flush(file)
+                with file.open('rb') as stream:
+                    os.fsync(stream.fileno())  # the disk has its content before it gets its name
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)  # room for what is written next
         raise
@@ -186,9 +187,3 @@ def recover_folder(folder: Path) -> None:
     old = folder.with_name(f'{folder.name}.old')
     if old.exists() and not folder.exists():
         old.rename(folder)
-
-
-def _flush(file: Path) -> None:
-    """Waits until the disk has the file's content."""
-    with file.open('rb') as stream:
-        os.fsync(stream.fileno())

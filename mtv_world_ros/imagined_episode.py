@@ -118,8 +118,8 @@ class ImaginedEpisode:
             ModelMemoryError: the device ran out of memory.
         """
         for plan in self._chunks(trajectory):
-            if plan.chunk:
-                self._check_stop()
+            if plan.chunk and self.should_stop():
+                raise RolloutPreempted('stopped between two chunks')
             # rollouts of further seeds branch off from the first one
             states = (self._rollouts + self._rollouts[:1] * self.num_seeds)[: self.num_seeds]
             seeds = (self.seed + self.num_chunks + SEED_STEP * r for r in range(self.num_seeds))
@@ -194,7 +194,3 @@ class ImaginedEpisode:
         return plan_chunks(
             trajectory, start.positions, start.stamp_ns, num_frames=spec.num_frames, fps=spec.fps
         )
-
-    def _check_stop(self) -> None:
-        if self.should_stop():
-            raise RolloutPreempted('stopped between two chunks')

@@ -101,7 +101,8 @@ def windowed_pixels(
         (camera.width, camera.height),
         window.of(camera.width, camera.height),
     )
-    if size == sent or _are_near(size, sent) and max(window.binning) > 1:
+    apart = np.abs(np.subtract(size, sent)).max()
+    if size == sent or apart <= _ROUNDING_PX and max(window.binning) > 1:
         _check_K(camera, window, size)
         return _shift(window) if window != WHOLE else np.eye(3), ''
     if size == full:
@@ -137,10 +138,6 @@ def _shift(window: ImageWindow) -> FloatArray:
         moved[axis, axis] = 1 / binning
         moved[axis, 2] = (0.5 - start) / binning - 0.5
     return moved
-
-
-def _are_near(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    return all(abs(a - b) <= _ROUNDING_PX for a, b in zip(size, other, strict=True))
 
 
 def _has_aspect(size: tuple[int, int], sent: tuple[int, int]) -> bool:

@@ -127,12 +127,13 @@ def imagine_episodes(
     (out / 'episodes.json').unlink(missing_ok=True)
     environment = private_domain() if options.episodes else dict(os.environ)
     started: dict[str, subprocess.Popen[bytes]] = {}
+    count = options.count or len(options.episodes) or 1  # from live cameras one by default
     try:
         for name, command in commands.items():
             started[name] = start_process(name, command, logs, environment)
             if name == 'viewer':
                 tell(_viewer_said(started[name], logs))
-        with tqdm(total=_count(options), unit='ep', disable=None) as bar:
+        with tqdm(total=count, unit='ep', disable=None) as bar:
             _wait(started, logs, bar)
     finally:
         # the runner first: it closes its record
@@ -202,11 +203,6 @@ def _viewer_said(viewer: subprocess.Popen[bytes], logs: Path) -> str:
             raise EpisodeError(f"{said} (logs are in '{logs}')")
         time.sleep(0.1)
     return found[1]
-
-
-def _count(options: ImagineOptions) -> int:
-    """Episodes that will be run; from live cameras one by default."""
-    return options.count or len(options.episodes) or 1
 
 
 def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path, bar: Any) -> None:

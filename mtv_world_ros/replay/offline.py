@@ -128,7 +128,9 @@ def replay_offline(
             until = starts[index + 1] if index + 1 < len(starts) else None
             try:
                 observation = observe(episode, pipeline, stamp)
-                shifted = _shifted(trajectory, stamp, observation.stamp_ns)
+                # its times count from the observation
+                times = trajectory.times + (stamp - observation.stamp_ns) / 1e9
+                shifted = replace(trajectory, times=times)
                 before = starts[index - 1] if index else stamp
                 for seen in _seen_between(episode, pipeline, before, stamp):
                     observed.see(seen)
@@ -260,11 +262,6 @@ def _last_before(stamps_ns: np.ndarray, stamp_ns: int) -> int:
 def _check(what: str, value_ns: int, limit_s: float, how: str) -> None:
     if value_ns > limit_s * 1e9:
         raise ObservationError(f'{what} {value_ns / 1e9:.3f} s {how}; allowed are {limit_s:g} s')
-
-
-def _shifted(trajectory: JointTrajectory, stamp_ns: int, observation_ns: int) -> JointTrajectory:
-    """The trajectory with times from the observation's stamp."""
-    return replace(trajectory, times=trajectory.times + (stamp_ns - observation_ns) / 1e9)
 
 
 def instruction_at(episode: Episode, stamp_ns: int) -> str:

@@ -104,11 +104,8 @@ def shown_as(topic: str, msgtype: str) -> tuple[str, ...] | None:
     """Returns what a topic shows: image or mask of a kind and view, ...; None = nothing."""
     match = _IMAGES.match(topic)
     if match and msgtype in (IMAGE, COMPRESSED_IMAGE):
-        return (
-            'mask' if _is_mask(topic, match) else 'image',
-            _KINDS[match['stream']],
-            match['view'],
-        )
+        is_mask = match['stream'] == 'mask' or '/mask/' in topic
+        return 'mask' if is_mask else 'image', _KINDS[match['stream']], match['view']
     if msgtype == JOINT_STATE:
         return 'joints', topic
     for suffix, wanted in _WORDS.items():
@@ -140,10 +137,6 @@ def take(streams: Streams, message: BagMessage) -> None:
         streams.words.extend((message.stamp_ns, text) for text in texts)
     else:
         streams.words.append((message.stamp_ns, f'instruction: {read.data}'))
-
-
-def _is_mask(topic: str, match: re.Match[str]) -> bool:
-    return match['stream'] == 'mask' or '/mask/' in topic
 
 
 def _reasons(status: Any) -> str:

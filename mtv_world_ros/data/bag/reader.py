@@ -211,20 +211,15 @@ class BagReader:
         self, plain: Path, file: Path, topics: Collection[str] | None
     ) -> Iterator[BagMessage]:
         with plain.open('rb') as stream:
-            yield from self._mcap_messages(stream, file, plain.stat().st_size, topics)
-
-    def _mcap_messages(
-        self, stream: BinaryIO, file: Path, size: int, topics: Collection[str] | None
-    ) -> Iterator[BagMessage]:
-        magic = stream.read(len(MAGIC))
-        if not MAGIC.startswith(magic):
-            raise EpisodeError(f"'{file}' is not an MCAP file: it starts with {magic!r}")
-        for opcode, body in self._records(stream, file, size):
-            if opcode == Opcode.CHUNK:
-                for inner, part in _split(_decompress(body, stream.tell(), self._most_bytes)):
+            magic = stream.read(len(MAGIC))
+            if not MAGIC.startswith(magic):
+                raise EpisodeError(f"'{file}' is not an MCAP file: it starts with {magic!r}")
+            for opcode, body in self._records(stream, file, plain.stat().st_size):
+                parts = [(opcode, body)]
+                if opcode == Opcode.CHUNK:
+                    parts = _split(_decompress(body, stream.tell(), self._most_bytes))
+                for inner, part in parts:
                     yield from self._take(inner, part, topics)
-            else:
-                yield from self._take(opcode, body, topics)
 
     def _records(self, stream: BinaryIO, file: Path, size: int) -> Iterator[tuple[int, bytes]]:
         """Records up to the footer; what is left of a chunk that was cut comes out as one."""

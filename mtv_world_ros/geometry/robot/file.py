@@ -252,11 +252,15 @@ def load_robot(path: Path | str) -> RobotModel:
         base = file.base_link or 'base'
         model = _from_dh(file, base)
     joints = file.joints or _movable(model, {mimic.joint for mimic in mimics})
+    pose_keys = set(PoseEntry.model_fields)
     return RobotModel(
         name=file.name,
         model=model,
         joint_names=joints,
-        tools=[_tool(entry) for entry in file.tools],
+        tools=[
+            Tool(T_link_tool=entry.matrix(), **entry.model_dump(exclude=pose_keys))
+            for entry in file.tools
+        ],
         base_link=base,
         mimics=mimics,
         file=path,
@@ -349,11 +353,6 @@ def _split_collisions(link: Any, urdf: Path, folder: Path, first: int) -> list[s
                 ElementTree.SubElement(piece, 'geometry'), 'mesh', filename=name
             )
     return made
-
-
-def _tool(entry: ToolEntry) -> Tool:
-    values = entry.model_dump(exclude={'position', 'quaternion_xyzw'})
-    return Tool(T_link_tool=entry.matrix(), **values)
 
 
 def read_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:

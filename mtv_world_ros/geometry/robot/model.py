@@ -114,7 +114,9 @@ class RobotModel:
         self.base_link = base_link
         self.mimics = tuple(mimics)
         _check_places(name, model)
-        self._frames = _link_frames(model)
+        # links by name; joints have frames too, maybe of the same name
+        frames = enumerate(model.frames)
+        self._frames = {f.name: i for i, f in frames if f.type == pin.FrameType.BODY}
         self._setters = [
             _Setter.of(self._joint(joint), column) for column, joint in enumerate(self.joint_names)
         ]
@@ -361,12 +363,6 @@ def _check_places(name: str, model: pin.Model) -> None:
                 f"'{part}' of robot '{name}' is at {place.translation.tolist()} m from what "
                 f'carries it; at most {FARTHEST_M:g} m are accepted'
             )
-
-
-def _link_frames(model: pin.Model) -> dict[str, int]:
-    """Links by name; joints have frames too, maybe of the same name."""
-    kind = pin.FrameType.BODY
-    return {frame.name: i for i, frame in enumerate(model.frames) if frame.type == kind}
 
 
 def check_can_move(joint: str, lower: float, upper: float, where: str) -> None:
