@@ -17,7 +17,6 @@ from mtv_world_ros.bounded_input import check_finite, parse_json, read_json
 from mtv_world_ros.config import Count, Number, Schema, validated
 from mtv_world_ros.errors import CheckpointError, ConfigError, nearest
 from mtv_world_ros.model.tensor_files import pickle_error, PICKLES
-from mtv_world_ros.model.wan_keys import transformer_keys
 
 #: diffusers' key for peft's configuration in a file; peft's own file for it, and its prefix
 METADATA = 'lora_adapter_metadata'
@@ -207,17 +206,19 @@ def _by_module(file: Path, tensors: Mapping[str, Tensor]) -> dict[str, dict[str,
 
 def _names(modules: Mapping[str, Any]) -> dict[str, str]:
     """Every name that files have for a module, flattened ones with `_` too, to ours."""
+    from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffusers
+
     attention = [f'{kind}_attn.{n}' for kind in ('self', 'cross') for n in 'qkvo']
     inner = [*attention, 'cross_attn.k_img', 'cross_attn.v_img', 'ffn.0', 'ffn.2']
     numbers = {name.split('.')[1] for name in modules if name.startswith('blocks.')}
     wan = [f'blocks.{number}.{name}' for number in numbers for name in inner]
     wan += ['text_embedding.0', 'text_embedding.2', 'time_embedding.0', 'time_embedding.2']
     wan += ['time_projection.1', 'img_emb.proj.1', 'img_emb.proj.3', 'head.head']
+    ours = convert_wan_transformer_to_diffusers({f'{name}.weight': name for name in wan})
+    bare = {theirs: name.removesuffix('.weight') for name, theirs in ours.items()}
     names = {name: name for name in modules}
-    for ours, take in transformer_keys([f'{name}.weight' for name in wan]).takes.items():
-        if ours.removesuffix('.weight') in modules:
-            names[take.source.removesuffix('.weight')] = ours.removesuffix('.weight')
-    return names | {name.replace('.', '_'): ours for name, ours in names.items()}
+    names |= {theirs: name for theirs, name in bare.items() if name in modules}
+    return names | {theirs.replace('.', '_'): name for theirs, name in names.items()}
 
 
 def _factors(

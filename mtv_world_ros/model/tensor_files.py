@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-import json
 from math import prod
 from os.path import isfile
 from pathlib import Path
@@ -13,7 +12,6 @@ import re
 from typing import Any
 
 from safetensors import safe_open, SafetensorError
-from safetensors.torch import save_file
 from torch import Tensor
 
 from mtv_world_ros.bounded_input import check_finite, read_json
@@ -22,8 +20,6 @@ from mtv_world_ros.errors import CheckpointError, ConfigError
 PICKLES = ('.bin', '.pt', '.pth', '.ckpt', '.pkl')
 INDEX = '.safetensors.index.json'
 _SHARD = re.compile(r'-(\d+)-of-(\d+)\.safetensors$')
-#: tensors are gathered up to so many bytes before they are written
-SHARD_BYTES = 2 * 2**30
 _BYTES = {'F64': 8, 'F32': 4, 'F16': 2, 'BF16': 2, 'I64': 8, 'I32': 4, 'F8_E4M3': 1}
 
 
@@ -176,42 +172,6 @@ def disk_errors() -> Iterator[None]:
         yield
     except SafetensorError as error:
         raise OSError(f'tensors cannot be written: {error}') from error
-
-
-def write_tensors(
-    tensors: dict[str, StoredTensor], folder: Path, stem: str, *, shard_bytes: int = SHARD_BYTES
-) -> None:
-    """Writes tensors as diffusers and transformers do: one file, or shards and their index.
-
-    Holds no more than one shard in memory.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    shards = _plan(tensors, shard_bytes)
-    places = {}
-    for number, names in enumerate(shards, start=1):
-        many = f'-{number:05d}-of-{len(shards):05d}' if len(shards) > 1 else ''
-        file = f'{stem}{many}.safetensors'
-        values = {name: tensors[name].read().contiguous() for name in names}
-        with disk_errors():
-            save_file(values, folder / file, metadata={'format': 'pt'})
-        del values  # before the next shard is read
-        places |= dict.fromkeys(names, file)
-    if len(shards) > 1:
-        total = sum(tensor.num_bytes for tensor in tensors.values())
-        index = {'metadata': {'total_size': total}, 'weight_map': places}
-        (folder / f'{stem}{INDEX}').write_text(json.dumps(index, indent=2) + '\n')
-
-
-def _plan(tensors: dict[str, StoredTensor], shard_bytes: int) -> list[list[str]]:
-    shards: list[list[str]] = [[]]
-    held = 0
-    for name, tensor in tensors.items():
-        if shards[-1] and held + tensor.num_bytes > shard_bytes:
-            shards.append([])
-            held = 0
-        shards[-1].append(name)
-        held += tensor.num_bytes
-    return shards
 
 
 def import_transformers() -> Any:

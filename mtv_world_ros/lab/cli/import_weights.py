@@ -10,7 +10,7 @@ from typing import Any, TYPE_CHECKING
 from mtv_world_ros.errors import CheckpointError
 
 if TYPE_CHECKING:
-    from mtv_world_ros.model.wan_weights import PartReport
+    from mtv_world_ros.lab.importing.wan_weights import PartReport
 
 #: of the paper, Implementation Details
 PROMPT = 'The robotic arm picks up objects from the table and places them'
@@ -55,7 +55,7 @@ def _import_weights(arguments: argparse.Namespace) -> int:
         )
     config = load_training_config(arguments.preset)
     sampling = config.sampling
-    from mtv_world_ros.model.wan_weights import import_weights
+    from mtv_world_ros.lab.importing.wan_weights import import_weights
 
     robot = load_robot(robot_path(config.video.robot))
     config = config.replace(video=config.video.replace(robot=robot.name))

@@ -9,8 +9,8 @@ import torch
 from wan_files import AUTOENCODER, TRANSFORMER, write_videox
 import yaml
 
+from mtv_world_ros.lab.importing.wan_weights import import_weights
 from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
-from mtv_world_ros.model.wan_weights import import_weights
 
 #: the preset of the paper's size, made tiny; the episode has 5 frames a second
 CHANGES: dict[str, dict[str, Any]] = {

@@ -9,7 +9,8 @@ from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
 
-from mtv_world_ros.model.tensor_files import open_tensors, StoredTensor, write_tensors
+from mtv_world_ros.lab.importing.wan_weights import write_tensors
+from mtv_world_ros.model.tensor_files import open_tensors, StoredTensor
 
 
 def test_no_more_than_one_shard_is_in_memory(tmp_path):

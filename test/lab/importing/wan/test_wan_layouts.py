@@ -14,16 +14,16 @@ import torch
 from wan_files import clip_shapes, clip_text_shapes, Shapes, umt5_shapes, vae_original_name
 from wan_reference import video_tensors
 
-from mtv_world_ros.lab.training.training_config import load_training_config
-from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
-from mtv_world_ros.model.wan_keys import (
+from mtv_world_ros.lab.importing.wan_keys import (
     autoencoder_keys,
     image_encoder_keys,
     KeyMap,
     text_encoder_keys,
     transformer_keys,
 )
-from mtv_world_ros.model.wan_weights import NEW
+from mtv_world_ros.lab.importing.wan_weights import NEW
+from mtv_world_ros.lab.training.training_config import load_training_config
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 
 def hash_of(shapes: Shapes) -> str:

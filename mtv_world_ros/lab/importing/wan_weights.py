@@ -10,28 +10,30 @@ from pathlib import Path
 import shutil
 from typing import Any
 
+from safetensors.torch import save_file
 import torch
 
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import whole_folder
 from mtv_world_ros.geometry.robot.file import save_robot
-from mtv_world_ros.model import wan_keys
+from mtv_world_ros.lab.importing import wan_keys
+from mtv_world_ros.lab.importing.wan_keys import KeyMap
 from mtv_world_ros.model.card import CheckpointCard, ROBOT_FOLDER
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.tensor_files import (
+    disk_errors,
     import_transformers,
     INDEX,
     open_tensors,
     pickle_error,
     PICKLES,
-    SHARD_BYTES,
     StoredTensor,
-    write_tensors,
 )
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
-from mtv_world_ros.model.wan_keys import KeyMap
 
+#: bytes of tensors that are gathered before they are written
+SHARD_BYTES = 2 * 2**30
 #: heads of CLIP's ViT-H/14, which show in no tensor
 _CLIP_HEADS = 16
 
@@ -347,6 +349,42 @@ def _write(
         new=new,
         unused=keys.unused,
     )
+
+
+def write_tensors(
+    tensors: dict[str, StoredTensor], folder: Path, stem: str, *, shard_bytes: int = SHARD_BYTES
+) -> None:
+    """Writes tensors as diffusers and transformers do: one file, or shards and their index.
+
+    Holds no more than one shard in memory.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    shards = _plan(tensors, shard_bytes)
+    places = {}
+    for number, names in enumerate(shards, start=1):
+        many = f'-{number:05d}-of-{len(shards):05d}' if len(shards) > 1 else ''
+        file = f'{stem}{many}.safetensors'
+        values = {name: tensors[name].read().contiguous() for name in names}
+        with disk_errors():
+            save_file(values, folder / file, metadata={'format': 'pt'})
+        del values  # before the next shard is read
+        places |= dict.fromkeys(names, file)
+    if len(shards) > 1:
+        total = sum(tensor.num_bytes for tensor in tensors.values())
+        index = {'metadata': {'total_size': total}, 'weight_map': places}
+        (folder / f'{stem}{INDEX}').write_text(json.dumps(index, indent=2) + '\n')
+
+
+def _plan(tensors: dict[str, StoredTensor], shard_bytes: int) -> list[list[str]]:
+    shards: list[list[str]] = [[]]
+    held = 0
+    for name, tensor in tensors.items():
+        if shards[-1] and held + tensor.num_bytes > shard_bytes:
+            shards.append([])
+            held = 0
+        shards[-1].append(name)
+        held += tensor.num_bytes
+    return shards
 
 
 def _taken(

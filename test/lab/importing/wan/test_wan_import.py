@@ -26,8 +26,8 @@ import yaml
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.lab.importing.wan_weights import import_weights, PartReport
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from mtv_world_ros.model.wan_weights import import_weights, PartReport
 
 WEIGHTS = 'diffusion_pytorch_model.safetensors'
 
