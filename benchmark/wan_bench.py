@@ -134,7 +134,7 @@ class Bench:
             self.transformer,
             self.scheduler,
             given,
-            seeds=[0],
+            seed=0,
             num_inference_steps=steps,
             should_stop=lambda: False,
         )

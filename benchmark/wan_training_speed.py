@@ -26,6 +26,7 @@ import torch
 from wan_bench import Bench
 
 from mtv_world_ros.lab.cli.train import set_overrides
+from mtv_world_ros.lab.training.adapter import add_adapter
 from mtv_world_ros.lab.training.base import Base
 from mtv_world_ros.lab.training.clips.batches import ClipBatch
 from mtv_world_ros.lab.training.dry_run import ideal_seconds, measured_peak
@@ -33,7 +34,6 @@ from mtv_world_ros.lab.training.encoding import encode_batch, EncodedBatch, Enco
 from mtv_world_ros.lab.training.trainer import Trainer
 from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
 from mtv_world_ros.model.checkpoint import Checkpoint
-from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.serving import ServingOptions
 
 

@@ -31,8 +31,7 @@ from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.calibration import (
     Calibration,
     HorizonCurve,
-    load_calibration,
-    load_horizon,
+    load_fit,
 )
 from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.success.fitted_to import Setting
@@ -143,8 +142,8 @@ def load_pipeline(
         task=task,
         segmenter=choose_segmenter(segmenter, device=device),
         describer=asked_describer(describer),
-        calibration=load_calibration(checkpoint_path(checkpoint)) if calibrated else None,
-        horizon=load_horizon(checkpoint_path(checkpoint)),
+        calibration=load_fit(checkpoint_path(checkpoint), Calibration) if calibrated else None,
+        horizon=load_fit(checkpoint_path(checkpoint), HorizonCurve),
         object_motion=motion,
         camera_checker=CameraChecker(model, load_shape(model)) if camera_check else None,
         setting=fitting_setting(checkpoint, model),

@@ -6,9 +6,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from math import sqrt
 from pathlib import Path
-from statistics import NormalDist
 import sys
 
 from mtv_world_ros.cli.shared_options import (
@@ -191,8 +189,7 @@ def _success_rate(verdicts: Sequence[str]) -> str:
     rest = f'; {without} without a verdict (open, or the estimate abstains)' if without else ''
     if not count:
         return f'success rate: no verdict in {len(verdicts)} episodes'
-    z = NormalDist().inv_cdf(0.975)
-    middle = (hits + z * z / 2) / (count + z * z)
-    half = z / (count + z * z) * sqrt(hits * (count - hits) / count + z * z / 4)
-    low, high = max(middle - half, 0.0), min(middle + half, 1.0)
+    from scipy.stats import binomtest
+
+    low, high = binomtest(hits, count).proportion_ci(method='wilson')
     return f'success rate: {hits} of {count} = {hits / count:.2f} [{low:.2f} {high:.2f}]{rest}'

@@ -39,9 +39,9 @@ class Checkpoint:
         card: inputs and outputs of the model, and its training data.
         text_encoder: umT5, in models with text.
         image_encoder: CLIP, in models with text.
-        adapter: folder of a LoRA adapter to use on the transformer; see `lora.py`.
-        object_motion: folder of an object motion network; see `object_motion/predictor.py`.
-        robot: folder of the robot that it was trained on, and of the default calibration.
+        adapter: folder of a LoRA adapter for the transformer.
+        object_motion: folder of the contact settings and the arms' response, for foresight.
+        robot: folder of the robot that the model was trained on, and of the default calibration.
     """
 
     transformer: MultiViewWanTransformer

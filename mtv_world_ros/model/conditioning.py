@@ -72,18 +72,10 @@ class Conditioning:
         same = (difference <= 0.01 * largest).reshape(-1, 1, 1, 1, 1)
         return replace(self, start=self.start * same.unsqueeze(3), anchor=shown * ~same)
 
-    def repeated(self, count: int) -> Conditioning:
-        """Returns the same for `count` samples, where it is for one."""
-        held = self._held()
-        return replace(self, **{n: v.expand(count, *v.shape[1:]) for n, v in held.items()})
-
     def part(self, samples: slice) -> Conditioning:
         """Returns that of some samples."""
-        return replace(self, **{n: v[samples] for n, v in self._held().items()})
-
-    def _held(self) -> dict[str, Tensor]:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {name: value for name, value in values.items() if value is not None}
+        return replace(self, **{n: v[samples] for n, v in values.items() if v is not None})
 
     def in_dtype(self, dtype: torch.dtype) -> Conditioning:
         """Returns the same with latents and tokens in a number format."""
@@ -130,21 +122,13 @@ def condition(
     first = control[:, :, :, 0]
     if not autoencoder.includes_start:
         control = control[:, :, :, 1:]
-    reference, start = _start(autoencoder, start_frame, control.shape[3])
+    reference = encode_frames(autoencoder, start_frame.unsqueeze(2))[:, :, :, 0]
     return Conditioning(
         control=control,
         start_control=first,
-        start=start,
+        start=start_slot(reference, control.shape[3], autoencoder.includes_start),
         reference=reference,
     )
-
-
-def _start(
-    autoencoder: Autoencoder, start_frame: Tensor, num_latent_frames: int
-) -> tuple[Tensor, Tensor]:
-    """(B, V, C, h, w) reference latents and the (B, V, C, F, h, w) start-image slot."""
-    reference = encode_frames(autoencoder, start_frame.unsqueeze(2))[:, :, :, 0]
-    return reference, start_slot(reference, num_latent_frames, autoencoder.includes_start)
 
 
 def start_slot(reference: Tensor, num_latent_frames: int, includes_start: bool) -> Tensor:
@@ -170,13 +154,8 @@ def check_history(
         transformer: configuration of the transformer.
 
     Raises:
-        CheckpointError: they do not, or there are no reference tokens to anchor.
+        CheckpointError: they do not.
     """
-    if settings.anchored and transformer.get('start_image', 'both') == 'channel':
-        raise CheckpointError(
-            "history.reference 'first_frame' needs reference tokens, which transformer."
-            "start_image 'channel' leaves out; set that to both or reference"
-        )
     if autoencoder.includes_start:
         merged, first = autoencoder.frames_per_latent, 1
     else:

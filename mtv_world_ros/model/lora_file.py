@@ -117,7 +117,7 @@ def read_lora(file: Path, transformer: nn.Module) -> dict[str, Factors]:
             every tensor must find its place, and every setting count.
     """
     tensors, settings = _read(file)
-    modules = linear_modules(transformer)
+    modules = {n: m for n, m in transformer.named_modules() if isinstance(m, nn.Linear)}
     names = _names(modules)
     found: dict[str, Factors] = {}
     for module, parts in _by_module(file, tensors).items():
@@ -131,17 +131,6 @@ def read_lora(file: Path, transformer: nn.Module) -> dict[str, Factors]:
         found[names[module]] = _factors(file, module, parts, modules[names[module]], settings)
     if not found:
         raise CheckpointError(f"'{file}' has no tensors; expected the factors of a LoRA")
-    return found
-
-
-def linear_modules(transformer: nn.Module) -> dict[str, Any]:
-    """Returns the layers that a LoRA may change, by name, also where one is loaded already."""
-    found = {}
-    for name, module in transformer.named_modules():
-        layer = getattr(module, 'base_layer', module)
-        inside = '.base_layer' in name or '.lora_' in name
-        if isinstance(layer, nn.Linear) and not inside:
-            found[name] = layer
     return found
 
 

@@ -81,7 +81,7 @@ def decoder_of(
     return place(TinyAutoencoder.load(Path(serving.tiny_decoder)), autoencoder.device, dtype)
 
 
-#: shapes that may be compiled: numbers of seeds, of views; torch gives up after 8
+#: shapes that may be compiled, by the number of views; torch gives up after 8
 _MOST_SHAPES = 64
 _COMPILERS = {'cpu': ('CXX', ('g++', 'clang++')), 'cuda': ('CC', ('gcc', 'clang', 'cc'))}
 
@@ -123,7 +123,6 @@ class ServingOptions(Schema):
     """Ways to serve a checkpoint; the defaults are the plain one.
 
     Attributes:
-        fuse_lora: add the adapter into the weights; nothing to compute for it in a step.
         compile: compile the transformer's repeated block, and on a GPU the norms of Wan's
             autoencoder; loading waits for it.
         attention: diffusers' name of the attention's implementation; empty = torch's choice.
@@ -134,7 +133,6 @@ class ServingOptions(Schema):
 
     section = ''
 
-    fuse_lora: bool = True
     compile: bool = False
     attention: str = ''
     offload: bool = False
@@ -146,11 +144,6 @@ class ServingOptions(Schema):
         if self.offload and self.compile:
             # an offloaded block is elsewhere each time, which compiled code does not expect
             raise ValueError('offload and compile exclude each other')
-        if self.offload and not self.fuse_lora:
-            raise ValueError(
-                'offload needs fuse_lora=true: it knows the weights alone, no adapter that is '
-                'exchanged beside them'
-            )
         if self.tiny_encoder and not self.tiny_decoder:
             raise ValueError("tiny_encoder=true needs tiny_decoder, the weights' file")
         return self

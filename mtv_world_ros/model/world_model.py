@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -58,21 +58,20 @@ def sample_latents(
     scheduler: Scheduler,
     conditioning: Conditioning,
     *,
-    seeds: Sequence[int],
+    seed: int,
     num_inference_steps: int,
     should_stop: Callable[[], bool],
     guidance_scale: float = 1.0,
 ) -> Tensor:
-    """Returns (K, V, C, F, h, w) float32 denoised latents, one sample a seed.
+    """Returns (1, V, C, F, h, w) float32 denoised latents.
 
-    The noise of a seed is drawn on the CPU and by itself, so a seed gives the same rollout on
-    every device and in every company.
+    The noise is drawn on the CPU, so a seed gives the same rollout on every device.
 
     Args:
         transformer: the model.
         scheduler: noise levels, shift and step rule.
-        conditioning: of one chunk (batch 1); all samples are denoised under it.
-        seeds: K seeds of the noise.
+        conditioning: of one chunk (batch 1).
+        seed: of the noise.
         num_inference_steps: denoising steps.
         should_stop: asked between steps.
         guidance_scale: how far to go from what `conditioning.negative_text` gives to what
@@ -81,15 +80,13 @@ def sample_latents(
     Raises:
         RolloutPreempted: `should_stop` said so between two steps.
     """
-    shape = conditioning.control.shape[1:]
     device = conditioning.control.device
     if transformer.start_image == 'either':
         conditioning = conditioning.with_one_start()
-    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
-    latents = _noise(generators, shape).to(device)
-    conditioning = conditioning.repeated(len(seeds))
+    generator = torch.Generator().manual_seed(seed)
+    latents = torch.randn(conditioning.control.shape, generator=generator).to(device)
     if conditioning.history is not None:
-        noise = _noise(generators, conditioning.history.shape[1:])
+        noise = torch.randn(conditioning.history.shape, generator=generator)
         conditioning = conditioning.with_noisy_history(noise.to(device))
     set_timesteps(scheduler, num_inference_steps, device)
     timesteps: Any = scheduler.timesteps  # the stubs are looser than the schedulers
@@ -108,11 +105,6 @@ def sample_latents(
         flow = flow_of(transformer, out, latents, sigmas[step].to(device))
         latents = scheduler.step(flow, timestep, latents, return_dict=False)[0]  # type: ignore[arg-type]
     return latents
-
-
-def _noise(generators: Sequence[torch.Generator], shape: Sequence[int]) -> Tensor:
-    """(K, *shape) noise, a sample from each generator."""
-    return torch.cat([torch.randn(1, *shape, generator=generator) for generator in generators])
 
 
 def set_timesteps(scheduler: Scheduler, num_inference_steps: int, device: torch.device) -> None:
@@ -192,7 +184,7 @@ class DiffusionWorldModel:
         check_memory(checkpoint, serving, self.device, dtype)
         home = torch.device('cpu') if serving.offload else self.device
         self.transformer = place(checkpoint.transformer, home, dtype).eval()
-        self._adapters = Adapters(self.transformer, fuse=serving.fuse_lora)
+        self._adapters = Adapters(self.transformer)
         #: of the checkpoint; None = it has none
         self.own_adapter = checkpoint.adapter
         if checkpoint.adapter is not None:
@@ -238,7 +230,6 @@ class DiffusionWorldModel:
 
         Raises:
             CheckpointError: the adapter cannot be read or is for another model.
-            ConfigError: peft is not installed.
         """
         if path is not None:
             check_same_model(self.card, path)
@@ -268,31 +259,6 @@ class DiffusionWorldModel:
         history: History | None = None,
     ) -> ByteArray:
         """Returns (V, T, H, W, 3) uint8 RGB frames; see `pipeline.WorldModel.predict`."""
-        return self.predict_batch(
-            start_frame,
-            trajectory_frames,
-            positions=positions,
-            seeds=[seed],
-            num_inference_steps=num_inference_steps,
-            should_stop=should_stop,
-            history=history,
-        )[0]
-
-    def predict_batch(
-        self,
-        start_frame: ByteArray,
-        trajectory_frames: ByteArray,
-        *,
-        positions: FloatArray,
-        seeds: Sequence[int],
-        num_inference_steps: int,
-        should_stop: Callable[[], bool],
-        history: History | None = None,
-    ) -> ByteArray:
-        """Returns (K, V, T, H, W, 3) uint8 RGB frames: one prediction a seed, in one batch.
-
-        The other arguments and the errors are those of `predict`.
-        """
         self._check_size(trajectory_frames)
         try:
             with torch.inference_mode():
@@ -304,15 +270,13 @@ class DiffusionWorldModel:
                     self.transformer,
                     self.scheduler,
                     conditioning,
-                    seeds=seeds,
+                    seed=seed,
                     num_inference_steps=num_inference_steps,
                     should_stop=should_stop,
                     guidance_scale=self.card.guidance_scale,
                 )
-                latents = latents.to(self._decoder.dtype)
-                # one at a time: decoding takes more memory than denoising
-                frames = [decode_frames(self._decoder, one[None]) for one in latents]
-                return torch.cat(frames).cpu().numpy()
+                frames = decode_frames(self._decoder, latents.to(self._decoder.dtype))
+                return frames[0].cpu().numpy()
         except (torch.OutOfMemoryError, MemoryError) as error:
             raise self._out_of_memory(trajectory_frames, error) from error
         except RuntimeError as error:

@@ -1,4 +1,4 @@
-"""Other nodes as one node sees them: what they say in `/diagnostics`, services, parameters."""
+"""Other nodes: their diagnostics, services and parameters."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ class Peers:
     def __init__(self, node: Node, spin_once: Callable[[], None]) -> None:
         self._node, self._spin_once = node, spin_once
         self._clients: dict[str, Client] = {}
-        self._heard: dict[str, tuple[float, dict[str, str]]] = {}
+        self._newest: dict[str, tuple[float, dict[str, str]]] = {}
         node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 100)
 
     def silence_s(self, name: str) -> float:
-        """For how long a node has said nothing [s]; infinite = never heard."""
-        heard = self._heard.get(self._status_name(name))
-        return float('inf') if heard is None else time.monotonic() - heard[0]
+        """Age of a node's newest diagnostics [s]; infinite = it never published."""
+        newest = self._newest.get(self._status_name(name))
+        return float('inf') if newest is None else time.monotonic() - newest[0]
 
     def state(self, name: str) -> Mapping[str, str]:
-        """What a node said of itself last."""
+        """Values of a node's newest diagnostics."""
         name = self._status_name(name)
-        return self._heard[name][1] if name in self._heard else {}
+        return self._newest[name][1] if name in self._newest else {}
 
     def unconnected(self, topics: Iterable[str], least: int = 1) -> list[str]:
         """Those of the topics of which a node says that its publisher has too few subscribers.
@@ -56,17 +56,17 @@ class Peers:
         Two that know of each other from the graph may still not be connected, and what is
         published until then is lost.
         """
-        states = [state for _, state in self._heard.values()]
+        states = [state for _, state in self._newest.values()]
 
-        def is_lonely(topic: str) -> bool:
+        def has_too_few(topic: str) -> bool:
             counts = (state.get(f'subscribers.{topic}') for state in states)
             return any(count is not None and int(count) < least for count in counts)
 
-        return [topic for topic in topics if is_lonely(topic)]
+        return [topic for topic in topics if has_too_few(topic)]
 
     def forget(self, name: str) -> None:
-        """Forgets what a node said: what it says next is new."""
-        self._heard.pop(self._status_name(name), None)
+        """Drops a node's diagnostics, so that the next ones are new."""
+        self._newest.pop(self._status_name(name), None)
 
     def wait(self, condition: Callable[[], bool], what: str, timeout_s: float) -> None:
         """Spins until the condition holds.
@@ -126,4 +126,4 @@ class Peers:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            self._heard[status.name] = (time.monotonic(), values_of(status))
+            self._newest[status.name] = (time.monotonic(), values_of(status))

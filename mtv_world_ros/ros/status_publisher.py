@@ -15,14 +15,14 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.ros.messages.conversions import make_header, to_diagnostics, to_status
+from mtv_world_ros.ros.messages.conversions import make_header, to_status
 
 #: a fault shows as a warning for this long [s]
 _WARN_S = 5.0
 
 
 class StatusPublisher:
-    """Publishes a node's `~/report` and `/diagnostics`, and counts what its side node does.
+    """Publishes a node's `~/report` and `/diagnostics`, and counts faults.
 
     Attributes:
         counts: whatever is counted, by name.
@@ -87,7 +87,7 @@ class StatusPublisher:
         name = f'{node.get_fully_qualified_name().lstrip("/")}{suffix}'
         status = to_status(name, self.hardware_id, level, message, values)
         header = make_header(node.get_clock().now().nanoseconds)
-        publisher.publish(to_diagnostics(header, status))
+        publisher.publish(DiagnosticArray(header=header, status=[status]))
 
 
 def create_publisher(node: Node, kind: Any, topic: str, depth: int) -> Publisher:

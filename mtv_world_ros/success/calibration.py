@@ -140,24 +140,6 @@ class Calibration(Weights):
         return f'fitted with the foresight of {version}'
 
 
-def save_calibration(folder: Path, calibration: Calibration) -> Path:
-    """Writes it into a checkpoint.
-
-    Raises:
-        CheckpointError: the folder cannot be written to.
-    """
-    return _save(Path(folder) / CALIBRATION, calibration, 'calibration')
-
-
-def load_calibration(folder: Path) -> Calibration | None:
-    """Returns the calibration of a checkpoint; None = it has none.
-
-    Raises:
-        CheckpointError: the file is not what `mtv-world calibrate` writes.
-    """
-    return _load(Path(folder) / CALIBRATION, Calibration)
-
-
 class HorizonCurve(Schema):
     """Mean J of the objects that move, of episodes imagined as a whole from their first frame.
 
@@ -197,28 +179,21 @@ class HorizonCurve(Schema):
         return num_trusted * self.period_s
 
 
-def save_horizon(folder: Path, curve: HorizonCurve) -> Path:
-    """Writes it into a checkpoint.
+#: in a checkpoint's folder
+_FILES: dict[type[Schema], str] = {Calibration: CALIBRATION, HorizonCurve: HORIZON}
+
+
+def save_fit(folder: Path, fit: Calibration | HorizonCurve) -> Path:
+    """Writes it into a checkpoint; returns the file.
 
     Raises:
         CheckpointError: the folder cannot be written to.
     """
-    return _save(Path(folder) / HORIZON, curve, 'horizon')
-
-
-def load_horizon(folder: Path) -> HorizonCurve | None:
-    """Returns the curve of a checkpoint; None = it has none.
-
-    Raises:
-        CheckpointError: the file is not what `mtv-world calibrate` writes.
-    """
-    return _load(Path(folder) / HORIZON, HorizonCurve)
-
-
-def _save(path: Path, record: Schema, what: str) -> Path:
+    path = Path(folder) / _FILES[type(fit)]
     try:
-        write_whole(path, json.dumps(record.model_dump(), indent=1) + '\n')
+        write_whole(path, json.dumps(fit.model_dump(), indent=1) + '\n')
     except OSError as error:
+        what = 'calibration' if isinstance(fit, Calibration) else 'horizon'
         raise CheckpointError(
             f"the {what} cannot be stored in the checkpoint '{path.parent}' ({error}); copy the "
             'checkpoint to a folder of your own and calibrate that one'
@@ -226,7 +201,13 @@ def _save(path: Path, record: Schema, what: str) -> Path:
     return path
 
 
-def _load(path: Path, kind: type[Model]) -> Model | None:
+def load_fit(folder: Path, kind: type[Model]) -> Model | None:
+    """Returns the `Calibration` or `HorizonCurve` of a checkpoint; None = it has none.
+
+    Raises:
+        CheckpointError: the file is not what `mtv-world calibrate` writes.
+    """
+    path = Path(folder) / _FILES[kind]
     if not path.is_file():
         return None
     try:

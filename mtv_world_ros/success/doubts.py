@@ -1,4 +1,4 @@
-"""What an estimate has to doubt beside the pictures: the cameras, the physics."""
+"""Doubts about an estimate that pictures do not show: wrong cameras, another physics."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from scipy.special import bdtrc
 
 from mtv_world_ros.data_types import FloatArray, SuccessEstimate
 
-#: an object that is nearer to one of its futures went as foreseen [m]: masks of small pictures,
-#: and a future in K, know no better
+#: an object nearer than this to one of its futures moved as foreseen [m]; masks of small pictures
+#: are no more exact
 NEAR_M = 0.035
-#: less movement says nothing of contact [m]
+#: a smaller motion is no evidence about contact [m]
 _MOVES_M = 0.03
-#: share of chunks that end unforeseen where the physics is the fitted one, at most
+#: largest share of chunks that end unforeseen under the fitted physics
 _USUAL = 0.15
-#: chance, where it is, below which it is taken to be another one
+#: p-value below which the physics is taken to be another one
 _SURE = 0.01
-#: chunks that are remembered
+#: chunks in the test
 _MOST = 24
 SAYS = 'the physics here is not the one that was fitted'
 
 
 def unforeseen(foreseen: FloatArray, real: FloatArray) -> float:
-    """Returns how far what really happened is from the nearest future [m]; NaN = nothing moved.
+    """Returns the distance of the real motion from the nearest future [m]; NaN = nothing moved.
 
     Args:
         foreseen: (K, 1 + T, O, 3) centres of objects from a chunk's start on [m].
@@ -39,29 +39,29 @@ def unforeseen(foreseen: FloatArray, real: FloatArray) -> float:
     known = np.isfinite(gaps).all(0)
     moved = np.maximum(np.linalg.norm(ahead, axis=-1).max(0, initial=0.0),
                        np.linalg.norm(came, axis=-1)) > _MOVES_M  # fmt: skip
-    told = known & moved
-    return float(gaps.min(0)[told].max()) if told.any() else nan
+    counts = known & moved
+    return float(gaps.min(0)[counts].max()) if counts.any() else nan
 
 
 class PhysicsWatch:
-    """Remembers how chunks that were executed ended, and says whether that was foreseen."""
+    """Tests whether executed chunks end as foreseen, by a binomial test over the last ones."""
 
     def __init__(self) -> None:
-        self._parted: deque[bool] = deque(maxlen=_MOST)
+        self._unforeseen: deque[bool] = deque(maxlen=_MOST)
 
     def take(self, away_m: float) -> None:
-        """Takes how far a chunk's end was from the nearest future [m]; NaN = it tells nothing."""
+        """Adds the distance of a chunk's end from the nearest future [m]; NaN = no evidence."""
         if np.isfinite(away_m):
-            self._parted.append(away_m > NEAR_M)
+            self._unforeseen.append(away_m > NEAR_M)
 
     def forget(self) -> None:
         """Begins anew: another task, or another fit."""
-        self._parted.clear()
+        self._unforeseen.clear()
 
     @property
     def doubt(self) -> str:
-        """Why futures are not to be believed here; empty = nothing speaks against them."""
-        count, of = sum(self._parted), len(self._parted)
+        """Why the fitted physics does not hold here; empty = nothing speaks against it."""
+        count, of = sum(self._unforeseen), len(self._unforeseen)
         if not of or bdtrc(count - 1, of, _USUAL) >= _SURE:
             return ''
         return (
@@ -72,7 +72,7 @@ class PhysicsWatch:
     @property
     def text(self) -> str:
         """What `/diagnostics` says."""
-        of = len(self._parted)
+        of = len(self._unforeseen)
         return self.doubt or (
             f'as it was fitted, by {of} executed chunks' if of else 'not compared yet'
         )
@@ -81,7 +81,7 @@ class PhysicsWatch:
 def doubted(
     estimate: SuccessEstimate, notes: Sequence[str] = (), refusal: str = ''
 ) -> SuccessEstimate:
-    """Returns an estimate that says its doubts.
+    """Returns an estimate with remarks, or without a verdict.
 
     Args:
         estimate: of pictures and foreseen motions.
@@ -98,21 +98,21 @@ def doubted(
     return replace(estimate, reasons=(*estimate.reasons, *notes)) if notes else estimate
 
 
-#: an estimate that is doubted is drawn to even chances by this share, and known no better than so
-_DRAWN, _HALF_WIDTH = 0.5, 0.35
+#: a doubted estimate is shrunk towards 0.5 by this share; least half width of its interval
+_SHRINKAGE, _HALF_WIDTH = 0.5, 0.35
 
 
 def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
-    """Returns an estimate of futures that are not to be believed as they are.
+    """Returns a less certain estimate, for foreseen motions under a doubtful physics.
 
     Args:
-        estimate: as if they were.
-        doubt: why they are not.
+        estimate: under the fitted physics.
+        doubt: why that does not hold.
     """
     reasons = (doubt, *estimate.reasons)
     if not isfinite(estimate.probability):
         return replace(estimate, reasons=reasons)
-    middle = 0.5 + (1 - _DRAWN) * (estimate.probability - 0.5)
+    middle = 0.5 + (1 - _SHRINKAGE) * (estimate.probability - 0.5)
     low, high = estimate.interval
     interval = (
         max(min(low, middle - _HALF_WIDTH), 0.0),

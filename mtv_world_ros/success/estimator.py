@@ -1,4 +1,4 @@
-"""How likely the task succeeds, from the imagined masks; abstains where it cannot tell."""
+"""Probability that the task succeeds, from masks and foreseen motions; may abstain."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def capped(probability: float, features: Mapping[str, float]) -> float:
 
 
 class Judged(NamedTuple):
-    """The estimate after a chunk, and the memory that the next chunk needs."""
+    """The estimate after a chunk, and the memory for the next chunk."""
 
     estimate: SuccessEstimate
     memory: RolloutMemory
@@ -93,8 +93,8 @@ class SuccessEstimator:
             task: name of the one to judge; default: the one the instruction matches. Where the
                 instruction names no objects for it, they take the task's placeholders in order.
             calibration: fitted weights, used where they hold.
-            segmenter: what finds the masks.
-            setting: where it judges; None = as where the calibration was fitted.
+            segmenter: finds the masks.
+            setting: robot and foresight in use; None = those of the calibration.
 
         Raises:
             ConfigError: `task` is not among `tasks`.
@@ -126,11 +126,11 @@ class SuccessEstimator:
         moved to where the relation wants it), and J of every other object with its first mask.
 
         Args:
-            footage: the chunk.
+            footage: masks and poses of the chunk.
             instruction: text for the robot; selects the task and its objects.
             memory: of the chunks before; None = the chunk is the rollout's first.
-            foreseen: motions of the objects up to the chunk's end, by a model of contact.
-            is_real: the frames were not imagined.
+            foreseen: motions of the objects up to the chunk's end.
+            is_real: whether the frames are real, not imagined.
         """
         memory = remember(memory, footage)
         try:
@@ -222,15 +222,15 @@ class SuccessEstimator:
         elif features['released'] == 0.0:
             low = 0.0
             reasons.append('a gripper is still closed')
-        strange = self._strange(views, ends is not None) if weights else ''
-        reasons.append(basis or self._origin(strange, is_real))
+        elsewhere = self._elsewhere(views, ends is not None) if weights else ''
+        reasons.append(basis or self._origin(elsewhere, is_real))
         return SuccessEstimate(
             probability=middle,
             interval=(low, high),
             jaccard=_jaccard(views, evidence.goal_jaccard, list(evidence.goal_jaccard)),
             reasons=tuple(reasons),
             features=features,
-            is_calibrated=not (basis or strange),
+            is_calibrated=not (basis or elsewhere),
         )
 
     def _objection(self, task: TaskSpec) -> str:
@@ -241,18 +241,18 @@ class SuccessEstimator:
         objection = self.calibration.objection(task.name, self.segmenter)
         return objection and f'{objection}: {stated}'
 
-    def _strange(self, views: Views, is_foreseen: bool) -> str:
-        """Why fitted weights were not fitted here; empty = they were."""
+    def _elsewhere(self, views: Views, is_foreseen: bool) -> str:
+        """Why the weights were fitted in another setting; empty = they were fitted in this one."""
         if self.calibration is None or self.setting is None:
             return ''
         cameras = [camera for camera in views.footage.cameras if camera.view in views.used]
         return self.calibration.elsewhere(self.setting, cameras, is_foreseen=is_foreseen)
 
-    def _origin(self, strange: str, is_real: bool) -> str:
-        """Where fitted weights come from."""
+    def _origin(self, elsewhere: str, is_real: bool) -> str:
+        """Which episodes the weights were fitted on."""
         calibration = self.calibration
         assert calibration is not None
-        called = f'uncalibrated: {strange}; weights' if strange else 'calibrated:'
+        called = f'uncalibrated: {elsewhere}; weights' if elsewhere else 'calibrated:'
         given = 'frames that were seen' if is_real else 'the world model'
         return (
             f'{called} fitted on {calibration.num_episodes} episodes of '

@@ -1,4 +1,4 @@
-"""What a calibration was fitted to: foresight, robot and cameras; elsewhere it is none."""
+"""Foresight, robot and cameras of the episodes that a calibration was fitted to."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ from mtv_world_ros.config import ListOf, Metres, Number, Schema
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.geometry.robot.model import RobotModel
 
-#: a calibrated arm differs from the nominal one by less [m]
+#: largest distance between the tools of a calibrated and of the nominal arm [m]
 ROBOT_SLACK_M = 0.03
-#: beyond the cameras of the fit: metres, of a direction's unit vector, of the image's width
+#: tolerances around the cameras of the fit: position [m], axes (unit vectors), focal length
+#: [image widths]
 _CAMERA_SLACK = np.repeat([0.03, 0.05, 0.05], (3, 6, 1))
 
 
 def _placement(camera: CameraModel) -> FloatArray:
-    """(10,) position [m], direction, what is right in the image, focal length in widths."""
+    """(10,) position [m], optical axis, x axis, focal length [image widths]."""
     pose = camera.T_mount_camera
     return np.array([*pose[:3, 3], *pose[:3, 2], *pose[:3, 0], camera.K[0, 0] / camera.width])
 
 
 class CameraRange(Schema):
-    """Within what the cameras of a view stood; each row as in `_placement`.
+    """Range of the cameras of one view, in the numbers of `_placement`.
 
     Attributes:
         mount_link: link that carries them.
-        low: (10,) smallest.
-        high: (10,) largest.
+        low: (10,) smallest values.
+        high: (10,) largest values.
     """
 
     mount_link: str
@@ -45,7 +46,7 @@ class CameraRange(Schema):
 
     @classmethod
     def of(cls, cameras: Sequence[CameraModel]) -> CameraRange:
-        """Returns the range of one view's cameras, which one link carries."""
+        """Returns the range of cameras of one view on one link."""
         rows = np.stack([_placement(camera) for camera in cameras])
         return cls(
             mount_link=cameras[0].mount_link,
@@ -54,7 +55,7 @@ class CameraRange(Schema):
         )
 
     def holds(self, camera: CameraModel) -> bool:
-        """Whether a camera stands where those of the fit did, within a small distance."""
+        """Whether a camera is within the range, up to the tolerances."""
         row = _placement(camera)
         below, above = np.array(self.low) - _CAMERA_SLACK, np.array(self.high) + _CAMERA_SLACK
         is_inside = bool(np.all((row >= below) & (row <= above)))
@@ -62,12 +63,12 @@ class CameraRange(Schema):
 
 
 class Setting(Schema):
-    """Where estimates are made.
+    """Robot and foresight with which estimates are made.
 
     Attributes:
-        foresight: digest of the numbers of contact and of the arms' response; empty = none.
-        robot: its name.
-        tools: (A, 3) where its tools are with all joints at 0 [m].
+        foresight: digest of the contact settings and the arms' response; empty = none.
+        robot: name of the robot.
+        tools: (A, 3) positions of its tools with all joints at 0 [m].
     """
 
     foresight: str = ''
@@ -76,12 +77,12 @@ class Setting(Schema):
 
     @classmethod
     def of(cls, robot: RobotModel, foresight: str = '') -> Setting:
-        """Returns that of a robot."""
+        """Returns the setting of a robot."""
         tools = robot.tool_poses(np.zeros((1, len(robot.joint_names))))[:, 0, :3, 3]
         return cls(foresight=foresight, robot=robot.name, tools=tuple(map(tuple, tools.tolist())))
 
     def is_same_robot(self, other: Setting) -> bool:
-        """Whether tools are where the other's are, within what calibrating an arm changes."""
+        """Whether the tools are where the other's are, up to what a calibration changes."""
         mine, theirs = np.array(self.tools), np.array(other.tools)
         return (
             self.robot == other.robot
@@ -91,21 +92,21 @@ class Setting(Schema):
 
 
 class FittedTo(Setting):
-    """Where the episodes of a calibration were imagined.
+    """Setting and cameras of the episodes of a calibration.
 
     Attributes:
-        cameras: of every view.
+        cameras: range of the cameras by view.
     """
 
     cameras: Mapping[str, CameraRange]
 
     @classmethod
     def episodes(cls, setting: Setting, sets: Iterable[Sequence[CameraModel]]) -> FittedTo:
-        """Returns that of episodes.
+        """Returns what episodes were made with.
 
         Args:
-            setting: of all of them.
-            sets: cameras of each.
+            setting: of all episodes.
+            sets: cameras of each episode.
         """
         views: dict[str, list[CameraModel]] = {}
         for cameras in sets:
@@ -128,9 +129,9 @@ class FittedTo(Setting):
             return f"fitted with another robot than this '{setting.robot}'"
         if is_foreseen and setting.foresight != self.foresight:
             return 'fitted with another foresight: other numbers of contact or of the arms'
-        strange = [
+        others = [
             camera.view
             for camera in cameras
             if camera.view not in self.cameras or not self.cameras[camera.view].holds(camera)
         ]
-        return f'fitted with other cameras of {", ".join(strange)}' if strange else ''
+        return f'fitted with other cameras of {", ".join(others)}' if others else ''

@@ -1,7 +1,7 @@
-"""How often a task succeeds among the motions that are foreseen: evidence before any picture.
+"""The share of foreseen motions in which a task succeeds: evidence before any picture.
 
-An object motion model foresees several motions of the same plan, from places and sizes within the
-error of the masks. Where some of them fail, a grasp is near its limits.
+Foresight gives several motions for one plan, from poses and sizes within the error of the masks.
+Where some of them fail, a grasp is near its limits.
 
 K motions, N steps, O objects, A arms.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import cycle
 from math import nan
 
 import numpy as np
@@ -26,11 +25,11 @@ from mtv_world_ros.success.task import ever_and_final, TaskSpec
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForeseenEnds:
-    """Whether a task is done at the end of motions.
+    """Outcome of a task at the end of each motion.
 
     Attributes:
-        done: (K,) bool.
-        weights: (K,) how much each counts.
+        done: (K,) whether the task is done.
+        weights: (K,) weight of each motion.
     """
 
     done: BoolArray
@@ -38,12 +37,12 @@ class ForeseenEnds:
 
     @property
     def share(self) -> float:
-        """Of the motions that succeed, by weight."""
+        """Weighted share of the motions that succeed."""
         return float(np.average(self.done, weights=self.weights))
 
     @property
     def is_majority(self) -> BoolArray:
-        """(K,) whether a motion has the outcome of the majority, by weight."""
+        """(K,) whether a motion has the outcome of the weighted majority."""
         return self.done == (self.share >= 0.5)
 
 
@@ -54,12 +53,12 @@ class ForeseenMotions:
     Attributes:
         names: of O objects.
         points: (K, N, O, 3) [m], NaN where not known.
-        rotations: (K, N, O, 3, 3) since the objects were found, or were whole.
+        rotations: (K, N, O, 3, 3) from the frame in which the objects were found, or were whole.
         sizes: (K, O, 3) extents [m].
         openings: (K, A, N) of the grippers, 0 closed to 1 open.
-        weights: (K,) how much each counts.
-        step_s: between the rows [s].
-        is_begun: whether they begin with the rollout, and not later.
+        weights: (K,) weight of each motion.
+        step_s: time between rows [s].
+        is_begun: whether the motions begin with the rollout, not later.
     """
 
     names: tuple[str, ...]
@@ -129,16 +128,14 @@ class ForeseenMotions:
 def foreseen_of(
     robot: RobotModel, objects: FoundObjects, num_steps: int, *, is_begun: bool = True
 ) -> ForeseenMotions:
-    """Returns what was foreseen of objects, without the last chunk's steps after `num_steps`.
+    """Returns the foreseen motions of objects, without the steps after `num_steps`.
 
-    Networks do not foresee what stops fingers, as a rim that they close on: they are told by
-    motions that do, in turn, if there are any, and else the grippers are as commanded.
+    Grippers of a motion without openings are as wide as commanded.
     """
     assert objects.positions is not None
     kept = slice(0, num_steps)
-    opened = [motion.openings for motion in objects.motions if motion.openings is not None]
-    stopped = cycle(opened or [robot.gripper_openings(objects.positions).T])
-    openings = [next(stopped) if m.openings is None else m.openings for m in objects.motions]
+    commanded = robot.gripper_openings(objects.positions).T
+    openings = [commanded if m.openings is None else m.openings for m in objects.motions]
     return ForeseenMotions(
         names=objects.names,
         points=np.stack([motion.points[kept] for motion in objects.motions]),

@@ -20,7 +20,8 @@ from mtv_world_ros.success.situation import Situation
 FLOOR_M = 0.005
 #: an object in a container may lean on its wall: its centre is at most this far over the wall [m]
 OVER_WALL_M = 0.03
-#: swings that are told apart, and what counts as one in their margin, in swings that are wanted
+#: amplitudes that `Shaken` distinguishes, and the softness of its margin, in shares of the
+#: amplitude that the task asks for
 _SWINGS = (0.25, 0.5, 0.625, 0.75, 0.875, 1.0, 1.125, 1.25, 1.5, 2.0, 3.0)
 _SOFT_SWING = 0.25
 

@@ -105,7 +105,6 @@ class RolloutMemory:
 
     Attributes:
         start_masks: of the rollout's first frame (T = 1).
-        start_poses: (V, 4, 4) T_base_camera then.
         points: (O, N, 3) centres, NaN where fewer than two views know one [m].
         leans: (O, N, 2) x and y of unit vectors along the objects' long axes, NaN where no view
             knows one.
@@ -118,7 +117,6 @@ class RolloutMemory:
     """
 
     start_masks: ObjectMasks
-    start_poses: FloatArray
     points: FloatArray
     leans: FloatArray
     seen_masks: BoolArray
@@ -162,7 +160,6 @@ def _begin(footage: Footage) -> RolloutMemory:
     points, leans = _points(footage, 0), _leans(footage, 0)
     memory = RolloutMemory(
         start_masks=footage.start_masks,
-        start_poses=footage.poses[:, 0],
         points=points[:, None],
         leans=leans[:, None],
         seen_masks=masks,

@@ -1,4 +1,4 @@
-"""Are cameras where they are said to be? The arm's outline by its URDF against a picture.
+"""Checks camera poses: the arm's outline by its URDF against a picture.
 
 The outline that joint states and a calibrated pose predict is laid over the picture's edges. A
 shift is searched first; then the pose is the most likely one by edges that are met along the
@@ -43,8 +43,8 @@ _EDGE, _LEAST_EDGE_PX, _ALIKE = 0.003, 0.4, 6.0
 #: an outline is met better than under other shifts by so many deviations, else nothing shows
 _CLEAR = 4.0
 #: an edge is met within a pixel where it is so strong; share of an outline's points that must be
-#: met for a pose to be believed, and below which the arm is elsewhere
-_MET, _BELIEVED, _ELSEWHERE = 0.5, 0.62, 0.5
+#: met for a pose to be accepted, and below which the arm is elsewhere
+_MET, _ACCEPTED, _ELSEWHERE = 0.5, 0.62, 0.5
 #: offsets of what the camera looks at, as shares of the width: smaller ones are none, larger ones
 #: are not corrected
 _NONE, _LARGE = 0.006, 0.07
@@ -81,7 +81,7 @@ class CameraFit:
     Attributes:
         view: its name.
         status: `fits`, `corrected` for this episode, `refused` as too far off, or `unchecked`.
-        T_told_found: (4, 4) found optical frame in the calibrated one; identity where not found.
+        T_given_found: (4, 4) found optical frame in the calibrated one; identity where not found.
         offset_px: how far the arm is from where it should be, at the picture's size; NaN = not
             known.
         off_m: of the camera's place [m].
@@ -91,7 +91,7 @@ class CameraFit:
 
     view: str
     status: Status
-    T_told_found: FloatArray
+    T_given_found: FloatArray
     offset_px: float = float('nan')
     off_m: float = float('nan')
     off_deg: float = float('nan')
@@ -125,7 +125,7 @@ class CameraCheck:
         """Returns cameras of the same views, at any size, as they were found to be."""
         found = {fit.view: fit for fit in self.fits if fit.status == 'corrected'}
         return tuple(
-            replace(c, T_mount_camera=c.T_mount_camera @ found[c.view].T_told_found)
+            replace(c, T_mount_camera=c.T_mount_camera @ found[c.view].T_given_found)
             if c.view in found
             else c
             for c in cameras
@@ -172,7 +172,7 @@ class CameraChecker:
 
 def _unchecked(view: str, why: str) -> CameraFit:
     text = f"camera '{view}' not checked against the arm: {why}"
-    return CameraFit(view=view, status='unchecked', T_told_found=np.eye(4), text=text)
+    return CameraFit(view=view, status='unchecked', T_given_found=np.eye(4), text=text)
 
 
 class _Found(NamedTuple):
@@ -193,7 +193,7 @@ def _judged(camera: CameraModel, found: _Found) -> CameraFit:
             f"camera '{camera.view}' does not show the arm where joint states and calibration put "
             'it, nor near; calibrate it again (mtv-world calibrate-camera), see mtv-world doctor'
         )
-        return CameraFit(view=camera.view, status='refused', T_told_found=np.eye(4), text=text)
+        return CameraFit(view=camera.view, status='refused', T_given_found=np.eye(4), text=text)
     off_m = float(np.linalg.norm(found.T[:3, 3]))
     off_deg = float(np.rad2deg(np.linalg.norm(cv2.Rodrigues(found.T[:3, :3])[0])))
     says = (
@@ -209,7 +209,7 @@ def _judged(camera: CameraModel, found: _Found) -> CameraFit:
     return CameraFit(
         view=camera.view,
         status=status,
-        T_told_found=found.T if status == 'corrected' else np.eye(4),
+        T_given_found=found.T if status == 'corrected' else np.eye(4),
         offset_px=found.offset * camera.width,
         off_m=off_m,
         off_deg=off_deg,
@@ -228,28 +228,28 @@ def _search(
     if camera.width > _WIDTH:
         camera = scaled(camera, _WIDTH, round(camera.height * _WIDTH / camera.width))
     edges, links = _edges(frame, camera), _links(robot, parts, positions)
-    T_told = camera_poses(camera, robot, positions[None])[0]
-    told = _outline(camera, links, T_told)
-    if len(told.pixels) < _FEWEST_POINTS:
+    T_given = camera_poses(camera, robot, positions[None])[0]
+    given = _outline(camera, links, T_given)
+    if len(given.pixels) < _FEWEST_POINTS:
         return 'the arm is hardly in view'
-    shift, clear = _shift(edges, told, camera.width)
+    shift, clear = _shift(edges, given, camera.width)
     if clear < _CLEAR:
         return 'its outline does not stand out in the picture'
-    T, covariance = T_told @ _turned_by(camera, shift), np.diag(_PRIOR**2)
+    T, covariance = T_given @ _turned_by(camera, shift), np.diag(_PRIOR**2)
     for window in _WINDOWS:
         outline = _outline(camera, links, T)
-        T, covariance = _stepped(edges, outline, camera, T_told, T, window * camera.width)
+        T, covariance = _stepped(edges, outline, camera, T_given, T, window * camera.width)
     met = _met(edges, _outline(camera, links, T))
-    T_told_found = inverse(T_told) @ T
+    T_given_found = inverse(T_given) @ T
     if met < _ELSEWHERE:
-        return _Found(T_told_found, np.nan)
-    slopes = _slopes(camera, told.points)
+        return _Found(T_given_found, np.nan)
+    slopes = _slopes(camera, given.points)
     spread = np.einsum('nij,jk,nik->n', slopes, covariance, slopes).mean()
-    if met < _BELIEVED or float(np.sqrt(spread)) > _UNSURE * camera.width:
+    if met < _ACCEPTED or float(np.sqrt(spread)) > _UNSURE * camera.width:
         return f'only {met:.0%} of its outline is met in the picture, which is too little'
-    moved, _ = project(camera, T_told_found, told.points)
-    offset = float(np.nanmean(np.linalg.norm(moved - told.pixels, axis=-1)))
-    return _Found(T_told_found, offset / camera.width)
+    moved, _ = project(camera, T_given_found, given.points)
+    offset = float(np.nanmean(np.linalg.norm(moved - given.pixels, axis=-1)))
+    return _Found(T_given_found, offset / camera.width)
 
 
 def _edges(frame: ByteArray, camera: CameraModel) -> _Edges:
@@ -362,7 +362,7 @@ def _stepped(
     edges: _Edges,
     outline: _Outline,
     camera: CameraModel,
-    T_told: FloatArray,
+    T_given: FloatArray,
     T: FloatArray,
     window: float,
 ) -> tuple[FloatArray, FloatArray]:
@@ -374,7 +374,7 @@ def _stepped(
     ways, weights = reach[peaks], strength[np.arange(len(peaks)), peaks]
     rows = np.einsum('ni,nij->nj', outline.normals, _slopes(camera, outline.points))
     sigma = max(_EDGE * camera.width, _LEAST_EDGE_PX)
-    so_far = inverse(T_told) @ T
+    so_far = inverse(T_given) @ T
     prior = np.concatenate([cv2.Rodrigues(so_far[:3, :3])[0][:, 0], so_far[:3, 3]])
     change = np.zeros(6)
     normal = np.eye(6)

@@ -20,15 +20,14 @@ from mtv_world_ros.errors import MtvWorldError
 UNSCORABLE = frozenset({'ambiguous', 'out_of_palette'})
 
 
-def jaccard(pred: BoolArray, true: BoolArray, void: BoolArray | None = None) -> FloatArray:
+def jaccard(pred: BoolArray, true: BoolArray) -> FloatArray:
     """Returns |pred and true| / |pred or true| over the last two axes.
 
-    Both empty gives 1, one empty 0; void pixels leave both counts (DAVIS 2017, `db_eval_iou`).
+    Both empty gives 1, one empty 0 (DAVIS 2017, `db_eval_iou`).
 
     Args:
         pred: (..., H, W) bool.
         true: (..., H, W) bool, of the same height and width.
-        void: (..., H, W) bool, pixels that do not count.
 
     Raises:
         MtvWorldError: the masks differ in height or width.
@@ -38,11 +37,8 @@ def jaccard(pred: BoolArray, true: BoolArray, void: BoolArray | None = None) -> 
             f'masks of {pred.shape[-1]}x{pred.shape[-2]} and {true.shape[-1]}x{true.shape[-2]} px '
             'cannot be compared: bring both to one size before scoring'
         )
-    both, either = pred & true, pred | true
-    if void is not None:
-        both, either = both & ~void, either & ~void
-    intersection = both.sum((-2, -1), dtype=np.float64)
-    union = either.sum((-2, -1), dtype=np.float64)
+    intersection = (pred & true).sum((-2, -1), dtype=np.float64)
+    union = (pred | true).sum((-2, -1), dtype=np.float64)
     return np.where(union == 0, 1.0, intersection / np.maximum(union, 1))
 
 
@@ -111,15 +107,8 @@ class ObjectScores:
     union: FloatArray
     status: tuple[tuple[str, ...], ...]
 
-    @property
-    def object_mean(self) -> FloatArray:
-        """(V,) mean over the scored objects: the headline."""
-        return mean_of_known(self.objects, axis=1)
 
-
-def object_scores(
-    pred: ObjectMasks, true: ObjectMasks, void: BoolArray | None = None
-) -> ObjectScores:
+def object_scores(pred: ObjectMasks, true: ObjectMasks) -> ObjectScores:
     """Scores predicted against true masks.
 
     An object is not scored (NaN) where its true masks are not to be trusted or where the
@@ -129,7 +118,6 @@ def object_scores(
     Args:
         pred: masks in the predicted frames 1..T.
         true: masks in the recorded frames at the same times.
-        void: (V, T, H, W) pixels that do not count.
 
     Raises:
         MtvWorldError: names, numbers of views or frames, or sizes differ.
@@ -139,14 +127,12 @@ def object_scores(
             f'masks of {pred.names} {pred.masks.shape[:3]} cannot be scored against '
             f'{true.names} {true.masks.shape[:3]}: names, views and frames must be the same'
         )
-    blank = None if void is None else void[:, None]
     status = tuple(
         tuple(map(_score_status, *rows)) for rows in zip(pred.status, true.status, strict=True)
     )
     scored = np.array([[_is_scored(word) for word in row] for row in status], dtype=bool)
     scored = scored.reshape(len(status), len(true.names))
-    frames = jaccard(pred.masks, true.masks, blank)
-    frames = np.where(scored[:, :, None], frames, np.nan)
+    frames = np.where(scored[:, :, None], jaccard(pred.masks, true.masks), np.nan)
     shown = true.masks.any((-2, -1))
     edges = np.full(frames.shape, np.nan)
     edges[scored] = boundary_f(pred.masks[scored], true.masks[scored])
@@ -156,7 +142,7 @@ def object_scores(
         visible=mean_of_known(np.where(shown, frames, np.nan), axis=2),
         objects=mean_of_known(frames, axis=2),
         boundary=mean_of_known(edges, axis=2),
-        union=_union(pred.masks, true.masks, scored, void),
+        union=_union(pred.masks, true.masks, scored),
         status=status,
     )
 
@@ -173,12 +159,10 @@ def _is_scored(status: str) -> bool:
     return where == 'ok' or (where == 'predicted' and word not in UNSCORABLE)
 
 
-def _union(
-    pred: BoolArray, true: BoolArray, scored: BoolArray, void: BoolArray | None
-) -> FloatArray:
+def _union(pred: BoolArray, true: BoolArray, scored: BoolArray) -> FloatArray:
     """(V,) mean over frames of J of the union of the scored objects, NaN where none is scored."""
     keep = scored[:, :, None, None, None]
-    frames = jaccard(np.any(pred & keep, axis=1), np.any(true & keep, axis=1), void)
+    frames = jaccard(np.any(pred & keep, axis=1), np.any(true & keep, axis=1))
     if frames.shape[1] == 0:
         return np.full(len(frames), np.nan)
     return np.where(scored.any(1), frames.mean(1), np.nan)
@@ -192,13 +176,8 @@ def persistence_scores(first: BoolArray, true: ObjectMasks) -> ObjectScores:
         true: masks in the recorded frames 1..T.
     """
     held = np.broadcast_to(first[:, :, None], true.masks.shape)
-    return object_scores(
-        ObjectMasks(names=true.names, masks=held, status=_all_ok(true.status)), true
-    )
-
-
-def _all_ok(status: tuple[tuple[str, ...], ...]) -> tuple[tuple[str, ...], ...]:
-    return tuple(tuple('ok' for _ in row) for row in status)
+    status = (('ok',) * len(true.names),) * len(true.status)
+    return object_scores(ObjectMasks(names=true.names, masks=held, status=status), true)
 
 
 def skill(score: FloatArray | float, copy: FloatArray | float) -> FloatArray:
@@ -208,17 +187,16 @@ def skill(score: FloatArray | float, copy: FloatArray | float) -> FloatArray:
     return np.where(room > 1e-9, (score - copy) / np.where(room > 1e-9, room, 1.0), np.nan)
 
 
-def moves(true: BoolArray, first: BoolArray, max_overlap: float = 0.5) -> BoolArray:
+def moves(true: BoolArray, first: BoolArray) -> BoolArray:
     """Returns (V, O) whether an object moves in the recording.
 
-    It moves if in some frame its mask and its first mask share less than `max_overlap` of the
-    smaller of the two. Hiding it, wholly or in part, leaves that share at 1. Frames that show
+    It moves if in some frame its mask and its first mask share less than half of the smaller of
+    the two. Hiding it, wholly or in part, leaves that share at 1. Frames that show
     less than a quarter of its largest area do not count.
 
     Args:
         true: (V, O, T, H, W) masks in the recorded frames.
         first: (V, O, H, W) masks in the recorded frame 0.
-        max_overlap: share under which the object has left its place.
     """
     area = true.sum((-2, -1))
     first_area = first.sum((-2, -1))[:, :, None]
@@ -226,7 +204,7 @@ def moves(true: BoolArray, first: BoolArray, max_overlap: float = 0.5) -> BoolAr
     largest = np.maximum(area.max(2, initial=0, keepdims=True), first_area)
     smaller = np.minimum(area, first_area)
     shown = (smaller > 0) & (4 * smaller >= largest)
-    return (shown & (shared < max_overlap * smaller)).any(2)
+    return (shown & (2 * shared < smaller)).any(2)
 
 
 def mean_of_known(values: FloatArray, axis: int | tuple[int, ...] | None = None) -> FloatArray:

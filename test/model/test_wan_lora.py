@@ -12,8 +12,9 @@ from wan_files import DIM
 from wan_lora import build, RANK, run
 
 from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.lab.training.adapter import add_adapter, save_adapter
 from mtv_world_ros.lab.training.training_config import load_training_config
-from mtv_world_ros.model.lora import ADAPTER, Adapters, add_adapter, save_adapter
+from mtv_world_ros.model.lora import ADAPTER, Adapters
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 
@@ -57,10 +58,12 @@ def test_a_new_adapter_changes_nothing():
 def test_saved_and_loaded_gives_the_same_output(tmp_path):
     expected = trained(tmp_path / 'adapter')
     model = build()
-    before = run(model)
-    assert not torch.allclose(expected, before, atol=0.1)
+    assert not torch.allclose(expected, run(model), atol=0.1)
+    places = {name: value.data_ptr() for name, value in model.state_dict().items()}
     Adapters(model).use(tmp_path / 'adapter')
-    torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-5)
+    # a compiled pass reads the tensors where they were
+    assert {name: value.data_ptr() for name, value in model.state_dict().items()} == places
+    torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-4)
     assert {path.name for path in (tmp_path / 'adapter').iterdir()} == {
         ADAPTER,
         'beside.safetensors',
@@ -68,22 +71,12 @@ def test_saved_and_loaded_gives_the_same_output(tmp_path):
     }
 
 
-def test_fused_gives_the_same_output_in_the_same_tensors(tmp_path):
-    expected = trained(tmp_path / 'adapter')
-    model = build()
-    places = {name: value.data_ptr() for name, value in model.state_dict().items()}
-    Adapters(model, fuse=True).use(tmp_path / 'adapter')
-    # a captured or compiled pass reads the tensors where they were
-    assert {name: value.data_ptr() for name, value in model.state_dict().items()} == places
-    torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-4)
-
-
-def test_fused_in_bfloat16_is_the_sum_rounded_once(tmp_path):
+def test_in_bfloat16_weights_are_the_sum_rounded_once(tmp_path):
     trained(tmp_path / 'adapter')
     model = torch.nn.Module.to(build(), torch.bfloat16)
     name = 'blocks.1.attn1.to_k'
     before = model.get_parameter(f'{name}.weight').detach().float()
-    Adapters(model, fuse=True).use(tmp_path / 'adapter')
+    Adapters(model).use(tmp_path / 'adapter')
     stored = load_file(tmp_path / 'adapter' / ADAPTER)
     a, b = (stored[f'{name}.lora_{side}.weight'] for side in 'AB')
     expected = before + 8.0 / RANK * (b @ a)
@@ -92,15 +85,14 @@ def test_fused_in_bfloat16_is_the_sum_rounded_once(tmp_path):
     )
 
 
-@pytest.mark.parametrize('fuse', [False, True])
-def test_adapters_are_exchanged_in_a_loaded_model(tmp_path, fuse):
+def test_adapters_are_exchanged_in_a_loaded_model(tmp_path):
     first, second = trained(tmp_path / 'a'), trained(tmp_path / 'b', seed=6)
     model = build()
     before = run(model)
-    adapters = Adapters(model, fuse=fuse)
+    adapters = Adapters(model)
     for path, expected in (('a', first), ('b', second), ('a', first)):
         adapters.use(tmp_path / path)
-        torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-4 if fuse else 1e-5)
+        torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-4)
     adapters.use(None)
     torch.testing.assert_close(run(model), before, rtol=0, atol=1e-5)
     for name, value in build().state_dict().items():
@@ -115,7 +107,7 @@ def test_a_failed_exchange_leaves_the_adapter_before(tmp_path):
     (tmp_path / 'broken.safetensors').write_bytes(b'no safetensors')
     with pytest.raises(CheckpointError, match='cannot be loaded'):
         adapters.use(tmp_path / 'broken.safetensors')
-    torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(run(model), expected, rtol=0, atol=1e-4)
     assert adapters.current == tmp_path / 'a'
 
 

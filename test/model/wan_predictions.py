@@ -32,13 +32,13 @@ def frames(*shape: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 255, (*shape, 32, 32, 3), np.uint8)
 
 
-def predict(model: DiffusionWorldModel, seeds: list[int], steps: int = 2, **changes: Any):
+def predict(model: DiffusionWorldModel, *, seed: int = 0, steps: int = 2, **changes: Any):
     arguments = {
         'start_frame': frames(VIEWS),
         'trajectory_frames': frames(VIEWS, 1 + T, seed=1),
         'positions': np.zeros((1 + T, 14)),
-        'seeds': seeds,
+        'seed': seed,
         'num_inference_steps': steps,
         'should_stop': lambda: False,
     }
-    return model.predict_batch(**{**arguments, **changes})
+    return model.predict(**{**arguments, **changes})

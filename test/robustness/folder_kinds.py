@@ -167,9 +167,9 @@ def make_calibration(folder: Path) -> None:
 
 
 def _read_calibration(folder: Path) -> Any:
-    from mtv_world_ros.success.calibration import load_calibration, load_horizon
+    from mtv_world_ros.success.calibration import Calibration, HorizonCurve, load_fit
 
-    return load_calibration(folder), load_horizon(folder)
+    return load_fit(folder, Calibration), load_fit(folder, HorizonCurve)
 
 
 def make_ranking(folder: Path) -> None:

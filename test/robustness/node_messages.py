@@ -217,13 +217,13 @@ def send(key: str, message: Any) -> None:
         AssertionError: the rollout would begin, from implausible input.
     """
     from mtv_world_ros.bounded_input import check_limit
-    from mtv_world_ros.ros.messages.rejection import bounded, Reason
+    from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
     from mtv_world_ros.ros.sensing.observations import ObservationBuffer
     from mtv_world_ros.ros.world_model.rollouts import RequestMaker
 
     robot, cameras, settings = _fixed()
     if key == 'instruction':
-        with bounded(Reason.INSTRUCTION_TOO_LONG):
+        with rejected_as(Reason.INSTRUCTION_TOO_LONG):
             check_limit('instruction_characters', len(message.data), 'the instruction')
         return
     buffer = ObservationBuffer(

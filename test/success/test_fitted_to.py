@@ -13,7 +13,7 @@ from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration as load_cameras
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.success.calibration import load_calibration
+from mtv_world_ros.success.calibration import Calibration, load_fit
 from mtv_world_ros.success.fitted_to import CameraRange, FittedTo, Setting
 
 ROBOT = checkpoint_robot('bundled')
@@ -104,7 +104,7 @@ def test_other_numbers_of_contact_are_another_setting(tmp_path):
 
 
 def test_the_bundled_estimate_is_calibrated_for_its_own_foresight_and_cameras():
-    calibration = load_calibration(share_path('resource', 'checkpoint'))
+    calibration = load_fit(share_path('resource', 'checkpoint'), Calibration)
     here = fitting_setting('bundled', ROBOT)
     assert calibration.elsewhere(here, CAMERAS, is_foreseen=True) == ''
     found = calibration.elsewhere(HERE, CAMERAS, is_foreseen=True)

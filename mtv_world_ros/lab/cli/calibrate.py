@@ -70,7 +70,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _calibrate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.assembly import checkpoint_path
     from mtv_world_ros.lab.splits import select
-    from mtv_world_ros.success.calibration import save_calibration, save_horizon
+    from mtv_world_ros.success.calibration import save_fit
 
     check_model(arguments.device, arguments.checkpoint)
     folder = checkpoint_path(arguments.checkpoint)
@@ -96,8 +96,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         fitted_to = _fitted_to(arguments, selection)
         stored = found.calibration.replace(fitted_to=fitted_to)
         if horizon is not None:  # first: with the calibration the checkpoint counts as calibrated
-            print(f'stored: {save_horizon(folder, horizon)}')
-        print(f'stored: {save_calibration(folder, stored)}')
+            print(f'stored: {save_fit(folder, horizon)}')
+        print(f'stored: {save_fit(folder, stored)}')
     print(text)
     return int(failed)
 

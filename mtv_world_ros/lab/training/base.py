@@ -11,11 +11,11 @@ from typing import Any
 import torch
 
 from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.lab.training.adapter import add_adapter
 from mtv_world_ros.lab.training.encoding import Encoders
 from mtv_world_ros.lab.training.training_config import TrainingConfig
 from mtv_world_ros.model.card import CheckpointCard, SHARED_KEYS
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
-from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer

@@ -13,8 +13,8 @@ from torch import nn, Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
+from mtv_world_ros.lab.training.adapter import add_adapter
 from mtv_world_ros.lab.training.training_config import TrainingConfig
-from mtv_world_ros.model.lora import add_adapter
 from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer

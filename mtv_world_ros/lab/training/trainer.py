@@ -14,6 +14,7 @@ import torch
 from tqdm import tqdm
 
 from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.lab.training.adapter import save_adapter
 from mtv_world_ros.lab.training.averaged_weights import AveragedWeights
 from mtv_world_ros.lab.training.base import Base
 from mtv_world_ros.lab.training.clips.batches import BatchSource, ClipBatch
@@ -50,7 +51,6 @@ from mtv_world_ros.model.checkpoint import (
     save_checkpoint,
 )
 from mtv_world_ros.model.conditioning import check_history
-from mtv_world_ros.model.lora import save_adapter
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.serving import compile_blocks

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from mtv_world_ros.errors import CheckpointError
 
-#: where the start image may enter: as reference tokens, in its channel slot, or both
-START_IMAGES = ('both', 'either', 'reference', 'channel')
+#: where the start image may enter: as reference tokens and in its channel slot, or in one of them
+START_IMAGES = ('both', 'either')
 
 
 def embed_video(transformer: Any, x: Tensor, temb: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -133,9 +133,8 @@ class MultiViewRotaryPosEmbed(WanRotaryPosEmbed):
         attention_head_dim: channels of one head.
         patch_size: (time, height, width) of a token; kept for the base class.
         max_seq_len: largest position along any axis, view offset included.
-        view_offset: `width` puts view v at columns v*w .. (v+1)*w; `time` at frames v*f ..
-            (v+1)*f; `none` gives all views the same positions (the view embedding alone tells them
-            apart).
+        view_offset: `width` puts view v at columns v*w .. (v+1)*w; `none` gives all views the same
+            positions (the view embedding alone tells them apart).
 
     Raises:
         CheckpointError: another `view_offset`; or, called, a grid beyond `max_seq_len`.
@@ -149,9 +148,9 @@ class MultiViewRotaryPosEmbed(WanRotaryPosEmbed):
         view_offset: str = 'width',
     ) -> None:
         super().__init__(attention_head_dim, patch_size, max_seq_len)  # type: ignore[arg-type]
-        if view_offset not in ('width', 'time', 'none'):
+        if view_offset not in ('width', 'none'):
             raise CheckpointError(
-                f"transformer.view_offset '{view_offset}' is not one of width, time, none"
+                f"transformer.view_offset '{view_offset}' is not one of width, none"
             )
         self.view_offset = view_offset
 
@@ -166,63 +165,47 @@ class MultiViewRotaryPosEmbed(WanRotaryPosEmbed):
                 negative. Default: 0 .. F-1.
         """
         _, num_views, num_frames, height, width, _ = hidden_states.shape
-        places = self._times(num_views, tuple(times or range(num_frames)))
+        places = times or range(num_frames)
         self._check_size(num_views, places, height, width)
         cos, sin = self.get_buffer('freqs_cos'), self.get_buffer('freqs_sin')
         # cosines are even, sines odd: a turn by -t undoes one by t
         return (
-            self._table(cos, _rows(cos[:, : self.t_dim], places, 1), height, width),
-            self._table(sin, _rows(sin[:, : self.t_dim], places, -1), height, width),
+            self._table(cos, _rows(cos[:, : self.t_dim], places, 1), num_views, height, width),
+            self._table(sin, _rows(sin[:, : self.t_dim], places, -1), num_views, height, width),
         )
 
-    def _times(self, num_views: int, times: tuple[int, ...]) -> list[list[int]]:
-        """V rows of F times: the views' own; those of the video are the same whatever is before.
-
-        With an offset in time the views' videos follow one another, and what is before the video
-        stands before all of them.
-        """
-        if self.view_offset != 'time':
-            return [list(times) for _ in range(num_views)]
-        after, before = max(times) + 1, max(0, -min(times))
-        return [
-            [t + v * after if t >= 0 else t - (num_views - 1 - v) * before for t in times]
-            for v in range(num_views)
-        ]
-
-    def _check_size(self, v: int, times: list[list[int]], h: int, w: int) -> None:
-        f = 1 + max(abs(t) for row in times for t in row)
+    def _check_size(self, v: int, times: Sequence[int], h: int, w: int) -> None:
+        f = 1 + max(abs(t) for t in times)
         largest = max(f, v * w if self.view_offset == 'width' else w, h)
         if largest > self.max_seq_len:
             raise CheckpointError(
-                f'{v} views of {len(times[0])} x {h} x {w} tokens reach position {largest}, the '
+                f'{v} views of {len(times)} x {h} x {w} tokens reach position {largest}, the '
                 f'model has {self.max_seq_len}; use fewer or smaller frames, or raise '
                 'transformer.rope_max_seq_len'
             )
 
-    def _table(self, freqs: Tensor, frames: Tensor, h: int, w: int) -> Tensor:
-        """The angles of a (V, F, h, w) grid; frames (V, F, t_dim) are those of time."""
-        v, f, _ = frames.shape
+    def _table(self, freqs: Tensor, frames: Tensor, v: int, h: int, w: int) -> Tensor:
+        """The angles of a (V, F, h, w) grid; frames (F, t_dim) are those of time."""
+        f = len(frames)
         _, row, column = freqs.split([self.t_dim, self.h_dim, self.w_dim], dim=1)
         if self.view_offset == 'width':
             columns = column[: v * w].view(v, 1, 1, w, -1)
         else:
             columns = column[:w].view(1, 1, 1, w, -1)
         table = [
-            frames.view(v, f, 1, 1, -1).expand(v, f, h, w, -1),
+            frames.view(1, f, 1, 1, -1).expand(v, f, h, w, -1),
             row[:h].view(1, 1, h, 1, -1).expand(v, f, h, w, -1),
             columns.expand(v, f, h, w, -1),
         ]
         return torch.cat(table, dim=-1).reshape(1, v * f * h * w, 1, -1)
 
 
-def _rows(table: Tensor, places: list[list[int]], sign: int) -> Tensor:
-    """(V, F, D) rows of a table (N, D); those of negative places times the sign.
+def _rows(table: Tensor, places: Sequence[int], sign: int) -> Tensor:
+    """(F, D) rows of a table (N, D); those of negative places times the sign.
 
     Cut out, not indexed with a tensor: that would have to be copied to the device first.
     """
-    return torch.stack(
-        [torch.stack([table[t] if t >= 0 else sign * table[-t] for t in row]) for row in places]
-    )
+    return torch.stack([table[t] if t >= 0 else sign * table[-t] for t in places])
 
 
 class TokenGrid(NamedTuple):
@@ -233,14 +216,12 @@ class TokenGrid(NamedTuple):
         times: F times for the rotary embedding. The video stands at 1 .. f and the reference image
             at 0, as Wan2.1-Fun-Control was trained, whatever is before them; the history stands
             at -p .. -1.
-        num_history: p.
-        num_before: token frames before the video, which are dropped from the output.
+        num_history: p. These and the reference image are dropped from the output.
     """
 
     tokens: Tensor
     times: tuple[int, ...]
     num_history: int
-    num_before: int
 
 
 def check_start_image(name: str) -> str:
@@ -252,16 +233,14 @@ def check_start_image(name: str) -> str:
     return name
 
 
-def arrange(video: Tensor, reference: Tensor | None, history: Tensor | None) -> TokenGrid:
-    """Returns the grid of (B, V, f | 1 | p, h, w, D) tokens, as far as there are any."""
+def arrange(video: Tensor, reference: Tensor, history: Tensor | None) -> TokenGrid:
+    """Returns the grid of (B, V, f | 1 | p, h, w, D) tokens."""
     num_history = 0 if history is None else history.shape[2]
     parts = [part for part in (history, reference, video) if part is not None]
-    first = 1 if reference is None else 0
     return TokenGrid(
         tokens=torch.cat(parts, dim=2),
-        times=(*range(-num_history, 0), *range(first, 1 + video.shape[2])),
+        times=tuple(range(-num_history, 1 + video.shape[2])),
         num_history=num_history,
-        num_before=num_history + 1 - first,
     )
 
 

@@ -55,9 +55,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         context: `text_image` (cross-attention as in Wan) or `none`.
         view_offset: see `MultiViewRotaryPosEmbed`.
         prediction: `flow` (noise - clean, Wan) or `sample` (the clean latents).
-        start_image: where the start image enters: `both`, `either` (see
-            `Conditioning.with_one_start`), as `reference` tokens alone, or in its
-            `channel` slot alone.
+        start_image: where the start image enters: `both` as reference tokens and in its channel
+            slot, or in `either` (see `Conditioning.with_one_start`).
         copies_control: the convolutional decoder may also copy from the trajectory video, where
             that shows the objects themselves (`rendering.object_motion`).
     """
@@ -206,14 +205,12 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         temb, time_proj, text, image = self._embed_times(
             timestep, history_timestep, encoder_hidden_states, encoder_hidden_states_image
         )
-        if self.start_image == 'reference':
-            start = torch.zeros_like(start)
         x = torch.cat([hidden_states, control, start], dim=2)
         tokens, skips = embed_video(self, x, temb[:, 0])
         ref_tokens, keys = embed_reference(self, reference, start_control, anchor, temb[:, 0])
         grid = arrange(
             tokens,
-            None if self.start_image == 'channel' else ref_tokens,
+            ref_tokens,
             None if history is None else embed_history(self, history, start, temb[:, -1]),
         )
         sequence = grid.tokens + self.view_embedding[:num_views, None, None, None]
@@ -226,7 +223,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         )
         shift, scale = (self.scale_shift_table + temb[:, :1]).chunk(2, dim=1)
         sequence = (self.norm_out(sequence.float()) * (1 + scale) + shift).type_as(sequence)
-        kept = sequence.reshape(grid.tokens.shape)[:, :, grid.num_before :]
+        kept = sequence.reshape(grid.tokens.shape)[:, :, grid.num_history + 1 :]
         return unembed(self, kept, skips, temb[:, 0], keys, reference, control)
 
     def _embed_times(

@@ -143,28 +143,28 @@ class Player(Node):
         ]
         end_s = time.monotonic() + self._options.wait_timeout
         say_s = time.monotonic() + _SILENT_S
-        while lonely := self._lonely(needed):
+        while unsubscribed := self._unsubscribed(needed):
             if time.monotonic() > say_s:
                 say_s = end_s + 1
                 self.get_logger().info(
                     f'waiting up to {self._options.wait_timeout:g} s for a subscriber of '
-                    f'{lonely}: start the node (world_model); --no-wait plays anyway'
+                    f'{unsubscribed}: start the node (world_model); --no-wait plays anyway'
                 )
             if time.monotonic() > end_s:
                 raise ConfigError(
-                    f'nobody subscribes to {lonely} after {self._options.wait_timeout:g} s; is '
-                    'the node running in the same ROS_DOMAIN_ID? (--no-wait plays anyway)'
+                    f'nobody subscribes to {unsubscribed} after {self._options.wait_timeout:g} s; '
+                    'is the node running in the same ROS_DOMAIN_ID? (--no-wait plays anyway)'
                 )
             self._executor.spin_once(timeout_sec=0.05)
         self._wait_until_settled(end_s)
 
-    def _lonely(self, topics: list[str]) -> list[str]:
+    def _unsubscribed(self, topics: list[str]) -> list[str]:
         """Topics without subscriber, as far as the graph, or their publisher, can tell."""
-        lonely = [topic for topic in topics if not self.count_subscribers(topic)]
-        if self._options.lock_step and not lonely:
+        unsubscribed = [topic for topic in topics if not self.count_subscribers(topic)]
+        if self._options.lock_step and not unsubscribed:
             node = self.resolve_topic_name(self._options.report_topic).rpartition('/')[0]
-            lonely = [] if self._peers.state(node) else [f'/diagnostics of {node}']
-        return lonely or self._peers.unconnected(topics)
+            unsubscribed = [] if self._peers.state(node) else [f'/diagnostics of {node}']
+        return unsubscribed or self._peers.unconnected(topics)
 
     def _wait_until_settled(self, end_s: float) -> None:
         """Until all subscriptions that the graph knows are connected and none changes."""

@@ -319,15 +319,15 @@ class EpisodeRunner(Node):
         )
 
     def _are_recorded(self, topics: Sequence[str]) -> bool:
-        is_heard = bool(self._peers.state(self._options.world_model))
+        is_known = bool(self._peers.state(self._options.world_model))
         # the policy sees these too
         shared = [t for t in topics if t.endswith(('/image_raw', '/joint_states'))]
-        lonely = self._peers.unconnected(topics)
+        unconnected = self._peers.unconnected(topics)
         for topic in shared:
             # viewers take JPEG images
             viewers = 0 if topic.endswith('/image_raw') else self._options.viewers
-            lonely += self._peers.unconnected([topic], least=2 + viewers)
-        return is_heard and not lonely
+            unconnected += self._peers.unconnected([topic], least=2 + viewers)
+        return is_known and not unconnected
 
     # plumbing
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import import_module
 import struct
 from typing import Any
 
 from builtin_interfaces.msg import Duration, Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 import numpy as np
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension, MultiArrayLayout
@@ -22,7 +22,7 @@ from mtv_world_ros.bounded_input import check_limit
 from mtv_world_ros.data.joint_plans import read_plan
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.ros.messages.rejection import bounded, Reason, refused_plan, Rejection
+from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 
 #: the encapsulation header comes first; the stamp is a header's first field
 _OFFSET = 4
@@ -93,7 +93,7 @@ def to_trajectory(message: JointTrajectoryMsg) -> JointTrajectory:
     Raises:
         Rejection: the message cannot be used.
     """
-    with refused_plan():
+    with rejected_as(Reason.TRAJECTORY_MALFORMED):
         return read_plan(message)
 
 
@@ -123,9 +123,10 @@ def to_positions(message: JointState) -> dict[str, float]:
             f'the joint state has {len(message.name)} names and {len(message.position)} '
             'positions; it needs one position a name',
         )
-    with bounded(Reason.JOINT_STATE_INVALID):
+    with rejected_as(Reason.JOINT_STATE_INVALID):
         check_limit('joint_names', len(message.name), 'the joint state')
-    repeated = _repeated(message.name)
+    counts = Counter(message.name)
+    repeated = sorted(name for name, count in counts.items() if count > 1)
     if repeated:
         raise Rejection(Reason.JOINT_STATE_INVALID, f'joint names {repeated} occur more than once')
     positions = dict(zip(message.name, message.position, strict=True))
@@ -135,10 +136,6 @@ def to_positions(message: JointState) -> dict[str, float]:
             Reason.JOINT_STATE_INVALID, f'the positions of joints {wrong} are not finite'
         )
     return positions
-
-
-def _repeated(names: Iterable[str]) -> list[str]:
-    return sorted(name for name, count in Counter(names).items() if count > 1)
 
 
 def to_joint_state(names: Sequence[str], positions: FloatArray, header: Header) -> JointState:
@@ -178,11 +175,6 @@ def to_status(
         hardware_id=hardware_id,
         values=[KeyValue(key=key, value=to_text(value)) for key, value in values.items()],
     )
-
-
-def to_diagnostics(header: Header, *statuses: DiagnosticStatus) -> DiagnosticArray:
-    """A diagnostic array of some statuses."""
-    return DiagnosticArray(header=header, status=list(statuses))
 
 
 def values_of(status: DiagnosticStatus) -> dict[str, str]:

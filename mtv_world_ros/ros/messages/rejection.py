@@ -58,28 +58,16 @@ class Rejection(MtvWorldError):
 
 @contextmanager
 def rejected_as(reason: Reason) -> Iterator[None]:
-    """Turns a user error raised inside into a `Rejection` for `reason`."""
+    """Turns a user error or an exceeded limit into a `Rejection`.
+
+    Args:
+        reason: what it counts under; what is wrong with a plan counts under its own fault.
+    """
     try:
         yield
     except Rejection:
         raise
-    except MtvWorldError as error:
-        raise Rejection(reason, str(error)) from error
-
-
-@contextmanager
-def bounded(reason: Reason) -> Iterator[None]:
-    """Turns a limit that is exceeded inside into a `Rejection` for `reason`."""
-    try:
-        yield
-    except LimitError as error:
-        raise Rejection(reason, str(error)) from error
-
-
-@contextmanager
-def refused_plan() -> Iterator[None]:
-    """Turns what is wrong with a plan into a `Rejection` that counts under its fault."""
-    try:
-        yield
     except PlanError as error:
         raise Rejection(Reason(error.fault), str(error)) from error
+    except (MtvWorldError, LimitError) as error:
+        raise Rejection(reason, str(error)) from error

@@ -133,11 +133,11 @@ class PolicyNode(Node):
         Raises:
             Rejection: there is none.
         """
-        if self._lonely():
+        if self._unconnected():
             raise Rejection(
                 Reason.WORLD_MODEL_MISSING,
-                f'nobody is connected to {self._lonely()}; is the world model running, and does '
-                "the parameter 'world_model' name it?",
+                f'nobody is connected to {self._unconnected()}; is the world model running, and '
+                "does the parameter 'world_model' name it?",
             )
         return self._buffer.observe(self.get_clock().now().nanoseconds).observation
 
@@ -162,10 +162,12 @@ class PolicyNode(Node):
             for kind, topic, handle in topics
         ]
 
-    def _lonely(self) -> list[str]:
-        """Topics that the world model is not connected to: what goes over them is lost."""
-        lonely = [s.topic_name for s in self._predictions if not s.get_publisher_count()]
-        return lonely + ([] if self._plans.get_subscription_count() else [self._plans.topic_name])
+    def _unconnected(self) -> list[str]:
+        """Topics that the world model is not connected to: messages on them are lost."""
+        unconnected = [s.topic_name for s in self._predictions if not s.get_publisher_count()]
+        return unconnected + (
+            [] if self._plans.get_subscription_count() else [self._plans.topic_name]
+        )
 
     def _on_report(self, message: DiagnosticArray) -> None:
         for status in message.status:

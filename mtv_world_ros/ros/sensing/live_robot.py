@@ -23,7 +23,7 @@ from mtv_world_ros.geometry.robot.file import described_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.transforms import inverse, quaternion
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
-from mtv_world_ros.ros.messages.rejection import bounded, Reason, Rejection
+from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.qos_profiles import LATCHED
 from mtv_world_ros.ros.sensing.observations import SensedScene
@@ -33,6 +33,9 @@ TOPIC = 'robot_description'
 
 class RobotDescription:
     """Holds what is described against the robot that the checkpoint was trained on.
+
+    Attributes:
+        problem: what is wrong with the description; empty = nothing.
 
     Args:
         node: owner of the subscription.
@@ -51,25 +54,30 @@ class RobotDescription:
         self._expected, self._on_robot = expected, on_robot
         self._log = node.get_logger()
         self._seen = b''
-        self._problem = ''
+        self.problem = ''
         self._offset_m: float | None = None
         self._topic = node.resolve_topic_name(TOPIC)
         node.create_subscription(String, TOPIC, guarded(self._take), LATCHED)
 
-    def problems(self) -> list[str]:
-        """What is wrong with the description; empty = nothing."""
-        return [self._problem] if self._problem else []
+    def check(self) -> None:
+        """Refuses to go on while another robot is described.
+
+        Raises:
+            Rejection: with what is different.
+        """
+        if self.problem:
+            raise Rejection(Reason.ROBOT_DESCRIPTION, self.problem)
 
     def values(self) -> dict[str, object]:
         """For `/diagnostics`."""
-        if self._problem:
+        if self.problem:
             return {TOPIC: 'another robot'}
         if self._offset_m is None:
             return {TOPIC: 'none'}
         return {TOPIC: 'used', f'{TOPIC}.offset_m': self._offset_m}
 
     def _take(self, message: String) -> None:
-        with bounded(Reason.ROBOT_DESCRIPTION):
+        with rejected_as(Reason.ROBOT_DESCRIPTION):
             check_limit('urdf_bytes', len(message.data), f'{self._topic}')
         text = message.data.encode()
         digest = hashlib.sha256(text).digest()
@@ -80,12 +88,12 @@ class RobotDescription:
             robot, offset_m = described_robot(self._expected, message.data)
         except RobotError as error:
             self._offset_m = None
-            self._problem = (
+            self.problem = (
                 f"{self._topic}: {error}. Set 'use_robot_description' to false, or remap the "
                 'topic, if it is meant for somebody else'
             )
-            raise Rejection(Reason.ROBOT_DESCRIPTION, self._problem) from error
-        self._problem, self._offset_m = '', offset_m
+            raise Rejection(Reason.ROBOT_DESCRIPTION, self.problem) from error
+        self.problem, self._offset_m = '', offset_m
         self._on_robot(robot)
         self._log.info(
             f"{self._topic}: robot '{robot.name}'; its tools are up to "
@@ -288,65 +296,3 @@ def _differ(one: FloatArray, other: FloatArray) -> bool:
 def _words(mount: Mount) -> str:
     ahead, place = (', '.join(f'{v:.3f}' for v in mount.T_link_frame[:3, k]) for k in (2, 3))
     return f"at ({place}) m in '{mount.link}', looking along ({ahead})"
-
-
-class LiveRobot:
-    """Listens to `robot_description` and TF, as far as the parameters say so.
-
-    Args:
-        node: owner of the subscriptions.
-        expected: the robot that the checkpoint was trained on.
-        settings: the present parameters.
-        on_robot: gets the same robot as it is described.
-        guarded: wraps a handler so that it never raises.
-
-    Raises:
-        ConfigError: poses are to come from TF, and tf2_msgs is not installed.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        expected: RobotModel,
-        settings: Callable[[], Settings],
-        on_robot: Callable[[RobotModel], None],
-        guarded: Callable[[Handler], Handler],
-    ) -> None:
-        self._extrinsics = Extrinsics(node, expected.posed_links, settings, guarded)
-        self._description: RobotDescription | None = None
-        if settings().use_robot_description:
-            self._description = RobotDescription(node, expected, on_robot, guarded)
-
-    def pose(self, view: str, frame: str, stamp_ns: int) -> Mount | None:
-        """See `Extrinsics.pose`."""
-        return self._extrinsics.pose(view, frame, stamp_ns)
-
-    def check(self) -> None:
-        """Refuses to go on while another robot is described.
-
-        Raises:
-            Rejection: with what is different.
-        """
-        for problem in self.problems():
-            raise Rejection(Reason.ROBOT_DESCRIPTION, problem)
-
-    def problems(self) -> list[str]:
-        """What keeps the robot from being imagined; empty = nothing."""
-        return [] if self._description is None else self._description.problems()
-
-    def values(self) -> dict[str, object]:
-        """For `/diagnostics`."""
-        described = {} if self._description is None else self._description.values()
-        return {**described, **self._extrinsics.values()}
-
-    def show(self, scene: SensedScene) -> None:
-        """Publishes the frames of a scene's views that TF lacks."""
-        self._extrinsics.show(scene)
-
-    def accept(self) -> None:
-        """Takes changed camera poses as the valid ones from now on."""
-        self._extrinsics.accept()
-
-    def forget_moving(self) -> None:
-        """Forgets what /tf said: the clock went back."""
-        self._extrinsics.forget_moving()

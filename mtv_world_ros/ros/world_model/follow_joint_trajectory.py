@@ -132,7 +132,7 @@ class FollowJointTrajectory:
         self._conclude(goal, 'abort', _code(reason), str(error))
 
     def take(self, result: Result) -> None:
-        """Tells the client of a chunk or of the end, if the plan came from one."""
+        """Sends feedback of a chunk, or the result, if the plan came from a goal."""
         goal = self._goals.get(result.request.rollout)
         if goal is None:
             return
@@ -218,9 +218,9 @@ class FollowJointTrajectory:
 
 
 class _Server(ActionServer):
-    """Goals that end when they are told to.
+    """An action server whose goals end by `conclude`.
 
-    rclpy's own way, a coroutine that waits, makes the executor turn without a pause.
+    rclpy's own way, a coroutine that waits, keeps the executor busy.
     """
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:

@@ -1,4 +1,4 @@
-"""Live fidelity: what was imagined against the real frames that arrive for the same times."""
+"""Live fidelity: J of imagined frames with the real frames of the same times."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MAX_OFFSET = 0.3
 
 @dataclass(slots=True, eq=False)  # arrays have no truth value: one is only itself
 class Expected:
-    """A chunk and the frames of it that still may come true: those before the next plan."""
+    """A chunk and the stamps of its frames that are executed: those before the next plan."""
 
     chunk: Chunk
     stamps: list[int] = field(default_factory=list)
@@ -52,16 +52,18 @@ class Expected:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fidelity:
+class ScoredChunk:
     """How a chunk compares with what really came: V views, O objects.
 
     Attributes:
+        chunk: the imagined chunk.
         names: O names.
         jaccard: (V, O) mean J over the compared frames, NaN = not scored.
-        copy: J of the chunk's first masks, held.
+        copy: (V, O) J of the chunk's first masks, held.
         num_frames: number of compared frames.
     """
 
+    chunk: Chunk
     names: tuple[str, ...]
     jaccard: FloatArray
     copy: FloatArray
@@ -71,14 +73,6 @@ class Fidelity:
     def mean(self) -> float:
         """Mean J over views and objects, NaN where none is scored."""
         return float(mean_of_known(self.jaccard))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScoredChunk:
-    """A chunk that was compared."""
-
-    chunk: Chunk
-    fidelity: Fidelity
 
 
 class _SeenRollout(NamedTuple):
@@ -95,7 +89,7 @@ class LiveFidelity:
     Chunks of imagine mode are not compared: nobody executes them.
 
     Attributes:
-        watch: whether what came of plans was foreseen.
+        watch: tests whether executed plans ended as foreseen.
 
     Args:
         node: owner of the publisher.
@@ -129,7 +123,7 @@ class LiveFidelity:
         self._thread = Thread(target=self._run, name='fidelity')
 
     def replan(self, request: Request) -> Request:
-        """Returns the request; what was imagined for later than its start is not executed."""
+        """Drops imagined frames after a new request's start, which nobody executes; returns it."""
         starts_ns = request.stamp_ns or request.scene.observation.stamp_ns
         with self._changed:
             for expected in self._expected:
@@ -188,8 +182,8 @@ class LiveFidelity:
             if isinstance(result, Exception):
                 self._on_error(result)
                 continue
-            self._kept.append(result.fidelity.mean)
-            self._publisher.publish(to_multi_array(result.fidelity.jaccard, ('view', 'object')))
+            self._kept.append(result.mean)
+            self._publisher.publish(to_multi_array(result.jaccard, ('view', 'object')))
             self._on_scored(result)
 
     def _run(self) -> None:
@@ -210,7 +204,7 @@ class LiveFidelity:
                 self._done.trigger()
 
     def _keep(self, view: str, message: Image | CompressedImage) -> None:
-        """Stores a real frame at the model's size; not more of them than can be told apart."""
+        """Stores a real frame at the model's size, unless the last one is nearly as new."""
         stamp_ns = to_ns(message.header.stamp)
         frames = self._frames[view]
         if frames and stamp_ns - frames[-1][0] < self._tolerance_ns / 4:
@@ -248,13 +242,14 @@ class LiveFidelity:
         start = episode.observation.positions[None]
         found = episode.observe(frames, np.concatenate([start, prediction.positions[indices]]))
         imagined = replace(prediction.masks, masks=prediction.masks.masks[:, :, indices])
-        fidelity = Fidelity(
+        scored = ScoredChunk(
+            chunk=expected.chunk,
             names=imagined.names,
             jaccard=object_scores(imagined, found.masks).objects,
             copy=persistence_scores(found.start_masks.masks[:, :, 0], found.masks).objects,
             num_frames=len(indices),
         )
-        self._results.append(ScoredChunk(chunk=expected.chunk, fidelity=fidelity))
+        self._results.append(scored)
         if prediction.foreseen is not None and len(indices) == len(prediction.video.times):
             self.watch.take(unforeseen(prediction.foreseen, episode.seen_points(len(indices))))
         self._done.trigger()

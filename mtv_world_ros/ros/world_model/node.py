@@ -101,13 +101,13 @@ class WorldModelNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Frees the model, whose parts know each other: Python would look for them much later."""
+        """Frees the model, whose parts refer to each other, at once."""
         self._release()
         gc.collect()
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Pre-empts the plan that runs; the model is freed when its client has been told."""
+        """Pre-empts the plan that runs; the model is freed once its end was reported."""
         if self._rollouts is not None:
             self._rollouts.deactivate()
         return TransitionCallbackReturn.SUCCESS

@@ -15,7 +15,7 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from std_msgs.msg import Float32MultiArray, Float64, Header
 
-from mtv_world_ros.data_types import ByteArray, ObjectMasks
+from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.pipeline import WorldModelSpec
 from mtv_world_ros.ros.messages.conversions import (
     make_header,
@@ -29,73 +29,51 @@ from mtv_world_ros.ros.status_publisher import create_publisher
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Result
 
 
-class ViewPublisher:
-    """Publishes the frames of one view; what nobody subscribes to is not made.
+class ImageStream:
+    """Publishes an image, its JPEG and its CameraInfo; what nobody subscribes to is not made.
 
     Args:
         node: owner of the publishers.
-        view: name of the view.
+        name: beginning of the topics.
         depth: frames kept for subscribers that ask for them again.
-        settings: what is offered is decided once, here.
+        has_jpeg: whether JPEG is offered, too.
     """
 
-    def __init__(self, node: Node, view: str, depth: int, settings: Settings) -> None:
-        self._streams = {'predicted': _Stream(node, f'~/{view}/predicted', depth)}
-        if settings.publish_compressed:
-            self._streams['predicted'].offer_compressed(node)
-        if settings.publish_trajectory_video:
-            self._streams['trajectory'] = _Stream(node, f'~/{view}/trajectory', depth)
-        if settings.publish_masks:
-            self._streams['mask'] = _Stream(node, f'~/{view}/mask', depth)
+    def __init__(self, node: Node, name: str, depth: int, *, has_jpeg: bool) -> None:
+        self._image = create_publisher(node, Image, f'{name}/image_raw', depth)
+        self._info = create_publisher(node, CameraInfo, f'{name}/camera_info', depth)
+        self._jpeg: Publisher | None = None
+        if has_jpeg:
+            topic = f'{name}/image_raw/compressed'
+            self._jpeg = create_publisher(node, CompressedImage, topic, depth)
+        self._scaled: tuple[CameraInfo, CameraInfo] | None = None
 
+    @property
     def publishers(self) -> list[Publisher]:
         """All of them."""
-        return [p for stream in self._streams.values() for p in stream.publishers()]
+        return [self._image, self._info, *([] if self._jpeg is None else [self._jpeg])]
 
-    def wants(self, stream: str) -> bool:
-        """Whether somebody subscribes to a stream: `predicted`, `trajectory` or `mask`."""
-        return stream in self._streams and self._streams[stream].is_wanted()
+    @property
+    def is_wanted(self) -> bool:
+        """Whether somebody subscribes."""
+        return any(publisher.get_subscription_count() for publisher in self.publishers)
 
-    def publish(
-        self, stream: str, pixels: ByteArray, header: Header, info: CameraInfo, quality: int
-    ) -> None:
-        """Publishes a frame, (H, W, 3) RGB or (H, W) labels, and its CameraInfo.
+    def publish(self, pixels: ByteArray, header: Header, info: CameraInfo, quality: int) -> None:
+        """Publishes a frame and its CameraInfo.
 
         Args:
-            stream: `predicted`, `trajectory` or `mask`.
-            pixels: uint8.
+            pixels: (H, W, 3) uint8 RGB, or (H, W) uint8 labels.
             header: stamp and frame.
             info: CameraInfo of the source image, of any size.
             quality: of JPEG.
         """
-        self._streams[stream].publish(pixels, header, info, quality)
-
-
-class _Stream:
-    """Image, optionally compressed image, and CameraInfo under one name."""
-
-    def __init__(self, node: Node, name: str, depth: int) -> None:
-        self._name, self._depth = name, depth
-        self._image = create_publisher(node, Image, f'{name}/image_raw', depth)
-        self._info = create_publisher(node, CameraInfo, f'{name}/camera_info', depth)
-        self._compressed: Publisher | None = None
-        self._scaled: tuple[CameraInfo, CameraInfo] | None = None
-
-    def offer_compressed(self, node: Node) -> None:
-        topic = f'{self._name}/image_raw/compressed'
-        self._compressed = create_publisher(node, CompressedImage, topic, self._depth)
-
-    def is_wanted(self) -> bool:
-        return any(publisher.get_subscription_count() for publisher in self.publishers())
-
-    def publish(self, pixels: ByteArray, header: Header, info: CameraInfo, quality: int) -> None:
         height, width = pixels.shape[:2]
         if self._info.get_subscription_count():
             self._info.publish(self._scale(info, width, height, header))
         if self._image.get_subscription_count():
             self._image.publish(to_image(pixels, header))
-        if self._compressed is not None and self._compressed.get_subscription_count():
-            self._compressed.publish(to_compressed(pixels, header, quality))
+        if self._jpeg is not None and self._jpeg.get_subscription_count():
+            self._jpeg.publish(to_compressed(pixels, header, quality))
 
     def _scale(self, info: CameraInfo, width: int, height: int, header: Header) -> CameraInfo:
         """Scales an info once for all frames of a rollout."""
@@ -103,10 +81,6 @@ class _Stream:
             self._scaled = info, scale_camera_info(info, width, height, header)
         self._scaled[1].header = header
         return self._scaled[1]
-
-    def publishers(self) -> list[Publisher]:
-        optional = [self._compressed] if self._compressed is not None else []
-        return [self._image, self._info, *optional]
 
 
 #: pause between two frames of a burst [s]: other callbacks get their turn
@@ -172,7 +146,7 @@ class PredictionPublisher:
         self._period_s = 1.0 / spec.fps
         # a chunk, and the one before it should a subscriber still ask for a frame of that again
         depth = 2 * spec.num_frames
-        self._views = [ViewPublisher(node, view, depth, settings()) for view in spec.views]
+        self._streams = [self._offer(view, depth) for view in spec.views]
         self._joints = create_publisher(node, JointState, '~/predicted/joint_states', depth)
         self._success = create_publisher(node, Float64, '~/success', 10)
         self._jaccard = create_publisher(node, Float32MultiArray, '~/jaccard', 10)
@@ -184,7 +158,8 @@ class PredictionPublisher:
     def subscriber_counts(self) -> dict[str, int]:
         """Subscribers that each topic is connected to, as `subscribers.<topic>`."""
         outputs = [self._joints, self._success, self._jaccard]
-        outputs += [publisher for view in self._views for publisher in view.publishers()]
+        for offered in self._streams:
+            outputs += [publisher for one in offered.values() for publisher in one.publishers]
         return {f'subscribers.{o.topic_name}': o.get_subscription_count() for o in outputs}
 
     def add(self, result: Result) -> None:
@@ -210,6 +185,22 @@ class PredictionPublisher:
         """Drops all frames that are not out yet."""
         for frames in (self._masks, self._images):
             frames.drop_others(None)
+
+    def _offer(self, view: str, depth: int) -> dict[str, ImageStream]:
+        """The streams of a view that the parameters ask for, by name."""
+        settings = self._settings()
+        names = ['predicted']
+        names += ['trajectory'] if settings.publish_trajectory_video else []
+        names += ['mask'] if settings.publish_masks else []
+        return {
+            name: ImageStream(
+                self._node,
+                f'~/{view}/{name}',
+                depth,
+                has_jpeg=name == 'predicted' and settings.publish_compressed,
+            )
+            for name in names
+        }
 
     def _wait_s(self, chunk: Chunk, index: int, last: Last) -> float:
         """Pace of the images."""
@@ -241,12 +232,13 @@ class PredictionPublisher:
         """Publishes a frame of streams that somebody subscribes to; returns its stamp [ns]."""
         stamp_ns = stamp_of(chunk, index, self._settings().stamp_mode)
         quality = self._settings().jpeg_quality
-        for view, publisher in enumerate(self._views):
+        for view, offered in enumerate(self._streams):
             info = chunk.scene.camera_infos[view]
-            for stream in filter(publisher.wants, streams):
-                pixels = _pixels(chunk, stream, view, index)
-                header = make_header(stamp_ns, info.header.frame_id)
-                publisher.publish(stream, pixels, header, info, quality)
+            for name in streams:
+                if name in offered and offered[name].is_wanted:
+                    pixels = _pixels(chunk, name, view, index)
+                    header = make_header(stamp_ns, info.header.frame_id)
+                    offered[name].publish(pixels, header, info, quality)
         return stamp_ns
 
     def _publish_estimate(self, chunk: Chunk) -> None:
@@ -350,16 +342,11 @@ def stamp_of(chunk: Chunk, index: int, stamp_mode: str) -> int:
 def _pixels(chunk: Chunk, stream: str, view: int, index: int) -> ByteArray:
     """A frame of a stream, (H, W, 3) RGB or (H, W) labels."""
     prediction = chunk.prediction
-    if stream == 'mask':
-        return label_image(prediction.masks, view, index)
+    if stream == 'mask':  # 0 = no object, i + 1 = object i; the later one where two overlap
+        labels = np.zeros(prediction.masks.masks.shape[-2:], np.uint8)
+        for number, mask in enumerate(prediction.masks.masks[view, :, index], start=1):
+            labels[mask] = number
+        return labels
     if stream == 'trajectory':
         return prediction.trajectory_video.frames[view, index + 1]
     return prediction.video.frames[view, index]
-
-
-def label_image(masks: ObjectMasks, view: int, index: int) -> ByteArray:
-    """(H, W) uint8: 0 = none, i + 1 = object i; the later object where two overlap."""
-    labels = np.zeros(masks.masks.shape[-2:], np.uint8)
-    for number, mask in enumerate(masks.masks[view, :, index], start=1):
-        labels[mask] = number
-    return labels

@@ -84,8 +84,8 @@ class Reporter:
             self.crash(error)
             error = Rejection(Reason.INTERNAL_ERROR, f'{type(error).__name__}: {error}')
         self.reject(error)
-        values = _rejection_values(error, trajectory_stamp_ns)
-        self._publish_report('rejected', values)
+        values = {'reason': error.reason.value, 'text': str(error)}
+        self._publish_report('rejected', {'trajectory_stamp_ns': trajectory_stamp_ns, **values})
         self.publish_diagnostics()
 
     def guarded(self, handle: Callable[..., None]) -> Callable[..., None]:
@@ -260,6 +260,7 @@ def _chunk_values(chunk: Chunk, settings: Settings) -> dict[str, object]:
     """Keys and values of a predicted chunk; stamps in ns, durations in s."""
     prediction, request = chunk.prediction, chunk.request
     num_frames = len(prediction.video.times)
+    frame_s = float(prediction.video.times[0] - prediction.trajectory_video.times[0])
     values = {
         **_chunk_identity(chunk),
         'chunk_seed': prediction.seed,
@@ -271,7 +272,7 @@ def _chunk_values(chunk: Chunk, settings: Settings) -> dict[str, object]:
         'frames': num_frames,
         'latency_s': chunk.ready_s - request.received_s,
         'lead_s': chunk.lead_s,
-        'real_time_factor': num_frames * _frame_s(chunk) / sum(prediction.seconds.values()),
+        'real_time_factor': num_frames * frame_s / sum(prediction.seconds.values()),
     }
     values |= {f'stage_s.{_key(stage)}': s for stage, s in prediction.seconds.items()}
     # the request may leave it to the checkpoint
@@ -305,13 +306,6 @@ def _chunk_identity(chunk: Chunk) -> dict[str, object]:
     }
 
 
-def _frame_s(chunk: Chunk) -> float:
-    """Time between two predicted frames [s]."""
-    times = chunk.prediction.video.times
-    before = chunk.prediction.trajectory_video.times[0]
-    return float(times[0] - before)
-
-
 def _ended_values(ended: Ended) -> dict[str, object]:
     """Keys and values of a rollout's end, with the last estimate of the plan if there is one."""
     values = {**_request_values(ended.request), 'num_chunks': ended.num_chunks}
@@ -330,18 +324,9 @@ def _request_values(request: Request) -> dict[str, object]:
         'rollout': request.rollout,
         'trajectory_stamp_ns': request.stamp_ns,
         'mode': 'imagine' if request.imagine else 'observe',
-        'seed': request.seed,
-        'num_inference_steps': request.num_inference_steps,
+        'seed': request.settings.seed,
+        'num_inference_steps': request.settings.num_inference_steps,
         'instruction': request.instruction,
-    }
-
-
-def _rejection_values(error: Rejection, trajectory_stamp_ns: int) -> dict[str, object]:
-    """Keys and values of a trajectory that never became a rollout."""
-    return {
-        'trajectory_stamp_ns': trajectory_stamp_ns,
-        'reason': error.reason.value,
-        'text': str(error),
     }
 
 
@@ -375,17 +360,17 @@ def _success_values(success: SuccessEstimate) -> dict[str, object]:
 
 def _fidelity_values(scored: ScoredChunk) -> dict[str, object]:
     """Keys and values of a chunk whose real frames came."""
-    prediction, found = scored.chunk.prediction, scored.fidelity
+    prediction = scored.chunk.prediction
     values: dict[str, object] = {
         **_request_values(scored.chunk.request),
         'chunk': prediction.chunk,
-        'frames_compared': found.num_frames,
-        'fidelity_jaccard': found.mean,
+        'frames_compared': scored.num_frames,
+        'fidelity_jaccard': scored.mean,
     }
     for row, view in enumerate(prediction.video.views):
-        for column, name in enumerate(found.names):
-            values[f'fidelity.{view}.{_key(name)}'] = float(found.jaccard[row, column])
-            values[f'fidelity_copy.{view}.{_key(name)}'] = float(found.copy[row, column])
+        for column, name in enumerate(scored.names):
+            values[f'fidelity.{view}.{_key(name)}'] = float(scored.jaccard[row, column])
+            values[f'fidelity_copy.{view}.{_key(name)}'] = float(scored.copy[row, column])
     return values
 
 

@@ -24,15 +24,9 @@ from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ros.messages.conversions import to_ns, to_trajectory
-from mtv_world_ros.ros.messages.rejection import (
-    bounded,
-    Reason,
-    refused_plan,
-    rejected_as,
-    Rejection,
-)
+from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 from mtv_world_ros.ros.parameters import refusing, Settings
-from mtv_world_ros.ros.sensing.live_robot import LiveRobot
+from mtv_world_ros.ros.sensing.live_robot import Extrinsics, RobotDescription
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer, SensedScene
 from mtv_world_ros.ros.sensing.subscriptions import Inputs
 from mtv_world_ros.ros.world_model.follow_joint_trajectory import (
@@ -50,12 +44,7 @@ from mtv_world_ros.ros.world_model.loading import (
 )
 from mtv_world_ros.ros.world_model.prediction_publisher import PredictionPublisher
 from mtv_world_ros.ros.world_model.reporter import Reporter
-from mtv_world_ros.ros.world_model.worker import (
-    from_observation,
-    Request,
-    RolloutWorker,
-    TimeLimits,
-)
+from mtv_world_ros.ros.world_model.worker import from_observation, Request, RolloutWorker
 
 #: measured joints may be beyond their limits by this, and by this share of their range
 _MEASURED_SLACK = 0.1
@@ -103,16 +92,13 @@ class RequestMaker:
         """
         settings = self._settings()
         trajectory = to_trajectory(message)
-        with refused_plan():
+        with rejected_as(Reason.JOINT_NAMES):
             check_plan_joints(trajectory, self.robot, settings.limit_tolerance)
         stamp_ns = to_ns(message.header.stamp)
-        limits = TimeLimits(
-            trajectory_age=settings.max_trajectory_age_s, horizon=settings.max_horizon_s
-        )
         last = self._last_scene() if self.imagine else None
         scene = last or self._real_scene(now_ns)
         seen = scene.observation
-        from_now = from_observation(trajectory, stamp_ns, seen.stamp_ns, limits)
+        from_now = from_observation(trajectory, stamp_ns, seen.stamp_ns, settings)
         self._check_speeds(from_now, seen.positions, settings.limit_tolerance)
         self.num_requests += 1
         return Request(
@@ -122,20 +108,15 @@ class RequestMaker:
             scene=scene,
             imagine=self.imagine,
             instruction=settings.instruction if self.instruction is None else self.instruction,
-            objects=settings.objects,
-            seed=settings.seed,
-            num_seeds=settings.num_seeds,
-            num_inference_steps=settings.num_inference_steps,
-            limits=limits,
+            settings=settings,
             received_s=received_s,
             received_ns=now_ns,
-            limit_tolerance=settings.limit_tolerance,
         )
 
     def _check_speeds(
         self, trajectory: JointTrajectory, positions: FloatArray, tolerance: float
     ) -> None:
-        """From (J,) measured positions on, none is to be quicker than it can."""
+        """Refuses a trajectory faster than the robot, from (J,) measured positions on."""
         robot = self.robot
         positions = np.clip(positions, robot.lower, robot.upper)
         whole = match_joints(trajectory, robot, positions)
@@ -220,7 +201,13 @@ class Rollouts:
         undo.callback(self._worker.close)
         self._adapter = AdapterSwitch(node, pipeline.world_model, self._worker.run_between)
         undo.callback(self._adapter.close)
-        self._live = LiveRobot(node, self._robot, settings, self._on_robot, reporter.guarded)
+        links = self._robot.posed_links
+        self._extrinsics = Extrinsics(node, links, settings, reporter.guarded)
+        self._description: RobotDescription | None = None
+        if settings().use_robot_description:
+            self._description = RobotDescription(
+                node, self._robot, self._on_robot, reporter.guarded
+            )
         self._buffer = ObservationBuffer(
             cameras=load_cameras(settings(), self._spec),
             joint_names=self._robot.joint_names,
@@ -228,7 +215,7 @@ class Rollouts:
             height=self._spec.height,
             limits=settings,
             on_image=self._on_image,
-            pose=self._live.pose,
+            pose=self._extrinsics.pose,
         )
         self._maker = RequestMaker(
             self._robot, self._buffer, settings, lambda: self._worker.last_scene
@@ -292,9 +279,9 @@ class Rollouts:
         self._is_active = True
 
     def deactivate(self) -> None:
-        """Refuses plans from now on; one that runs or waits is pre-empted, and told so."""
+        """Refuses plans from now on; one that runs or waits is reported as pre-empted."""
         self._is_active = False
-        self._start_rollouts()  # plans that came before are told as well
+        self._start_rollouts()  # plans that came before are reported as well
         self._give_up('preempted', 'the node was deactivated')
         self._publish_results()
 
@@ -310,8 +297,8 @@ class Rollouts:
 
     def missing(self) -> Sequence[str]:
         """What the node needs and does not get; in imagine mode only to begin."""
-        if self._live.problems():
-            return self._live.problems()
+        if self._description is not None and self._description.problem:
+            return [self._description.problem]
         if self._maker.imagine and self._worker.last_scene is not None:
             return []
         silent = [f'nobody publishes {topic}' for topic in self._inputs.unpublished()]
@@ -329,7 +316,8 @@ class Rollouts:
             'busy': self._worker.busy,
             'cameras': self._worker.camera_check.text,
             'physics': self._fidelity.watch.text,
-            **self._live.values(),
+            **({} if self._description is None else self._description.values()),
+            **self._extrinsics.values(),
             **self._fidelity.values(),
             **self._inputs.publisher_counts(),
             **self._publisher.subscriber_counts(),
@@ -338,24 +326,24 @@ class Rollouts:
         }
 
     def _on_image(self, view: str, message: Image | CompressedImage) -> None:
-        """Hands real images on; an observation of all views once a frame of the model."""
+        """Passes real images on, and one observation of all views per frame of the model."""
         if not self._is_active:
             return
         self._look_again()
         self._fidelity.see(view, message)
         if self._worker.sees(self._buffer.newest_stamp_ns):
-            with suppress(Rejection):  # the plan that comes too early is told
+            with suppress(Rejection):  # a plan without an observation is rejected later
                 self._worker.see(
                     self._buffer.observe(self._node.get_clock().now().nanoseconds).observation
                 )
 
     def _on_instruction(self, message: String) -> None:
-        with bounded(Reason.INSTRUCTION_TOO_LONG):
+        with rejected_as(Reason.INSTRUCTION_TOO_LONG):
             check_limit('instruction_characters', len(message.data), 'the instruction')
         self._maker.instruction = message.data
 
     def _on_trajectory(self, plan: JointTrajectoryMsg | Goal) -> None:
-        """Stores it; images that came with it are stored before it is looked at."""
+        """Queues a plan, so that images that came with it are stored before it is checked."""
         self._arrived.append((time.monotonic(), plan))
         self._arrivals.trigger()
 
@@ -364,14 +352,14 @@ class Rollouts:
             self._reporter.guarded(self._start_rollout)(self._arrived.popleft())
 
     def _look_again(self) -> None:
-        """At a plan that waits: what it answers may be here, or it waited long enough."""
+        """Checks a waiting plan again: its observation may be here, or it waited long enough."""
         if self._arrived:
             self._arrivals.trigger()
 
     def _is_early(self, received_s: float, plan: JointTrajectoryMsg | Goal) -> bool:
-        """Whether an imagined episode begins with a plan that overtook what it answers.
+        """Whether the first plan of an imagined episode arrived before its observation.
 
-        Nothing orders topics, and a policy may answer faster than this node hears of the start.
+        Nothing orders topics: a policy may answer before this node receives the start.
         """
         if not self._maker.imagine or self._worker.last_scene is not None or self._worker.busy:
             return False
@@ -393,11 +381,12 @@ class Rollouts:
                 raise Rejection(
                     Reason.NOT_ACTIVE, 'the node is inactive; its lifecycle manager activates it'
                 )
-            self._live.check()
+            if self._description is not None:
+                self._description.check()
             if goal is not None:
                 goal.check(self._robot.joint_names)
             request = self._maker.make(message, now_ns, received_s)
-            self._live.show(request.scene)
+            self._extrinsics.show(request.scene)
             self._worker.submit(self._fidelity.replan(request))
         except Exception as error:  # one answer a plan, whatever is wrong with it
             self._reporter.reject_trajectory(error, to_ns(message.header.stamp))
@@ -417,7 +406,7 @@ class Rollouts:
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._give_up()
         try:
-            self._live.accept()
+            self._extrinsics.accept()
             self._buffer.accept_cameras(reload_cameras(self._settings(), self._spec))
         except Rejection as error:
             self._reporter.reject(error)
@@ -449,10 +438,10 @@ class Rollouts:
         self._publisher.reset()
 
     def _on_jump(self, _: object) -> None:
-        """The clock went back, as when a bag starts over: what is stored lies in the future."""
+        """Drops what is stored when the clock jumps back, as when a bag starts over."""
         self._reporter.count('clock_jumps_back')
         self._buffer.clear()
-        self._live.forget_moving()
+        self._extrinsics.forget_moving()
         self._give_up()
 
 

@@ -18,19 +18,12 @@ from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.messages.conversions import NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
+from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.observations import SensedScene
 from mtv_world_ros.vision.camera_check import CameraCheck
 
 #: a thread that is stuck in the model is not waited for longer than this at the end [s]
 _LONGEST_JOIN_S = 5.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TimeLimits:
-    """Limits [s] beyond which a trajectory is refused."""
-
-    trajectory_age: float
-    horizon: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,15 +39,10 @@ class Request:
         imagine: whether to start from the last predicted frames if there are newer ones, and
             whether the next request shall.
         instruction: text for the robot.
-        objects: names of the objects; empty = those the instruction names.
-        seed: of the noise of the first chunk after a reset; in imagine mode every further chunk
-            counts one up, over requests too.
-        num_seeds: rollouts that the estimate is the mean of; the first one's frames are shown.
-        num_inference_steps: denoising steps a chunk.
-        limits: greatest age and length of a plan.
+        settings: the parameters when it came in. In imagine mode the seed counts one up with
+            every chunk after a reset, over requests too.
         received_s: when it came in [s], of `time.monotonic`.
         received_ns: the same by the node's clock [ns].
-        limit_tolerance: joints may exceed their limits by this [rad or m].
     """
 
     rollout: int
@@ -63,14 +51,9 @@ class Request:
     scene: SensedScene
     imagine: bool
     instruction: str
-    objects: tuple[str, ...]
-    seed: int
-    num_inference_steps: int
-    limits: TimeLimits
+    settings: Settings
     received_s: float
     received_ns: int = 0
-    limit_tolerance: float = 1e-3
-    num_seeds: int = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,7 +108,7 @@ class RolloutWorker:
 
     Attributes:
         camera_check: what the newest episode's first pictures say about the cameras.
-        doubt: asked why futures are not to be believed here; empty = they are.
+        doubt: returns why the fitted physics does not hold here; empty = it may hold.
 
     Args:
         pipeline: the main path.
@@ -148,7 +131,7 @@ class RolloutWorker:
         self._episode: ImaginedEpisode | None = None
         self._last: SensedScene | None = None
         self._results: deque[Result] = deque()
-        #: when the thread last showed that it goes on [s]; None = it waits for work
+        #: time of the thread's last step [s]; None = it waits for work
         self._beat_s: float | None = None
         self._thread = self._new_thread()
 
@@ -187,7 +170,7 @@ class RolloutWorker:
 
     @property
     def _is_given_up(self) -> bool:
-        """Whether another thread took over from the one that asks."""
+        """Whether the calling thread was replaced by another one."""
         return current_thread() is not self._thread
 
     @property
@@ -216,11 +199,11 @@ class RolloutWorker:
             self._changed.notify_all()
 
     def sees(self, stamp_ns: int) -> bool:
-        """Tells whether a real observation of this time is wanted by `see`."""
+        """Returns whether `see` takes an observation of this stamp [ns]."""
         return self._observed.is_due(stamp_ns)
 
     def see(self, observation: Observation) -> None:
-        """Takes a real observation between plans; later plans are judged with it in mind."""
+        """Adds a real observation between plans to what later plans are judged with."""
         self._observed.see(observation)
         with self._changed:
             self._changed.notify_all()
@@ -292,8 +275,8 @@ class RolloutWorker:
             self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join(_LONGEST_JOIN_S)
-        with self._changed:  # one that is stuck tells nobody when it ends
-            self._notify = _tell_nobody
+        with self._changed:  # a thread that is stuck notifies nobody when it ends
+            self._notify = lambda: None
 
     def _run(self) -> None:
         while (request := self._next()) is not None:
@@ -332,7 +315,7 @@ class RolloutWorker:
         return bool(is_asked) or self._observed.is_behind
 
     def _catch_up(self) -> None:
-        """Looks at real frames while no rollout runs; what fails here is forgotten."""
+        """Segments real frames while no rollout runs; after a failure they are dropped."""
         try:
             self._observed.catch_up()
         except Exception:
@@ -383,13 +366,14 @@ class RolloutWorker:
     def _imagine(self, request: Request) -> None:
         """Imagines the chunks of a request and hands each on."""
         scene, episode = self._begin(request)
-        episode.instruction, episode.objects = request.instruction, request.objects
-        episode.seed, episode.num_seeds = request.seed, request.num_seeds
-        episode.num_inference_steps = request.num_inference_steps
-        episode.limit_tolerance = request.limit_tolerance
+        settings = request.settings
+        episode.instruction, episode.objects = request.instruction, settings.objects
+        episode.seed, episode.num_seeds = settings.seed, settings.num_seeds
+        episode.num_inference_steps = settings.num_inference_steps
+        episode.limit_tolerance = settings.limit_tolerance
         start = episode.observation
         trajectory = from_observation(
-            request.trajectory, request.stamp_ns, start.stamp_ns, request.limits
+            request.trajectory, request.stamp_ns, start.stamp_ns, settings
         )
         robot = self._pipeline.robot
         trajectory = match_joints(trajectory, robot, start.positions)
@@ -415,7 +399,9 @@ class RolloutWorker:
             episode = self._pipeline.begin(scene.observation)
         else:
             episode = self._observed.begin(
-                scene.observation, instruction=request.instruction, objects=request.objects
+                scene.observation,
+                instruction=request.instruction,
+                objects=request.settings.objects,
             )
         episode.should_stop = self._should_stop
         self.camera_check = episode.camera_check
@@ -427,12 +413,8 @@ class RolloutWorker:
         self._notify()
 
 
-def _tell_nobody() -> None:
-    """In place of `notify` when nobody listens any more."""
-
-
 def from_observation(
-    trajectory: JointTrajectory, stamp_ns: int, observation_ns: int, limits: TimeLimits
+    trajectory: JointTrajectory, stamp_ns: int, observation_ns: int, settings: Settings
 ) -> JointTrajectory:
     """Returns the trajectory with times from the observation's stamp.
 
@@ -440,28 +422,29 @@ def from_observation(
         trajectory: its times count from `stamp_ns`.
         stamp_ns: when it starts [ns]; 0 = at the observation.
         observation_ns: stamp of the observation [ns].
-        limits: greatest age and length of a plan.
+        settings: have the greatest age and length of a plan.
 
     Raises:
         Rejection: the plan starts too long ago, has ended already, or ends too late.
     """
     offset = (stamp_ns - observation_ns) / NANO if stamp_ns else 0.0
     end = offset + float(trajectory.times[-1])
-    if -offset > limits.trajectory_age:
+    if -offset > settings.max_trajectory_age_s:
         raise Rejection(
             Reason.TRAJECTORY_STALE,
             f'the trajectory is stamped {-offset:.3f} s before the observation it would start '
-            f"from; 'max_trajectory_age_s' allows {limits.trajectory_age:g} s",
+            f"from; 'max_trajectory_age_s' allows {settings.max_trajectory_age_s:g} s",
         )
     if end < 0:
         raise Rejection(
             Reason.TRAJECTORY_STALE,
             f'the trajectory ended {-end:.3f} s before the observation it would start from',
         )
-    if end > limits.horizon:
+    if end > settings.max_horizon_s:
         raise Rejection(
             Reason.TRAJECTORY_TOO_LONG,
             f"the trajectory ends {end:.3f} s after its observation; 'max_horizon_s' allows "
-            f'{limits.horizon:g} s (do its stamp and the images come from the same clock?)',
+            f'{settings.max_horizon_s:g} s (do its stamp and the images come from the same '
+            'clock?)',
         )
     return replace(trajectory, times=trajectory.times + offset) if offset else trajectory

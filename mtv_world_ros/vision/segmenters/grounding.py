@@ -101,7 +101,7 @@ def prepare(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroundingConfig:
-    """Which detections are believed.
+    """Score thresholds of detections.
 
     Attributes:
         min_score: an object that scores less is absent.

@@ -20,7 +20,7 @@ Tensor = Any  # torch is imported where it is used
 class SamVideo(Protocol):
     """A video model of the SAM family: SAM 2 and the tracker inside SAM 3 share this interface."""
 
-    #: what a session is told of frames: where tensors lie, what type they have
+    #: of the session's tensors
     device: str
 
     @property
@@ -42,8 +42,6 @@ def track_masks(
     first_frame: ByteArray,
     first_masks: BoolArray,
     frames: Iterable[ByteArray],
-    *,
-    bounded: bool = True,
 ) -> Iterator[BoolArray]:
     """Yields the (O, H, W) masks in each frame as it comes.
 
@@ -55,7 +53,6 @@ def track_masks(
         first_frame: (H, W, 3) uint8 RGB, the frame that the masks belong to.
         first_masks: (O, H, W), none of them empty.
         frames: (H, W, 3) uint8 RGB, those that follow.
-        bounded: False keeps everything, to compare with.
     """
     if not len(first_masks):
         for frame in frames:
@@ -64,8 +61,7 @@ def track_masks(
     session = start_session(model, first_frame, first_masks)
     for index, frame in enumerate(frames, start=1):
         yield output_masks(model.advance(session, frame, index), *frame.shape[:2])
-        if bounded:
-            drop_old(session, index, reach(model.tracker.config))
+        drop_old(session, index, reach(model.tracker.config))
 
 
 def start_session(model: SamVideo, first_frame: ByteArray, first_masks: BoolArray) -> Any:
@@ -103,15 +99,6 @@ def drop_old(session: Any, index: int, kept: int) -> None:
         for store in (outputs['non_cond_frame_outputs'], tracked):
             for old in [number for number in store if number < index - kept]:
                 del store[old]
-
-
-def stored_entries(session: Any) -> int:
-    """Returns how many frames and outputs a session holds."""
-    outputs = sum(
-        len(store) for stores in session.output_dict_per_obj.values() for store in stores.values()
-    )
-    tracked = sum(map(len, session.frames_tracked_per_obj.values()))
-    return len(session.processed_frames) + outputs + tracked
 
 
 def _square_mask(mask: BoolArray, model: SamVideo) -> Tensor:

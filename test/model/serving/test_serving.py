@@ -49,8 +49,8 @@ def difference(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 def test_settings_are_read_from_a_text() -> None:
     assert ServingOptions.parse('') == ServingOptions()
-    options = ServingOptions.parse(' fuse_lora=false  compile=true ')
-    assert options == ServingOptions(fuse_lora=False, compile=True)
+    options = ServingOptions.parse(' offload=false  compile=true ')
+    assert options == ServingOptions(compile=True)
     options = ServingOptions.parse("offload=true compile=false tiny_decoder='my weights/tae'")
     assert options == ServingOptions(offload=True, tiny_decoder='my weights/tae')
 
@@ -58,9 +58,8 @@ def test_settings_are_read_from_a_text() -> None:
 @pytest.mark.parametrize(
     ('text', 'message'),
     [
-        ('fuse_lorra=true', r"'fuse_lorra' is not one of .*did you mean 'fuse_lora'"),
-        ('fuse_lora=yes', r"fuse_lora is 'yes'; it must be true or false"),
-        ('offload=true fuse_lora=false', 'offload needs fuse_lora=true'),
+        ('compiled=true', r"'compiled' is not one of .*did you mean 'compile'"),
+        ('compile=yes', r"compile is 'yes'; it must be true or false"),
         ('offload=true compile=true', 'offload and compile exclude each other'),
         ('tiny_encoder=true', 'tiny_encoder=true needs tiny_decoder'),
         ("tiny_decoder='a b", 'cannot be read: No closing quotation'),
@@ -71,9 +70,9 @@ def test_wrong_settings_are_refused(text: str, message: str) -> None:
         ServingOptions.parse(text)
 
 
-@pytest.mark.parametrize('serving', ['offload=true', 'attention=native', 'fuse_lora=false'])
+@pytest.mark.parametrize('serving', ['offload=true', 'attention=native'])
 def test_an_option_predicts_the_same(folder: Path, serving: str) -> None:
-    assert difference(predict(load(folder, serving), [0]), predict(load(folder), [0])).max() <= 1
+    assert difference(predict(load(folder, serving)), predict(load(folder))).max() <= 1
 
 
 def test_offloaded_blocks_come_and_go_one_by_one(folder: Path) -> None:
@@ -168,13 +167,13 @@ def test_the_tiny_decoder_decodes_what_was_denoised(
         'mtv_world_ros.model.world_model.decode_frames',
         lambda decoder, x: latents.append(x) or decode_frames(decoder, x),
     )
-    before = predict(plain, [0])
+    before = predict(plain)
     with torch.inference_mode():
         expected = decode_frames(TinyAutoencoder.load(tiny_file), latents[0])
     assert difference(expected.numpy(), before).max() > 1
-    decoded = predict(load(folder, f'tiny_decoder={tiny_file}'), [0])
+    decoded = predict(load(folder, f'tiny_decoder={tiny_file}'))
     assert difference(decoded, expected.numpy()).max() <= 1
-    both = predict(load(folder, f'tiny_decoder={tiny_file} tiny_encoder=true'), [0])
+    both = predict(load(folder, f'tiny_decoder={tiny_file} tiny_encoder=true'))
     assert both.shape == decoded.shape and difference(both, decoded).max() > 1
 
 
@@ -249,7 +248,7 @@ def test_a_lack_of_memory_outside_torchs_own_is_named(
     model = load(folder)
     monkeypatch.setattr('mtv_world_ros.model.world_model.sample_latents', fail)
     with pytest.raises(ModelMemoryError, match='out of memory on cpu with 2 views'):
-        predict(model, [0])
+        predict(model)
 
 
 _STARVED = """
@@ -260,21 +259,22 @@ from mtv_world_ros.errors import ModelMemoryError
 model = load_pipeline(num_threads=1, dtype='float32').world_model
 spec = model.spec
 shape = (len(spec.views), 1 + spec.num_frames, spec.height, spec.width, 3)
-def predict(count):
-    return model.predict_batch(
-        np.zeros((shape[0], *shape[2:]), np.uint8), np.zeros(shape, np.uint8),
-        positions=np.zeros((shape[1], 14)), seeds=range(count), num_inference_steps=1,
+def predict(scale):
+    views, frames, height, width, _ = shape
+    video = np.zeros((views, frames, scale * height, scale * width, 3), np.uint8)
+    return model.predict(
+        video[:, 0], video, positions=np.zeros((frames, 14)), seed=0, num_inference_steps=1,
         should_stop=lambda: False)
 used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()
 hard = resource.getrlimit(resource.RLIMIT_AS)[1]
 resource.setrlimit(resource.RLIMIT_AS, (used + 300 * 2**20, hard))
 try:
-    predict(400)
+    predict(12)
     print('no error')
 except ModelMemoryError as error:
     print(error)
 resource.setrlimit(resource.RLIMIT_AS, (hard, hard))
-print(predict(1).shape == (1, shape[0], shape[1] - 1, *shape[2:]))
+print(predict(1).shape == (shape[0], shape[1] - 1, *shape[2:]))
 """
 
 
@@ -303,12 +303,12 @@ def test_an_option_predicts_nearly_the_same_on_a_gpu(
     plain = load(folder, device='cuda')
     quick = load(folder, serving, device='cuda')
     for seed in (0, 1):
-        assert difference(predict(quick, [seed]), predict(plain, [seed])).mean() < tolerance
+        assert difference(predict(quick, seed=seed), predict(plain, seed=seed)).mean() < tolerance
 
 
 @pytest.mark.gpu
 def test_encoders_leave_the_gpu_when_blocks_are_offloaded(folder: Path) -> None:
     model = load(folder, 'offload=true', device='cuda')
-    predict(model, [0])
+    predict(model)
     assert {p.device.type for p in model.image_encoder.model.parameters()} == {'cpu'}
     assert {p.device.type for b in model.transformer.blocks for p in b.parameters()} == {'cpu'}

@@ -73,7 +73,7 @@ def test_forward_equals_the_published_tensor_flow(tmp_path):
 
 
 @pytest.mark.parametrize('views', [1, 2, 3])
-@pytest.mark.parametrize('view_offset', ['width', 'time', 'none'])
+@pytest.mark.parametrize('view_offset', ['width', 'none'])
 def test_forward_and_backward_with_any_number_of_views(tmp_path, views, view_offset):
     model = build(tmp_path, view_offset=view_offset)
     values = inputs(views)
@@ -103,18 +103,17 @@ def test_swapping_views_swaps_their_outputs_where_positions_are_equal(tmp_path):
     assert not torch.allclose(model(**swapped(values)), model(**values).flip(1), atol=1e-3)
 
 
-@pytest.mark.parametrize('view_offset', ['width', 'time'])
 @torch.inference_mode()
-def test_positions_tell_views_apart(tmp_path, view_offset):
+def test_positions_tell_views_apart(tmp_path):
     values = inputs(views=2)
-    model = build(tmp_path, view_offset=view_offset)
+    model = build(tmp_path, view_offset='width')
     assert not torch.allclose(model(**swapped(values)), model(**values).flip(1), atol=1e-3)
 
 
 @torch.inference_mode()
 def test_the_first_view_stands_where_wans_only_one_does(tmp_path):
     """What public weights learnt of positions holds for view 0, whatever the other views."""
-    for offset in ('width', 'time', 'none'):
+    for offset in ('width', 'none'):
         rope = build(tmp_path, view_offset=offset).rope
         count = (1 + FRAMES) * 4 * 4
         single = rope(torch.empty(1, 1, 1 + FRAMES, 4, 4, 1))

@@ -6,9 +6,10 @@ import pytest
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.ros.messages.conversions import NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
-from mtv_world_ros.ros.world_model.worker import from_observation, TimeLimits
+from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.world_model.worker import from_observation
 
-LIMITS = TimeLimits(trajectory_age=1.0, horizon=10.0)
+LIMITS = Settings(max_horizon_s=10.0)
 PLAN = JointTrajectory(joint_names=('a',), times=[0.5, 1.0], positions=[[0.0], [1.0]])
 
 
@@ -27,7 +28,7 @@ def test_stamp_moves_the_times(offset_s, times):
     ('stamp_s', 'limits', 'reason'),
     [
         (98.5, LIMITS, Reason.TRAJECTORY_STALE),
-        (98.9, TimeLimits(trajectory_age=5.0, horizon=10.0), Reason.TRAJECTORY_STALE),  # is over
+        (98.9, Settings(max_trajectory_age_s=5.0), Reason.TRAJECTORY_STALE),  # is over
         (109.5, LIMITS, Reason.TRAJECTORY_TOO_LONG),
     ],
 )

@@ -13,7 +13,8 @@ import pytest
 
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import RolloutPreempted
-from mtv_world_ros.ros.world_model.worker import Ended, Request, RolloutWorker, TimeLimits
+from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.world_model.worker import Ended, Request, RolloutWorker
 
 LONGEST_S = 120.0
 
@@ -22,11 +23,10 @@ def request(number: int) -> Request:
     plan = JointTrajectory(
         joint_names=('joint',), times=np.array([0.1]), positions=np.zeros((1, 1))
     )
-    limits = TimeLimits(trajectory_age=1.0, horizon=10.0)
-    given: dict[str, Any] = {'instruction': '', 'objects': (), 'seed': 0, 'received_s': 0.0}
+    scene: Any = SimpleNamespace()
     return Request(
-        rollout=number, trajectory=plan, stamp_ns=0, scene=SimpleNamespace(), imagine=False,
-        num_inference_steps=1, limits=limits, **given,
+        rollout=number, trajectory=plan, stamp_ns=0, scene=scene, imagine=False, instruction='',
+        settings=Settings(), received_s=0.0,
     )  # fmt: skip
 
 

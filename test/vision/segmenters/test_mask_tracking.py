@@ -9,7 +9,6 @@ from mtv_world_ros.vision.segmenters.prompted import (
     drop_old,
     reach,
     start_session,
-    stored_entries,
     track_masks,
 )
 from mtv_world_ros.vision.segmenters.sam import Sam2Video, Sam3Video
@@ -44,10 +43,11 @@ def clip(num_frames, seed=0):
     return frames, masks
 
 
-def test_dropping_what_is_out_of_reach_changes_no_mask(video):
+def test_dropping_what_is_out_of_reach_changes_no_mask(video, monkeypatch):
     frames, masks = clip(22)
-    kept = list(track_masks(video, frames[0], masks, frames[1:], bounded=False))
     dropped = list(track_masks(video, frames[0], masks, frames[1:]))
+    monkeypatch.setattr('mtv_world_ros.vision.segmenters.prompted.drop_old', lambda *_: None)
+    kept = list(track_masks(video, frames[0], masks, frames[1:]))
     assert np.array_equal(kept, dropped)
     assert len({mask.tobytes() for mask in kept}) > 5  # and there were masks that differ
 
@@ -58,6 +58,12 @@ def test_keeping_too_little_changes_masks(sam2, monkeypatch):
     kept = np.array(list(track_masks(sam2, frames[0], masks, frames[1:])))
     monkeypatch.setattr('mtv_world_ros.vision.segmenters.prompted.reach', lambda config: 1)
     assert not np.array_equal(kept, list(track_masks(sam2, frames[0], masks, frames[1:])))
+
+
+def stored_entries(session):
+    """How many frames and outputs a session holds."""
+    kept = [*session.output_dict_per_obj.values(), session.frames_tracked_per_obj]
+    return len(session.processed_frames) + sum(len(s) for stores in kept for s in stores.values())
 
 
 def test_stored_entries_stop_growing(video):

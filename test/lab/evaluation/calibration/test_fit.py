@@ -35,12 +35,11 @@ from mtv_world_ros.lab.evaluation.metrics.success_agreement import (
 )
 from mtv_world_ros.success.calibration import (
     CALIBRATION,
+    Calibration,
     HORIZON,
     HorizonCurve,
-    load_calibration,
-    load_horizon,
-    save_calibration,
-    save_horizon,
+    load_fit,
+    save_fit,
 )
 from mtv_world_ros.success.estimator import capped
 
@@ -381,13 +380,13 @@ def test_weights_stay_as_stated_where_the_episodes_say_nothing():
 
 def test_calibration_is_read_back_as_it_was_stored(tmp_path):
     calibration = calibrate(made_samples(), segmenter='colour', made={'date': 'today'}).calibration
-    save_calibration(tmp_path, calibration)
-    read = load_calibration(tmp_path)
+    save_fit(tmp_path, calibration)
+    read = load_fit(tmp_path, Calibration)
     assert read is not None
     assert read.weights == calibration.weights and read.tasks == calibration.tasks
     features = {'margin': 1.0, 'grasp': nan}
     assert read.probability(features) == calibration.probability(features)
-    assert load_calibration(tmp_path / 'none') is None
+    assert load_fit(tmp_path / 'none', Calibration) is None
 
 
 @pytest.mark.parametrize(
@@ -400,11 +399,11 @@ def test_calibration_is_read_back_as_it_was_stored(tmp_path):
     ],
 )
 def test_broken_calibration_says_what_to_do(tmp_path, change, message):
-    save_calibration(tmp_path, calibrate(made_samples(), segmenter='colour').calibration)
+    save_fit(tmp_path, calibrate(made_samples(), segmenter='colour').calibration)
     file = tmp_path / CALIBRATION
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
     with pytest.raises(CheckpointError, match=message) as caught:
-        load_calibration(tmp_path)
+        load_fit(tmp_path, Calibration)
     assert 'mtv-world calibrate' in str(caught.value)
 
 
@@ -429,12 +428,12 @@ def test_trusted_up_to_the_first_frame_whose_lower_bound_falls_below_the_level(l
 
 
 def test_horizon_is_read_back_and_a_broken_one_is_refused(tmp_path):
-    save_horizon(tmp_path, CURVE)
-    assert load_horizon(tmp_path) == CURVE
+    save_fit(tmp_path, CURVE)
+    assert load_fit(tmp_path, HorizonCurve) == CURVE
     (tmp_path / HORIZON).write_text('{"period_s": 0}')
     with pytest.raises(CheckpointError, match='delete the file'):
-        load_horizon(tmp_path)
-    assert load_horizon(tmp_path / 'none') is None
+        load_fit(tmp_path, HorizonCurve)
+    assert load_fit(tmp_path / 'none', HorizonCurve) is None
 
 
 def test_report_holds_the_scores_and_a_page_that_needs_no_other_file(tmp_path):
