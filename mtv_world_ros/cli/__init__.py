@@ -95,7 +95,7 @@ def _commands() -> Iterable[metadata.EntryPoint]:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Takes no empty path, which Python reads as the present folder; commands are parsed by it."""
+    """Refuses empty paths, which Python reads as the present folder."""
 
     def __init__(self, **how: Any) -> None:
         super().__init__(**how)
@@ -109,7 +109,7 @@ def _path(text: str) -> Path:
 
 
 def _check_texts(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    """Refuses an empty text, unless it is what the option is without one."""
+    """Refuses an empty text that is not the option's default."""
     for action in parser._actions:
         given = getattr(arguments, action.dest, None)
         is_empty = '' in given if isinstance(given, list) else given == ''
@@ -185,6 +185,6 @@ def _advice(error: Exception) -> str:
 
 
 def _said(text: str, status: int) -> int:
-    """The status, once the one line is on stderr."""
+    """Prints the line on stderr and returns the status."""
     print(f'mtv-world: {text}', file=sys.stderr)
     return status

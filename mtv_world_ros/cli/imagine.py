@@ -169,7 +169,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
 
 
 def episode_table(results: Sequence[Mapping[str, object]]) -> list[str]:
-    """Returns a row an episode with its estimate, why, and the success rate, as lines of text."""
+    """Returns a table of the episodes: estimate, reasons, success rate."""
     lines = ['episode  end            chunks  estimate         verdict   seconds  bag']
     for result in results:
         low, value, high = (result[f'success{end}'] for end in ('_low', '', '_high'))

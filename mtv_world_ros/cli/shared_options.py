@@ -185,7 +185,7 @@ def watch_arguments(arguments: argparse.Namespace) -> tuple[str, ...] | None:
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """Where a live view goes.
+    """Target of a live view.
 
     Attributes:
         port: of the page for browsers.
@@ -226,7 +226,7 @@ def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
 
 
 def check_model(device: str, *checkpoints: str) -> None:
-    """Checks what is often mistyped, before seconds go into imports and hours into the run.
+    """Checks checkpoints and device before the slow imports.
 
     Raises:
         CheckpointError: a folder is no checkpoint.

@@ -29,7 +29,7 @@ _MAX_TABS = 8
 
 
 class LiveViewer(Node):
-    """Subscribes to whatever the viewer can show, as soon as somebody publishes it.
+    """Subscribes to every topic that the viewer can show, once it has a publisher.
 
     Args:
         stream: recording of the viewer, which is served or saved already.
@@ -50,7 +50,7 @@ class LiveViewer(Node):
         self.create_timer(_LOOK_PERIOD_S, self._look)
 
     def _look(self) -> None:
-        """Subscribes to what is new; of raw and compressed images of one kind, to the latter."""
+        """Subscribes to new topics; of raw and compressed images of one view to the latter."""
         found = dict(self.get_topic_names_and_types())
         for topic in sorted(found, key=lambda topic: (not topic.endswith('compressed'), topic)):
             kind = shown_as(topic, found[topic][0])
@@ -103,7 +103,7 @@ class LiveViewer(Node):
         rerun_log.log_streams(self._stream, taken, self._root, self._begin_ns)
 
     def _begins_episode(self, topic: str, msgtype: str) -> bool:
-        """Whether a message is the first picture of another episode than that on show."""
+        """Whether a message is the first image of a new episode."""
         kind = shown_as(topic, msgtype) or ('',)
         return kind[:2] == ('image', 'real') and kind[1:] in self._shown.images
 

@@ -227,7 +227,7 @@ def declare(node: Node, kind: type[Schema]) -> None:
 def refusing(
     check: Callable[[list[Parameter]], None],
 ) -> Callable[[list[Parameter]], SetParametersResult]:
-    """Returns the callback of a check that raises: whatever it raises is why it is refused."""
+    """Returns a set-parameters callback that refuses with the text of what `check` raises."""
 
     def called(changed: list[Parameter]) -> SetParametersResult:
         try:
@@ -242,7 +242,7 @@ def refusing(
 
 
 def _answered(serve: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
-    """Answers calls that rclpy raises at, such as for a value of no known type."""
+    """Answers requests that rclpy fails on, such as a value of an unknown type."""
     try:
         return serve(request, response)
     except Exception as error:
@@ -403,7 +403,7 @@ def _refusal(name: str, field: FieldInfo, value: object) -> str:
 
 
 def _check(node: Node, kind: type[Schema], parameters: list[Parameter]) -> None:
-    """Refuses what the schema refuses: choices, ranges, numbers that are none.
+    """Refuses values outside the schema: choices, ranges, numbers that are not finite.
 
     Raises:
         ConfigError: names the parameter and what would be valid.

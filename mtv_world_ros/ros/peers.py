@@ -51,7 +51,7 @@ class Peers:
         return self._newest[name][1] if name in self._newest else {}
 
     def unconnected(self, topics: Iterable[str], least: int = 1) -> list[str]:
-        """Those of the topics of which a node says that its publisher has too few subscribers.
+        """Returns the topics whose publisher, by its node's diagnostics, has too few subscribers.
 
         Two that know of each other from the graph may still not be connected, and what is
         published until then is lost.
@@ -81,7 +81,7 @@ class Peers:
             self._spin_once()
 
     def call(self, kind: Any, name: str, request: Any, wait_s: float = _ANSWER_S) -> Any:
-        """Calls a service, which a second request does not harm, and returns its answer.
+        """Calls an idempotent service and returns its answer.
 
         Raises:
             ConfigError: the node is missing or does not answer in time.

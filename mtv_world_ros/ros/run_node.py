@@ -102,7 +102,7 @@ def run(
 
 
 def _why_refused(error: Exception) -> str:
-    """What rclpy dislikes about the command line or a parameter file, and what is valid."""
+    """Why rclpy refused the command line or a parameter file, and what is valid."""
     said = str(error).partition('failed to initialize rcl: ')[2] or str(error)
     hint = ''
     if 'same type' in said:

@@ -82,7 +82,7 @@ class Weights(Schema):
 
 
 class Calibration(Weights):
-    """What `mtv-world calibrate` found.
+    """Weights that `mtv-world calibrate` fitted.
 
     Attributes:
         observed: for frames that were seen, not imagined, of the same episodes; None = as for
@@ -112,12 +112,12 @@ class Calibration(Weights):
     fitted_to: FittedTo | None = None
 
     def given(self, is_real: bool, is_foreseen: bool = True) -> Weights:
-        """Returns the weights for frames that are real, or imagined with motions foreseen."""
+        """Returns the weights for real frames, or imagined ones with or without foresight."""
         special = self.observed if is_real else None if is_foreseen else self.unforeseen
         return special or self
 
     def objection(self, task: str, segmenter: str) -> str:
-        """Returns why it does not apply to a task and a segmenter; empty = it applies."""
+        """Returns why the weights do not hold for a task and segmenter; empty = they hold."""
         if segmenter != self.segmenter:
             return f"uncalibrated for the segmenter '{segmenter}' (fitted with '{self.segmenter}')"
         if task not in self.tasks:
@@ -127,7 +127,7 @@ class Calibration(Weights):
     def elsewhere(
         self, setting: Setting, cameras: Sequence[CameraModel], *, is_foreseen: bool
     ) -> str:
-        """Returns why what was fitted is none here; empty = it was fitted here.
+        """Returns how the setting differs from that of the fit; empty = it does not.
 
         Its weights are used all the same: stated ones know less. Arguments as in
         `FittedTo.objection`.

@@ -1,4 +1,4 @@
-"""What a rollout says about a task: margins of its relations, J with goals, and grasps."""
+"""Evidence of a rollout about a task: margins of relations, J with goals, grasps."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ FEATURES: tuple[str, ...] = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """What one rollout says about one task.
+    """Evidence of one rollout about one task.
 
     Attributes:
         worst: the condition nearest to failing, or furthest from holding; None = pictures do not
@@ -156,7 +156,7 @@ class Evidence:
 
     @classmethod
     def none(cls, reason: CannotTell) -> Evidence:
-        """Returns what is left where pictures do not tell."""
+        """Returns the evidence of pictures that do not show the outcome."""
         features = dict.fromkeys((*FEATURES, 'moved'), nan)
         notes = (f'pictures do not tell: {reason}',)
         return cls(worst=None, features=features, sigma=nan, goal_jaccard={}, notes=notes)
@@ -273,7 +273,7 @@ def _grasps(scene: ImaginedScene, task: TaskSpec) -> tuple[float, float]:
 
 
 def _moved(scene: ImaginedScene, task: TaskSpec) -> float:
-    """0 if an object that the task moves is known to be still at its start, else 1."""
+    """0 if an object that the task moves is known to have stayed at its start, else 1."""
     for role in task.movers:
         trail = scene.views.memory.points[scene.item(role)]
         known = np.isfinite(trail).all(1)
@@ -307,7 +307,7 @@ def _carry_error(scene: ImaginedScene, role: str, grasp: Grasp) -> float:
 
 
 def _has_moved(scene: ImaginedScene, role: str) -> bool:
-    """Whether the object was away from its start in three frames; unknown ones do not tell."""
+    """Whether the object was away from its start in at least three known frames."""
     trail = scene.views.memory.points[scene.item(role)]
     return _is_away(np.linalg.norm(trail - trail[0], axis=1))
 
@@ -319,5 +319,5 @@ def _is_away(away: FloatArray) -> bool:
 
 
 def view_mean(values: FloatArray) -> float:
-    """Returns the mean over the views that know, NaN if none does."""
+    """Returns the mean of the values that are not NaN, NaN if there is none."""
     return float(mean_of_known(values))

@@ -1,4 +1,4 @@
-"""Relations between objects that a task may ask for, and by how much each of them holds.
+"""Relations between objects that a task may ask for, and their margins.
 
 The defaults are the benchmark's thresholds, and written nowhere else. Lengths in metres, x to the
 right, y away from the robot, z up. A distance in the plane is that of the centres in x and y.
@@ -30,7 +30,7 @@ Goal = tuple[str, FloatArray]
 
 
 class Margin(NamedTuple):
-    """By how much a condition holds.
+    """Margin of a condition.
 
     Attributes:
         condition: in words.

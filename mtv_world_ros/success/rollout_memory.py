@@ -1,4 +1,4 @@
-"""What the estimator sees of a chunk, and what it remembers of the rollout from chunk to chunk."""
+"""The estimator's input of a chunk, and its memory of the rollout from chunk to chunk."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Footage:
         return self.start_masks.masks[:, :, 0] if frame == 0 else self.masks.masks[:, :, frame - 1]
 
     def known(self, frame: int) -> BoolArray:
-        """Returns (V, O) whether an object's mask is to be trusted and is there."""
+        """Returns (V, O) whether an object's mask is not empty and its status `ok`."""
         status = self.start_masks.status if frame == 0 else self.masks.status
         ok = np.array([[word == 'ok' for word in row] for row in status], np.bool_)
         masks = self.frame_masks(frame)
@@ -101,7 +101,7 @@ class Grasp(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RolloutMemory:
-    """What is remembered of a rollout: V views, O objects, A arms, N frames so far.
+    """Memory of a rollout: V views, O objects, A arms, N frames so far.
 
     Attributes:
         start_masks: of the rollout's first frame (T = 1).

@@ -1,4 +1,4 @@
-"""Masks of a rollout in calibrated views: which are known, where objects are, J with a goal."""
+"""Masks of a rollout in calibrated views: status, object positions, J with a goal."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ class Views:
         return ', '.join(words)
 
     def _is_hidden_in_place(self, item: int) -> bool:
-        """Whether some view shows less of it than before, and none shows it elsewhere."""
+        """Whether some view shows less of the object than before, and none shows it elsewhere."""
         seen, last = self.memory.seen_masks[:, item], self.footage.masks.masks[:, item, -1]
         area, seen_area = last.sum((-2, -1)), seen.sum((-2, -1))
         inside = (seen & last).sum((-2, -1))

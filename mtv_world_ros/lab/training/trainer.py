@@ -54,7 +54,6 @@ from mtv_world_ros.model.conditioning import check_history
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.serving import compile_blocks
-from mtv_world_ros.model.transformer.stem import with_new_source
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 #: losses averaged for the progress bar and the log
@@ -181,7 +180,6 @@ class Trainer:
                 f"'{theirs.robot}' with {len(theirs.spec.views)} views; run fit-contact"
             )
         given = loaded.transformer.state_dict()
-        given = with_new_source(given, self.weights.worker.state_dict())
         try:
             self.weights.worker.load_state_dict(given)
         except RuntimeError as error:

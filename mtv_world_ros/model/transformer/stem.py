@@ -9,8 +9,6 @@ h4 w4 = a quarter of it, D = width of the transformer, G = frames merged into on
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from torch import nn, Tensor
 import torch.nn.functional as F
@@ -238,23 +236,3 @@ class ReferenceDecoder(nn.Module):
         if self.num_sources > NUM_SOURCES:
             parts.append(control.float().reshape(n, 1, 3, p, h, w))
         return (weights * torch.cat(parts, dim=1)).sum(dim=1).reshape(n, c, h, w)
-
-
-def with_new_source(
-    state: Mapping[str, Tensor], wanted: Mapping[str, Tensor]
-) -> dict[str, Tensor]:
-    """Returns a transformer's weights for one whose decoder also copies from the control.
-
-    Args:
-        state: weights by name.
-        wanted: those of the transformer that they are for; where it is the same, nothing changes.
-    """
-    grown = dict(state)
-    for name, fill in (
-        ('proj_out.conv_out.weight', 0.0),
-        ('proj_out.conv_out.bias', _NEW_SOURCE_BIAS),
-    ):
-        if name in state and name in wanted and len(state[name]) < len(wanted[name]):
-            more = state[name].new_full(wanted[name][len(state[name]) :].shape, fill)
-            grown[name] = torch.cat([state[name], more])
-    return grown

@@ -50,7 +50,7 @@ ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
 
 @dataclass(slots=True)
 class Timeline:
-    """Maps bag time to the clock on the wall.
+    """Maps bag time to wall time.
 
     Attributes:
         bag_ns: bag time at which playing started [ns].
@@ -71,7 +71,7 @@ class Timeline:
         return self.bag_ns + round((wall_ns - self.wall_ns) * self.rate)
 
     def pause(self, duration_ns: int) -> None:
-        """Moves all that is still to come by a pause."""
+        """Delays everything after this moment."""
         self.wall_ns += duration_ns
 
 
@@ -159,7 +159,7 @@ class Player(Node):
         self._wait_until_settled(end_s)
 
     def _unsubscribed(self, topics: list[str]) -> list[str]:
-        """Topics without subscriber, as far as the graph, or their publisher, can tell."""
+        """Topics without a subscriber, by the ROS graph and by other nodes' diagnostics."""
         unsubscribed = [topic for topic in topics if not self.count_subscribers(topic)]
         if self._options.lock_step and not unsubscribed:
             node = self.resolve_topic_name(self._options.report_topic).rpartition('/')[0]
@@ -167,7 +167,7 @@ class Player(Node):
         return unsubscribed or self._peers.unconnected(topics)
 
     def _wait_until_settled(self, end_s: float) -> None:
-        """Until all subscriptions that the graph knows are connected and none changes."""
+        """Waits until the number of connections has not changed for a while."""
         known, since_s = self._connections(), time.monotonic()
         while time.monotonic() < min(since_s + _SETTLED_S, end_s):
             self._executor.spin_once(timeout_sec=0.05)
@@ -193,7 +193,7 @@ class Player(Node):
                 self._wait_for_answer(timeline, message.stamp_ns, stamp_ns)
 
     def _messages(self) -> Iterator[BagMessage]:
-        """Messages from start to end; latched ones also where they lie before the start."""
+        """Messages from start to end, and latched ones before the start."""
         first_ns: int | None = None
         for message in in_order(self._reader.messages(tuple(self._outputs))):
             if first_ns is None:
@@ -233,7 +233,7 @@ class Player(Node):
                 publisher.wait_for_all_acked(Duration(seconds=4))
 
     def _wait_for_frames(self) -> None:
-        """In lock-step, lets the clock go on until the frames of the last answer are out."""
+        """In lock-step, advances the clock until the frames of the last answer are published."""
         end_s = time.monotonic() + self._options.answer_timeout
         while self._unpublished and self._timeline is not None and time.monotonic() < end_s:
             self._publish_clock(self._timeline.bag_time(time.time_ns()))
@@ -255,7 +255,7 @@ class Player(Node):
                 self._unpublished.discard(chunk)
 
     def _wait_for_answer(self, timeline: Timeline, bag_ns: int, stamp_ns: int) -> None:
-        """Holds the bag until the node says how the trajectory ended."""
+        """Pauses the bag until the node reports the end of the trajectory."""
         begin_ns, seen = time.time_ns(), len(self._ends)
         end_s = time.monotonic() + self._options.answer_timeout
         answer: dict[str, str] | None = None

@@ -44,10 +44,10 @@ _LOOK_PERIOD_S = 0.05
 
 
 class Recorder(Node):
-    """Subscribes to topics as their publishers offer them and writes what comes.
+    """Subscribes to topics with their publishers' QoS and writes the messages.
 
-    A topic of which nothing comes although it has a publisher is named in a warning: a publisher
-    may reach a new subscription late, e.g. while it still serves one that was killed.
+    A topic with a publisher but without messages is named in a warning: a publisher may reach a
+    new subscription late, e.g. while it still serves one that was killed.
 
     Args:
         options: of the command line, see `parse`.
@@ -84,7 +84,7 @@ class Recorder(Node):
         self._writer = self._open()
 
     def record(self) -> None:
-        """Records for the wanted time, or until a signal comes and what was sent has arrived.
+        """Records for the given duration, or until a signal and the messages sent before it.
 
         Raises:
             ConfigError: a topic has no publisher in time.
@@ -111,7 +111,7 @@ class Recorder(Node):
             self.destroy_node()
 
     def _close_bag(self) -> None:
-        """Finishes the bag and says what is in it and what is not; drops one of no message."""
+        """Finishes the bag and logs its counts; a bag without messages is dropped."""
         writer, self._writer = self._writer, None
         if writer is None:
             return
@@ -134,11 +134,11 @@ class Recorder(Node):
             self.get_logger().warning(f'lost before they got here: {lost}')
 
     def _open(self) -> BagWriter | None:
-        """What is recorded into from the start."""
+        """The bag that is open from the start."""
         return BagWriter(self._options.out, overwrite=self._options.overwrite, keep=True)
 
     def _after_spin(self) -> None:
-        """What is to be done now and then."""
+        """Flushes the bag, and names silent topics."""
         if self._writer is not None and time.monotonic() > self._next_flush_s:
             self._next_flush_s = time.monotonic() + _FLUSH_PERIOD_S
             self._writer.flush()
@@ -161,7 +161,7 @@ class Recorder(Node):
                 waiting.remove(topic)
 
     def _announce(self) -> None:
-        """Says so, once every subscription is connected."""
+        """Logs `recording` once every subscription is connected."""
         connected = (s.get_publisher_count() for s in self._taken)
         if not self._is_announced() and all(connected):
             self._announced_s = time.monotonic()
@@ -172,7 +172,7 @@ class Recorder(Node):
         return self._announced_s < float('inf')
 
     def _name_silent(self) -> None:
-        """Names the topics that brought nothing so far, once; what they bring is said then."""
+        """Logs, once, the topics without messages so far; their first message is logged later."""
         self.silent_after_s = float('inf')
         self._silent = {s.topic_name for s in self._taken if not self._counts[s.topic_name]}
         if self._silent:
@@ -213,7 +213,7 @@ class Recorder(Node):
         self._taken.append(taken)
 
     def _handler(self, topic: str, msgtype: str, leads: bool) -> Callable[[bytes], None]:
-        """Writes messages; where it leads, its header dates what has none."""
+        """Returns the callback that writes; a leading topic dates messages without a header."""
         by_header = self._options.stamp == 'header'
 
         def write(data: bytes) -> None:

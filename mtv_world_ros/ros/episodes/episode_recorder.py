@@ -32,7 +32,7 @@ class EpisodeRecorder(Recorder):
         return None
 
     def _on_begin(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Begins a bag; one that is ending is closed, one that has just begun is named again."""
+        """Begins a bag after closing an ending one; a second call returns the same bag."""
         if self._writer is not None and self._end_before_s == float('inf'):
             response.success, response.message = True, str(self._bag)
             return response
@@ -51,7 +51,7 @@ class EpisodeRecorder(Recorder):
         return response
 
     def _on_end(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """The bag is closed as soon as what was sent has arrived."""
+        """Closes the bag once the topics are silent."""
         now_s = time.monotonic()
         self.last_message_s, self._end_before_s = now_s, now_s + _LONGEST_DRAIN_S
         response.success = True

@@ -51,7 +51,7 @@ def predicted_topics(world_model: str, views: Sequence[str]) -> list[str]:
 
 
 class RecorderProcess:
-    """Starts and stops the recorder of episodes; however it is stopped, it closes its bag whole.
+    """Starts and stops the recorder process, which closes its bag however it is stopped.
 
     Args:
         out: folder of the bags; logs go to `logs/` in it.
@@ -103,7 +103,7 @@ class RecorderProcess:
             raise EpisodeError(f"{said}; its log is '{self._log}'")
 
     def end(self) -> None:
-        """Lets the recorder take what is still on its way, and waits for the closed bag.
+        """Ends the bag and waits until it is closed.
 
         Raises:
             EpisodeError: the recorder ended; the bag holds what had been received.
@@ -226,7 +226,7 @@ class EpisodeRunner(Node):
         return {**result, **_ending(seen)}
 
     def _live_out(self, number: int, start: EpisodeStart) -> dict[str, str]:
-        """Starts an episode and waits for its end; returns what was reported of that."""
+        """Runs an episode; returns the values of the report of its end."""
         options, peers = self._options, self._peers
         common = {'seed': options.seed + 1000 * number}
         if start.calibration_file:
@@ -253,7 +253,7 @@ class EpisodeRunner(Node):
         return self._wait_for_end()
 
     def _show(self, start: EpisodeStart, only: str = '') -> None:
-        """Publishes the start once, as cameras and joints would; `only` = the end of topics."""
+        """Publishes the start once, on topics that end with `only`."""
         for topic, message in start.stamped(self.get_clock().now().nanoseconds):
             if topic.endswith(only):
                 self._outputs[topic].publish(message)
@@ -298,7 +298,7 @@ class EpisodeRunner(Node):
         return live.start(self._options.instruction)
 
     def _connect(self) -> None:
-        """Starts the recorder and waits until everything that is published will reach it."""
+        """Starts the recorder and waits until it is connected to every publisher."""
         options = self._options
         shown = [output.topic_name for output in self._outputs.values()]
         least = 2  # the world model and the policy
@@ -364,7 +364,7 @@ def _is_viewed(topic: str) -> bool:
 
 
 def _ending(seen: Mapping[str, str]) -> dict[str, Any]:
-    """What was reported of an episode's end; the estimate's numbers are null where it abstains."""
+    """The report of an episode's end; numbers of the estimate are null where it abstains."""
     kept = ('how', 'text', 'policy', 'task', 'scene_seed', 'seed', 'num_chunks')
     numbers = {key: float(seen.get(key, 'nan')) for key in ESTIMATE[:3]}
     return {

@@ -1,4 +1,4 @@
-"""What an imagined episode starts from: a recorded frame, or what the cameras show now."""
+"""The start of an imagined episode: a recorded frame, or the present one of the cameras."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from mtv_world_ros.ros.sensing.subscriptions import Handler, MatchedSubscription
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeStart:
-    """One moment, as the robot's drivers publish it.
+    """Images, camera infos and joint state of one moment.
 
     Attributes:
         source: recorded episode, or live topics.
@@ -120,7 +120,7 @@ def _recorded_info(path: Path, view: str) -> CameraInfo:
 
 
 class LiveCameras:
-    """Keeps what cameras and joints publish now.
+    """Keeps the newest images, camera infos and joint states.
 
     Args:
         node: owner of the subscriptions.
@@ -145,23 +145,23 @@ class LiveCameras:
         ]
 
     def refresh(self) -> None:
-        """Looks at the publishers again; to be called now and then."""
+        """Matches QoS to the publishers again; call it periodically."""
         for subscription in self._subscriptions:
             subscription.refresh()
 
     def clear(self) -> None:
-        """Forgets images and joints: those that come next are new."""
+        """Drops images and joint states, so that the next ones are new."""
         self._images.clear()
         self._positions.clear()
 
     def missing(self) -> list[str]:
-        """What has not come yet."""
+        """Names of what was not received yet."""
         missing = [f"image of '{view}'" for view in self._views if view not in self._images]
         missing += [f"camera_info of '{v}'" for v in self._views if v not in self._infos]
         return missing + ([] if self._positions else ['joint_states'])
 
     def start(self, instruction: str) -> EpisodeStart:
-        """The newest of everything, as the start of an episode."""
+        """Returns the newest messages as the start of an episode."""
         names = tuple(self._positions)
         values = np.array([self._positions[name] for name in names])
         return EpisodeStart(

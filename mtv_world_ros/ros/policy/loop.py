@@ -66,7 +66,7 @@ def chunk_stamps(start_ns: int, num_frames: int, fps: float) -> list[int]:
 
 
 class PredictedFrames:
-    """Keeps what the world model published since the last `clear`.
+    """Keeps the predicted frames and joint states since the last `clear`.
 
     Args:
         views: names of the V views, in the model's order.
@@ -92,7 +92,7 @@ class PredictedFrames:
             stored.clear()
 
     def missing(self, stamps: Sequence[int]) -> list[str]:
-        """What is not here of the frames at these stamps, as text."""
+        """Names of the frames at these stamps that were not received."""
         streams = {**self._images, 'joint_states': self._joints}
         return [
             f'{name} at {stamp} ns'
@@ -102,7 +102,7 @@ class PredictedFrames:
         ]
 
     def unexpected(self, stamps: Sequence[int]) -> list[int]:
-        """Stamps of images that are here and not among these."""
+        """Stamps of received images that are not among these."""
         found = {stamp for stored in self._images.values() for stamp in stored}
         return sorted(found - set(stamps))
 
@@ -138,14 +138,14 @@ _OVERDUE = {
 
 
 class Outputs(Protocol):
-    """What the loop does to the world."""
+    """Publishers and sensors that the loop uses."""
 
     def send(self, trajectory: JointTrajectory, stamp_ns: int) -> None:
         """Publishes an answer under the stamp of the observation that it answers."""
         ...
 
     def report(self, state: str, values: Mapping[str, object]) -> None:
-        """Tells of a chunk, or of the episode's begin or end."""
+        """Reports a chunk, or the begin or end of the episode."""
         ...
 
     def fault(self, kind: str, text: str) -> None:
@@ -163,7 +163,7 @@ class Outputs(Protocol):
 
 @dataclass(slots=True)
 class _Chunk:
-    """One turn of the loop: times [s] of `time.monotonic`, and what the world model said."""
+    """One cycle: times [s] of `time.monotonic`, and the world model's report."""
 
     begin_s: float
     policy_s: float = 0.0
@@ -237,7 +237,7 @@ class PolicyLoop:
         self._out.report('ended', {**self._values(), **self._estimate, 'how': how, 'text': text})
 
     def on_answers(self) -> None:
-        """Takes what the policy said."""
+        """Handles the policy's answers."""
         for answer in self._actor.take():
             if answer.ticket != self._ticket:
                 self._out.fault('late_answer', 'an answer came after its episode had ended')
@@ -249,7 +249,7 @@ class PolicyLoop:
                 self._execute(answer)
 
     def on_report(self, values: Mapping[str, str]) -> None:
-        """Takes what the world model said of a rollout."""
+        """Handles a report of the world model about a rollout."""
         state, stamp = values.get('state', ''), values.get('trajectory_stamp_ns', '')
         if self.phase == 'idle':
             return
@@ -267,7 +267,7 @@ class PolicyLoop:
                 self.end(state, f'{reason}: {values["text"]}' if reason else 'by somebody else')
 
     def tick(self) -> None:
-        """Goes on where what it waits for is there; to be called now and then."""
+        """Continues with received data, or ends an overdue episode; call it periodically."""
         if self.phase == 'observing':
             self._observe()
         elif self.phase == 'collecting':
@@ -319,7 +319,7 @@ class PolicyLoop:
         self._out.send(first_part(answer.trajectory, start, seconds), stamp_ns)
 
     def _start_of(self, trajectory: JointTrajectory, observation: Observation) -> FloatArray:
-        """Where the trajectory's joints are when it starts; those of other robots at its begin."""
+        """Measured positions of the trajectory's joints; its first row for joints of others."""
         seen = dict(zip(self._joint_names, observation.positions, strict=True))
         named = zip(trajectory.joint_names, trajectory.positions[0], strict=True)
         return np.array([seen.get(name, first) for name, first in named])

@@ -47,7 +47,7 @@ def load_named_robot(settings: PolicySettings) -> RobotModel:
 
 
 def load_named_policy(settings: PolicySettings) -> PolicyMaker:
-    """Returns how the policy that is set is made."""
+    """Returns the maker of the policy that is set."""
     return assemble_policy(settings.policy, load_named_robot(settings))
 
 
@@ -123,7 +123,7 @@ class PolicyNode(Node):
         self._status.report(state, values)
 
     def fault(self, kind: str, text: str) -> None:
-        """Counts a fault and says it in `/diagnostics` at once."""
+        """Counts a fault and publishes `/diagnostics` at once."""
         self._status.fault(kind, text)
         self._publish_diagnostics()
 

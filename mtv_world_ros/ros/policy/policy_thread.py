@@ -1,4 +1,4 @@
-"""One thread that asks the policy, so that one which takes its time stops nothing else."""
+"""A thread that calls the policy, so that a slow one does not block the node."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CLOSE_S = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolicyAnswer:
-    """What came of a question.
+    """The answer to a question.
 
     Attributes:
         ticket: of the question.
@@ -34,7 +34,7 @@ class PolicyAnswer:
 
 
 class Actor:
-    """Asks one question after the other.
+    """Calls the policy in a thread, one question after the other.
 
     Args:
         notify: called from the thread whenever `take` has something new.

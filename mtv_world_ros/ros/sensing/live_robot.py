@@ -1,4 +1,4 @@
-"""What a live robot says of itself: its description and, by TF, where its cameras are."""
+"""The live robot's description, and the poses of its cameras by TF."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TOPIC = 'robot_description'
 
 
 class RobotDescription:
-    """Holds what is described against the robot that the checkpoint was trained on.
+    """Compares `robot_description` with the robot that the checkpoint was trained on.
 
     Attributes:
         problem: what is wrong with the description; empty = nothing.
@@ -113,7 +113,7 @@ def tf_message() -> Any | None:
 
 
 class Extrinsics:
-    """Listens to TF, and publishes the frames of views that it lacks.
+    """Camera poses by TF; publishes the frames of views that TF lacks.
 
     Args:
         node: owner of the subscriptions and the publisher.
@@ -153,7 +153,7 @@ class Extrinsics:
             node.create_subscription(self._message, topic, take, qos)
 
     def pose(self, view: str, frame: str, stamp_ns: int) -> Mount | None:
-        """Returns what carries a view's camera, and its pose; None = the files say it.
+        """Returns the link and pose of a view's camera by TF; None = use the calibration file.
 
         Args:
             view: name of the view.
@@ -193,11 +193,11 @@ class Extrinsics:
         return mount
 
     def accept(self) -> None:
-        """Takes changed poses as the valid ones from now on."""
+        """Accepts changed poses."""
         self._used.clear()
 
     def forget_moving(self) -> None:
-        """Forgets what /tf said: the clock went back."""
+        """Drops the transforms of /tf after the clock jumped back."""
         self._tree.forget_moving()
 
     def values(self) -> dict[str, object]:
@@ -220,7 +220,7 @@ class Extrinsics:
             self._publisher.publish(self._message(transforms=latest))  # type: ignore
 
     def _place(self, frame: str, camera: CameraModel) -> bool:
-        """Places a camera's frame where TF lacks it; tells whether that is news."""
+        """Adds a camera's frame that TF lacks; returns whether it is new or has moved."""
         name, link, T_link_frame = self._tree.name(frame), camera.mount_link, camera.T_mount_camera
         if not name or name in self._links or self._tree.is_connected(name, self._links):
             return False

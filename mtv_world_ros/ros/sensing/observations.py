@@ -59,7 +59,7 @@ class SensedScene:
 
 
 class ObservationBuffer:
-    """Keeps what came in last and makes an observation of it, or says why it cannot.
+    """Keeps the newest messages and makes observations of them.
 
     Args:
         cameras: calibrated cameras of the V views, in the model's order.
@@ -142,7 +142,7 @@ class ObservationBuffer:
             self._joints[name].append((stamp_ns, position))
 
     def _check_speed(self, name: str, stamp_ns: int, position: float, received: float) -> None:
-        """Refuses a sample that no joint can have reached, unless the one before said so, too."""
+        """Refuses a sample out of reach of the last one, unless two in a row agree."""
         if not self._joints[name]:
             return
         last_ns, last = self._joints[name][-1]
@@ -184,11 +184,11 @@ class ObservationBuffer:
 
     @property
     def notes(self) -> list[str]:
-        """What camera infos leave open of the images that came, and how it is taken, in words."""
+        """Assumptions about images that their camera infos do not settle, as text."""
         return [note for note in self._intrinsics.notes.values() if note]
 
     def problems(self, now_ns: int) -> list[str]:
-        """Returns what is missing or too old for an observation, in words; empty = nothing."""
+        """Returns what is missing or too old for an observation, as text."""
         limits, said = self._limits(), []
         for view, images in self._images.items():
             said += _freshness(f"images of view '{view}'", images, now_ns, limits.max_image_age_s)
@@ -303,7 +303,7 @@ class ObservationBuffer:
 
 
 def _common_size(frames: Sequence[ByteArray], least: tuple[int, int]) -> tuple[int, int]:
-    """Width and height of the largest frame; smaller where it has vastly many pixels."""
+    """Width and height of the largest frame, shrunk to at most `_MOST_PIXELS`."""
     height, width = max((frame.shape[:2] for frame in frames), key=prod)
     shrink = min(1.0, sqrt(max(_MOST_PIXELS, prod(least)) / (width * height)))
     return max(round(shrink * width), 1), max(round(shrink * height), 1)
@@ -313,7 +313,7 @@ class Intrinsics:
     """The cameras as their CameraInfo describes them.
 
     Attributes:
-        notes: what the infos leave open of images that came, and how it is taken; by view.
+        notes: by view, the assumption about images that its info does not settle.
 
     Args:
         cameras: calibrated cameras of the V views; their poses are used.
@@ -434,7 +434,7 @@ def _are_equal(before: Iterable[CameraModel], now: Iterable[CameraModel]) -> boo
 
 
 def _differences(first: CameraInfo, later: CameraInfo) -> str:
-    """What sets two infos of one camera apart; empty if nothing."""
+    """Differences between two infos of one camera, as text; empty = none."""
     said = []
     for field in _COMPARED:
         before, now = getattr(first, field), getattr(later, field)

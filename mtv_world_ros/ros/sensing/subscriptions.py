@@ -113,7 +113,7 @@ def subscribe_observations(
 
 
 class MatchedSubscription:
-    """Starts with what every publisher can serve and asks for more once all of them offer it.
+    """Starts with the weakest QoS and asks for the strongest that all publishers offer.
 
     Nothing is lost between the two: the first goes only at a refresh after the second is
     connected. Until then a message may come twice, so that this is for messages of which the
