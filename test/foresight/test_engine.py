@@ -7,35 +7,25 @@ import time
 
 import numpy as np
 import pytest
+import small_scene
 
 from mtv_world_ros.errors import RolloutPreempted
 from mtv_world_ros.foresight import engine as engine_module
 from mtv_world_ros.foresight.arms import Arms
-from mtv_world_ros.foresight.contact_settings import ContactSettings, ContactSpread
+from mtv_world_ros.foresight.contact_settings import ContactSpread
 from mtv_world_ros.foresight.course import SUBSTEPS
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import draw_futures
 from mtv_world_ros.foresight.solid_foresight import SolidForesight, TrackedSolids
 from mtv_world_ros.foresight.solids import Solid
 
-SETTINGS = ContactSettings(
-    finger_stiffness=400.0,
-    finger_damping=10.0,
-    finger_mass_kg=0.05,
-    grip_friction=1.0,
-    table_friction=0.5,
-    density=500.0,
-    tray_kg=0.4,
-    num_motions=4,
-)
+SETTINGS = small_scene.SETTINGS.model_copy(update={'num_motions': 4})
 BLOCK = Solid(centre=np.array([0.0, 0.0, 0.02]), size=np.array([0.02, 0.03, 0.04]))
 AWAY = Solid(centre=np.array([0.5, 0.2, 0.02]), size=np.full(3, 0.04))
 
 
-def batch_of(robot, *solids, threads=1, **changed):
-    settings = SETTINGS.model_copy(update=changed)
-    engine = Engine(Arms(robot, None), threads)
-    return engine.begin(draw_futures(settings, solids, engine.arms.drives))
+def batch_of(robot, *solids, **changed):
+    return small_scene.batch_of(robot, *solids, **{'num_motions': 4, **changed})
 
 
 def picking(seconds: float = 2.0) -> np.ndarray:

@@ -6,33 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from small_scene import batch_of, SETTINGS
 
-from mtv_world_ros.foresight.arms import Arms
-from mtv_world_ros.foresight.contact_settings import ContactSettings
-from mtv_world_ros.foresight.engine import Engine
-from mtv_world_ros.foresight.futures import draw_futures
 from mtv_world_ros.foresight.solids import Solid
 
 G = 9.81
-SETTINGS = ContactSettings(
-    finger_stiffness=400.0,
-    finger_damping=10.0,
-    finger_mass_kg=0.05,
-    grip_friction=1.0,
-    table_friction=0.5,
-    density=500.0,
-    tray_kg=0.4,
-    num_motions=1,
-)
 #: away from the hand
 BLOCK = Solid(centre=np.array([0.5, 0.0, 0.02]), size=np.array([0.04, 0.04, 0.04]))
 REST = np.array([0.3, 0.04])
-
-
-def batch_of(robot, *solids, **changed):
-    settings = SETTINGS.model_copy(update=changed)
-    engine = Engine(Arms(robot, None))
-    return engine.begin(draw_futures(settings, solids, engine.arms.drives))
 
 
 def moved(batch, seconds, commands=None, **begun):

@@ -8,27 +8,17 @@ import struct
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, Delaunay
+from small_scene import batch_of, SETTINGS
 
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.foresight.arms import Arms
-from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import draw_futures
 from mtv_world_ros.foresight.robot_parts import load_parts
 from mtv_world_ros.foresight.solids import Solid
 from mtv_world_ros.geometry.robot.file import load_robot, save_robot
 
-SETTINGS = ContactSettings(
-    finger_stiffness=400.0,
-    finger_damping=10.0,
-    finger_mass_kg=0.05,
-    grip_friction=1.0,
-    table_friction=0.5,
-    density=500.0,
-    tray_kg=0.4,
-    num_motions=1,
-)
 MESH = """<robot name="mesh"><link name="base"/>
   <link name="arm"><collision><geometry><mesh filename="{file}" scale="2 2 2"/></geometry>
   </collision></link>
@@ -107,8 +97,7 @@ def test_there_is_room_between_the_prongs_of_a_gripper_that_is_one_mesh(tmp_path
 
 
 def test_fingers_that_turn_go_from_one_end_of_their_joint_to_the_other(tmp_path):
-    engine = Engine(Arms(fork(tmp_path), None))
-    batch = engine.begin(draw_futures(SETTINGS, (), engine.arms.drives))
+    batch = batch_of(fork(tmp_path))
     np.testing.assert_allclose(batch.model.joint('jaw').range, [0.0, 1.0])
     times = np.arange(0, 2.0, 0.02)
     commands = np.stack([np.full(len(times), 0.3), np.where(times < 0.1, 0.0, 0.9)], -1)
@@ -136,9 +125,8 @@ def test_a_mesh_that_is_missing_is_named(tmp_path):
 @pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
 def test_bundled_robots_stay_where_they_are_told_to_be(name):
     robot = load_robot(share_path('config', 'robots', f'{name}.yaml'))
-    engine = Engine(Arms(robot, None))
     away = Solid(centre=np.array([1.5, 1.5, 0.02]), size=np.full(3, 0.04))
-    batch = engine.begin(draw_futures(SETTINGS, (away,), engine.arms.drives))
+    batch = batch_of(robot, away)
     middle = np.where(np.isfinite(robot.lower + robot.upper), robot.lower + robot.upper, 0) / 2
     motion, state = batch.advance(np.repeat(middle[None], 26, 0), 5)
     assert not state.lost
@@ -148,17 +136,13 @@ def test_bundled_robots_stay_where_they_are_told_to_be(name):
 @pytest.mark.parametrize(('swing', 'apart_m'), [(False, (0.0, 0.0005)), (True, (0.003, 0.0118))])
 def test_fingers_that_follow_one_joint_are_kept_together_unless_they_swing(lift, swing, apart_m):
     """A heavy block off the middle stops one finger first, by 4.7 N at most, which are 11.8 mm."""
-    engine = Engine(Arms(lift, None))
-    settings = SETTINGS.model_copy(
-        update={'fingers_swing': swing, 'density': 20000.0, 'table_friction': 1.0}
-    )
     block = Solid(centre=np.array([0.0, 0.01, 0.02]), size=np.array([0.02, 0.03, 0.04]))
-    batch = engine.begin(draw_futures(settings, (block,), engine.arms.drives))
+    batch = batch_of(lift, block, fingers_swing=swing, density=20000.0, table_friction=1.0)
     times = np.arange(0, 0.8, 0.02)
     commands = np.stack([np.full(len(times), 0.02), np.where(times < 0.05, 0.04, 0.0)], -1)
     _, state = batch.advance(commands, 1)
     qpos = state.physics[0, 1 : 1 + batch.model.nq]
-    fingers = qpos[batch._scene.arm_qpos][engine.arms.drives.fingers]
+    fingers = qpos[batch._scene.arm_qpos][batch._scene.arms.drives.fingers]
     assert apart_m[0] <= abs(fingers[0] - fingers[1]) < apart_m[1]
 
 

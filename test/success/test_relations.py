@@ -134,15 +134,12 @@ def test_tasks_want_all_their_relations_and_open_grippers():
     assert not both.holds(at, at.openings).any()
 
 
-@pytest.mark.parametrize(('distance', 'succeeds'), [(0.059, False), (0.061, True)])
-def test_apart(distance, succeeds):
-    history = situation({'a': B, 'b': B + [[0.6 * distance, 0.8 * distance, 0.0]]})
+@pytest.mark.parametrize(('over', 'succeeds'), [(-0.001, False), (0.001, True)])
+def test_apart_from_another_and_moved_away_from_its_start(over, succeeds):
+    way = np.array([[0.6, 0.8, 0.0]])
+    history = situation({'a': B, 'b': B + (0.06 + over) * way})
     assert bool(holds(Apart(kind='apart', subject='a', target='b'), history)[0]) is succeeds
-
-
-@pytest.mark.parametrize(('distance', 'succeeds'), [(0.099, False), (0.101, True)])
-def test_moved_away_from_its_start(distance, succeeds):
-    history = situation({'a': np.concatenate([B, B + [[0.0, distance, 0.0]]])})
+    history = situation({'a': np.concatenate([B, B + (0.1 + over) * way])})
     assert holds(Moved(kind='moved', subject='a'), history).tolist() == [False, succeeds]
 
 
