@@ -1,4 +1,4 @@
-"""How arms follow their commands: they lag, overshoot, and cut off what is too quick for them.
+"""Response of arms to commands: lag, overshoot and limited bandwidth.
 
 Each joint is driven towards its command like a mass on a damped spring, and feels the others
 through the arm's inertia. Scaled by the spring's stiffness k (J,), with the mass matrix M (J, J)
@@ -46,7 +46,7 @@ _FLOOR, _HIGHEST_M = 'floor', 100.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArmState:
-    """Where the joints are, how fast, and what was commanded; all (J,)."""
+    """Positions, velocities and last commands of the joints; all (J,)."""
 
     positions: FloatArray
     velocities: FloatArray
@@ -116,7 +116,7 @@ class ArmResponse:
         commands: FloatArray,
         state: ArmState | None = None,
     ) -> tuple[FloatArray, ArmState]:
-        """Returns where the joints are (T, J) at commands (T, J), and then.
+        """Returns the positions (T, J) under commands (T, J), and the state after them.
 
         Args:
             robot: gives the inertia.

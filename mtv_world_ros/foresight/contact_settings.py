@@ -1,4 +1,4 @@
-"""What rigid bodies are given beside the shapes that masks show."""
+"""Physical parameters of the rigid bodies, which masks do not show."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Thickness = Annotated[float, Field(ge=1e-4, le=0.1)]
 
 
 class ContactSpread(Schema):
-    """How exactly what futures begin with is known: standard deviations."""
+    """Standard deviations of what futures begin with."""
 
     place_m: float = Field(default=0.001, ge=0, le=1, description='of where objects are [m]')
     turn_rad: float = Field(default=0.02, ge=0, le=4, description='of how they are turned [rad]')

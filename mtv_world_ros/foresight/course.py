@@ -1,4 +1,4 @@
-"""What the drives of the arms are told at each step of the engine, and where that takes them.
+"""Control inputs of the arms' drives at each step of the engine, and their motion.
 
 Shape letters: N periods of commands, S steps of the engine, D degrees of freedom, J joints.
 """
@@ -25,7 +25,7 @@ FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Course:
-    """Where the arms go if they touch no solid, and what their drives are told.
+    """Motion of the arms that touch no solid, and the control inputs of their drives.
 
     Attributes:
         controls: (S, D) where the drives are told to be [rad or m].
@@ -40,7 +40,7 @@ class Course:
     velocities: FloatArray
 
     def late(self, steps: int, last: Course | None) -> Course:
-        """Returns the same, so many steps later.
+        """Returns the course, delayed by so many steps.
 
         Args:
             steps: of the engine.
@@ -72,7 +72,7 @@ class Course:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArmsState:
-    """Where the arms are by now, had they touched no solid.
+    """State of the arms, had they touched no solid.
 
     Attributes:
         physics: of MuJoCo's full physics, of a scene of the arms and the table.
@@ -114,7 +114,7 @@ class CoursePlanner:
         )
 
     def plan(self, commands: FloatArray, state: ArmsState) -> tuple[Course, ArmsState]:
-        """Returns what the arms do at commands (1 + N, J), `PERIOD_S` apart, and then."""
+        """Returns the course of commands (1 + N, J), `PERIOD_S` apart, and the state after it."""
         scene, drives = self._scene, self._scene.arms.drives
         told = np.concatenate([state.commands[None], commands[1:]])
         rows = drives.spread(self._squeezed(told))

@@ -52,7 +52,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchState:
-    """Where K futures are; what one part of a plan hands to the next.
+    """State of K futures, between two parts of a plan.
 
     Attributes:
         physics: (K, N) of MuJoCo's full physics.
@@ -71,7 +71,7 @@ class BatchState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchMotion:
-    """What K futures do; row 0 is where they begin.
+    """Motion of K futures; row 0 is their start.
 
     Attributes:
         points: (K, T + 1, O, 3) centres of the solids [m].
@@ -87,7 +87,7 @@ class BatchMotion:
 
 
 def _log_once(message: str) -> None:
-    """Takes the engine's warnings, which would fill a file and the terminal; each is told once."""
+    """Logs each warning of the engine once; by default they fill a file and the terminal."""
     kind = message.split(' Time =')[0]
     if kind not in _told:
         _told.add(kind)
@@ -174,7 +174,7 @@ class Batch:
         )
 
     def start(self, positions: FloatArray) -> BatchState:
-        """Returns where the futures begin, with the robot at rest at joints (J,)."""
+        """Returns the start of the futures, with the robot at rest at joints (J,)."""
         scene, model = self._scene, self._models[0]
         at = scene.arms.drives.spread(positions)
         physics = np.zeros((len(self.futures), mujoco.mj_stateSize(model, FULL)))
@@ -193,7 +193,7 @@ class Batch:
         state: BatchState | None = None,
         should_stop: Callable[[], bool] = lambda: False,
     ) -> tuple[BatchMotion, BatchState]:
-        """Returns what the futures do at each `every`-th of commands, and where they are then.
+        """Returns the motion at each `every`-th of commands, and the state after them.
 
         Args:
             commands: (1 + T * every, J), `PERIOD_S` apart [rad or m].

@@ -1,4 +1,4 @@
-"""The named objects on their way through an imagined episode: found, foreseen, shown.
+"""The named objects of an imagined episode: detection, foresight and rendering.
 
 Shape letters: V views, O objects, K futures, T frames, H W pixels, J joints.
 """
@@ -27,10 +27,10 @@ Majority = Callable[[ForeseenMotions], BoolArray | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectForesight:
-    """Objects of an episode; each call that changes something returns what is then.
+    """Objects of an episode; immutable, so calls that change something return a new one.
 
     Attributes:
-        model: says where objects go; None = nothing is foreseen, pictures alone tell.
+        model: says where objects go; None = no foresight, verdicts rest on frames alone.
         segmenter: finds them in real frames.
         robot: whose commands move them.
         first: the episode's first real observation, at its own size.
@@ -128,7 +128,7 @@ class ObjectForesight:
 
     @property
     def refusal(self) -> str:
-        """Why there is no verdict; empty = there may be one.
+        """The reason to give no verdict; empty = none.
 
         Where the episode begins, what cannot be foreseen of an object is a reason, too: pictures
         of objects that cannot be where they were found tell nothing.

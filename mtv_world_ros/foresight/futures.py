@@ -1,4 +1,4 @@
-"""What is not known before a plan is executed, drawn once for each of several futures.
+"""Sampling of what is not known before a plan is executed, once for each future.
 
 Shape letters: O solids, D degrees of freedom of the arms.
 """
@@ -21,7 +21,7 @@ STANDS_M = 0.01
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Future:
-    """One way in which what is not known may be.
+    """One sample of what is not known.
 
     Attributes:
         settings: of contact.

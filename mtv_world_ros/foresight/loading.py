@@ -1,4 +1,4 @@
-"""Foresight of a checkpoint: how its arms follow, and its numbers of contact, as files.
+"""Files of a checkpoint's foresight: the arms' response and the contact settings.
 
 A folder holds `arm_response.json`, of `mtv-world fit-contact`, and `contact.json`.
 """
@@ -21,7 +21,7 @@ CONTACT_FILE, RESPONSE_FILE = 'contact.json', 'arm_response.json'
 
 
 def load_foresight(folder: Path, robot: RobotModel, threads: int = 1) -> SolidForesight | None:
-    """Reads what `fit-contact` wrote; None = nothing is foreseen, pictures alone tell.
+    """Reads the files of `fit-contact`; None = no foresight, verdicts rest on frames alone.
 
     Args:
         folder: that it wrote.
@@ -39,7 +39,7 @@ def load_foresight(folder: Path, robot: RobotModel, threads: int = 1) -> SolidFo
 
 
 def load_response(folder: Path, robot: RobotModel) -> ArmResponse | None:
-    """Reads how the arms follow their commands; None = it was not found.
+    """Reads the arms' response to commands; None = it was not fitted.
 
     Raises:
         CheckpointError: the file is not whole, or of another robot.
@@ -59,7 +59,7 @@ def load_response(folder: Path, robot: RobotModel) -> ArmResponse | None:
 
 
 def load_contact(folder: Path) -> ContactSettings | None:
-    """Reads numbers of contact; None = there are none.
+    """Reads the contact settings; None = there are none.
 
     Raises:
         CheckpointError: the file cannot be used.
@@ -75,10 +75,10 @@ def load_contact(folder: Path) -> ContactSettings | None:
 
 
 def save_contact(contact: ContactSettings, folder: Path) -> None:
-    """Writes numbers of contact into the folder of a checkpoint's foresight."""
+    """Writes the contact settings into the folder of a checkpoint's foresight."""
     write_json(folder / CONTACT_FILE, contact.model_dump(mode='json'))
 
 
 def save_response(response: ArmResponse, folder: Path) -> None:
-    """Writes how the arms follow their commands."""
+    """Writes the arms' response to commands."""
     write_json(folder / RESPONSE_FILE, response.as_json())

@@ -1,4 +1,4 @@
-"""A robot's parts that touch things, and inertias of those that state none.
+"""Collision parts of a robot, and inertias of links that state none.
 
 Shape letters: N points, P parts.
 """
@@ -58,7 +58,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotParts:
-    """Parts of all links, and what was assumed for want of a description.
+    """Parts of all links, and the assumptions where the description is incomplete.
 
     Attributes:
         parts: P.

@@ -46,7 +46,7 @@ _TABLE_REACH_M = 2.0
 
 
 class SolidForesight:
-    """Finds objects in a frame, and says where plans take them in several futures.
+    """Finds objects in a frame, and predicts their motion under plans in several futures.
 
     Args:
         robot: any whose base stands still.
@@ -184,7 +184,7 @@ class SolidForesight:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackedSolids:
-    """Objects on their way; what one chunk hands to the next.
+    """State of the objects between two chunks.
 
     Attributes:
         foresight: says where they go.
@@ -236,7 +236,7 @@ class TrackedSolids:
 
     @property
     def refusal(self) -> str:
-        """Why there is no verdict, as most futures are implausible; empty = there may be one."""
+        """The reason to give no verdict, as most futures are implausible; empty = none."""
         count = self.foresight.settings.num_motions
         if self.state is None or not _too_many(self.state, count):
             return ''
@@ -345,7 +345,7 @@ def table_in(
 
 
 def _too_many(state: BatchState, count: int) -> bool:
-    """Whether too few of the futures are left to tell anything."""
+    """Whether too few of the futures remain for a verdict."""
     return len(state.lost) > (1 - _ENOUGH) * count
 
 

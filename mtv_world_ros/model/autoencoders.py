@@ -153,7 +153,7 @@ def _run(layers: nn.ModuleList, frames: Tensor, together: int) -> Tensor:
 
 
 def _run_part(layers: nn.ModuleList, frames: Tensor, memory: dict[int, Tensor]) -> Tensor:
-    """The same for some of the frames; `memory` has what each memory block saw last."""
+    """Runs a part of the frames; `memory` holds the last input of each memory block."""
     batch = len(frames)
     x = frames.flatten(0, 1)
     for index, layer in enumerate(layers):

@@ -1,4 +1,4 @@
-"""`world_model.json`: what a checkpoint takes, gives and was trained on."""
+"""`world_model.json`: a checkpoint's inputs, outputs and training."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class HistorySettings(Schema):
         return self.reference == 'first_frame'
 
     def as_card(self) -> dict[str, Any]:
-        """Returns the checkpoint card's entry; empty where nothing is on."""
+        """Returns the entry of the checkpoint card; empty without history."""
         names = set(HistorySettings.model_fields)
         return {'history': self.model_dump(include=names)} if self.on else {}
 
@@ -96,7 +96,7 @@ class CheckpointCard(Schema):
 
     @property
     def spec(self) -> WorldModelSpec:
-        """What the model takes and gives."""
+        """The model's inputs and outputs."""
         return WorldModelSpec(
             views=self.views,
             fps=self.fps,
@@ -109,7 +109,7 @@ class CheckpointCard(Schema):
         )
 
     def plain(self) -> dict[str, Any]:
-        """Returns what the file says: nothing of what was left to its default."""
+        """Returns the contents of the file, without values that were left to their defaults."""
         return self.model_dump(mode='json', exclude_unset=True)
 
     def write(self, folder: Path) -> None:
@@ -147,7 +147,7 @@ def read_card(folder: Path) -> CheckpointCard:
 
 
 def check_same_model(card: CheckpointCard, adapter: Path) -> None:
-    """Checks that an adapter was trained for what a checkpoint takes and gives.
+    """Checks that an adapter was trained for a model of the same inputs and outputs.
 
     Args:
         card: of the checkpoint.

@@ -58,7 +58,7 @@ class Checkpoint:
 def save_checkpoint(
     checkpoint: Checkpoint, folder: Path, *, dtype: torch.dtype = torch.float32
 ) -> None:
-    """Writes a checkpoint folder; it appears under its name only when it is whole."""
+    """Writes a checkpoint folder, which appears under its name only when it is complete."""
     with disk_errors(), whole_folder(folder) as partial:
         stored = place(copy_of(checkpoint.transformer), torch.device('cpu'), dtype)
         stored.save_pretrained(partial / 'transformer', safe_serialization=True)

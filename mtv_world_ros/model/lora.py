@@ -34,7 +34,7 @@ def beside(transformer: MultiViewWanTransformer) -> dict[str, Tensor]:
 
 @dataclass(frozen=True, slots=True)
 class Adapter:
-    """An adapter in memory that is known to fit a transformer; without anything: none.
+    """An adapter in memory, checked against a transformer; an empty one means no adapter.
 
     Attributes:
         path: of the adapter's file; None = no adapter.
@@ -51,7 +51,7 @@ _NONE = Adapter(None, {}, {})
 
 
 class Adapters:
-    """Exchanges the adapter of a loaded transformer; the weights under it come back as they were.
+    """Exchanges the adapter of a loaded transformer, and restores the weights without it.
 
     Reading one is safe in another thread than the one that exchanges them.
 
@@ -72,11 +72,11 @@ class Adapters:
 
     @property
     def current(self) -> Path | None:
-        """Where the adapter in use was read; None = there is none."""
+        """Path of the active adapter; None = there is none."""
         return self._held.path
 
     def read(self, path: Path | None) -> Adapter:
-        """Returns an adapter that `use` takes at once, whatever becomes of its files.
+        """Reads an adapter into memory, for `use`.
 
         Args:
             path: a folder of ours, of diffusers or of peft, or a LoRA file; None = none.
@@ -90,7 +90,7 @@ class Adapters:
             return Adapter(path, *self._read(path))
 
     def use(self, adapter: Adapter | Path | None) -> None:
-        """Takes another adapter, or none; where that fails, the one before stays.
+        """Activates another adapter, or none; on failure the previous one stays active.
 
         Args:
             adapter: the result of `read`, or a path for it.
@@ -109,7 +109,7 @@ class Adapters:
 
     @torch.no_grad()
     def _exchange(self, adapter: Adapter) -> None:
-        """Takes the adapter before out of the weights and adds another one, in place."""
+        """Removes the previous adapter from the weights and adds another one, in place."""
         whole = {**self._beside, **adapter.whole}
         for name, parameter in beside(self._transformer).items():
             parameter.copy_(whole[name])
@@ -171,7 +171,7 @@ class Adapters:
 
 
 def base_of(transformer: MultiViewWanTransformer) -> dict[str, Any]:
-    """What must be equal where an adapter is used and where it was trained."""
+    """Returns the configuration that must be equal in training and in use of an adapter."""
     config: Any = transformer.config
     names = ('num_layers', 'num_attention_heads', 'attention_head_dim', 'in_channels', 'num_views')
     return {name: config[name] for name in names}

@@ -57,7 +57,7 @@ _PLAIN = {
 
 
 class Factors(NamedTuple):
-    """What a module's weight changes by: `scale * B @ A`; A (r, in), B (out, r)."""
+    """Change of a module's weight: `scale * B @ A`; A (r, in), B (out, r)."""
 
     A: Tensor
     B: Tensor
@@ -65,7 +65,7 @@ class Factors(NamedTuple):
 
 
 class LoraSettings(Schema):
-    """How strongly the factors count, in peft's words.
+    """Scaling of the factors, under peft's names.
 
     Attributes:
         r: rank where `rank_pattern` says no other.
@@ -82,7 +82,7 @@ class LoraSettings(Schema):
     use_rslora: bool = False
 
     def scale(self, module: str, rank: int) -> float:
-        """Returns what the product of a module's factors is multiplied by.
+        """Returns the scale of the product of a module's factors.
 
         Args:
             module: its name in the file.
@@ -101,7 +101,7 @@ class LoraSettings(Schema):
 
 
 def _matching(pattern: Mapping[str, Any], module: str, default: Any) -> Any:
-    """The value of the first pattern that fits, as peft takes it."""
+    """The value of the first pattern that matches, as peft matches them."""
     try:
         found = (v for key, v in pattern.items() if re.match(rf'(.*\.)?({key})$', module))
         return next(found, default)
@@ -194,7 +194,7 @@ def _by_module(file: Path, tensors: Mapping[str, Tensor]) -> dict[str, dict[str,
 
 
 def _names(modules: Mapping[str, Any]) -> dict[str, str]:
-    """Every name that files have for a module, flattened ones with `_` too, to ours."""
+    """Maps the names that files use for a module, also flattened with `_`, to ours."""
     from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffusers
 
     attention = [f'{kind}_attn.{n}' for kind in ('self', 'cross') for n in 'qkvo']
@@ -234,7 +234,7 @@ def _factors(
 
 
 def _scale(module: str, rank: int, alpha: Tensor | None, settings: LoraSettings | None) -> float:
-    """Alpha / rank; 1 where neither tensors nor settings say an alpha, as files of others mean."""
+    """Alpha / rank; 1 where neither tensors nor settings hold an alpha, as other tools do."""
     if alpha is None:
         return 1.0 if settings is None else settings.scale(module, rank)
     if settings is not None and settings.lora_alpha is not None:

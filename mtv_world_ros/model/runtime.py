@@ -17,7 +17,7 @@ _DTYPES = {'float32': torch.float32, 'bfloat16': torch.bfloat16}
 
 
 def set_num_threads(num_threads: int) -> None:
-    """Limits torch on a CPU; 0 = all usable cores but one, which callbacks keep; of two both."""
+    """Limits torch's threads; 0 = all usable cores but one for callbacks, or both of two."""
     usable = len(os.sched_getaffinity(0))
     torch.set_num_threads(num_threads or max(min(usable, 2), usable - 1))
 

@@ -1,4 +1,4 @@
-"""How a model is served: its options, what they change in it, and whether it fits the device."""
+"""Serving of a model: options, their effect, and the check of the device's memory."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _set_attention(transformer: MultiViewWanTransformer, name: str) -> None:
 def decoder_of(
     autoencoder: Autoencoder, serving: ServingOptions, dtype: torch.dtype
 ) -> Autoencoder:
-    """Returns what decodes: the autoencoder, on its device, or the tiny one in its place.
+    """Returns the decoder: the autoencoder, on its device, or the tiny one in its place.
 
     Raises:
         CheckpointError: the tiny one's weights cannot be read, or are for other latents.
@@ -120,7 +120,7 @@ def compile_norms(autoencoder: Autoencoder) -> None:
 
 
 class ServingOptions(Schema):
-    """Ways to serve a checkpoint; the defaults are the plain one.
+    """Options of serving a checkpoint; the defaults change nothing.
 
     Attributes:
         compile: compile the transformer's repeated block, and on a GPU the norms of Wan's
@@ -150,7 +150,7 @@ class ServingOptions(Schema):
 
     @classmethod
     def parse(cls, text: str) -> ServingOptions:
-        """Returns what a text like `compile=true tiny_decoder=FILE` says, apart by spaces.
+        """Parses options separated by spaces, such as `compile=true tiny_decoder=FILE`.
 
         A value with spaces stands in quotes.
 
@@ -194,7 +194,7 @@ _IMAGE_TOKENS = 257
 def check_memory(
     checkpoint: Checkpoint, serving: ServingOptions, device: torch.device, dtype: torch.dtype
 ) -> None:
-    """Checks that a model fits into what is free on the device now.
+    """Checks that a model fits into the free memory of the device.
 
     Raises:
         ModelMemoryError: the model does not fit.
@@ -225,7 +225,7 @@ def _advice(serving: ServingOptions) -> str:
 
 
 def free_bytes(device: torch.device) -> int | None:
-    """Returns what a device has left; None where nobody says."""
+    """Returns the free memory of a device; None = unknown."""
     if device.type == 'cuda':
         return torch.cuda.mem_get_info(device)[0]
     info = Path('/proc/meminfo')
@@ -236,7 +236,7 @@ def free_bytes(device: torch.device) -> int | None:
 
 
 def weight_bytes(checkpoint: Checkpoint, serving: ServingOptions, dtype: torch.dtype) -> int:
-    """Returns what the weights take that are on the device all the time."""
+    """Returns the size of the weights that stay on the device."""
     blocks = [_weights(block) for block in checkpoint.transformer.blocks]
     numbers = _weights(checkpoint.transformer)
     if serving.offload:  # one computes while the next one comes
@@ -251,7 +251,7 @@ def _weights(module: nn.Module) -> int:
 
 
 def activation_bytes(checkpoint: Checkpoint, serving: ServingOptions, dtype: torch.dtype) -> int:
-    """Returns the most that a pass of the transformer or decoding holds beside the weights."""
+    """Returns the peak memory of a pass of the transformer or of decoding, without weights."""
     config: Any = checkpoint.transformer.config
     spec = checkpoint.card.spec
     shape = (config['latent_channels'], spec.height // 8, spec.width // 8)
@@ -304,14 +304,14 @@ def _default(dtype: torch.dtype) -> Iterator[None]:
 
 
 def peak_bytes(work: Callable[[], object]) -> int:
-    """Returns the most bytes that tensors made by `work` hold at a time."""
+    """Returns the peak number of bytes of the tensors that `work` makes."""
     with _Held() as held:
         work()
     return held.peak
 
 
 class _Held(TorchDispatchMode):
-    """Counts the bytes of tensors from their making to their end."""
+    """Counts the bytes of the tensors that are alive."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -67,7 +67,7 @@ def open_tensors(path: Path, stem: str = '') -> dict[str, StoredTensor]:
 
 
 def pickle_error(files: Iterable[Path]) -> CheckpointError:
-    """Returns the error for files that are pickles, and what to give in their place."""
+    """Returns the error for pickles, which names the formats to use in their place."""
     names = sorted(str(file) for file in files)
     return CheckpointError(
         f'{names} may be pickles, which can run code and are never read; expected '
@@ -91,7 +91,7 @@ def _open_folder(folder: Path, stem: str) -> dict[str, StoredTensor]:
 
 
 def _check_shards(files: list[Path]) -> None:
-    """Shards without an index say in their names how many there are."""
+    """Checks that shards without an index are complete, by the number in their names."""
     numbers = [match for file in files if (match := _SHARD.search(file.name))]
     if not numbers:
         return

@@ -126,7 +126,7 @@ def denoise(
     conditioning: Conditioning,
     text: Tensor | None,
 ) -> Tensor:
-    """Returns what the transformer predicts of latents, in float32.
+    """Returns the transformer's prediction for latents, in float32.
 
     Args:
         transformer: the model.
@@ -223,7 +223,7 @@ class DiffusionWorldModel:
         )
 
     def read_adapter(self, path: Path | None) -> Adapter:
-        """Returns an adapter that fits, for `use_adapter`; also while a prediction runs.
+        """Reads and checks an adapter, for `use_adapter`; safe while a prediction runs.
 
         Args:
             path: see `Adapters.read`; None = none.
@@ -236,7 +236,7 @@ class DiffusionWorldModel:
         return self._adapters.read(path)
 
     def use_adapter(self, adapter: Adapter | Path | None) -> None:
-        """Exchanges the LoRA adapter, not while a prediction runs; None = none.
+        """Exchanges the LoRA adapter; not to be called while a prediction runs. None = none.
 
         Raises:
             CheckpointError: it cannot be read or is for another model; the one before stays.

@@ -76,7 +76,7 @@ class _Outline(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraFit:
-    """What one view's picture says about its calibration.
+    """Result of the check for one view.
 
     Attributes:
         view: its name.
@@ -100,7 +100,7 @@ class CameraFit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraCheck:
-    """What the pictures of an episode's first frame say about its cameras."""
+    """Results of the check for the cameras of an episode's first frame."""
 
     fits: tuple[CameraFit, ...] = ()
 
@@ -113,12 +113,12 @@ class CameraCheck:
 
     @property
     def refusal(self) -> str:
-        """Why no verdict rests on these cameras; empty = one may."""
+        """The reason to give no verdict with these cameras; empty = none."""
         return '; '.join(fit.text for fit in self.fits if fit.status == 'refused')
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What has to be said of the cameras, one line each."""
+        """Remarks about the cameras, one line each."""
         return tuple(fit.text for fit in self.fits if fit.status != 'fits')
 
     def corrected(self, cameras: Sequence[CameraModel]) -> tuple[CameraModel, ...]:
@@ -154,7 +154,7 @@ class CameraChecker:
         return CameraChecker(robot, self._shape)
 
     def check(self, observation: Observation) -> CameraCheck:
-        """Returns what an observation says about each of its cameras."""
+        """Checks each camera of an observation."""
         views = zip(observation.cameras, observation.frames, strict=True)
         return CameraCheck(
             fits=tuple(self._fit(camera, frame, observation.positions) for camera, frame in views)

@@ -55,7 +55,7 @@ def without_cross_attention(blocks: Any) -> None:
 
 
 class RunwiseBlock(WanTransformerBlock):
-    """Computes what its base class does; a noise level is held once a run, not once a token."""
+    """Equals its base class; modulation is stored once per run of tokens, not per token."""
 
     def forward(
         self,

@@ -245,7 +245,7 @@ def arrange(video: Tensor, reference: Tensor, history: Tensor | None) -> TokenGr
 
 
 def by_token(time_proj: Tensor, grid: TokenGrid) -> Tensor:
-    """Returns the blocks' modulation: one for all tokens, or where levels differ one for each.
+    """Returns the blocks' modulation: one for all tokens, or one per token if levels differ.
 
     Args:
         time_proj: (B, 1, 6, D), or (B, 2, 6, D) of the video's and the history's noise level.
@@ -261,7 +261,7 @@ def by_token(time_proj: Tensor, grid: TokenGrid) -> Tensor:
 
 
 def by_run(time_proj: Tensor, grid: TokenGrid) -> Tensor:
-    """Returns the same, (B, R, 6, D), of R runs of tokens: one of all, or the V * F frames."""
+    """Returns it (B, R, 6, D) for R runs of tokens: a single one, or the V * F frames."""
     if not grid.num_history:
         return time_proj
     views, frames = grid.tokens.shape[1:3]

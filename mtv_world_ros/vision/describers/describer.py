@@ -1,4 +1,4 @@
-"""What names the objects of a scene, and the way to do it by the instruction's words alone."""
+"""Naming of a scene's objects; the default uses the words of the instruction alone."""
 
 from __future__ import annotations
 
@@ -198,7 +198,7 @@ class Describer(Protocol):
 
 
 class InstructionDescriber:
-    """Names the objects that the instruction names by colour; looks at no image."""
+    """Finds the objects that the instruction names by colour; uses no image."""
 
     def describe(self, first_frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
         """Returns what `objects_from_instruction` finds; no more than colours is known of it."""

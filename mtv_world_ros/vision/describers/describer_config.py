@@ -1,4 +1,4 @@
-"""Who names the objects of an instruction: files, and the describer that a list is."""
+"""Configuration files of describers, and the describer that reads an object list."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mtv_world_ros.vision.describers.openai_chat import OpenAIConfig
 
 
 class ObjectList:
-    """Looks objects up by instruction; looks at no image.
+    """Looks objects up by instruction; uses no image.
 
     Args:
         by_instruction: objects per instruction; letter case, spacing and a full stop do not count.

@@ -39,7 +39,7 @@ _Seconds = Annotated[Seconds, expected('a positive number of at most 86400')]
 
 
 class OpenAIConfig(Schema):
-    """Which server and model, and how patient to be."""
+    """Server, model, timeout and retries."""
 
     model: str = Field(description='name as the server knows it')
     base_url: str = Field(
@@ -200,7 +200,7 @@ class OpenAIChat:
 
 
 class _FormatRefused(Exception):
-    """The server does not take this `response_format`, or dislikes something else."""
+    """The server rejected the request, perhaps because of its `response_format`."""
 
 
 def _api_key(config: OpenAIConfig) -> str:

@@ -227,7 +227,7 @@ class DescriptionCache:
         return digest.hexdigest()
 
     def get(self, key: str) -> tuple[DescribedObject, ...] | None:
-        """Returns what was kept; None if there is nothing, or nothing that can be read."""
+        """Returns a stored description; None if there is none that can be read."""
         try:
             kept = read_json(self._file(key))
             return check_objects(kept['objects'], complete=False)
@@ -235,7 +235,7 @@ class DescriptionCache:
             return None  # asked again, and written over
 
     def put(self, key: str, objects: tuple[DescribedObject, ...], model: str) -> None:
-        """Keeps a description; a reader sees the whole file or none.
+        """Stores a description; a reader sees the whole file or none.
 
         Raises:
             ConfigError: the folder cannot be written to.

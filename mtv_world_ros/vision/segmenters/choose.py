@@ -1,4 +1,4 @@
-"""Which segmenter is used, given a choice and the weights at hand."""
+"""Choice of the segmenter, by name and by the weights that are available."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Object masks from colour words, without weights; says so where it does not know."""
+"""Object masks from colour words, without weights; the status states every doubt."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a segmenter is, and what all of them share."""
+"""The segmenters' protocol, and functions that all of them share."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def check_request(
 
 
 def keep_doubts(first: ObjectMasks, masks: ObjectMasks) -> ObjectMasks:
-    """Returns `masks`, doubted where it was uncertain which object they start from.
+    """Returns `masks` with the doubts about the objects from which they start.
 
     Args:
         first: masks of the start frame.

@@ -120,7 +120,7 @@ def track(
 
 
 def judge(masks: BoolArray, first: BoolArray, config: TrackingConfig) -> str:
-    """Returns the status of masks that something else tracked.
+    """Returns the status of masks that another method tracked.
 
     Args:
         masks: (T, H, W) as tracked.
