@@ -26,6 +26,7 @@ from mtv_world_ros.lab.evaluation.imagined_stretches import (
 from mtv_world_ros.lab.evaluation.metrics.arm_masks import arm_scenes, ArmScene
 from mtv_world_ros.lab.evaluation.metrics.frechet.feature_store import feature_path, FeatureTaker
 from mtv_world_ros.lab.evaluation.metrics.image_quality import ImageQuality
+from mtv_world_ros.lab.evaluation.metrics.object_scores import object_scores, ObjectScores
 from mtv_world_ros.lab.evaluation.metrics.picture_scores import (
     HELD,
     picture_scores,
@@ -47,7 +48,6 @@ from mtv_world_ros.lab.stored_rollout import join, save_rollout
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.viewing.scored_rollout import StoredRollout
-from mtv_world_ros.vision.jaccard import object_scores, ObjectScores
 
 #: what the time of an episode goes into
 STAGES = ('reading', 'imagining', 'segmenting', 'scoring', 'features', 'storing')

@@ -23,7 +23,7 @@ from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.status_publisher import create_publisher
 from mtv_world_ros.ros.world_model.worker import Chunk, Request, Result
 from mtv_world_ros.success.doubts import PhysicsWatch, unforeseen
-from mtv_world_ros.vision.jaccard import mean_of_known, object_scores, persistence_scores
+from mtv_world_ros.vision.jaccard import held_masks, mean_of_known, object_jaccard
 
 #: chunks that wait for their real frames; the oldest is given up for a newer one
 MAX_CHUNKS = 8
@@ -242,11 +242,12 @@ class LiveFidelity:
         start = episode.observation.positions[None]
         found = episode.observe(frames, np.concatenate([start, prediction.positions[indices]]))
         imagined = replace(prediction.masks, masks=prediction.masks.masks[:, :, indices])
+        held = held_masks(found.start_masks.masks[:, :, 0], found.masks)
         scored = ScoredChunk(
             chunk=expected.chunk,
             names=imagined.names,
-            jaccard=object_scores(imagined, found.masks).objects,
-            copy=persistence_scores(found.start_masks.masks[:, :, 0], found.masks).objects,
+            jaccard=mean_of_known(object_jaccard(imagined, found.masks), axis=2),
+            copy=mean_of_known(object_jaccard(held, found.masks), axis=2),
             num_frames=len(indices),
         )
         self._results.append(scored)

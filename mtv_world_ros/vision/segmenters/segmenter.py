@@ -11,9 +11,6 @@ import numpy as np
 from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
 from mtv_world_ros.errors import ObservationError
 
-#: a start mask of such a status may be another object's; nothing that follows it can tell
-START_DOUBTS = frozenset({'ambiguous', 'low_confidence'})
-
 
 class Segmenter(Protocol):
     """Finds named objects in videos."""
@@ -73,23 +70,6 @@ def check_request(
             f'the frames of the start masks are {first_frames.shape}; they must be {wanted} like '
             'the frames to segment'
         )
-
-
-def keep_doubts(first: ObjectMasks, masks: ObjectMasks) -> ObjectMasks:
-    """Returns `masks` with the doubts about the objects from which they start.
-
-    Args:
-        first: masks of the start frame.
-        masks: masks that were tracked from the first ones.
-    """
-    status = tuple(
-        tuple(
-            doubt if doubt in START_DOUBTS and word == 'ok' else word
-            for doubt, word in zip(doubts, words, strict=True)
-        )
-        for doubts, words in zip(first.status, masks.status, strict=True)
-    )
-    return ObjectMasks(names=masks.names, masks=masks.masks, status=status)
 
 
 def masks_from_ids(ids: ByteArray, objects: Sequence[str], names: Sequence[str]) -> ObjectMasks:

@@ -5,7 +5,7 @@ import pytest
 from mtv_world_ros.errors import ObservationError
 from mtv_world_ros.vision.jaccard import jaccard
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter, PALETTE
-from mtv_world_ros.vision.segmenters.segmenter import keep_doubts, masks_from_ids, resize_masks
+from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, resize_masks
 
 HEIGHT, WIDTH = 72, 96
 
@@ -213,17 +213,6 @@ def test_carrot_on_a_large_green_thing_does_not_swallow_it():
 def test_green_carrot_has_no_part_of_its_own_colour():
     frames, true = video([{'green': (40, 40)}] * 2)
     assert jaccard(segment(frames, 'green carrot').masks[0, 0], true['green']).min() > 0.8
-
-
-def test_doubt_about_the_start_stays_with_what_is_followed_from_it():
-    frames, true = video([{'red': (20, 40)}] * 2)
-    frames[:, :, 40:48, 60:68] = frames[:, :, 40:48, 20:28]
-    first = segment(frames[:, :1], 'red block')
-    rest = segment(frames[:, 1:], 'red block', first_masks=first.masks[:, :, 0])
-    assert (first.status, rest.status) == ((('ambiguous',),), (('ok',),))
-    assert keep_doubts(first, rest).status == (('ambiguous',),)
-    assert keep_doubts(rest, first).status == (('ambiguous',),)
-    assert keep_doubts(rest, rest).status == (('ok',),)
 
 
 def test_short_occlusion_stays_ok_and_empty():

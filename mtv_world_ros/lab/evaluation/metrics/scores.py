@@ -10,13 +10,9 @@ import numpy as np
 
 from mtv_world_ros.data_types import ByteArray, ObjectMasks
 from mtv_world_ros.lab.evaluation.imagined_stretches import Stretch
-from mtv_world_ros.vision.jaccard import (
-    moves,
-    object_scores,
-    ObjectScores,
-    persistence_scores,
-)
-from mtv_world_ros.vision.segmenters.segmenter import keep_doubts, masks_from_ids, Segmenter
+from mtv_world_ros.lab.evaluation.metrics.object_scores import moves, object_scores, ObjectScores
+from mtv_world_ros.vision.jaccard import held_masks
+from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, Segmenter
 
 #: what `moving` means, for whoever reads the numbers
 MOVING_RULE = (
@@ -24,6 +20,9 @@ MOVING_RULE = (
     'less than half of the smaller of the two; {source} masks; frames that show less than a '
     'quarter of its largest area do not count'
 )
+
+#: a start mask of such a status may be another object's; nothing that follows it can tell
+START_DOUBTS = frozenset({'ambiguous', 'low_confidence'})
 
 #: fields of a row that hold a value per frame
 FRAME_FIELDS = ('j_frames', 'j_copy_frames', 'j_shuffled_frames')
@@ -161,6 +160,23 @@ def true_masks(
     return Truth(first=first, first_frames=start, masks=masks, moving=moving)
 
 
+def keep_doubts(first: ObjectMasks, masks: ObjectMasks) -> ObjectMasks:
+    """Returns `masks` with the doubts about the objects from which they start.
+
+    Args:
+        first: masks of the start frame.
+        masks: masks that were tracked from the first ones.
+    """
+    status = tuple(
+        tuple(
+            doubt if doubt in START_DOUBTS and word == 'ok' else word
+            for doubt, word in zip(doubts, words, strict=True)
+        )
+        for doubts, words in zip(first.status, masks.status, strict=True)
+    )
+    return ObjectMasks(names=masks.names, masks=masks.masks, status=status)
+
+
 def find_masks(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> ObjectMasks:
     """Segments (V, T, H, W, 3) frames, starting from the recorded first frame and masks."""
     return segmenter.segment(
@@ -200,7 +216,7 @@ def score_rows(
     """
     first = truth.first.masks[:, :, 0]
     imagined = np.zeros_like(truth.moving) if masks is None else moves(masks.masks, first)
-    scores = {**others, 'copy': persistence_scores(truth.first.masks[:, :, 0], truth.masks)}
+    scores = {**others, 'copy': object_scores(held_masks(first, truth.masks), truth.masks)}
     rows = []
     for v, view in enumerate(views):
         for o, name in enumerate(truth.names):
