@@ -64,7 +64,7 @@ class Factors(NamedTuple):
     scale: float
 
 
-class LoraSettings(Schema):
+class PeftSettings(Schema):
     """Scaling of the factors, under peft's names.
 
     Attributes:
@@ -134,7 +134,7 @@ def read_lora(file: Path, transformer: nn.Module) -> dict[str, Factors]:
     return found
 
 
-def _read(file: Path) -> tuple[dict[str, Tensor], LoraSettings | None]:
+def _read(file: Path) -> tuple[dict[str, Tensor], PeftSettings | None]:
     if file.suffix in PICKLES:
         raise pickle_error([file])
     try:
@@ -162,19 +162,19 @@ def _read(file: Path) -> tuple[dict[str, Tensor], LoraSettings | None]:
     return tensors, None if config is None else _settings(config, where)
 
 
-def _settings(config: Any, where: str) -> LoraSettings:
+def _settings(config: Any, where: str) -> PeftSettings:
     if not isinstance(config, dict):
         raise CheckpointError(f'{where} must be a map of settings, got {config!r}')
     bare = {str(key).removeprefix('transformer.'): value for key, value in config.items()}
     for name, value in bare.items():
-        ignored = name in _WITHOUT_EFFECT or name in LoraSettings.model_fields
+        ignored = name in _WITHOUT_EFFECT or name in PeftSettings.model_fields
         if value and not ignored and value not in _PLAIN.get(name, ()):
             raise CheckpointError(
                 f'{where}: {name}={value!r} is not supported; merge the adapter with peft and '
                 'import the merged weights'
             )
-    read = {k: v for k, v in bare.items() if k in LoraSettings.model_fields and v is not None}
-    return validated(LoraSettings, read, where, error=CheckpointError)
+    read = {k: v for k, v in bare.items() if k in PeftSettings.model_fields and v is not None}
+    return validated(PeftSettings, read, where, error=CheckpointError)
 
 
 def _by_module(file: Path, tensors: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
@@ -215,7 +215,7 @@ def _factors(
     module: str,
     parts: Mapping[str, Tensor],
     layer: nn.Linear,
-    settings: LoraSettings | None,
+    settings: PeftSettings | None,
 ) -> Factors:
     if not {'A', 'B'} <= set(parts):
         raise CheckpointError(f"'{file}': layer '{module}' has one of its two factors only")
@@ -233,7 +233,7 @@ def _factors(
         raise CheckpointError(f"'{file}': {error}") from error
 
 
-def _scale(module: str, rank: int, alpha: Tensor | None, settings: LoraSettings | None) -> float:
+def _scale(module: str, rank: int, alpha: Tensor | None, settings: PeftSettings | None) -> float:
     """Alpha / rank; 1 where neither tensors nor settings hold an alpha, as other tools do."""
     if alpha is None:
         return 1.0 if settings is None else settings.scale(module, rank)
