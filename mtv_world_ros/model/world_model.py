@@ -180,7 +180,6 @@ class DiffusionWorldModel:
     ) -> None:
         self.device = torch.device(device)
         self.card = checkpoint.card
-        self._serving = serving
         check_memory(checkpoint, serving, self.device, dtype)
         home = torch.device('cpu') if serving.offload else self.device
         self.transformer = place(checkpoint.transformer, home, dtype).eval()

@@ -84,8 +84,6 @@ class CameraFit:
         T_given_found: (4, 4) found optical frame in the calibrated one; identity where not found.
         offset_px: how far the arm is from where it should be, at the picture's size; NaN = not
             known.
-        off_m: of the camera's place [m].
-        off_deg: of its direction and roll [degrees].
         text: the finding in words.
     """
 
@@ -93,8 +91,6 @@ class CameraFit:
     status: Status
     T_given_found: FloatArray
     offset_px: float = float('nan')
-    off_m: float = float('nan')
-    off_deg: float = float('nan')
     text: str = ''
 
 
@@ -211,8 +207,6 @@ def _judged(camera: CameraModel, found: _Found) -> CameraFit:
         status=status,
         T_given_found=found.T if status == 'corrected' else np.eye(4),
         offset_px=found.offset * camera.width,
-        off_m=off_m,
-        off_deg=off_deg,
         text=text,
     )
 
