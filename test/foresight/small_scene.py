@@ -6,8 +6,8 @@ from mtv_world_ros.foresight.arms import Arms
 from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.engine import Batch, Engine
 from mtv_world_ros.foresight.futures import draw_futures
+from mtv_world_ros.foresight.solids import Solid
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.geometry.solids import Solid
 
 SETTINGS = ContactSettings(
     finger_stiffness=400.0,
