@@ -1,64 +1,37 @@
 """The client against a server process that speaks LeRobot's asynchronous inference."""
 
 from pathlib import Path
-import subprocess
-import sys
 
 import numpy as np
+from policy_servers import HOME, make_policy, observe, policy_values, ROBOT, running
 import pytest
-import yaml
 
 pytest.importorskip('grpc', reason='grpcio is not installed (pip install .[policies])')
 pytest.importorskip('google.protobuf', reason='protobuf is not installed')
 
-from mtv_world_ros.assembly import assemble_policy, robot_path
-from mtv_world_ros.data_types import CameraModel, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.policies.policy import EpisodeOrigin, load_policy_config
+from mtv_world_ros.policies.policy import load_policy_config
 
-SERVER = Path(__file__).with_name('lerobot_server.py')
-ROBOT = load_robot(robot_path('yam_bimanual'))
-HOME = np.array([0.0, 1.047, 1.047, 0.0, 0.0, 0.0, 0.03] * 2)
 MARK = Path('/tmp/mtv_world_ros_was_here')
-
-
-def start_server():
-    process = subprocess.Popen([sys.executable, str(SERVER)], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    return process, int(process.stdout.readline())
+NOISE = np.random.default_rng(0).integers(0, 256, (2, 72, 96, 3), np.uint8)
 
 
 @pytest.fixture(scope='module')
 def server():
-    process, port = start_server()
-    yield process, port
-    process.kill()
-    process.wait()
+    with running('lerobot_server') as (_, port):
+        yield port
 
 
-def make_policy(tmp_path, port, **changes):
-    values = yaml.safe_load(share_path('config', 'policies', 'lerobot.yaml').read_text())
+def make(tmp_path, port, **changes):
+    values = policy_values('lerobot')
     values['policy']['actions_per_chunk'] = 6
     values |= {'server': f'127.0.0.1:{port}', 'timeout_s': 1.5, **changes}
-    path = tmp_path / 'policy.yaml'
-    path.write_text(yaml.safe_dump(values))
-    return assemble_policy(path, ROBOT)(EpisodeOrigin())
-
-
-def observe():
-    cameras = tuple(
-        CameraModel(view=view, width=96, height=72, K=np.diag([90.0, 90.0, 1.0]),
-                    mount_link='base', T_mount_camera=np.eye(4))
-        for view in ('low', 'high')
-    )  # fmt: skip
-    frames = np.random.default_rng(0).integers(0, 256, (2, 72, 96, 3), np.uint8)
-    return Observation(cameras=cameras, frames=frames, positions=HOME, stamp_ns=10**9)
+    return make_policy(tmp_path, values)
 
 
 def test_actions_become_commands_in_the_robots_units_at_the_servers_rate(tmp_path, server):
-    policy = make_policy(tmp_path, server[1])
+    policy = make(tmp_path, server)
     policy.reset(seed=0)
     answer = policy.act(observe(), 'stack')
     assert answer.joint_names == ROBOT.joint_names
@@ -85,13 +58,13 @@ def test_commands_beyond_the_limits_are_clipped_on_request():
 
 def test_observations_larger_than_a_message_are_sent_in_parts(tmp_path, server):
     images = [{'key': 'top', 'view': 'high', 'width': 1600, 'height': 1200}]  # 5.8 MB
-    policy = make_policy(tmp_path, server[1], images=images)
+    policy = make(tmp_path, server, images=images)
     policy.reset(seed=0)
-    assert policy.act(observe(), 'stack') is not None
+    assert policy.act(observe(frames=NOISE), 'stack') is not None
 
 
 def test_a_failure_of_the_server_is_told_and_the_next_question_goes_on(tmp_path, server):
-    policy = make_policy(tmp_path, server[1])
+    policy = make(tmp_path, server)
     policy.reset(seed=0)
     with pytest.raises(PolicyError, match='gave no actions; its log says why'):
         policy.act(observe(), 'fail')
@@ -100,7 +73,7 @@ def test_a_failure_of_the_server_is_told_and_the_next_question_goes_on(tmp_path,
 
 def test_an_answer_that_would_execute_code_is_refused(tmp_path, server):
     MARK.unlink(missing_ok=True)
-    policy = make_policy(tmp_path, server[1])
+    policy = make(tmp_path, server)
     policy.reset(seed=0)
     with pytest.raises(PolicyError, match=r"names 'posix\.system'.*was not looked up"):
         policy.act(observe(), 'evil')
@@ -108,20 +81,20 @@ def test_an_answer_that_would_execute_code_is_refused(tmp_path, server):
 
 
 def test_a_late_answer_is_told(tmp_path, server):
-    policy = make_policy(tmp_path, server[1])
+    policy = make(tmp_path, server)
     policy.reset(seed=0)
     with pytest.raises(PolicyError, match='DEADLINE_EXCEEDED'):
         policy.act(observe(), 'sleep')
 
 
 def test_a_server_that_dies_is_told(tmp_path):
-    process, port = start_server()
-    policy = make_policy(tmp_path, port)
-    policy.reset(seed=0)
-    process.kill()
-    process.wait()
-    with pytest.raises(PolicyError, match='UNAVAILABLE'):
-        policy.act(observe(), 'stack')
+    with running('lerobot_server') as (process, port):
+        policy = make(tmp_path, port)
+        policy.reset(seed=0)
+        process.kill()
+        process.wait()
+        with pytest.raises(PolicyError, match='UNAVAILABLE'):
+            policy.act(observe(), 'stack')
 
 
 @pytest.mark.parametrize(
@@ -135,4 +108,4 @@ def test_a_server_that_dies_is_told(tmp_path):
 )
 def test_wrong_configurations_say_what_would_be_right(tmp_path, changes, text):
     with pytest.raises(ConfigError, match=text):
-        make_policy(tmp_path, 1, **changes)
+        make(tmp_path, 1, **changes)

@@ -1,69 +1,34 @@
 """The client against a server process that speaks openpi's protocol."""
 
-from pathlib import Path
 import socket
-import subprocess
-import sys
 import time
 
 import numpy as np
+from policy_servers import HOME, make_policy, observe, policy_values, ROBOT, running
 import pytest
-import yaml
 
 pytest.importorskip('msgpack', reason='msgpack is not installed (pip install .[policies])')
 pytest.importorskip('websockets', reason='websockets is not installed (pip install .[policies])')
 
-from mtv_world_ros.assembly import assemble_policy, robot_path
-from mtv_world_ros.data_types import CameraModel, Observation
 from mtv_world_ros.errors import ConfigError, PolicyError
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.policies.openpi_client import limit_sending
-from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.policies.server_mapping import fitted
-
-SERVER = Path(__file__).with_name('openpi_server.py')
-ROBOT = load_robot(robot_path('yam_bimanual'))
-HOME = np.array([0.0, 1.047, 1.047, 0.0, 0.0, 0.0, 0.03] * 2)
-
-
-def start_server(*options):
-    process = subprocess.Popen(
-        [sys.executable, str(SERVER), *options], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    return process, int(process.stdout.readline())
 
 
 @pytest.fixture(scope='module')
 def server():
-    process, port = start_server()
-    yield port
-    process.kill()
-    process.wait()
+    with running('openpi_server') as (_, port):
+        yield port
 
 
-def make_policy(tmp_path, port, **changes):
-    values = yaml.safe_load(share_path('config', 'policies', 'openpi.yaml').read_text())
+def make(tmp_path, port, **changes):
+    values = policy_values('openpi')
     values |= {'server': f'ws://127.0.0.1:{port}', 'timeout_s': 1.0, **changes}
-    path = tmp_path / 'policy.yaml'
-    path.write_text(yaml.safe_dump(values))
-    return assemble_policy(path, ROBOT)(EpisodeOrigin())
-
-
-def observe(positions=HOME):
-    frames = np.zeros((2, 72, 96, 3), np.uint8)
-    frames[0], frames[1] = 60, 200
-    cameras = tuple(
-        CameraModel(view=view, width=96, height=72, K=np.diag([90.0, 90.0, 1.0]),
-                    mount_link='base', T_mount_camera=np.eye(4))
-        for view in ('low', 'high')
-    )  # fmt: skip
-    return Observation(cameras=cameras, frames=frames, positions=positions, stamp_ns=10**9)
+    return make_policy(tmp_path, values)
 
 
 def test_actions_become_commands_in_the_robots_units_at_the_servers_rate(tmp_path, server):
-    policy = make_policy(tmp_path, server)
+    policy = make(tmp_path, server)
     policy.reset(seed=0)
     assert policy.metadata == {'model': 'tiny', 'action_horizon': 10}
     answer = policy.act(observe(), 'stack')
@@ -80,11 +45,13 @@ def test_actions_become_commands_in_the_robots_units_at_the_servers_rate(tmp_pat
 
 
 def test_images_arrive_in_the_size_and_layout_that_the_server_wants(tmp_path, server):
-    policy = make_policy(tmp_path, server)
+    frames = np.full((2, 72, 96, 3), 60, np.uint8)
+    frames[1] = 200
+    policy = make(tmp_path, server)
     policy.reset(seed=0)
     from mtv_world_ros.policies.openpi_client import pack
 
-    answer = policy._exchange(pack(policy._config.request(observe(), 'stack')))
+    answer = policy._exchange(pack(policy._config.request(observe(frames=frames), 'stack')))
     assert answer['seen'] == {
         'cam_high': [3, 224, 224, 'uint8'],
         'cam_low': [3, 224, 224, 'uint8'],
@@ -102,7 +69,7 @@ def test_padding_keeps_the_aspect_ratio_and_centres():
 
 
 def test_a_servers_traceback_is_told_and_the_next_episode_connects_again(tmp_path, server):
-    policy = make_policy(tmp_path, server)
+    policy = make(tmp_path, server)
     policy.reset(seed=0)
     with pytest.raises(PolicyError, match="failed: KeyError: 'no such checkpoint'"):
         policy.act(observe(), 'fail')
@@ -111,7 +78,7 @@ def test_a_servers_traceback_is_told_and_the_next_episode_connects_again(tmp_pat
 
 
 def test_a_late_answer_is_not_taken_for_the_next_one(tmp_path, server):
-    policy = make_policy(tmp_path, server)
+    policy = make(tmp_path, server)
     policy.reset(seed=0)
     with pytest.raises(PolicyError, match=r"did not answer within 1 s \('timeout_s'\)"):
         policy.act(observe(), 'sleep')
@@ -121,27 +88,26 @@ def test_a_late_answer_is_not_taken_for_the_next_one(tmp_path, server):
 
 
 def test_not_a_number_is_refused_with_its_place(tmp_path, server):
-    policy = make_policy(tmp_path, server)
+    policy = make(tmp_path, server)
     with pytest.raises(PolicyError, match='action 3 has nan in column 2'):
         policy.act(observe(), 'nan')
 
 
 def test_a_server_that_dies_is_told(tmp_path):
-    process, port = start_server()
-    policy = make_policy(tmp_path, port)
-    policy.reset(seed=0)
-    process.kill()
-    process.wait()
-    with pytest.raises(PolicyError, match='is gone'):
-        policy.act(observe(), 'stack')
-    with pytest.raises(PolicyError, match='no connection .* is it running'):
+    with running('openpi_server') as (process, port):
+        policy = make(tmp_path, port)
         policy.reset(seed=0)
+        process.kill()
+        process.wait()
+        with pytest.raises(PolicyError, match='is gone'):
+            policy.act(observe(), 'stack')
+        with pytest.raises(PolicyError, match='no connection .* is it running'):
+            policy.reset(seed=0)
 
 
 def test_the_api_key_comes_from_the_environment(tmp_path, monkeypatch):
-    process, port = start_server('--key')
-    try:
-        policy = make_policy(tmp_path, port, api_key_variable='OPENPI_KEY')
+    with running('openpi_server', '--key') as (_, port):
+        policy = make(tmp_path, port, api_key_variable='OPENPI_KEY')
         with pytest.raises(ConfigError, match="'OPENPI_KEY' with the API key is not set"):
             policy.reset(seed=0)
         monkeypatch.setenv('OPENPI_KEY', 'wrong')
@@ -149,16 +115,11 @@ def test_the_api_key_comes_from_the_environment(tmp_path, monkeypatch):
             policy.reset(seed=0)
         monkeypatch.setenv('OPENPI_KEY', 'secret')
         assert policy.act(observe(), 'stack') is not None
-    finally:
-        process.kill()
-        process.wait()
 
 
 def test_relative_actions_count_from_the_observed_positions(tmp_path, server):
-    actions = yaml.safe_load(share_path('config', 'policies', 'openpi.yaml').read_text())[
-        'actions'
-    ]
-    policy = make_policy(tmp_path, server, actions={**actions, 'relative': True})
+    actions = {**policy_values('openpi')['actions'], 'relative': True}
+    policy = make(tmp_path, server, actions=actions)
     answer = policy.act(observe(), 'stack')
     assert answer.positions[0, 1] == pytest.approx(2 * 1.047 + 0.01, abs=1e-5)
 
@@ -177,7 +138,7 @@ def test_relative_actions_count_from_the_observed_positions(tmp_path, server):
 )  # fmt: skip
 def test_wrong_configurations_say_what_would_be_right(tmp_path, changes, text):
     with pytest.raises(ConfigError, match=text):
-        make_policy(tmp_path, 1, **changes)
+        make(tmp_path, 1, **changes)
 
 
 def test_what_is_sent_to_one_that_takes_nothing_ends_in_time():

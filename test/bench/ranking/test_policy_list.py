@@ -7,6 +7,7 @@ import sys
 import time
 
 import numpy as np
+from policy_servers import HOME, observe
 import pytest
 import yaml
 
@@ -20,13 +21,12 @@ from mtv_world_ros.bench.ranking.policy_list import (
     load_policy_list,
     tasks_of,
 )
-from mtv_world_ros.data_types import CameraModel, JointTrajectory, Observation
+from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import ConfigError, PolicyError, SimulatorError
 from mtv_world_ros.files import share_path
 
 #: a websocket server of openpi's protocol whose prompt says what goes wrong
 SERVER = Path(__file__).parents[2] / 'policies' / 'openpi_server.py'
-HOME = np.array([0.0, 1.047, 1.047, 0.0, 0.0, 0.0, 0.03] * 2)
 OPENPI = {
     'name': 'served', 'policy': 'openpi', 'change': {'timeout_s': 1.0},
     'command': [sys.executable, str(SERVER), '--port', '{port}'], 'start_timeout_s': 60.0,
@@ -73,16 +73,6 @@ def make(load, tmp_path, expert):
         return made(entry['name'], 'stack_blocks_two', 1, expert)
 
     return make
-
-
-def observe():
-    frames = np.zeros((2, 72, 96, 3), np.uint8)
-    cameras = tuple(
-        CameraModel(view=view, width=96, height=72, K=np.diag([90.0, 90.0, 1.0]),
-                    mount_link='base', T_mount_camera=np.eye(4))
-        for view in ('low', 'high')
-    )  # fmt: skip
-    return Observation(cameras=cameras, frames=frames, positions=HOME, stamp_ns=10**9)
 
 
 def wild(does, name='mine'):
