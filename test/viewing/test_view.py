@@ -12,12 +12,13 @@ import pytest
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.bag import messages
+from mtv_world_ros.data.bag.reader import BagMessage
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.rendering.images import encode_jpeg
 from mtv_world_ros.viewing import sheets
-from mtv_world_ros.viewing.streams import read_streams
+from mtv_world_ros.viewing.streams import read_streams, Streams, take
 
 EPISODE = share_path('resource', 'demo_episode')
 START_NS = 1_700_000_000_000_000_000
@@ -31,33 +32,28 @@ def write_predictions(path: Path, start_ns: int = START_NS) -> Path:
     with BagWriter(path) as writer:
         for k in range(3):
             stamp = start_ns + k * 200_000_000
-            header = messages.make_header(stamp, 'low')
             for stream in ('predicted', 'trajectory'):
-                image = messages.make(
-                    messages.COMPRESSED_IMAGE,
-                    header=header,
-                    format='rgb8; jpeg compressed bgr8',
-                    data=np.frombuffer(encode_jpeg(frame, 90), np.uint8),
-                )
+                image = messages.make_compressed(stamp, 'low', encode_jpeg(frame, 90))
                 topic = f'/world_model/low/{stream}/image_raw/compressed'
-                data = messages.serialize(messages.COMPRESSED_IMAGE, image)
-                writer.write_raw(topic, messages.COMPRESSED_IMAGE, stamp, data)
-            mask = messages.make(
-                messages.IMAGE,
-                header=header,
-                height=72,
-                width=96,
-                encoding='mono8',
-                is_bigendian=0,
-                step=96,
-                data=labels.ravel(),
-            )
-            data = messages.serialize(messages.IMAGE, mask)
-            writer.write_raw('/world_model/low/mask/image_raw', messages.IMAGE, stamp, data)
+                writer.write_message(topic, messages.COMPRESSED_IMAGE, stamp, image)
+            mask = messages.make_image(stamp, 'low', labels)
+            writer.write_message('/world_model/low/mask/image_raw', messages.IMAGE, stamp, mask)
         value = messages.make('std_msgs/msg/Float64', data=0.75)
-        data = messages.serialize('std_msgs/msg/Float64', value)
-        writer.write_raw('/world_model/success', 'std_msgs/msg/Float64', stamp, data)
+        writer.write_message('/world_model/success', 'std_msgs/msg/Float64', stamp, value)
     return path
+
+
+@pytest.mark.parametrize(('is_bigendian', 'order'), [(0, '<u2'), (1, '>u2')])
+def test_raw_images_of_16_bits_are_shown_whatever_the_order_of_their_bytes(is_bigendian, order):
+    message = messages.make(
+        messages.IMAGE, header=messages.make_header(1, 'low'), height=1, width=2,
+        encoding='mono16', is_bigendian=is_bigendian, step=4,
+        data=np.array([0x1234, 0xFF00], order).view(np.uint8),
+    )  # fmt: skip
+    streams, data = Streams(), messages.serialize(messages.IMAGE, message)
+    take(streams, BagMessage('/low/image_raw', messages.IMAGE, 1, data))
+    ((_, frame),) = streams.images['real', 'low']
+    assert frame[0, :, 0].tolist() == [0x12, 0xFF]
 
 
 def test_an_episode_and_its_predictions_are_of_one_time(tmp_path):
