@@ -95,8 +95,7 @@ def test_siblings_part_where_the_fault_begins(expert):
     assert differs[0] > 0
     late = plan(expert, 'expert-late-0.3')
     differs = np.flatnonzero(np.abs(late[: len(expert_plan)] - expert_plan).max(axis=1) > 1e-6)
-    grippers = [expert.robot.joint_names.index(tool.gripper_joint) for tool in expert.robot.tools]
-    arms = [j for j in range(expert_plan.shape[1]) if j not in grippers]
+    arms = arm_columns(expert)
     np.testing.assert_array_equal(late[: len(expert_plan), arms], expert_plan[:, arms])
     assert differs[0] > 20
 
