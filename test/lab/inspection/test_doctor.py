@@ -71,8 +71,10 @@ def test_the_command_passes_a_good_recording_and_writes_report_and_pictures(tmp_
     assert '![high](high.png)' in report
 
 
-@pytest.mark.parametrize('view', ['low', 'high'])
-@pytest.mark.parametrize('shift', [(10, 0), (-10, 0), (0, 10), (0, -10)])
+@pytest.mark.parametrize(
+    ('view', 'shift'),
+    [('low', (10, 0)), ('high', (-10, 0)), ('low', (0, 10)), ('high', (0, -10))],
+)
 def test_a_principal_point_10_px_off_flips_the_verdict(episode, inspector, view, shift):
     wrong = inspector.inspect(shifted_k(episode, view, *shift)).views[0]
     assert wrong.verdict != 'ok'
