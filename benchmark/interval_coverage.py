@@ -17,8 +17,9 @@ from functools import cache
 import numpy as np
 from page import parse_arguments, publish, table
 from scipy.special import betaincinv, ndtr, ndtri
+from scipy.stats import rankdata
 
-from mtv_world_ros.bench.ranking.scores import area_interval, areas_under_roc
+from mtv_world_ros.bench.ranking.scores import area_interval
 from mtv_world_ros.lab.evaluation.metrics.policy_agreement import (
     mean_maximum_rank_violation,
     pearson,
@@ -142,7 +143,9 @@ def _judged(
 @cache
 def _true_area(differs: bool) -> float:
     (said,), real, _ = _judged(np.random.default_rng(5), 2000, differs)
-    return float(areas_under_roc(said, real, np.ones((1, len(said))))[0])
+    num_real = int(real.sum())
+    above = rankdata(said)[real].sum() - num_real * (num_real + 1) / 2
+    return float(above / (num_real * (len(real) - num_real)))
 
 
 def powered(rng: np.random.Generator, num: int, differs: bool) -> tuple[Interval, float]:

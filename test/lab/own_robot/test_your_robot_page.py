@@ -36,6 +36,11 @@ SMALL = {
     'evaluate': ['--no-ceiling', '--actions', 'true', '--threads', '1', '--no-report'],
     'imagine': ['--max-chunks', '2', '--threads', '1'],
 }
+#: as the page has it for a first try, from the bundled weights, and smaller
+FIRST_TRY = [
+    '--threads', '1', '--set', 'optimizer.steps=2', '--set', 'optimizer.batch_size=1',
+    '--set', 'video.width=160', '--set', 'video.height=96', '--set', 'video.num_frames=8',
+]  # fmt: skip
 #: a busy machine takes long to start a node, and to hand it images
 PATIENT = ['--wait-timeout', '300', '--answer-timeout', '300']
 CALM = ['-p', 'num_threads:=1', '-p', 'max_image_age_s:=60.0', '-p', 'max_joint_state_age_s:=60.0']
@@ -189,7 +194,7 @@ def test_the_page_leads_from_videos_to_a_contact_sheet(lab, monkeypatch, capsys)
     told = lines(of_videos=True)
     assert len(told) <= 8
     for words in told:
-        more = ['--set', 'optimizer.steps=2', '--threads', '1'] if words[1] == 'train' else []
+        more = FIRST_TRY if words[1] == 'train' else []
         more = SMALL['evaluate'][:-1] if words[1] == 'evaluate' else more
         status = main([*words[1:], *more])
         said = capsys.readouterr()
