@@ -33,7 +33,7 @@ VIDEO_NAMES = {'my_robot': 'crane', 'front,side': 'door,window'}
 #: keep the commands small
 SMALL = {
     'train': ['--threads', '1', *TINY],
-    'evaluate': ['--no-ceiling', '--actions', 'true', '--threads', '1', '--no-report'],
+    'evaluate': ['--no-ceiling', '--actions', 'true', '--steps=1', '--threads=1', '--no-report'],
     'imagine': ['--max-chunks', '2', '--threads', '1'],
 }
 #: as the page has it for a first try, from the bundled weights, and smaller
