@@ -116,7 +116,7 @@ def _add_imagine(commands: argparse._SubParsersAction) -> None:
 def _imagine(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.episode_reader import list_episodes
     from mtv_world_ros.errors import ConfigError
-    from mtv_world_ros.launching.imagination import imagine_episodes, ImagineOptions
+    from mtv_world_ros.launching import imagine_episodes, ImagineOptions
 
     check_model(arguments.device, arguments.checkpoint)
     watch = watch_arguments(arguments)

@@ -11,7 +11,7 @@ from mtv_world_ros.errors import ConfigError, PolicyError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.launching.imagination import imagine_episodes, ImagineOptions
+from mtv_world_ros.launching import imagine_episodes, ImagineOptions
 from mtv_world_ros.policies.policy import EpisodeOrigin, RecordedPolicy
 
 ROBOT = load_robot(robot_path('yam_bimanual'))

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.files import check_room
-from mtv_world_ros.launching.imagination import ROOM_BYTES
+from mtv_world_ros.launching import ROOM_BYTES
 from mtv_world_ros.processes import (
     how_it_ended,
     module_command,

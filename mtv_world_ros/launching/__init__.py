@@ -1,1 +1,0 @@
-"""World model, policy and episode runner as processes."""
