@@ -163,9 +163,7 @@ class BagWriter:
                 self._finish()
                 self._check_free()
                 self._take_name()
-            except OSError as error:
-                raise EpisodeError(self._left_behind(str(error))) from error
-            except EpisodeError as error:
+            except (OSError, EpisodeError) as error:
                 raise EpisodeError(self._left_behind(str(error))) from error
             finally:
                 self._file.close()
