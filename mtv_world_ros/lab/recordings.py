@@ -222,47 +222,27 @@ def _key(path: Path, spec: WorldModelSpec, robot: RobotModel, source: EpisodeSou
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 
+#: fields of a recording, of its commands and of a camera, as they are stored
+_TEXT = ('task', 'outcome', 'instruction', 'objects', 'masks_by', 'stamp_ns')
+_ARRAYS = ('times', 'frames', 'positions', 'object_ids', 'object_poses')
+_OF_COMMANDS = ('times', 'positions', 'velocities')
+_OF_CAMERA = ('view', 'width', 'height', 'distortion_model', 'mount_link')
+
+
 def _save(file: BytesIO, recording: Recording) -> None:
-    commands = recording.commands
-    text = {
-        'task': recording.task,
-        'outcome': recording.outcome,
-        'instruction': recording.instruction,
-        'objects': recording.objects,
-        'masks_by': recording.masks_by,
-        'joint_names': commands.joint_names,
-        'stamp_ns': recording.stamp_ns,
-        'cameras': [
-            {
-                'view': c.view,
-                'width': c.width,
-                'height': c.height,
-                'distortion_model': c.distortion_model,
-                'mount_link': c.mount_link,
-            }
-            for c in recording.cameras
-        ],
-    }
-    arrays = {
-        'times': recording.times,
-        'frames': recording.frames,
-        'positions': recording.positions,
-        'command_times': commands.times,
-        'command_positions': commands.positions,
-    }
-    if recording.object_ids is not None:
-        arrays['object_ids'] = recording.object_ids
-    if recording.object_poses is not None:
-        arrays['object_poses'] = recording.object_poses
-    if commands.velocities is not None:
-        arrays['command_velocities'] = commands.velocities
-    for view, track in recording.camera_tracks.items():
-        arrays[f'track_{view}'] = track
-    for index, camera in enumerate(recording.cameras):
+    cameras, commands = recording.cameras, recording.commands
+    text = {name: getattr(recording, name) for name in _TEXT}
+    text['joint_names'] = commands.joint_names
+    text['cameras'] = [{name: getattr(one, name) for name in _OF_CAMERA} for one in cameras]
+    arrays = {name: getattr(recording, name) for name in _ARRAYS}
+    arrays |= {f'command_{name}': getattr(commands, name) for name in _OF_COMMANDS}
+    arrays |= {f'track_{view}': track for view, track in recording.camera_tracks.items()}
+    for index, camera in enumerate(cameras):
         arrays[f'K_{index}'] = camera.K
         arrays[f'distortion_{index}'] = camera.distortion
         arrays[f'pose_{index}'] = camera.T_mount_camera
-    np.savez(file, text=np.array(json.dumps(text)), **arrays)  # type: ignore[arg-type]
+    known = {name: array for name, array in arrays.items() if array is not None}
+    np.savez(file, text=np.array(json.dumps(text)), **known)
 
 
 def _load(file: Path, path: Path) -> Recording:
@@ -275,31 +255,15 @@ def _load(file: Path, path: Path) -> Recording:
             T_mount_camera=stored[f'pose_{i}'],
             **row,
         )
-        for i, row in enumerate(text['cameras'])
+        for i, row in enumerate(text.pop('cameras'))
     )
+    commands = {name: stored.get(f'command_{name}') for name in _OF_COMMANDS}
+    tracks = {camera.view: stored.get(f'track_{camera.view}') for camera in cameras}
     return Recording(
-        path=Path(path),
-        task=text['task'],
-        outcome=text['outcome'],
-        instruction=text['instruction'],
-        objects=tuple(text['objects']),
+        path=path,
         cameras=cameras,
-        times=stored['times'],
-        frames=stored['frames'],
-        object_ids=stored.get('object_ids'),
-        positions=stored['positions'],
-        commands=JointTrajectory(
-            joint_names=text['joint_names'],
-            times=stored['command_times'],
-            positions=stored['command_positions'],
-            velocities=stored.get('command_velocities'),
-        ),
-        stamp_ns=text['stamp_ns'],
-        object_poses=stored.get('object_poses'),
-        masks_by=text.get('masks_by', ''),
-        camera_tracks={
-            camera.view: stored[f'track_{camera.view}']
-            for camera in cameras
-            if f'track_{camera.view}' in stored
-        },
+        commands=JointTrajectory(joint_names=text.pop('joint_names'), **commands),
+        camera_tracks={view: track for view, track in tracks.items() if track is not None},
+        **{name: stored.get(name) for name in _ARRAYS},
+        **text | {'objects': tuple(text['objects'])},
     )

@@ -5,21 +5,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.cli.shared_options import (
-    add_options,
-    check_model,
-    pipeline_choices,
-    provenance,
-    threads_of_workers,
-)
+from mtv_world_ros.cli.shared_options import add_options, check_model, provenance
 from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.files import check_free
-from mtv_world_ros.lab.cli.evaluate import say_failed
+from mtv_world_ros.lab.cli.evaluate import load_pipelines, say_failed
 
 if TYPE_CHECKING:
     from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
@@ -157,20 +150,12 @@ def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
 
 def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[EvaluationSummary]:
     """Imagines and scores the episodes once a seed."""
-    from mtv_world_ros.assembly import load_pipeline
     from mtv_world_ros.imagined_episode import SEED_STEP
-    from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel
+    from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
     from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
     from mtv_world_ros.lab.jobs import fingerprint
 
-    load = partial(
-        load_pipeline,
-        arguments.checkpoint,
-        **pipeline_choices(arguments),
-        calibrated=False,
-    )
-    pipeline = load(num_threads=arguments.threads)
-    threads = threads_of_workers(arguments)
+    pipeline, parallel = load_pipelines(arguments, arguments.checkpoint, calibrated=False)
     return [
         evaluate(
             pipeline,
@@ -192,11 +177,7 @@ def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Evalua
             ),
             zero_shot=selection.zero_shot,
             provenance=provenance(arguments),
-            parallel=Parallel(
-                workers=arguments.workers,
-                make_pipeline=partial(load, num_threads=threads),
-                threads=threads,
-            ),
+            parallel=parallel,
             overwrite=arguments.overwrite,
         )
         for index in range(arguments.seeds)

@@ -9,7 +9,7 @@ from math import isfinite
 from pathlib import Path
 import re
 import sys
-from typing import NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import (
     add_options,
@@ -23,6 +23,7 @@ from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import check_free
 
 if TYPE_CHECKING:
+    from mtv_world_ros.lab.evaluation.evaluate_episodes import Parallel
     from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
     from mtv_world_ros.lab.splits import Selection
     from mtv_world_ros.pipeline import Pipeline
@@ -220,22 +221,29 @@ def _slug(label: str) -> str:
     return re.sub(r'[^\w.-]+', '_', label).strip('.') or '_'
 
 
+def load_pipelines(
+    arguments: argparse.Namespace, checkpoint: str | Path, **options: Any
+) -> tuple[Pipeline, Parallel]:
+    """Returns the pipeline of this process, and what makes those of worker processes."""
+    from mtv_world_ros.assembly import load_pipeline
+    from mtv_world_ros.lab.evaluation.evaluate_episodes import Parallel
+
+    load = partial(load_pipeline, checkpoint, **pipeline_choices(arguments), **options)
+    pipeline, threads = load(num_threads=arguments.threads), threads_of_workers(arguments)
+    make = partial(load, num_threads=threads)
+    return pipeline, Parallel(workers=arguments.workers, make_pipeline=make, threads=threads)
+
+
 def _score(
     arguments: argparse.Namespace, entry: Entry, selection: Selection, truth: str, out: Path
 ) -> EvaluationSummary:
-    from mtv_world_ros.assembly import asked_describer, load_pipeline
+    from mtv_world_ros.assembly import asked_describer
     from mtv_world_ros.data.bag_mapping import load_source
-    from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate, Parallel
+    from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
     from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
     from mtv_world_ros.lab.jobs import fingerprint
 
-    load = partial(
-        load_pipeline,
-        entry.path,
-        **pipeline_choices(arguments),
-    )
-    pipeline = load(num_threads=arguments.threads)
-    threads = threads_of_workers(arguments)
+    pipeline, parallel = load_pipelines(arguments, entry.path)
     return evaluate(
         pipeline,
         selection.paths,
@@ -261,11 +269,7 @@ def _score(
             'dataset': f'{arguments.dataset}: {selection}',
             'physics': truth,
         },
-        parallel=Parallel(
-            workers=arguments.workers,
-            make_pipeline=partial(load, num_threads=threads),
-            threads=threads,
-        ),
+        parallel=parallel,
         describer=asked_describer(arguments.describer),
         overwrite=arguments.overwrite,
     )

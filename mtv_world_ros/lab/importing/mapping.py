@@ -29,7 +29,7 @@ from mtv_world_ros.geometry.robot.joint_columns import JointEntries, JointTable,
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.importing.camera_parameters import CameraSource
 from mtv_world_ros.lab.importing.lerobot import LeRobotDataset
-from mtv_world_ros.lab.importing.tool_actions import ToolPoses
+from mtv_world_ros.lab.importing.tool_poses import ToolPoses
 
 
 class Stream(JointTable):

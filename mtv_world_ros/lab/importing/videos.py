@@ -32,7 +32,7 @@ from mtv_world_ros.lab.importing.bags import write_imported
 from mtv_world_ros.lab.importing.convert import import_each, ImportSummary, START_NS
 from mtv_world_ros.lab.importing.mapping import ActionStream, digest_of, load_mapped_robot
 from mtv_world_ros.lab.importing.stored_objects import AS_RECORDED, ObjectStage
-from mtv_world_ros.lab.importing.tool_states import joints_of_poses
+from mtv_world_ros.lab.importing.tool_poses import joints_of_poses
 
 
 def _inside(pattern: str) -> str:

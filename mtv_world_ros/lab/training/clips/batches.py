@@ -169,9 +169,7 @@ class BatchSource:
         )
 
     def _clip(self, step: int, number: int) -> _Sample:
-        return self._sample(np.random.default_rng((self._seed, step, number)))
-
-    def _sample(self, rng: np.random.Generator) -> _Sample:
+        rng = np.random.default_rng((self._seed, step, number))
         recording, starts = self._choose(rng)
         start = int(starts[rng.integers(len(starts))])
         clip = cut_clip(recording, start, self._spec)
