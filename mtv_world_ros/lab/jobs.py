@@ -106,8 +106,8 @@ def _in_processes(
 class WorkerPool(ProcessPoolExecutor):
     """Processes whose `run_job` runs jobs; they end with this process, however that ends.
 
-    One that stands still (SIGSTOP) is killed: the pool breaks, and nobody waits on. So is one that
-    the SIGTERM of a broken pool does not end, e.g. as it was forked with another's handler.
+    One that stands still (SIGSTOP) is killed: the pool breaks, and no call waits on. So is one
+    that ignores the SIGTERM of a broken pool, e.g. as it was forked with another's handler.
 
     Args:
         make_run: makes what runs a job, once in every process.
@@ -207,11 +207,11 @@ def run_job(*job: Any) -> Any:
 
 
 class _Scoring:
-    """Runs a scorer, and says why where a job has no scores.
+    """Runs a scorer; a job without scores gives the reason.
 
     Args:
         make_scorer: makes it.
-        is_late: in another process, where what goes wrong meanwhile is told by every job.
+        is_late: in a worker process, where every job gives the error of `make_scorer`.
     """
 
     def __init__(self, make_scorer: Callable[[], Scorer], is_late: bool = True) -> None:

@@ -55,7 +55,7 @@ def record_through_node(
     nothing). Logs of the processes go to `out/logs`.
 
     Raises:
-        EpisodeError: a process failed; the message says what it said last and names its log.
+        EpisodeError: a process failed; the message has its last line and names its log.
         OSError: the disk is full.
     """
     check_room(out, ROOM_BYTES)

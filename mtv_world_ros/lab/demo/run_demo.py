@@ -245,8 +245,10 @@ def read_predictions(bag: Path, views: Sequence[str]) -> Predictions:
             reports += _values(deserialize(message.msgtype, message.data))
     chunks = [report for report in reports if report.get('state') == 'chunk']
     if not chunks:
-        said = '; '.join(report.get('text', report.get('state', '')) for report in reports)
-        raise EpisodeError(f"'{bag}' holds no imagined chunk; the node reported: {said or 'none'}")
+        states = '; '.join(report.get('text', report.get('state', '')) for report in reports)
+        raise EpisodeError(
+            f"'{bag}' holds no imagined chunk; the node reported: {states or 'none'}"
+        )
     return Predictions(
         chunks=tuple(_chunk(report, images, views) for report in chunks),
         reports=tuple(reports),

@@ -30,12 +30,12 @@ def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
 
 
 def _evaluated(name: str, rollout: StoredRollout, result: EpisodeResult) -> ScoredRollout:
-    last, said = float(rollout.times[-1]), result.probability
-    text = f'success {said:.2f}' if isfinite(said) else 'abstains'
+    last, estimate = float(rollout.times[-1]), result.probability
+    text = f'success {estimate:.2f}' if isfinite(estimate) else 'abstains'
     return ScoredRollout(
         name=name,
         rollout=rollout,
-        estimates={'imagined': ((last, said),)} if isfinite(said) else {},
+        estimates={'imagined': ((last, estimate),)} if isfinite(estimate) else {},
         words=(
             (0.0, f'{result.task}: recorded {result.outcome}'),
             (last, f'{text}: {"; ".join(result.reasons)}'),

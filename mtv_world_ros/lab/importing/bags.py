@@ -111,11 +111,11 @@ def described_robot(bag: Path, mapping: BagMapping, folder: Path) -> tuple[Path,
             file.write_text(yaml.safe_dump(guessed.values, sort_keys=False), encoding='utf-8')
             return save_robot(file, folder), (*chosen, *guessed.notes)
         except (RobotError, ConfigError) as error:
-            source, said = f"'{topic}' of '{bag}'", str(error)
+            source, reason = f"'{topic}' of '{bag}'", str(error)
             for temporary in (urdf, file):
-                said = said.replace(f"'{temporary}'", source)
+                reason = reason.replace(f"'{temporary}'", source)
             raise RobotError(
-                f"{said}; --robot, or 'robot' in the mapping, names another file"
+                f"{reason}; --robot, or 'robot' in the mapping, names another file"
             ) from error
 
 

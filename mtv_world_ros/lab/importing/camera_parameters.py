@@ -168,7 +168,7 @@ def camera_track(
 def _sized(
     camera: CameraModel, size: tuple[int, int], poses: FloatArray | None = None
 ) -> CameraTrack:
-    """The camera for images of a size; data sets may have stretched them, which is said."""
+    """The camera for images of a size; a note says where they were stretched."""
     try:
         sized, note = windowed_camera(camera, *size)
     except CalibrationError:

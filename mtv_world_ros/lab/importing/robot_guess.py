@@ -233,7 +233,7 @@ class _Hand:
         self.travel_m = round(travel_m, 5)
 
     def tool_pose(self) -> FloatArray:
-        """A frame near the finger tips: z away from the arm, y the way of a finger."""
+        """A frame near the finger tips: z away from the arm, y along a finger's motion."""
         shut, opened = self._tips()
         T = np.eye(4)
         middle = np.mean([points.mean(axis=0) for points in shut], axis=0)
@@ -270,7 +270,7 @@ class _Hand:
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """x, y, z of fingers that turn about an axis; None where they slide.
 
-        The way of a tip that turns is an arc: what is between the tips is taken in its place.
+        A tip that turns moves on an arc: the line between the tips is taken in its place.
         """
         if _slides(self._model, self.joint) or len(opened) != 2:
             return None

@@ -68,7 +68,7 @@ class VideoMapping(Written):
         return self._robot_file
 
     def written(self) -> BagMapping:
-        """What is said of the episodes that are written."""
+        """Task, outcome and quality of the episodes that are written."""
         given = {name: getattr(self, name) for name in Written.model_fields}
         return BagMapping(**given, views={view: ViewTopics(image=view) for view in self.views})
 
@@ -154,8 +154,8 @@ def import_videos(
     """
     recordings = find_recordings(folder, mapping)
     save_robot(mapping.robot_file, out / 'robot')
-    said = mapping.model_dump_json(exclude={'robot'}).encode()
-    key = digest_of(mapping.robot_file, calibration, start=stage.key + said)
+    text = mapping.model_dump_json(exclude={'robot'}).encode()
+    key = digest_of(mapping.robot_file, calibration, start=stage.key + text)
 
     def convert(one: VideoRecording, path: Path) -> tuple[str, ...]:
         episode = read_recording(one, mapping, calibration)

@@ -37,8 +37,8 @@ def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
     known = [item for item in judgements if item.outcome in ('success', 'failure')]
     probability = np.array([item.probability for item in known])
     real = np.array([item.outcome == 'success' for item in known], bool)
-    said = np.array([verdict(item.probability) for item in known])
-    called, decided, judged = said == 1, np.isfinite(said), np.isfinite(probability)
+    verdicts = np.array([verdict(item.probability) for item in known])
+    called, decided, judged = verdicts == 1, np.isfinite(verdicts), np.isfinite(probability)
     hit, avoided = _mean(called[real & decided]), _mean(~called[~real & decided])
     balanced = None if hit is None or avoided is None else (hit + avoided) / 2
     abstained, estimates, outcomes = ~decided, probability[judged], real[judged]
@@ -58,10 +58,10 @@ def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
 
 
 def expected_calibration_error(probability: FloatArray, real: BoolArray) -> float:
-    """Returns how far what was said is from what came true, over bins of what was said.
+    """Returns how far estimates (N,) are from the share of successes, over bins of estimates.
 
-    Bins weigh by how many (N,) estimates lie in them (Guo et al., 2017); what was said is the
-    probability of success, not of the likelier outcome.
+    Bins weigh by how many estimates lie in them (Guo et al., 2017). An estimate is the probability
+    of success, not of the likelier outcome.
     """
     bins = _binned(probability, NUM_BINS)
     return float(sum(at.mean() * abs(probability[at].mean() - real[at].mean()) for _, at in bins))
@@ -91,14 +91,14 @@ class Bin:
 
     Attributes:
         middle: of the probabilities that belong here.
-        said: mean probability.
+        estimate: their mean.
         came_true: share, with its interval.
         interval: 95 % Wilson interval of the share.
         count: number of estimates.
     """
 
     middle: float
-    said: float
+    estimate: float
     came_true: float
     interval: tuple[float, float]
     count: int
@@ -111,15 +111,15 @@ def reliability_bins(judgements: Sequence[Judgement]) -> list[Bin]:
         for item in judgements
         if item.outcome in ('success', 'failure') and np.isfinite(item.probability)
     ]
-    said = np.array([item.probability for item in judged])
+    estimates = np.array([item.probability for item in judged])
     true = np.array([item.outcome == 'success' for item in judged], bool)
     return [
         Bin(
             middle=middle,
-            said=float(said[at].mean()),
+            estimate=float(estimates[at].mean()),
             came_true=float(true[at].mean()),
             interval=wilson(int(true[at].sum()), int(at.sum())),
             count=int(at.sum()),
         )
-        for middle, at in _binned(said, NUM_CHART_BINS)
+        for middle, at in _binned(estimates, NUM_CHART_BINS)
     ]

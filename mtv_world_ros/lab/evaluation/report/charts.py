@@ -172,17 +172,16 @@ def reliability_chart(title: str, bins: Sequence[Bin], colour: str) -> Markup:
         _square(axes, 'estimated probability of success', 'share that really succeeded')
         axes.xaxis.labelpad = 20
         for index, found in enumerate(bins):
-            axes.plot([found.said, found.said], found.interval, '_-', color=drawn, clip_on=False)
-            axes.plot(
-                found.said, found.came_true, 'o', color=drawn, clip_on=False, gid=f'bin-{index}'
-            )
+            x = found.estimate
+            axes.plot([x, x], found.interval, '_-', color=drawn, clip_on=False)
+            axes.plot(x, found.came_true, 'o', color=drawn, clip_on=False, gid=f'bin-{index}')
             place = axes.get_xaxis_transform()
             axes.text(
                 found.middle, -0.14, f'n={found.count}', transform=place, ha='center',
                 color=_COLOURS['faint'], fontsize=8,
             )  # fmt: skip
         titles = {
-            f'bin-{index}': f'said {found.said:.2f}, came true {found.came_true:.2f}'
+            f'bin-{index}': f'said {found.estimate:.2f}, came true {found.came_true:.2f}'
             for index, found in enumerate(bins)
         }
         return _svg(axes, title, width, height, titles)

@@ -134,12 +134,12 @@ def _bin(score: float) -> str:
 
 def _estimate(result: EpisodeResult) -> str:
     """Whether the success estimate is right; empty where the outcome is not known."""
-    said = verdict(result.probability)
-    if not isfinite(said):
+    judged = verdict(result.probability)
+    if not isfinite(judged):
         return 'no verdict'
     if result.outcome not in ('success', 'failure'):
         return ''
-    return 'right' if said == (result.outcome == 'success') else 'wrong'
+    return 'right' if judged == (result.outcome == 'success') else 'wrong'
 
 
 def _about(result: EpisodeResult) -> str:

@@ -154,7 +154,7 @@ def _doubts(found: EvaluationSummary) -> list[str]:
 
 
 def _few(found: EvaluationSummary) -> str:
-    """Why nothing can be told at all, in words; empty = it can."""
+    """Why there are too few episodes for a verdict, in words; empty = there are enough."""
     count = len(found.results)
     if count >= MIN_EPISODES:
         return ''

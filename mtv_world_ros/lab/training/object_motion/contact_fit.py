@@ -312,9 +312,9 @@ def first_settings(arms: Arms) -> ContactSettings:
     drives = arms.drives
     stiffness, damping, mass = 200.0, 10.0, 0.05
     if drives.fingers.any():
-        way = drives.travels[drives.fingers] ** 2
+        squared_travel = drives.travels[drives.fingers] ** 2
         numbers = (drives.stiffness, drives.damping, drives.armature)
-        found = [float(np.mean(one[drives.fingers] / way)) for one in numbers]
+        found = [float(np.mean(one[drives.fingers] / squared_travel)) for one in numbers]
         stiffness, damping, mass = (max(one, 1e-6) for one in found)
     return ContactSettings(
         finger_stiffness=stiffness,
@@ -620,7 +620,7 @@ class _Trial:
         late = slice(rows // 2, rows)
         foreseen = motion.points[:, late] - motion.points[:, :1]
         away = np.linalg.norm(foreseen - self.displacements[late], axis=-1)
-        away = np.clip(np.nan_to_num(away, nan=np.nan), 0.0, _LOST_M)
+        away = np.minimum(away, _LOST_M)
         unlikely = np.log1p((away / _NEAR_M) ** 2)
         known = np.isfinite(self.displacements[late]).all(-1)
         counted = np.where(known, np.nan_to_num(unlikely), 0.0).sum(1)

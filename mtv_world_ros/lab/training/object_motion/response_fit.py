@@ -36,7 +36,7 @@ _FAR = 4.0
 _LEAST_ARMATURE, _LEAST_DAMPING = 1e-4, 0.02
 #: largest compliance, armature, damping and lead
 _LARGEST = np.array([10.0, 1.0, 1.0, 1.0])
-#: of a joint that moves in fewer rows nothing is said
+#: a joint that moves in fewer rows is not fitted
 _LEAST_ROWS = 100
 #: slower joints tell nothing [rad/s or m/s]
 _MOVES = 0.02
@@ -174,13 +174,13 @@ def _equations(
     velocity = (positions[2:] - positions[:-2]) / (2 * PERIOD_S)
     acceleration = np.diff(positions, n=2, axis=0) / PERIOD_S**2
     # as `follow` does, where a command is that of the period before its row
-    way = (commands[2:] - commands[:-2]) / (2 * PERIOD_S)
+    commanded = (commands[2:] - commands[:-2]) / (2 * PERIOD_S)
     driven = (commands[1:-1] + commands[2:]) / 2
     torques, mechanics = [], RobotMechanics(robot)
     for q, v, a in zip(positions[inner], velocity, acceleration, strict=True):
         mass, bias = mechanics.inertia(q, v)
         torques.append(mass @ a + bias)
-    left = np.stack([np.array(torques), acceleration, velocity, -way], axis=-1)
+    left = np.stack([np.array(torques), acceleration, velocity, -commanded], axis=-1)
     moving = (np.abs(velocity) > _MOVES)[..., None]
     return left * moving, (driven - positions[inner]) * moving[..., 0]
 
