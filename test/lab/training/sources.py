@@ -1,18 +1,30 @@
-"""Tiny presets, batches of recordings and trainers of them, as tests want them."""
+"""Tiny presets, batches of recordings, trainers of them, and trainings in other processes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+import json
+import os
 from pathlib import Path
+import subprocess
+import sys
 from typing import Any
 
 import torch
+import yaml
 
 from mtv_world_ros.data.recording import Recording
+from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.trainer import Trainer
-from mtv_world_ros.lab.training.training_config import TrainingConfig
+from mtv_world_ros.lab.training.training_config import (
+    load_training_config,
+    TrainingConfig,
+    TrainingRun,
+)
+from mtv_world_ros.lab.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 #: a model that is trained in seconds
@@ -63,3 +75,37 @@ def losses_of(trainer: Trainer, source: BatchSource) -> list[float]:
     """The losses of all steps that are left; none is saved."""
     reports = trainer.run(source, save_every=1000, on_save=lambda _: None)
     return [report.loss for report in reports]
+
+
+def run_training(out: Path, episodes: Path, preset: Path, **options: Any) -> None:
+    """Trains the bundled robot's model on one thread of this process."""
+    torch.set_num_threads(1)
+    run = TrainingRun(config=load_training_config(preset), dataset=episodes, out=out, **options)
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    train(run, robot=robot, segmenter=ColourSegmenter())
+
+
+def write_preset(folder: Path, config: TrainingConfig, **optimizer: Any) -> Path:
+    """A preset with other values of its optimizer."""
+    values = json.loads(json.dumps(config.model_dump()))
+    values['optimizer'] |= optimizer
+    file = folder / 'preset.yaml'
+    file.write_text(yaml.safe_dump(values))
+    return file
+
+
+def run_script(name: str, *arguments: Path, launcher: Sequence[str] = ()) -> None:
+    """Runs a script of this folder to its end, without a GPU."""
+    script = Path(__file__).with_name(name)
+    ended = subprocess.run(
+        [sys.executable, *launcher, str(script), *map(str, arguments)],
+        env={
+            **os.environ,
+            'PYTHONPATH': str(Path(__file__).parents[3]),
+            'CUDA_VISIBLE_DEVICES': '',
+        },
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert ended.returncode == 0, ended.stderr

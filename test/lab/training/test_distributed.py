@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from datetime import timedelta
 import json
-import os
 from pathlib import Path
 import runpy
-import subprocess
 import sys
 from types import SimpleNamespace
 
 import pytest
 from safetensors.torch import load_file
-from sources import make_trainer
+from sources import make_trainer, run_script, write_preset
 import torch
-import yaml
 
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.lab.training.distributed import Processes
@@ -23,32 +20,17 @@ from mtv_world_ros.lab.training.trainer import Trainer
 from mtv_world_ros.lab.training.training_config import TrainingConfig
 
 SCRIPT = Path(__file__).with_name('train_recorded.py')
-ROOT = Path(__file__).parents[3]
-
-
-def preset(config: TrainingConfig, folder: Path, steps: int = 3) -> Path:
-    """Three clips a step, two processes: one gets two of them."""
-    values = json.loads(json.dumps(config.model_dump()))
-    values['optimizer'] |= {'batch_size': 3, 'steps': steps, 'max_grad_norm': 1e6}
-    file = folder / 'preset.yaml'
-    file.write_text(yaml.safe_dump(values))
-    return file
+#: of two processes one gets two of the clips of a step
+THREE_CLIPS = {'batch_size': 3, 'max_grad_norm': 1e6}
 
 
 def test_two_processes_make_the_steps_of_one(tiny, episode, tmp_path, monkeypatch):
-    arguments = [str(episode.parent), str(preset(tiny, tmp_path))]
+    arguments = [episode.parent, write_preset(tmp_path, tiny, steps=3, **THREE_CLIPS)]
     two, one = tmp_path / 'two', tmp_path / 'one'
     launcher = ['-m', 'torch.distributed.run', '--standalone', '--nproc-per-node', '2']
-    started = subprocess.run(
-        [sys.executable, *launcher, str(SCRIPT), str(two), *arguments],
-        env={**os.environ, 'PYTHONPATH': str(ROOT), 'CUDA_VISIBLE_DEVICES': ''},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert started.returncode == 0, started.stderr
+    run_script(SCRIPT.name, two, *arguments, launcher=launcher)
     computed = Trainer.gradients
-    monkeypatch.setattr(sys, 'argv', [str(SCRIPT), str(one), *arguments])
+    monkeypatch.setattr(sys, 'argv', [str(part) for part in (SCRIPT, one, *arguments)])
     try:
         runpy.run_path(str(SCRIPT), run_name='__main__')
     finally:
@@ -120,16 +102,8 @@ def test_fewer_clips_than_processes_are_refused(tiny, tmp_path):
 
 
 def test_a_process_whose_sister_was_killed_says_so_and_the_state_is_whole(tiny, episode, tmp_path):
-    file = preset(tiny, tmp_path, steps=10**6)
-    arguments = [str(tmp_path), str(episode.parent), str(file)]
-    ended = subprocess.run(
-        [sys.executable, str(SCRIPT.with_name('train_lost.py')), *arguments],
-        env={**os.environ, 'PYTHONPATH': str(ROOT), 'CUDA_VISIBLE_DEVICES': ''},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert ended.returncode == 0, ended.stderr
+    preset = write_preset(tmp_path, tiny, steps=10**6, **THREE_CLIPS)
+    run_script('train_lost.py', tmp_path, episode.parent, preset)
     said = (tmp_path / 'said').read_text()
     assert said.startswith('TrainingError: process 0 of 2 lost another one')
     assert 'run the same command again' in said

@@ -3,34 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
-from pathlib import Path
-import subprocess
-import sys
 
 from safetensors.torch import load_file
-from sources import make_trainer
+from sources import make_trainer, run_script, write_preset
 import torch
-import yaml
-
-SCRIPT = Path(__file__).with_name('train_killed.py')
-ROOT = Path(__file__).parents[3]
 
 
 def test_kill_9_changes_neither_curve_nor_weights(tiny, episode, tmp_path):
-    config = tiny.replace(optimizer=tiny.optimizer.replace(steps=40))
-    preset = tmp_path / 'preset.yaml'
-    preset.write_text(yaml.safe_dump(json.loads(json.dumps(config.model_dump()))))
-    started = subprocess.run(
-        [sys.executable, str(SCRIPT), str(tmp_path), str(episode.parent), str(preset)],
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert started.returncode == 0, started.stderr
+    preset = write_preset(tmp_path, tiny, steps=40)
+    run_script('train_killed.py', tmp_path, episode.parent, preset)
     kills = json.loads((tmp_path / 'kills.json').read_text())
-    assert len(kills) >= 3 and any('state.partial' in told for told in kills), kills
+    assert len(kills) >= 3 and any('state.partial' in place for place in kills), kills
     curves, tensors = [], []
     for name in ('whole', 'killed'):
         rows = [json.loads(line) for line in (tmp_path / name / 'log.jsonl').open()]

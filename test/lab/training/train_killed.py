@@ -15,13 +15,7 @@ import signal
 import sys
 import time
 
-import torch
-
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.lab.training.training_config import load_training_config, TrainingRun
-from mtv_world_ros.lab.training.training_run import train
-from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from sources import run_training
 
 _KILLS = 4
 
@@ -33,11 +27,7 @@ def start(out: Path, episodes: Path, preset: Path) -> int:
         return child
     code = 1
     try:
-        torch.set_num_threads(1)
-        robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-        config = load_training_config(preset)
-        run = TrainingRun(config=config, dataset=episodes, out=out, save_every=3)
-        train(run, robot=robot, segmenter=ColourSegmenter())
+        run_training(out, episodes, preset, save_every=3)
         code = 0
     finally:
         os._exit(code)
@@ -83,8 +73,8 @@ if __name__ == '__main__':
     for number in range(_KILLS):
         process = start(folder / 'killed', bags, file)
         moment = random.random() * 0.1
-        told = kill(process, folder / 'killed', saving=number % 2 == 1, after=moment)
-        kills += [told] if told else []
+        place = kill(process, folder / 'killed', saving=number % 2 == 1, after=moment)
+        kills += [place] if place else []
     for name in ('killed', 'whole'):
         process = start(folder / name, bags, file)
         assert os.waitpid(process, 0)[1] == 0

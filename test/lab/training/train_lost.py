@@ -12,14 +12,9 @@ import socket
 import sys
 import time
 
-import torch
+from sources import run_training
 
 from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.lab.training.training_config import load_training_config, TrainingRun
-from mtv_world_ros.lab.training.training_run import train
-from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
 def start(number: int, port: int, out: Path, episodes: Path, preset: Path) -> int:
@@ -36,11 +31,7 @@ def start(number: int, port: int, out: Path, episodes: Path, preset: Path) -> in
         'MASTER_PORT': str(port),
     }
     try:
-        torch.set_num_threads(1)
-        robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-        config = load_training_config(preset)
-        run = TrainingRun(config=config, dataset=episodes, out=out, save_every=5)
-        train(run, robot=robot, segmenter=ColourSegmenter())
+        run_training(out, episodes, preset, save_every=5)
     except MtvWorldError as error:
         (out / 'said').write_text(f'{type(error).__name__}: {error}')
     finally:

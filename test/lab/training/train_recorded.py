@@ -10,15 +10,11 @@ from pathlib import Path
 import sys
 
 from safetensors.torch import save_file
+from sources import run_training
 import torch
 
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.lab.training.clips.batches import ClipBatch
 from mtv_world_ros.lab.training.trainer import Trainer
-from mtv_world_ros.lab.training.training_config import load_training_config, TrainingRun
-from mtv_world_ros.lab.training.training_run import train
-from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
 def record(out: Path) -> None:
@@ -40,11 +36,6 @@ def record(out: Path) -> None:
 
 
 if __name__ == '__main__':
-    torch.set_num_threads(1)
     folder, episodes, preset = (Path(argument) for argument in sys.argv[1:])
     record(folder)
-    train(
-        TrainingRun(config=load_training_config(preset), dataset=episodes, out=folder),
-        robot=load_robot(share_path('config', 'robots', 'yam_bimanual.yaml')),
-        segmenter=ColourSegmenter(),
-    )
+    run_training(folder, episodes, preset)
