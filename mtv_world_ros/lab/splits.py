@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, BeforeValidator, ValidationError
 
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.data.episode import EpisodeInfo, NOMINAL, PHYSICS
@@ -176,8 +176,8 @@ class _Entry(BaseModel):
     """An episode in `dataset.json`: its name, what is zero-shot in it, scene and seed if any."""
 
     name: str
-    scene: str | None = None
-    zero_shot: str | None = None
+    scene: Annotated[str, BeforeValidator(lambda given: given or '')] = ''
+    zero_shot: Any = None
     seed: Any = None
 
 
