@@ -141,6 +141,8 @@ def write_whole(path: Path, content: bytes | str) -> None:
     Raises:
         OSError: the file cannot be written; the old one is untouched.
     """
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, f"'{path}' is a folder; name a file")
     data = content.encode() if isinstance(content, str) else content
     beside = path.with_name(f'.{path.name}.{os.getpid()}.part')  # others may write the same file
     path.parent.mkdir(parents=True, exist_ok=True)

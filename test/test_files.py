@@ -31,3 +31,10 @@ def test_what_was_there_stays_where_the_new_is_not_written(tmp_path, monkeypatch
         write_whole(path, 'new content')
     assert path.read_text() == 'old'
     assert os.listdir(tmp_path) == ['file']
+
+
+def test_a_folder_in_place_of_the_file_is_named(tmp_path):
+    (tmp_path / 'page.html').mkdir()
+    with pytest.raises(IsADirectoryError, match=r"page\.html' is a folder; name a file"):
+        write_whole(tmp_path / 'page.html', 'text')
+    assert os.listdir(tmp_path) == ['page.html']

@@ -146,20 +146,30 @@ def _segmenter_findings(segmenters: dict[str, list[str]]) -> list[Finding]:
 
 
 def _with_strangers(found: FolderInspection) -> FolderInspection:
-    """Names episodes whose pictures share nothing with the others."""
-    inspections = dict(found.episodes)
+    """Names episodes whose pictures share nothing with the others.
+
+    Where the robot moves as it is drawn, the camera is the right one and the scene another.
+    """
+    inspections, notes = dict(found.episodes), list(found.notes)
     for view, places in found.places.items():
         names = found.members[view]
         alone = np.isinf(places.apart).sum(axis=1) == len(names) - 1
         if len(names) > 2 and alone.any() and not alone.all():
             for number in np.flatnonzero(alone):
                 name = names[int(number)]
-                text = (
-                    f"view '{view}' shares no background with any other episode: another camera "
-                    'or scene, a mirrored or turned image'
-                )
+                text = f"view '{view}' shares no background with any other episode: another "
+                if _fits(found, view, name):
+                    notes.append(f'{name}: {text}scene, or light')
+                    continue
+                text += 'camera or scene, a mirrored or turned image'
                 inspections[name] = _with(inspections[name], view, broken(text))
-    return replace(found, episodes=inspections)
+    return replace(found, episodes=inspections, notes=tuple(notes))
+
+
+def _fits(found: FolderInspection, view: str, name: str) -> bool:
+    """Whether nothing is wrong with a view, and all of it was checked."""
+    sections = [section for section in found.episodes[name].views if section.name == view]
+    return all(section.verdict == 'ok' for section in sections)
 
 
 def _with_places(
@@ -191,11 +201,16 @@ def _with_places(
 def _stale(
     names: Sequence[str], places: CameraPlaces, posed: dict[str, CameraModel]
 ) -> dict[str, str]:
-    """Episodes whose pose is that of an earlier one, though the camera was moved between them."""
+    """Episodes whose pose is that of an earlier one, though the camera was moved between them.
+
+    Backgrounds that share nothing do not tell: another scene looks like that, too.
+    """
     stale: dict[str, str] = {}
     for late, name in enumerate(names):
         for early, other in enumerate(names[:late]):
             if places.place[early] == places.place[late] or not {name, other} <= posed.keys():
+                continue
+            if np.isinf(places.apart[early, late]):
                 continue
             shift = _shift(posed[other], posed[name])
             if shift < _FOLLOWS * min(places.apart[early, late], _FAR):

@@ -144,6 +144,25 @@ def test_a_moved_camera_and_who_belongs_where_are_named(inspected):
     assert found.verdict == 'broken'
 
 
+def test_another_scene_before_the_right_camera_is_no_fault(tmp_path):
+    """Nothing of the background is that of the others, but the robot moves as it is drawn."""
+    robot, camera = load(tmp_path), make_cameras()['door']
+    for number, name in enumerate(('good0', 'good1', 'painted')):
+        positions = make_positions(SECONDS, seed=number)
+        frames = render(robot, camera, positions)
+        if name == 'painted':
+            empty = np.median(frames, axis=0).astype(np.uint8)
+            other = np.random.default_rng(0).integers(90, 190, (24, 32, 3)).astype(np.uint8)
+            other = other.repeat(10, axis=0).repeat(10, axis=1)
+            frames = np.where((frames == empty).all(axis=-1, keepdims=True), other, frames)
+        write(tmp_path / 'data' / name, robot, camera, positions, frames)
+    inspector = Inspector(robot, load_shape(robot), QUICK)
+    found, _ = inspect_folder(list_episodes(tmp_path / 'data'), inspector, read_episode)
+    text = folder_text(found)
+    assert found.verdict == 'ok', text
+    assert "painted: view 'door' shares no background" in text and 'another scene' in text
+
+
 @pytest.mark.parametrize('has_own_pose', [True, False])
 def test_a_moved_camera_is_a_fault_only_with_the_pose_of_before(folder, tmp_path, has_own_pose):
     robot, data = folder
