@@ -23,7 +23,7 @@ def run(out, policy, *more):
 
 
 def test_the_expert_succeeds_as_the_page_says(tmp_path, capsys):
-    """The first command of docs/policies.md, twice, while somebody watches."""
+    """The command of docs/watch_it.md."""
     pytest.importorskip('rerun')
     live, watch = tmp_path / 'live.rrd', ('--watch', str(tmp_path / 'live.rrd'), '--count', '2')
     assert run(tmp_path, 'expert', '--max-chunks', '5', *watch) == 0
