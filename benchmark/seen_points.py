@@ -52,7 +52,7 @@ HEAD = (
     'view',
     'places',
     'fitted points: n, median [px]',
-    'others: n, median, largest [px]',
+    'others: n, median, three largest [px]',
     'fx [px], fy / fx, k1',
     "the doctor's match",
     'doubted',
@@ -217,11 +217,20 @@ def _delay(
 def _distances(
     read: Recordings, view: str, cameras: Sequence[CameraModel], fitted: Points, others: Points
 ) -> list[str]:
-    near, far = (np.concatenate(read.apart(cameras, part[view])) for part in (fitted, others))
+    near = np.concatenate(read.apart(cameras, fitted[view]))
+    each = read.apart(cameras, others[view])
+    far = np.concatenate(each)
+    names = [episode.info.path.name for episode in read.episodes]
+    where = [
+        f'{name} at {row[0]:g} s'
+        for name, here in zip(names, each, strict=True)
+        for row, _ in zip(others[view].get(name, []), here, strict=True)
+    ]
+    largest = [f'{far[n]:.1f} ({where[n]})' for n in np.argsort(-far)[:3]]
     K, bend = cameras[0].K, cameras[0].distortion
     return [
         f'{len(near)}, {np.median(near):.1f}',
-        f'{len(far)}, {np.median(far):.1f}, {far.max():.1f}',
+        f'{len(far)}, {np.median(far):.1f}, {", ".join(largest)}',
         f'{K[0, 0]:.1f}, {K[1, 1] / K[0, 0]:.3f}, {bend[0] if len(bend) else 0:.3f}',
     ]
 
