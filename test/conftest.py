@@ -55,17 +55,16 @@ OBSTACLES = {
 }
 #: files of tests that take longest, which begin first: no worker has one of them alone at the end
 SLOW = [
-    'test_your_robot_page', 'test_shell_lines', 'test_calibrate_camera', 'test_shared_camera',
-    'test_finger_fit', 'test_doctor', 'test_contact_fit', 'test_doctor_of_folders',
-    'test_node_setups', 'test_imagine_command', 'test_foreseen_scenes', 'test_cli',
-    'test_distributed', 'test_wan_benchmarks', 'test_player_recorder', 'test_kill',
-    'test_interval_coverage', 'test_never_lost', 'test_full_disk', 'test_wan_commands',
-    'test_collect', 'test_runner', 'test_workers', 'test_wan_training', 'test_processes',
-    'test_serving', 'test_evaluate', 'test_lifecycle', 'test_interrupts',
-    'test_policy_in_the_loop', 'test_html', 'test_bundled_episode', 'test_trainer',
-    'test_rank_command', 'test_comparison', 'test_doctor_of_own_robot', 'test_held_out',
-    'test_policy_beside_a_robot', 'test_both_worlds', 'test_own_checkpoint',
-    'test_adapter_parameter', 'test_signals', 'test_evaluate_command', 'test_parameter_values',
+    'test_shell_lines', 'test_your_robot_page', 'test_imagine_command', 'test_foreseen_scenes',
+    'test_calibrate_camera', 'test_shared_camera', 'test_doctor', 'test_contact_fit',
+    'test_doctor_of_folders', 'test_node_setups', 'test_cli', 'test_distributed',
+    'test_wan_benchmarks', 'test_player_recorder', 'test_kill', 'test_interval_coverage',
+    'test_never_lost', 'test_full_disk', 'test_wan_commands', 'test_collect', 'test_runner',
+    'test_workers', 'test_wan_training', 'test_processes', 'test_serving', 'test_evaluate',
+    'test_lifecycle', 'test_interrupts', 'test_policy_in_the_loop', 'test_html',
+    'test_bundled_episode', 'test_trainer', 'test_rank_command', 'test_comparison',
+    'test_doctor_of_own_robot', 'test_held_out', 'test_policy_beside_a_robot', 'test_both_worlds',
+    'test_own_checkpoint', 'test_adapter_parameter', 'test_signals', 'test_evaluate_command',
     'test_bad_input', 'test_stored_objects',
 ]  # fmt: skip
 
