@@ -28,7 +28,7 @@ class Course:
     """Motion of the arms that touch no solid, and the control inputs of their drives.
 
     Attributes:
-        controls: (S, D) where the drives are told to be [rad or m].
+        controls: (S, D) set points of the drives [rad or m].
         pushes: (S, D) with which they help themselves beside, as what moves fingers [N m or N].
         positions: (S + 1, D) where they are [rad or m]; row 0 at the begin.
         velocities: (S + 1, D).
@@ -64,7 +64,7 @@ class Course:
         )
 
     def _rest(self, steps: int) -> Course:
-        """So many steps in which the arms are told to be where this course begins."""
+        """So many steps in which the arms hold the start of this course."""
         where = np.repeat(self.positions[:1], steps + 1, axis=0)
         still = np.zeros_like(where)
         return Course(controls=where[1:], pushes=still[1:], positions=where, velocities=still)
@@ -76,7 +76,7 @@ class ArmsState:
 
     Attributes:
         physics: of MuJoCo's full physics, of a scene of the arms and the table.
-        ways: (2, D) of the fingers: where they are told to be, and how fast that moves.
+        ways: (2, D) set points of the fingers, and their speeds.
         commands: (J,) the last ones [rad or m].
     """
 
@@ -116,8 +116,8 @@ class CoursePlanner:
     def plan(self, commands: FloatArray, state: ArmsState) -> tuple[Course, ArmsState]:
         """Returns the course of commands (1 + N, J), `PERIOD_S` apart, and the state after it."""
         scene, drives = self._scene, self._scene.arms.drives
-        told = np.concatenate([state.commands[None], commands[1:]])
-        rows = drives.spread(self._squeezed(told))
+        targets = np.concatenate([state.commands[None], commands[1:]])
+        rows = drives.spread(self._squeezed(targets))
         led = rows[1:] + drives.lead * np.diff(rows, axis=0) / PERIOD_S
         controls = np.repeat(led, SUBSTEPS, axis=0)
         pushes = np.zeros_like(controls)

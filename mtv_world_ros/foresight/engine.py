@@ -94,7 +94,7 @@ def _log_once(message: str) -> None:
         logger.warning('MuJoCo, of a foreseen future: %s', kind)
 
 
-#: warnings that were told
+#: warnings that were logged
 _told: set[str] = set()
 
 
@@ -245,9 +245,11 @@ class Batch:
             crowded[place] = self._constraints(run, number) > _CROWDED
         self._compute(run, moving[~crowded], controls[~crowded])
         few = self._engine.threads
-        slow, told = moving[crowded], controls[crowded]
+        slow, goals = moving[crowded], controls[crowded]
         for first in range(0, len(slow), few):
-            self._compute_crowded(run, slow[first : first + few], told[first : first + few], check)
+            self._compute_crowded(
+                run, slow[first : first + few], goals[first : first + few], check
+            )
 
     def _compute_crowded(
         self, run: _Run, moving: np.ndarray, controls: FloatArray, check: Callable[[], None]
@@ -282,8 +284,8 @@ class Batch:
     def _controls(self, run: _Run, number: int, row: int) -> FloatArray:
         """(S, D) numbers of the drives of a future in a row."""
         course, steps = run.courses[number], run.steps_of(row)
-        told = course.controls[steps] + course.pushes[steps] / self._gains[number]
-        return told + self.futures[number].zeros
+        targets = course.controls[steps] + course.pushes[steps] / self._gains[number]
+        return targets + self.futures[number].zeros
 
     def _is_clear(self, run: _Run, number: int, row: int) -> bool:
         """Whether the arms pass by all solids in a row."""

@@ -305,8 +305,8 @@ def refuse_unknown(node: Node) -> None:
     # rclpy has no public way to ask for what was given
     unknown = [name for name in node._parameter_overrides if not node.has_parameter(name)]
     if unknown:
-        said = ', '.join(f"'{name}'{nearest(name, known)}" for name in unknown)
-        raise ConfigError(f"'{node.get_name()}' has no parameter {said}; --help lists them")
+        names = ', '.join(f"'{name}'{nearest(name, known)}" for name in unknown)
+        raise ConfigError(f"'{node.get_name()}' has no parameter {names}; --help lists them")
 
 
 def declare_camera_topics(node: Node, views: Sequence[str]) -> dict[str, str]:

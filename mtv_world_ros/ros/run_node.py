@@ -34,7 +34,7 @@ def end_with_parent() -> None:
     if not parent or not sys.platform.startswith('linux'):
         return
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
-    if os.getppid() != int(parent):  # gone before that was said
+    if os.getppid() != int(parent):  # gone before the signal was set
         sys.exit(1)
 
 
@@ -103,13 +103,13 @@ def run(
 
 def _why_refused(error: Exception) -> str:
     """Why rclpy refused the command line or a parameter file, and what is valid."""
-    said = str(error).partition('failed to initialize rcl: ')[2] or str(error)
+    detail = str(error).partition('failed to initialize rcl: ')[2] or str(error)
     hint = ''
-    if 'same type' in said:
+    if 'same type' in detail:
         hint = '; all items of a list must be of one type: write [1.0, 2.0], or ["a", "1"]'
-    elif 'parameter override' in said:
+    elif 'parameter override' in detail:
         hint = '; expected -p NAME:=VALUE with VALUE in YAML, e.g. -p seed:=3'
-    return f'the arguments after --ros-args cannot be used: {said}{hint}'
+    return f'the arguments after --ros-args cannot be used: {detail}{hint}'
 
 
 def _find_log_folder() -> None:

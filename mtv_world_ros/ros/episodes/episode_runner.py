@@ -99,8 +99,8 @@ class RecorderProcess:
         if self._process.poll() is not None:
             status, text = self._process.returncode, last_line(self._log, 'its log is empty')
             raise EpisodeError(f'the recorder ended with status {status}: {text}')
-        if said := self._stopped.report({'recorder': self._process}):
-            raise EpisodeError(f"{said}; its log is '{self._log}'")
+        if problem := self._stopped.report({'recorder': self._process}):
+            raise EpisodeError(f"{problem}; its log is '{self._log}'")
 
     def end(self) -> None:
         """Ends the bag and waits until it is closed.
@@ -185,8 +185,8 @@ class EpisodeRunner(Node):
             self._running = {'episode': number, 'start': start.source, 'bag': ''}
             result = self._run_one(number, start)
             self._keep(result)
-            said = f': {result["text"]}' if result['text'] else ''
-            self.get_logger().info(f'episode {number}: {result["how"]}{said}')
+            why = f': {result["text"]}' if result['text'] else ''
+            self.get_logger().info(f'episode {number}: {result["how"]}{why}')
             if result['how'].endswith('_died'):
                 raise ConfigError(f'episode {number}: {result["how"]}; see its log')
 
@@ -196,7 +196,7 @@ class EpisodeRunner(Node):
         bag = self._options.out / f'episode_{self._running.get("episode", 0):05d}'
         if self._running and bag.is_dir():
             cut_off = {'how': 'interrupted', 'text': 'it was stopped before its end'}
-            with suppress(OSError):  # the disk is full: that is said already
+            with suppress(OSError):  # the disk is full: reported already
                 self._keep({**self._running, 'bag': str(bag), **_ending(cut_off)})
         self.destroy_node()
 

@@ -168,7 +168,7 @@ class _Chunk:
     begin_s: float
     policy_s: float = 0.0
     sent_s: float = 0.0
-    said: Mapping[str, str] | None = None
+    report: Mapping[str, str] | None = None
 
 
 class PolicyLoop:
@@ -258,7 +258,7 @@ class PolicyLoop:
                 self.end('another_policy', f'a trajectory stamped {stamp} ns was imagined')
         elif self.phase == 'imagining' and self._is_mine(stamp):
             if state == 'chunk':
-                self._chunk.said = values
+                self._chunk.report = values
             elif state == 'done':
                 self._wait('collecting', self._settings.frames_timeout_s)
                 self.tick()
@@ -325,15 +325,15 @@ class PolicyLoop:
         return np.array([seen.get(name, first) for name, first in named])
 
     def _collect(self) -> None:
-        said, before = self._chunk.said, self._observation
+        report, before = self._chunk.report, self._observation
         assert before is not None
-        if said is None:
+        if report is None:
             self._why_waiting = 'the rollout is done, but of its chunk there was no report'
             return
-        num_frames = int(said['frames'])
+        num_frames = int(report['frames'])
         # beside a real robot the world model starts from frames newer than those answered
         is_strict = self._settings.mode == 'imagine'
-        start_ns = before.stamp_ns if is_strict else int(said['observation_stamp_ns'])
+        start_ns = before.stamp_ns if is_strict else int(report['observation_stamp_ns'])
         stamps = chunk_stamps(start_ns, num_frames, self._spec.fps)
         missing = self._frames.missing(stamps)
         unexpected = self._frames.unexpected(stamps)
@@ -345,7 +345,7 @@ class PolicyLoop:
             self._why_waiting = f'{len(missing)} frames, the first of {missing[0]}'
             return
         self.num_chunks += 1
-        self._report_chunk(said, num_frames)
+        self._report_chunk(report, num_frames)
         self._go_on(stamps[-1], before)
 
     def _go_on(self, stamp_ns: int, before: Observation) -> None:
@@ -356,21 +356,21 @@ class PolicyLoop:
         else:
             self._act(self._frames.observation(stamp_ns, before))
 
-    def _report_chunk(self, said: Mapping[str, str], num_frames: int) -> None:
+    def _report_chunk(self, report: Mapping[str, str], num_frames: int) -> None:
         now_s, chunk = time.monotonic(), self._chunk
-        self._estimate = {key: said[key] for key in ESTIMATE if key in said}
-        stages = {key: value for key, value in said.items() if key.startswith('stage_s.')}
+        self._estimate = {key: report[key] for key in ESTIMATE if key in report}
+        stages = {key: value for key, value in report.items() if key.startswith('stage_s.')}
         values = {
             **self._values(),
-            'first_stamp_ns': said['first_stamp_ns'],
-            'last_stamp_ns': said['last_stamp_ns'],
+            'first_stamp_ns': report['first_stamp_ns'],
+            'last_stamp_ns': report['last_stamp_ns'],
             'frames': num_frames,
             'loop_s': now_s - chunk.begin_s,
             'policy_s': chunk.policy_s,
             'rollout_s': now_s - chunk.sent_s,
-            'latency_s': said['latency_s'],
+            'latency_s': report['latency_s'],
             **stages,
-            'success': said.get('success', 'nan'),
+            'success': report.get('success', 'nan'),
         }
         self._out.report('chunk', values)
 

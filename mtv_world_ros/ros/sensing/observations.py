@@ -189,19 +189,21 @@ class ObservationBuffer:
 
     def problems(self, now_ns: int) -> list[str]:
         """Returns what is missing or too old for an observation, as text."""
-        limits, said = self._limits(), []
+        limits, missing = self._limits(), []
         for view, images in self._images.items():
-            said += _freshness(f"images of view '{view}'", images, now_ns, limits.max_image_age_s)
+            missing += _freshness(
+                f"images of view '{view}'", images, now_ns, limits.max_image_age_s
+            )
             if not self._intrinsics.has(view):
-                said.append(f"no camera_info of view '{view}'")
+                missing.append(f"no camera_info of view '{view}'")
         old = {
             name: _freshness('', samples, now_ns, limits.max_joint_state_age_s)
             for name, samples in self._joints.items()
         }
         names = [name for name, text in old.items() if text]
         if names:
-            said.append(f'no fresh joint_states of {", ".join(names)}')
-        return said
+            missing.append(f'no fresh joint_states of {", ".join(names)}')
+        return missing
 
     def observe(self, now_ns: int) -> SensedScene:
         """Makes an observation of the newest images that belong together.
@@ -435,14 +437,14 @@ def _are_equal(before: Iterable[CameraModel], now: Iterable[CameraModel]) -> boo
 
 def _differences(first: CameraInfo, later: CameraInfo) -> str:
     """Differences between two infos of one camera, as text; empty = none."""
-    said = []
+    changes = []
     for field in _COMPARED:
         before, now = getattr(first, field), getattr(later, field)
         if not np.array_equal(before, now):
-            said.append(f'{field} from {_short(before)} to {_short(now)}')
-    if not said and window_of(first) != window_of(later):
-        said.append(f'{window_of(first)} to {window_of(later)}')
-    return ', '.join(said)
+            changes.append(f'{field} from {_short(before)} to {_short(now)}')
+    if not changes and window_of(first) != window_of(later):
+        changes.append(f'{window_of(first)} to {window_of(later)}')
+    return ', '.join(changes)
 
 
 def _short(value: object) -> str:

@@ -160,9 +160,9 @@ class OpenAIChat:
         if not isinstance(text, str):
             raise self._unusable(f'its content is {excerpt(repr(text))}')
         if refusal or reason == 'content_filter':
-            said = refusal or text or 'its content filter stopped it'
+            why = refusal or text or 'its content filter stopped it'
             raise DescriptionError(
-                f"{self.identity} refuses to describe the frame: '{excerpt(str(said))}'; use "
+                f"{self.identity} refuses to describe the frame: '{excerpt(str(why))}'; use "
                 "another model, or an object list (describer 'kind: list')",
                 'refused',
             )
@@ -183,20 +183,20 @@ class OpenAIChat:
 
     def _failed(self, status: int, text: str) -> DescriptionError:
         """The error for an HTTP status that is final."""
-        said = f'{self.identity} answers with status {status}: {excerpt(text)}'
+        reply = f'{self.identity} answers with status {status}: {excerpt(text)}'
         budget = f"'retry_budget_s' ({self.config.retry_budget_s:g} s)"
         if status == 429:
             return DescriptionError(
-                f'{said}; the rate limit did not clear within {budget}', 'rate_limited'
+                f'{reply}; the rate limit did not clear within {budget}', 'rate_limited'
             )
         if status >= 500:
-            return DescriptionError(f'{said}; it did not recover within {budget}', 'server_error')
+            return DescriptionError(f'{reply}; it did not recover within {budget}', 'server_error')
         where = {
             401: f"check the key in '{self.config.key_variable}'",
             403: f"check the key in '{self.config.key_variable}'",
             404: "check the describer's 'model' and 'base_url'",
         }.get(status, "check that 'model' takes images")
-        return DescriptionError(f'{said}; {where}', 'rejected')
+        return DescriptionError(f'{reply}; {where}', 'rejected')
 
 
 class _FormatRefused(Exception):
