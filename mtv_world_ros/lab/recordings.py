@@ -11,6 +11,7 @@ import hashlib
 from io import BytesIO
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -257,7 +258,7 @@ def _load(file: Path, path: Path) -> Recording:
         )
         for i, row in enumerate(text.pop('cameras'))
     )
-    commands = {name: stored.get(f'command_{name}') for name in _OF_COMMANDS}
+    commands: dict[str, Any] = {name: stored.get(f'command_{name}') for name in _OF_COMMANDS}
     tracks = {camera.view: stored.get(f'track_{camera.view}') for camera in cameras}
     return Recording(
         path=path,
