@@ -5,6 +5,7 @@ commands. Where rclpy is installed, the node and those who talk to it run too.
 """
 
 from importlib.util import find_spec
+import json
 import os
 from pathlib import Path
 import shlex
@@ -15,6 +16,7 @@ import sys
 
 from bags import MAPPING, record
 from crane import FPS, load, make_cameras, make_positions, render, tool_pixels
+import cv2
 import numpy as np
 import pytest
 from test_own_checkpoint import TINY
@@ -22,8 +24,10 @@ import yaml
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.lab.inspection import joint_camera
+from mtv_world_ros.lab.training.object_motion import contact_fit
 from mtv_world_ros.rendering.video import encode_video
 
 PAGE = Path(__file__).resolve().parents[3] / 'docs' / 'your_robot.md'
@@ -35,6 +39,7 @@ SMALL = {
     'train': ['--threads', '1', *TINY],
     'evaluate': ['--no-ceiling', '--actions', 'true', '--steps=1', '--threads=1', '--no-report'],
     'imagine': ['--max-chunks', '2', '--threads', '1'],
+    'fit-contact': ['--motions', '2', '--threads', '1'],
 }
 #: as the page has it for a first try, from the bundled weights, and smaller
 FIRST_TRY = [
@@ -68,6 +73,11 @@ class Nod:
 STATUS = {'doctor': 3}
 
 
+#: a block on the floor beside the robot [m]: its corners, and a colour that no tile has
+BLOCK = np.array([0.45, -0.4, 0.04]) + 0.04 * np.array(
+    [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+)
+PINK = (250, 40, 200)
 #: the part of the page that is about videos and tables
 VIDEOS = '## From videos and tables'
 
@@ -160,7 +170,7 @@ def lab(tmp_path_factory):
     folder = tmp_path_factory.mktemp('lab')
     robot, cameras = load(folder), make_cameras()
     del cameras['palm']
-    clicked = {view: {} for view in cameras}
+    clicked, boxes = ({view: {} for view in cameras} for _ in range(2))
     for name, seed in (('one', 0), ('two', 1)):
         positions = make_positions(6.0, seed=seed)
         (folder / 'raw' / name).mkdir(parents=True)
@@ -168,6 +178,11 @@ def lab(tmp_path_factory):
                    header=','.join(robot.joint_names), comments='')  # fmt: skip
         for view, camera in cameras.items():
             frames = render(robot, camera, positions)
+            corners = project(camera, camera.T_mount_camera, BLOCK)[0]
+            for frame in frames:  # the robot does not come between it and the cameras
+                cv2.fillConvexPoly(frame, cv2.convexHull(corners.round().astype(np.int32)), PINK)
+            edges = [*corners.min(0) - 1, *corners.max(0) + 1]
+            boxes[view][name] = {'pink block': [[0.0, *np.round(edges).tolist()]]}
             (folder / 'raw' / name / f'{view}.mp4').write_bytes(encode_video(frames, FPS))
             seen = tool_pixels(robot, camera, positions)
             clicked[view][name] = [[k / FPS, *seen[k].round().tolist()] for k in (3, 21, 45)]
@@ -183,6 +198,7 @@ def lab(tmp_path_factory):
     }
     (folder / 'my_lab.yaml').write_text(yaml.safe_dump(said))
     (folder / 'points.yaml').write_text(yaml.safe_dump(clicked))
+    (folder / 'objects.yaml').write_text(yaml.safe_dump({'boxes': boxes}))
     return folder, cameras
 
 
@@ -191,15 +207,27 @@ def test_the_page_leads_from_videos_to_a_contact_sheet(lab, monkeypatch, capsys)
     folder, cameras = lab
     monkeypatch.chdir(folder)
     monkeypatch.setattr(joint_camera, '_STAGES', joint_camera._STAGES[:2])  # the last is finer
+    monkeypatch.setattr(contact_fit, '_DRAWS', 8)
+    monkeypatch.setattr(contact_fit, '_ROUNDS', 1)
     told = lines(of_videos=True)
     assert len(told) <= 8
     for words in told:
         more = FIRST_TRY if words[1] == 'train' else []
-        more = SMALL['evaluate'][:-1] if words[1] == 'evaluate' else more
+        if words[1] in ('evaluate', 'fit-contact'):
+            more = [word for word in SMALL[words[1]] if word != '--no-report']
         status = main([*words[1:], *more])
         said = capsys.readouterr()
         assert status == 0, f'{words}: {said.out}{said.err}'
     assert 'data:image/webp' in (folder / 'out' / 'lab' / 'report.html').read_text()
+    contact = folder / 'runs' / 'lab' / 'checkpoint' / 'object_motion' / 'contact.json'
+    found = json.loads(contact.read_text())
+    # the floor, through cameras that are known to 4 px; no recording has commands of its own
+    assert abs(found['table_m']) < 0.03 and found['squeeze'] > 0
+    for name in ('one', 'two'):
+        masks = read_episode(folder / 'data' / 'lab' / name).masks
+        assert masks is not None and all(
+            (np.asarray(m.frames) > 0).any((1, 2)).all() for m in masks.values()
+        )
     robot = load_robot(folder / 'data' / 'lab' / 'robot' / 'robot.yaml')
     for name, seed in (('one', 0), ('two', 1)):
         found = read_episode(folder / 'data' / 'lab' / name, robot=robot).cameras
