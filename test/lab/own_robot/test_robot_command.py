@@ -104,6 +104,9 @@ def test_the_tool_of_fingers_that_turn_is_on_the_axis_between_their_tips(crane):
     turned = Rotation.from_quat(tool['quaternion_xyzw']).as_matrix()
     assert turned[2, 2] > np.cos(np.radians(2))  # 17 degrees before
     assert abs(turned[0, 1]) > 0.999  # along the way of the fingers
+    # a knuckle of (37.2, 50.1) mm turns by .8 rad
+    way = 0.0372 - np.hypot(0.0372, 0.0501) * np.cos(np.arctan2(0.0501, 0.0372) + 0.8)
+    assert tool['finger_travel_m'] == pytest.approx(way, abs=1e-4)
 
 
 def test_joints_that_follow_in_a_chain_are_resolved_and_circles_named(crane):
