@@ -310,8 +310,8 @@ class Arms:
     def _mass(self) -> FloatArray:
         """(J, J) mass matrix in the middle of the joints' ranges."""
         robot, model = self.robot, self._model
-        middle = (robot.lower + robot.upper) / 2
-        middle = np.where(np.isfinite(middle), middle, 0.0)
+        ends = np.stack([robot.lower, robot.upper])
+        middle = np.where(np.isfinite(ends).all(0), ends, 0.0).mean(0)
         q = robot.configurations(middle[None])[0]
         follows = robot.joint_motions
         return follows.T @ pin.crba(model, model.createData(), q) @ follows
