@@ -157,7 +157,7 @@ def with_images(episode: Episode, change: Callable[[Track], Track]) -> Episode:
 def shorter(track: Track) -> Track:
     """The first 60 %: what went on after that has joint states alone."""
     count = round(0.6 * len(track.stamps_ns))
-    return Track(track.stamps_ns[:count], np.asarray(track.frames)[:count])
+    return Track(track.stamps_ns[:count], np.asarray(track.frames, np.uint8)[:count])
 
 
 def frozen(track: Track) -> Track:
@@ -170,12 +170,12 @@ def frozen(track: Track) -> Track:
 def sparse(track: Track) -> Track:
     """A frame a second."""
     step = max(1, round(1e9 / float(np.median(np.diff(track.stamps_ns)))))
-    return Track(track.stamps_ns[::step], np.asarray(track.frames)[::step])
+    return Track(track.stamps_ns[::step], np.asarray(track.frames, np.uint8)[::step])
 
 
 def flipped(track: Track) -> Track:
     """Mirrored frames."""
-    return track._replace(frames=np.ascontiguousarray(np.asarray(track.frames)[:, :, ::-1]))
+    return track._replace(frames=np.ascontiguousarray(np.asarray(track.frames, np.uint8)[:, :, ::-1]))
 
 
 def without_arm(track: Track) -> Track:

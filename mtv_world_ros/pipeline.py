@@ -34,7 +34,7 @@ from mtv_world_ros.rendering.trajectory_video import (
 from mtv_world_ros.rollout_state import RolloutState
 from mtv_world_ros.success.calibration import HorizonCurve
 from mtv_world_ros.success.doubts import doubted, widened
-from mtv_world_ros.success.estimator import Judged, SuccessEstimator
+from mtv_world_ros.success.estimator import JudgedChunk, SuccessEstimator
 from mtv_world_ros.success.foreseen import ForeseenMotions
 from mtv_world_ros.success.rollout_memory import footage_of
 from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
@@ -297,7 +297,7 @@ class Pipeline:
         foreseen: ForeseenMotions | None = None,
         *,
         is_real: bool = False,
-    ) -> Judged:
+    ) -> JudgedChunk:
         """Returns the estimate after a chunk with joints at (1 + T, J), and what it remembers."""
         cameras, check = state.observation.cameras, episode.camera_check
         footage = footage_of(self.robot, cameras, positions, start_masks, masks)

@@ -15,7 +15,7 @@ from mtv_world_ros.data.tool_targets import ToolTargets
 STATE = 'state'
 
 
-class ViewTopics(Schema):
+class ViewSource(Schema):
     """Topics of a view."""
 
     image: str = Field(description='topic of Image, CompressedImage or FFMPEGPacket')
@@ -61,7 +61,7 @@ class BagMapping(Written):
         'the one of `/robot_description`',
     )
     namespace: str = Field(default='', description='of the robot, e.g. `left_arm`')
-    views: dict[str, Annotated[ViewTopics, BeforeValidator(_view)]] = Field(
+    views: dict[str, Annotated[ViewSource, BeforeValidator(_view)]] = Field(
         default={}, description='topic of the images by view; empty = `<view>/image_raw`'
     )
     joint_states: str = 'joint_states'

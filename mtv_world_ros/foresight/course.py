@@ -14,7 +14,7 @@ from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.foresight.arm_response import PERIOD_S
 from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.library import mujoco, Rollout
-from mtv_world_ros.foresight.scene import Scene, STEP_S
+from mtv_world_ros.foresight.scene import CompiledScene, STEP_S
 
 #: a gripper that is closed by this share of its travel squeezes in full
 _CLOSED = 0.2
@@ -24,7 +24,7 @@ FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Course:
+class FreeMotion:
     """Motion of the arms that touch no solid, and the control inputs of their drives.
 
     Attributes:
@@ -39,7 +39,7 @@ class Course:
     positions: FloatArray
     velocities: FloatArray
 
-    def late(self, steps: int, last: Course | None) -> Course:
+    def late(self, steps: int, last: FreeMotion | None) -> FreeMotion:
         """Returns the course, delayed by so many steps.
 
         Args:
@@ -56,18 +56,18 @@ class Course:
             first = before[len(before) - skip - steps : len(before) - skip]
             return np.concatenate([first, rows[: len(rows) - steps]])
 
-        return Course(
+        return FreeMotion(
             controls=shifted(self.controls, last.controls, 0),
             pushes=shifted(self.pushes, last.pushes, 0),
             positions=shifted(self.positions, last.positions, 1),
             velocities=shifted(self.velocities, last.velocities, 1),
         )
 
-    def _rest(self, steps: int) -> Course:
+    def _rest(self, steps: int) -> FreeMotion:
         """So many steps in which the arms hold the start of this course."""
         where = np.repeat(self.positions[:1], steps + 1, axis=0)
         still = np.zeros_like(where)
-        return Course(controls=where[1:], pushes=still[1:], positions=where, velocities=still)
+        return FreeMotion(controls=where[1:], pushes=still[1:], positions=where, velocities=still)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +93,7 @@ class CoursePlanner:
         settings: of contact.
     """
 
-    def __init__(self, scene: Scene, settings: ContactSettings) -> None:
+    def __init__(self, scene: CompiledScene, settings: ContactSettings) -> None:
         self._scene, self._squeeze = scene, settings.squeeze
         self._model = scene.model_of(settings, ())
         self._data = mujoco.MjData(self._model)
@@ -113,7 +113,7 @@ class CoursePlanner:
             physics=physics, ways=np.stack([at, np.zeros_like(at)]), commands=positions
         )
 
-    def plan(self, commands: FloatArray, state: ArmsState) -> tuple[Course, ArmsState]:
+    def plan(self, commands: FloatArray, state: ArmsState) -> tuple[FreeMotion, ArmsState]:
         """Returns the course of commands (1 + N, J), `PERIOD_S` apart, and the state after it."""
         scene, drives = self._scene, self._scene.arms.drives
         targets = np.concatenate([state.commands[None], commands[1:]])
@@ -138,7 +138,7 @@ class CoursePlanner:
         nq = self._model.nq
         physics = np.concatenate([state.physics[None], states[0]])
         then = ArmsState(physics=physics[-1], ways=ways, commands=commands[-1])
-        course = Course(
+        course = FreeMotion(
             controls=controls,
             pushes=pushes,
             positions=physics[:, 1 + scene.arm_qpos],

@@ -19,14 +19,14 @@ from mtv_world_ros.foresight.arm_response import PERIOD_S
 from mtv_world_ros.foresight.arms import Arms, SOLIDS
 from mtv_world_ros.foresight.course import (
     ArmsState,
-    Course,
     CoursePlanner,
+    FreeMotion,
     FULL,
     SUBSTEPS,
 )
 from mtv_world_ros.foresight.futures import Future
 from mtv_world_ros.foresight.library import mujoco, Rollout
-from mtv_world_ros.foresight.scene import kind_of, Scene, STEP_S
+from mtv_world_ros.foresight.scene import CompiledScene, kind_of, STEP_S
 
 #: slower solids are at rest [rad/s], [m/s]; arms that are nearer to their way are on it
 _REST_RAD_S, _REST_M_S = 0.02, 0.002
@@ -65,7 +65,7 @@ class BatchState:
     physics: FloatArray
     arms: ArmsState
     still: np.ndarray
-    last: Course | None = None
+    last: FreeMotion | None = None
     lost: dict[int, str] = field(default_factory=dict)
 
 
@@ -108,17 +108,17 @@ class Engine:
 
     def __init__(self, arms: Arms, threads: int = 1) -> None:
         self.arms, self.threads = arms, max(threads, 1)
-        self._scenes: dict[tuple[str, ...], tuple[Scene, list[Any]]] = {}
+        self._scenes: dict[tuple[str, ...], tuple[CompiledScene, list[Any]]] = {}
         mujoco.set_mju_user_warning(_log_once)
         self._rollout = Rollout(nthread=0 if threads < 2 else threads)
 
-    def scene_of(self, kinds: Sequence[str]) -> tuple[Scene, list[Any]]:
+    def scene_of(self, kinds: Sequence[str]) -> tuple[CompiledScene, list[Any]]:
         """Returns the compiled scene of solids of some kinds, and data of each thread."""
         key = tuple(kinds)
         if key not in self._scenes:
             if len(self._scenes) >= 8:
                 self._scenes.pop(next(iter(self._scenes)))
-            scene = Scene.compiled(self.arms, kinds)
+            scene = CompiledScene.compiled(self.arms, kinds)
             self._scenes[key] = scene, [mujoco.MjData(scene.model) for _ in range(self.threads)]
         return self._scenes[key]
 
@@ -300,9 +300,9 @@ class _Run:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: CompiledScene,
         futures: Sequence[Future],
-        courses: Sequence[Course],
+        courses: Sequence[FreeMotion],
         steps: int,
         state: BatchState,
     ) -> None:
@@ -414,7 +414,7 @@ class _Run:
 class _Nearby:
     """Tells whether arms come near solids, or fingers to the table."""
 
-    def __init__(self, scene: Scene, model: Any) -> None:
+    def __init__(self, scene: CompiledScene, model: Any) -> None:
         self._scene, self._model = scene, model.__copy__()
         of_arms = self._model.geom_contype > SOLIDS
         of_solids = self._model.geom_contype == SOLIDS

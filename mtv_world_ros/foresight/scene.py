@@ -76,7 +76,7 @@ class _Piece:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Scene:
+class CompiledScene:
     """A compiled scene; `model_of` gives it the numbers of a future.
 
     Attributes:
@@ -100,7 +100,7 @@ class Scene:
     _bodies: tuple[int, ...] = field(repr=False)
 
     @classmethod
-    def compiled(cls, arms: Arms, kinds: Sequence[str]) -> Scene:
+    def compiled(cls, arms: Arms, kinds: Sequence[str]) -> CompiledScene:
         """Returns the scene of a robot and solids of some kinds.
 
         Raises:

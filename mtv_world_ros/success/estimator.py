@@ -42,7 +42,7 @@ def verdict_word(probability: float) -> str:
     return {1.0: 'success', 0.0: 'failure'}.get(verdict(probability), 'open')
 
 
-__all__ = ['Judged', 'SuccessEstimator', 'load_tasks']
+__all__ = ['JudgedChunk', 'SuccessEstimator', 'load_tasks']
 
 #: largest probability of a task that cannot be done yet: a gripper that has to be open is closed,
 #: or an object that has to move has not moved
@@ -68,7 +68,7 @@ def capped(probability: float, features: Mapping[str, float]) -> float:
     return min(probability, UNDONE_PROBABILITY) if closed or left else probability
 
 
-class Judged(NamedTuple):
+class JudgedChunk(NamedTuple):
     """The estimate after a chunk, and the memory for the next chunk."""
 
     estimate: SuccessEstimate
@@ -119,7 +119,7 @@ class SuccessEstimator:
         foreseen: ForeseenMotions | None = None,
         *,
         is_real: bool = False,
-    ) -> Judged:
+    ) -> JudgedChunk:
         """Returns the probability that the task is done at the end of a rollout's chunk.
 
         `jaccard` holds J of every subject with its goal mask (its first mask of the rollout,
@@ -138,7 +138,7 @@ class SuccessEstimator:
             _check_views(task, footage)
         except CannotTell as reason:
             views = Views(footage=footage, memory=memory, used=())
-            return Judged(_abstains(reason, views, []), memory)
+            return JudgedChunk(_abstains(reason, views, []), memory)
         views = Views(footage=footage, memory=memory, used=task.views)
         subjects = [
             views.names.index(bound[role]) for role in task.movers if bound[role] in views.names
@@ -149,9 +149,9 @@ class SuccessEstimator:
             evidence = gather(views, task, bound)
         except CannotTell as reason:
             if ends is None:
-                return Judged(_abstains(reason, views, subjects), memory)
+                return JudgedChunk(_abstains(reason, views, subjects), memory)
             evidence = Evidence.none(reason)
-        return Judged(self._judge(task, evidence, views, ends, is_real), memory)
+        return JudgedChunk(self._judge(task, evidence, views, ends, is_real), memory)
 
     def foresee(
         self, foreseen: ForeseenMotions, instruction: str, memory: RolloutMemory | None = None

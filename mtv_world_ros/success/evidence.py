@@ -23,7 +23,7 @@ from mtv_world_ros.success.relations import (
     ServedOn,
     Within,
 )
-from mtv_world_ros.success.rollout_memory import Grasp
+from mtv_world_ros.success.rollout_memory import ObservedGrasp
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.jaccard import mean_of_known
@@ -295,7 +295,7 @@ def _nearest_grasp(scene: ImaginedScene, role: str, *, is_rim: bool) -> tuple[fl
     return best, error
 
 
-def _carry_error(scene: ImaginedScene, role: str, grasp: Grasp) -> float:
+def _carry_error(scene: ImaginedScene, role: str, grasp: ObservedGrasp) -> float:
     """Distance in the table plane from where the grasp would have carried the object [m]."""
     until = grasp.released_at
     if until is None:

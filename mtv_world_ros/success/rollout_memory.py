@@ -80,7 +80,7 @@ def footage_of(
     )
 
 
-class Grasp(NamedTuple):
+class ObservedGrasp(NamedTuple):
     """A gripper that closed.
 
     Attributes:
@@ -122,7 +122,7 @@ class RolloutMemory:
     seen_masks: BoolArray
     seen_points: FloatArray
     largest: FloatArray
-    grasps: tuple[Grasp, ...] = ()
+    grasps: tuple[ObservedGrasp, ...] = ()
     levels: FloatArray | None = None
     closed: BoolArray | None = None
 
@@ -227,7 +227,7 @@ def _grasped(memory: RolloutMemory, footage: Footage, frame: int, arm: int) -> R
             for masks in memory.seen_masks.swapaxes(0, 1)
         ]
     )
-    grasp = Grasp(arm, tool, gaps, memory.seen_points.copy())
+    grasp = ObservedGrasp(arm, tool, gaps, memory.seen_points.copy())
     return replace(memory, grasps=(*memory.grasps, grasp)[-MAX_GRASPS:])
 
 

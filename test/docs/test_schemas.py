@@ -6,7 +6,7 @@ import pytest
 
 from mtv_world_ros.bench.collect.dataset_readme import KEYS
 from mtv_world_ros.geometry.calibration_file import _View
-from mtv_world_ros.geometry.robot.file import ArmEntry, DhEntry, MimicEntry, RobotFile, ToolEntry
+from mtv_world_ros.geometry.robot.file import DhArmEntry, DhEntry, MimicEntry, RobotFile, ToolEntry
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
 
@@ -14,7 +14,7 @@ DOCS = Path(__file__).resolve().parents[2] / 'docs'
 @pytest.mark.parametrize(
     ('page', 'kinds'),
     [
-        ('robots.md', (RobotFile, ToolEntry, MimicEntry, ArmEntry, DhEntry)),
+        ('robots.md', (RobotFile, ToolEntry, MimicEntry, DhArmEntry, DhEntry)),
         ('cameras.md', (_View,)),
     ],
 )

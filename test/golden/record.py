@@ -334,8 +334,8 @@ def main() -> int:
         before = json.loads(path.read_text())
         if PART != [1, 1]:
             before = {key: value for key, value in before.items() if key in found}
-        texts = (_text(name, one).split('\n') for one in (before, found))
-        lines = list(difflib.unified_diff(*texts, 'recorded', 'now', n=1))
+        recorded, now = (_text(name, one).split('\n') for one in (before, found))
+        lines = list(difflib.unified_diff(recorded, now, 'recorded', 'now', n=1))
         differs |= bool(lines)
         print(f'{name}: {"differs" if lines else "equal"}', *lines, sep='\n')
     return int(differs)

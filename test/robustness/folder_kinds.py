@@ -174,11 +174,13 @@ def _read_calibration(folder: Path) -> Any:
 
 def make_ranking(folder: Path) -> None:
     """One result of a ranking."""
-    from mtv_world_ros.bench.ranking.rollout_jobs import Judged, Result
+    from mtv_world_ros.bench.ranking.rollout_jobs import Result, StoredEstimate
     from mtv_world_ros.bench.ranking.run_jobs import FOLDER
     from mtv_world_ros.files import write_json
 
-    judged = Judged(probability=0.5, interval=(0.25, 0.75), jaccard=((0.5,),), reasons=('a',))
+    judged = StoredEstimate(
+        probability=0.5, interval=(0.25, 0.75), jaccard=((0.5,),), reasons=('a',)
+    )
     result = Result(
         policy='expert', task='stack', index=0, seed=1, ever=True, final=True, imagined=judged,
         seen=judged, no_picture=judged, num_chunks=3, num_imagined=3, is_over=False,

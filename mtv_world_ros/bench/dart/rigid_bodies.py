@@ -113,7 +113,7 @@ class RigidBodies:
             _body(number, solid, settings, mass)
             for number, (solid, mass) in enumerate(zip(solids, masses, strict=True))
         ]
-        self.arms = Arms(robot, response, settings, pose)
+        self.arms = DrivenArms(robot, response, settings, pose)
         self.arms.check_stable(step_s)
         detector = dart.collision.DARTCollisionDetector()
         solver = self._world.getConstraintSolver()
@@ -233,7 +233,7 @@ class RigidBodies:
             one.setVelocities(velocities)
 
 
-class Arms:
+class DrivenArms:
     """The robot's skeleton, and the forces that drive it.
 
     In free air a joint goes just as `ArmResponse` expects it; what touches the arm moves it off

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from mtv_world_ros.bench.dart.rigid_bodies import Arms, RigidBodies
+from mtv_world_ros.bench.dart.rigid_bodies import DrivenArms, RigidBodies
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.foresight.arm_response import ArmResponse, ArmState, PERIOD_S
@@ -87,7 +87,7 @@ class SteppedWorld:
                 'the engine dart has lost an object or an arm; choose another --physics'
             )
 
-    def _run(self, course: Course) -> None:
+    def _run(self, course: DriveTargets) -> None:
         """Steps the engine over a period, or moves arms that only pass by."""
         bodies = self._bodies
         self._num_still = self._num_still + 1 if bodies.is_at_rest else 0
@@ -106,7 +106,7 @@ class SteppedWorld:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class DriveTargets:
     """What arms are to do in a period of commands, at steps of the engine.
 
     Attributes:
@@ -125,8 +125,8 @@ class Course:
 
 
 def course_of(
-    arms: Arms, where: FloatArray, speeds: FloatArray, swings: FloatArray
-) -> tuple[Course, FloatArray]:
+    arms: DrivenArms, where: FloatArray, speeds: FloatArray, swings: FloatArray
+) -> tuple[DriveTargets, FloatArray]:
     """Returns what arms are to do in a period, and the swings (2, F) of the fingers after it.
 
     Args:
@@ -148,10 +148,10 @@ def course_of(
     free, fast = ways.copy(), velocities.copy()
     free[:, fingers] += off
     fast[:, fingers] += np.concatenate([swings[1:], np.diff(off, axis=0) / STEP_S])
-    return Course(ways, velocities, forces, free, fast), then
+    return DriveTargets(ways, velocities, forces, free, fast), then
 
 
-def _step(bodies: RigidBodies, course: Course) -> None:
+def _step(bodies: RigidBodies, course: DriveTargets) -> None:
     """Steps the engine through a course."""
     for forces, way, velocity in zip(
         course.forces, course.ways[:-1], course.velocities[:-1], strict=True

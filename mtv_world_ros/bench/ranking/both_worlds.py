@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.bench.ranking.rollout_jobs import COMMANDS_PART, Course, OBJECTS_PART
+from mtv_world_ros.bench.ranking.rollout_jobs import COMMANDS_PART, OBJECTS_PART, WorldComparison
 from mtv_world_ros.bench.ranking.worlds import SeenChunk
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.imagined_episode import ObservedChunk
@@ -50,7 +50,7 @@ class BothWorlds:
     observed: Sequence[ObservedChunk]
     imagined: Sequence[Prediction]
 
-    def course(self) -> Course:
+    def course(self) -> WorldComparison:
         """Returns how the rollout went."""
         commands = [chunk.commands for chunk in self.real]
         gaps = command_gaps(commands, [chunk.positions for chunk in self.imagined])
@@ -65,7 +65,7 @@ class BothWorlds:
         seen = _estimates(self.observed, self.fps)
         imagined = _estimates(self.imagined, self.fps)
         ends = sorted({*seen, *imagined})
-        return Course(
+        return WorldComparison(
             times=_rounded(times),
             command_gaps=_rounded(gaps),
             overlaps=_rounded(_least(overlaps, len(gaps))),

@@ -11,7 +11,7 @@ from urllib.parse import quote
 from markupsafe import escape, Markup
 
 from mtv_world_ros.bench.ranking.both_worlds import SHEET, VIDEO
-from mtv_world_ros.bench.ranking.rollout_jobs import Course, Judged, Result
+from mtv_world_ros.bench.ranking.rollout_jobs import Result, StoredEstimate, WorldComparison
 from mtv_world_ros.bench.ranking.run_jobs import FOLDER
 from mtv_world_ros.lab.documents import number
 from mtv_world_ros.lab.evaluation.report.filters import Filter, filters
@@ -113,12 +113,12 @@ def verdict(result: Result) -> str:
     return 'right' if said == result.final else f'false {_word(bool(said))}'
 
 
-def estimate_text(judged: Judged) -> str:
+def estimate_text(judged: StoredEstimate) -> str:
     """Returns an estimate in words."""
     return number(judged.probability, 2) if isfinite(judged.probability) else 'abstains'
 
 
-def _first_to_part(course: Course | None) -> str:
+def _first_to_part(course: WorldComparison | None) -> str:
     """Which of `_PARTS` differs first between the two worlds; empty = not known."""
     if course is None:
         return ''
@@ -127,7 +127,7 @@ def _first_to_part(course: Course | None) -> str:
     return 'commands' if course.commands_part_s == course.part_s else 'objects'
 
 
-def when_they_part(course: Course) -> list[tuple[float, str]]:
+def when_they_part(course: WorldComparison) -> list[tuple[float, str]]:
     """Returns when [s] what parts in the two worlds, the first one first."""
     whats = {
         'commands': course.commands_part_s,
@@ -148,7 +148,7 @@ def _address(out: Path, result: Result, suffix: str) -> str:
     return f'{FOLDER}/{quote(path.name)}' if path.is_file() else ''
 
 
-def curves(course: Course) -> Markup:
+def curves(course: WorldComparison) -> Markup:
     """Returns estimates in both worlds and the overlap of the objects over time, as SVG."""
     last = max([*course.times, *course.ends], default=0.0) or 1.0
     lines = {

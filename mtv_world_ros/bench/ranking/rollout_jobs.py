@@ -77,7 +77,7 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Judged:
+class StoredEstimate:
     """A success estimate in a result file.
 
     Attributes:
@@ -95,7 +95,7 @@ class Judged:
     reasons: tuple[str, ...]
 
     @classmethod
-    def of(cls, estimate: SuccessEstimate | None) -> Judged:
+    def of(cls, estimate: SuccessEstimate | None) -> StoredEstimate:
         """Returns an estimate in plain values; None = the policy gave no answer to judge."""
         if estimate is None:
             return cls.stated(nan, 'abstains: the policy gave no answer')
@@ -107,7 +107,7 @@ class Judged:
         )
 
     @classmethod
-    def of_motions(cls, estimate: SuccessEstimate | None) -> Judged:
+    def of_motions(cls, estimate: SuccessEstimate | None) -> StoredEstimate:
         """Returns the share of an estimate's foreseen motions that succeed."""
         feature = nan if estimate is None else estimate.features.get('foreseen', nan)
         if not isfinite(feature):
@@ -115,7 +115,7 @@ class Judged:
         return cls.stated((1 + feature) / 2, 'the share of foreseen motions that succeed')
 
     @classmethod
-    def stated(cls, probability: float, reason: str) -> Judged:
+    def stated(cls, probability: float, reason: str) -> StoredEstimate:
         """Returns a verdict without J; NaN = abstains."""
         interval = (probability, probability)
         return cls(probability=probability, interval=interval, jaccard=(), reasons=(reason,))
@@ -126,11 +126,11 @@ class Judged:
         return verdict(self.probability)
 
 
-_NOT_MEASURED = Judged.stated(nan, 'abstains: not measured')
+_NOT_MEASURED = StoredEstimate.stated(nan, 'abstains: not measured')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Course:
+class WorldComparison:
     """How a rollout went in both worlds, by frame of the model.
 
     Attributes:
@@ -204,18 +204,18 @@ class Result:
     seed: int
     ever: bool
     final: bool
-    imagined: Judged
-    seen: Judged
-    no_picture: Judged
-    foreseen: Judged = _NOT_MEASURED
-    pictures: Judged = _NOT_MEASURED
+    imagined: StoredEstimate
+    seen: StoredEstimate
+    no_picture: StoredEstimate
+    foreseen: StoredEstimate = _NOT_MEASURED
+    pictures: StoredEstimate = _NOT_MEASURED
     num_chunks: int
     num_imagined: int
     is_over: bool
     seconds: Mapping[str, float]
     end: str = ''
     imagined_end: str = ''
-    course: Course | None = None
+    course: WorldComparison | None = None
     files: Mapping[str, str] = field(default_factory=dict)
 
     @property

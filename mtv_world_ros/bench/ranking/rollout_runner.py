@@ -16,7 +16,7 @@ from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
 from mtv_world_ros.bench.ranking.both_worlds import BothWorlds
 from mtv_world_ros.bench.ranking.flips import last_frames_png, OBJECTS, objects_png
 from mtv_world_ros.bench.ranking.no_picture_rule import judge_without_pictures
-from mtv_world_ros.bench.ranking.rollout_jobs import Job, Judged, Result
+from mtv_world_ros.bench.ranking.rollout_jobs import Job, Result, StoredEstimate
 from mtv_world_ros.bench.ranking.worlds import (
     ImaginedWorld,
     PolicyRun,
@@ -133,10 +133,10 @@ class RolloutRunner:
             seed=job.seed,
             ever=real.ever,
             final=real.final,
-            imagined=Judged.of(imagined.success),
-            foreseen=Judged.of_motions(imagined.success),
-            pictures=Judged.of(pictures),
-            seen=Judged.of(found[-1].success if found else None),
+            imagined=StoredEstimate.of(imagined.success),
+            foreseen=StoredEstimate.of_motions(imagined.success),
+            pictures=StoredEstimate.of(pictures),
+            seen=StoredEstimate.of(found[-1].success if found else None),
             no_picture=_judge_without_pictures(self._begin(real, job, observed.names), world),
             num_chunks=real.run.num_chunks,
             num_imagined=run.num_chunks,
@@ -270,13 +270,13 @@ def _objects_shown(masks: ObjectMasks) -> str:
     return base64.b64encode(objects_png(masks.masks[:, :, -1])).decode()
 
 
-def _judge_without_pictures(episode: ImaginedEpisode, simulated: SimulatedWorld) -> Judged:
+def _judge_without_pictures(episode: ImaginedEpisode, simulated: SimulatedWorld) -> StoredEstimate:
     commands = np.concatenate([simulated.start.positions[None], *simulated.commands])
     try:
         success = judge_without_pictures(episode, commands)
     except CannotTell as reason:
-        return Judged.stated(nan, f'abstains: {reason}')
-    return Judged.stated(float(success), 'the no-picture rule')
+        return StoredEstimate.stated(nan, f'abstains: {reason}')
+    return StoredEstimate.stated(float(success), 'the no-picture rule')
 
 
 def make_runner(

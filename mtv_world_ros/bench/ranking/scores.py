@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from mtv_world_ros.bench.expert.faults.catalogue import FAULTS, parse_variant
-from mtv_world_ros.bench.ranking.rollout_jobs import Judged, Result
+from mtv_world_ros.bench.ranking.rollout_jobs import Result, StoredEstimate
 from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.lab.evaluation.metrics.policy_agreement import rate_agreement, rates
 from mtv_world_ros.lab.evaluation.metrics.statistics import (
@@ -130,7 +130,7 @@ class Score:
         }
 
 
-def judged_by(result: Result, judge: str) -> Judged:
+def judged_by(result: Result, judge: str) -> StoredEstimate:
     """Returns the verdict of a judge, a key of `JUDGES`."""
     return getattr(result, judge)
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from mtv_world_ros.bench.collect.record import START_NS
-from mtv_world_ros.bench.ranking.rollout_jobs import Judged
+from mtv_world_ros.bench.ranking.rollout_jobs import StoredEstimate
 from mtv_world_ros.bench.world.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
 from mtv_world_ros.data_types import (
     ByteArray,
@@ -162,7 +162,7 @@ class ImaginedWorld:
 
         None = it abstains.
         """
-        judged = Judged.of(self.success)
+        judged = StoredEstimate.of(self.success)
         return judged.success == 1 if isfinite(judged.probability) else None
 
 

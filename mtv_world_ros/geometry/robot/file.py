@@ -177,7 +177,7 @@ class DhEntry(JointEntry):
     type: Literal['revolute', 'prismatic'] = 'revolute'
 
 
-class ArmEntry(PoseEntry):
+class DhArmEntry(PoseEntry):
     """An arm as a Denavit-Hartenberg table; its pose is that of frame 0 in the base."""
 
     arm: str
@@ -217,7 +217,7 @@ class RobotFile(Schema):
 
     name: str
     urdf: str | None = Field(default=None, description='file, relative to the YAML')
-    dh: ListOf[ArmEntry] | None = Field(default=None, description='arms, in place of a URDF')
+    dh: ListOf[DhArmEntry] | None = Field(default=None, description='arms, in place of a URDF')
     base_link: str | None = Field(default=None, description="null = the URDF's root, or `base`")
     joints: ListOf[str] | None = Field(
         default=None, description='order of position vectors; null = all that move by themselves'
@@ -459,7 +459,7 @@ def _from_dh(file: RobotFile, base: str) -> pin.Model:
     return model
 
 
-def _add_dh_arm(model: pin.Model, arm: ArmEntry) -> None:
+def _add_dh_arm(model: pin.Model, arm: DhArmEntry) -> None:
     parent, placement = 0, pin.SE3(arm.matrix())
     for row in arm.joints:
         joint = pin.JointModelRZ() if row.type == 'revolute' else pin.JointModelPZ()

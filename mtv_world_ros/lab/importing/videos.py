@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Private
 
 from mtv_world_ros.bounded_input import check_limit, parse_json, read_text
 from mtv_world_ros.config import read_yaml, validated, wrong
-from mtv_world_ros.data.bag_mapping import BagMapping, ViewTopics, Written
+from mtv_world_ros.data.bag_mapping import BagMapping, ViewSource, Written
 from mtv_world_ros.data.episode import Episode, EpisodeInfo, JointStates, Track
 from mtv_world_ros.data.joint_plans import following
 from mtv_world_ros.data_types import ByteArray, FloatArray
@@ -70,7 +70,7 @@ class VideoMapping(Written):
     def written(self) -> BagMapping:
         """Task, outcome and quality of the episodes that are written."""
         given = {name: getattr(self, name) for name in Written.model_fields}
-        return BagMapping(**given, views={view: ViewTopics(image=view) for view in self.views})
+        return BagMapping(**given, views={view: ViewSource(image=view) for view in self.views})
 
 
 def load_video_mapping(path: Path) -> VideoMapping:
@@ -186,7 +186,7 @@ def read_recording(
     images, cameras, unknown = {}, {}, {}
     known = {} if calibration is None else load_calibration(calibration)
     for view, pattern in mapping.views.items():
-        frames = VideoFrames(recording.file(pattern))
+        frames = VideoFileFrames(recording.file(pattern))
         if abs(len(frames) - len(stamps)) > 0:
             notes.append(
                 f"view '{view}': {len(frames)} frames and {len(stamps)} rows: frame k is taken to "
@@ -285,7 +285,7 @@ def _instruction(keys: Mapping[str, Any], mapping: VideoMapping, path: Path) -> 
     return str(value[0]) if isinstance(value, list) and value else str(value)
 
 
-class VideoFrames:
+class VideoFileFrames:
     """The first `count` frames (None = all) of a video file, decoded one after the other.
 
     Raises:
@@ -300,9 +300,9 @@ class VideoFrames:
         if self._count == 0:
             raise EpisodeError(f"'{path}' holds no frame")
 
-    def first(self, count: int) -> VideoFrames:
+    def first(self, count: int) -> VideoFileFrames:
         """The first frames alone."""
-        return VideoFrames(self._path, count)
+        return VideoFileFrames(self._path, count)
 
     def __len__(self) -> int:
         return self._count

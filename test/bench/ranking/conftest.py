@@ -7,7 +7,7 @@ import pytest
 
 from mtv_world_ros.bench.expert.expert import Expert
 from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
-from mtv_world_ros.bench.ranking.rollout_jobs import Judged, Result
+from mtv_world_ros.bench.ranking.rollout_jobs import Result, StoredEstimate
 from mtv_world_ros.bench.ranking.rollout_runner import RolloutConfig, RolloutRunner
 from mtv_world_ros.bench.world.opengl import missing_opengl
 from mtv_world_ros.bench.world.simulator import SimEpisode
@@ -76,7 +76,7 @@ def make_result():
         policy, index, final, probability, task='stack_blocks_two', seen=None, rule=None, **more
     ):
         judged = [
-            Judged(
+            StoredEstimate(
                 probability=value, interval=(value, value), jaccard=((value,),), reasons=('why',)
             )
             for value in (

@@ -10,7 +10,7 @@ from mtv_world_ros.bench.ranking.both_worlds import command_gaps, first_apart, o
 from mtv_world_ros.bench.ranking.ranking_report import write_ranking
 from mtv_world_ros.bench.ranking.ranking_summary import Summary
 from mtv_world_ros.bench.ranking.rollout_cards import curves, verdict, when_they_part, worst_first
-from mtv_world_ros.bench.ranking.rollout_jobs import Course, make_jobs, Result
+from mtv_world_ros.bench.ranking.rollout_jobs import make_jobs, Result, WorldComparison
 from mtv_world_ros.bench.ranking.rollout_runner import ComparisonRunner
 from mtv_world_ros.bench.ranking.run_jobs import RankedCheckpoint, read_results, run_jobs
 from mtv_world_ros.lab.stored_rollout import load_rollout
@@ -151,7 +151,7 @@ def test_every_rollout_can_be_played_from_the_page_the_worst_first(ranked):
 
 
 def test_a_course_survives_its_file_and_old_results_have_none(make_result):
-    course = Course(
+    course = WorldComparison(
         times=(0.2, 0.4), command_gaps=(0.0, NAN), overlaps=(1.0, 0.2), ends=(0.4,),
         seen=(NAN,), imagined=(0.7,), objects_part_s=0.4, parted_object='red block',
     )  # fmt: skip

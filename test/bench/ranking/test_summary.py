@@ -13,7 +13,7 @@ from mtv_world_ros.bench.ranking.ranking_report import (
     write_ranking,
 )
 from mtv_world_ros.bench.ranking.ranking_summary import Summary
-from mtv_world_ros.bench.ranking.rollout_jobs import Job, Judged, Result
+from mtv_world_ros.bench.ranking.rollout_jobs import Job, Result, StoredEstimate
 from mtv_world_ros.bench.ranking.scores import JUDGES
 
 #: (policy, true outcomes, imagined probabilities) of four episodes
@@ -160,7 +160,7 @@ def test_a_result_survives_its_file(make_result):
 
 def test_what_a_picture_is_worth_stands_beside_what_is_foreseen(make_result):
     def said(value):
-        return Judged.stated(value, 'said')
+        return StoredEstimate.stated(value, 'said')
 
     results = [
         make_result(

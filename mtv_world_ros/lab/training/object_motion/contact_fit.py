@@ -28,7 +28,7 @@ from mtv_world_ros.foresight.contact_settings import ContactSettings
 from mtv_world_ros.foresight.course import CoursePlanner, SUBSTEPS
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import Future
-from mtv_world_ros.foresight.scene import Scene
+from mtv_world_ros.foresight.scene import CompiledScene
 from mtv_world_ros.foresight.solid_foresight import COMMANDS_A_STEP, STEP_S, table_in
 from mtv_world_ros.foresight.solids import bottom_of, fit_solid, is_box, is_vessel, Solid
 from mtv_world_ros.geometry.resample import nearest_rows
@@ -96,7 +96,7 @@ def fit_fingers(
     known = known[:: max(1, len(known) // _MOST_EPISODES)][:_MOST_EPISODES]
     if not known:
         return settings
-    scene = Scene.compiled(arms, ())
+    scene = CompiledScene.compiled(arms, ())
     swinging = settings.model_copy(update={'fingers_swing': True})
     rng = np.random.default_rng(3)
     names = ('finger_stiffness', 'finger_damping', 'finger_mass_kg')
@@ -115,7 +115,7 @@ def fit_fingers(
 
 
 def _loss(
-    scene: Scene,
+    scene: CompiledScene,
     settings: ContactSettings,
     grippers: Sequence[FreeGrippers],
     most: float = np.inf,
@@ -222,7 +222,7 @@ class ContactRecording:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
+class FittedNumber:
     """A number that was found.
 
     Attributes:
@@ -335,7 +335,7 @@ def fit_contact(
     threads: int = 1,
     report: Callable[[str], None] = lambda line: None,
     progress: Callable[[Sequence[int]], Iterable[int]] = iter,
-) -> tuple[ContactSettings, list[Finding]]:
+) -> tuple[ContactSettings, list[FittedNumber]]:
     """Returns likely settings with their spread, and what was found with intervals.
 
     Args:
@@ -533,7 +533,7 @@ def _finding(
     likelihoods: FloatArray,
     weights: FloatArray,
     conditional: float | None = None,
-) -> Finding:
+) -> FittedNumber:
     """What draws of a number say of it.
 
     Args:
@@ -553,7 +553,7 @@ def _finding(
             (values[:_DRAWS] <= thirds[0], values[:_DRAWS] >= thirds[1])]  # fmt: skip
     count = int((np.abs(ends[0] - ends[1]) > _SAYS).sum())
     low, middle, high = np.exp([low, middle, high]).tolist()
-    return Finding(
+    return FittedNumber(
         name=name,
         value=middle,
         low=low,
@@ -629,7 +629,7 @@ class _Trial:
         return found
 
 
-def find_delay(recordings: Sequence[ContactRecording], arms: Arms) -> Finding:
+def find_delay(recordings: Sequence[ContactRecording], arms: Arms) -> FittedNumber:
     """Returns how much later joints move than commands of now would have them move."""
     errors = np.stack([_delay_errors(one, arms) for one in recordings])
     known = errors[np.isfinite(errors).all(-1)]
@@ -654,7 +654,7 @@ def _delay_errors(recording: ContactRecording, arms: Arms) -> FloatArray:
     return np.array(errors)
 
 
-def find_table(recordings: Sequence[ContactRecording]) -> Finding:
+def find_table(recordings: Sequence[ContactRecording]) -> FittedNumber:
     """Returns the height at which what stands on a table ends below."""
     bottoms = []
     for recording in recordings[:: max(1, len(recordings) // _MOST_TABLES)]:
@@ -674,19 +674,19 @@ def _resampled(
     of: int,
     counted: str,
     middle: Callable[..., Any],
-) -> Finding:
+) -> FittedNumber:
     """The `middle` of (E, ...) known rows, with an interval from resampled ones.
 
     `of` rows were looked at; `counted` is what they are.
     """
     if not len(known):
         nothing = dict.fromkeys(('value', 'low', 'high', 'spread'), 0.0)
-        return Finding(name=name, count=0, of=of, counted=counted, **nothing)
+        return FittedNumber(name=name, count=0, of=of, counted=counted, **nothing)
     rng = np.random.default_rng(_SEED)
     rows = rng.integers(0, len(known), (_RESAMPLED, len(known)))
     found = np.array([middle(known[row]) for row in rows])
     low, high = np.quantile(found, (0.05, 0.95))
-    return Finding(
+    return FittedNumber(
         name=name,
         value=float(middle(known)),
         low=float(low),

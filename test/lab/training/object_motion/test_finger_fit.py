@@ -7,7 +7,7 @@ import pytest
 
 from mtv_world_ros.foresight.arms import Arms
 from mtv_world_ros.foresight.course import CoursePlanner, SUBSTEPS
-from mtv_world_ros.foresight.scene import Scene
+from mtv_world_ros.foresight.scene import CompiledScene
 from mtv_world_ros.lab.training.object_motion import contact_fit
 from mtv_world_ros.lab.training.object_motion.contact_fit import (
     first_settings,
@@ -34,7 +34,7 @@ def shaken(robot, seed: int) -> np.ndarray:
 
 def recorded(arms, positions, settings) -> FreeGrippers:
     """What grippers of these settings report."""
-    planner = CoursePlanner(Scene.compiled(arms, ()), settings)
+    planner = CoursePlanner(CompiledScene.compiled(arms, ()), settings)
     course, _ = planner.plan(positions, planner.begin(positions[0]))
     where = arms.drives.joints(course.positions[::SUBSTEPS], len(arms.robot.joint_names))
     return FreeGrippers.of(arms.robot, positions, where)
