@@ -22,6 +22,7 @@ from pathlib import Path
 import re
 import tempfile
 import time
+from typing import Any
 from xml.etree import ElementTree
 from zlib import crc32
 
@@ -154,10 +155,14 @@ def with_images(episode: Episode, change: Callable[[Track], Track]) -> Episode:
     return replace(episode, images={v: change(track) for v, track in episode.images.items()})
 
 
+def _pixels(track: Track) -> Any:
+    return np.asarray(track.frames)
+
+
 def shorter(track: Track) -> Track:
     """The first 60 %: what went on after that has joint states alone."""
     count = round(0.6 * len(track.stamps_ns))
-    return Track(track.stamps_ns[:count], np.asarray(track.frames, np.uint8)[:count])
+    return Track(track.stamps_ns[:count], _pixels(track)[:count])
 
 
 def frozen(track: Track) -> Track:
@@ -170,12 +175,12 @@ def frozen(track: Track) -> Track:
 def sparse(track: Track) -> Track:
     """A frame a second."""
     step = max(1, round(1e9 / float(np.median(np.diff(track.stamps_ns)))))
-    return Track(track.stamps_ns[::step], np.asarray(track.frames, np.uint8)[::step])
+    return Track(track.stamps_ns[::step], _pixels(track)[::step])
 
 
 def flipped(track: Track) -> Track:
     """Mirrored frames."""
-    return track._replace(frames=np.ascontiguousarray(np.asarray(track.frames, np.uint8)[:, :, ::-1]))
+    return track._replace(frames=np.ascontiguousarray(_pixels(track)[:, :, ::-1]))
 
 
 def without_arm(track: Track) -> Track:
