@@ -122,9 +122,12 @@ class JointTable(Schema):
             self._columns, self._joint_names = self._of(robot), robot.joint_names
         return self
 
+    def _needed(self, robot: RobotModel) -> Sequence[str]:
+        """Joints that must have a column."""
+        return () if self.allow_missing else robot.joint_names
+
     def _of(self, robot: RobotModel) -> tuple[JointColumn, ...]:
-        known = robot.joint_names
-        needed = () if self.allow_missing else known  # joints that must have a column
+        known, needed = robot.joint_names, self._needed(robot)
         entries = self.joints
         if entries is None:
             entries = {joint: ColumnEntry(column=joint) for joint in needed or known}

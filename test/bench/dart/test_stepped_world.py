@@ -82,7 +82,7 @@ def test_a_block_is_carried_to_where_the_recorded_one_was(robot, response, recor
     """And fingers are where it stops them, whatever they are commanded to."""
     points, joints = acted(robot, response, recording)
     way = points[-1] - points[0]
-    assert np.linalg.norm(way[0] - recording.ways[-1, 0]) < 0.025 < 0.1 < np.linalg.norm(way[0])
+    assert np.linalg.norm(way[0] - recording.displacements[-1, 0]) < 0.025 < 0.1 < np.linalg.norm(way[0])
     assert np.linalg.norm(way[1]) < 0.01
     widest = robot.gripper_openings(joints) - robot.gripper_openings(recording.positions)
     assert 0.3 < widest.max() < 0.8
@@ -99,7 +99,7 @@ def test_a_gripper_that_stays_open_carries_nothing(robot, response, recording):
 
 def test_fingers_that_do_not_rub_lose_the_block(robot, response, recording):
     points, _ = acted(robot, response, recording, grip_friction=0.02)
-    assert np.linalg.norm(points[-1, 0] - points[0, 0] - recording.ways[-1, 0]) > 0.05
+    assert np.linalg.norm(points[-1, 0] - points[0, 0] - recording.displacements[-1, 0]) > 0.05
 
 
 def shaken(robot, seconds: float = 2.0) -> np.ndarray:
