@@ -53,7 +53,7 @@ class Stack:
     """World model, policy and runner as processes, and a client that interferes."""
 
     def __init__(self, folder, ros, client):
-        self.folder, self.client = folder, client
+        self.folder, self.client, self.policy = folder, client, None
         ros.make_checkpoint(folder / 'checkpoint')
         self.world = ros.start_node(
             folder, 'pace:=burst', 'mode:=imagine', 'max_trajectory_age_s:=0.001',
@@ -64,6 +64,8 @@ class Stack:
         self.diagnostics = []
 
     def start(self, out, ros, episodes, seed):
+        if self.policy is not None:
+            self.policy.stop(signal.SIGINT)
         self.policy = ros.start_policy(
             self.folder, 'answer_timeout_s:=1.5', *ros.FROZEN, remaps=ros.JOINT_STATES
         )
