@@ -36,7 +36,7 @@ style: $(STAMP)
 types: $(STAMP)
 	$(BIN)/pyright
 
-test: style  ## the linters and all tests (8 to 15 minutes)
+test: style  ## the linters and all tests (8 to 14 minutes)
 	@$(MAKE) --no-print-directory --jobs=2 types tests
 
 # a worker has a core: torch's threads would only take turns

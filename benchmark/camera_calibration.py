@@ -42,11 +42,11 @@ from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.geometry.transforms import looking_along
+from mtv_world_ros.lab.camera_calibration.fixed_camera import FixedCamera
+from mtv_world_ros.lab.camera_calibration.wrist_camera import follow_scene, WristCamera
 from mtv_world_ros.lab.cli.own_robot import GOOD_MATCH, is_doubtful
 from mtv_world_ros.lab.inspection.camera_pose import CameraEstimate, difference, moved
 from mtv_world_ros.lab.inspection.clocks import JointTrack
-from mtv_world_ros.lab.inspection.fixed_camera import FixedCamera
-from mtv_world_ros.lab.inspection.wrist_camera import follow_scene, WristCamera
 
 #: of estimates
 KINDS = ('on the arm, guess', 'on the arm, no guess', 'fixed, guess', 'fixed, no guess')

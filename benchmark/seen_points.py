@@ -36,15 +36,15 @@ from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import load_shape, RobotShape
-from mtv_world_ros.lab.cli.shared_camera import recorded_robot
-from mtv_world_ros.lab.inspection import joint_camera
-from mtv_world_ros.lab.inspection.clocks import JointTrack
-from mtv_world_ros.lab.inspection.shared_camera import (
+from mtv_world_ros.lab.camera_calibration import joint_camera
+from mtv_world_ros.lab.camera_calibration.shared_camera import (
     estimate_shared,
     expected_within,
     seen_points,
     SharedEstimate,
 )
+from mtv_world_ros.lab.cli.shared_camera import recorded_robot
+from mtv_world_ros.lab.inspection.clocks import JointTrack
 
 WAYS = ('recorded', 'search', 'points', 'same-focal')
 HEAD = (

@@ -17,9 +17,9 @@ from mtv_world_ros.files import check_free, share_path
 from mtv_world_ros.geometry.calibration_file import save_calibration
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.shape import load_shape
+from mtv_world_ros.lab.camera_calibration.fixed_camera import FixedCamera
 from mtv_world_ros.lab.inspection.camera_pose import difference
 from mtv_world_ros.lab.inspection.clocks import JointTrack
-from mtv_world_ros.lab.inspection.fixed_camera import FixedCamera
 
 parser = argparse.ArgumentParser()
 parser.add_argument(

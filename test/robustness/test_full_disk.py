@@ -15,9 +15,9 @@ import yaml
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.files import share_path
+from mtv_world_ros.lab.camera_calibration.fixed_camera import FixedCamera
 from mtv_world_ros.lab.inspection import inspect
 from mtv_world_ros.lab.inspection.camera_pose import CameraEstimate
-from mtv_world_ros.lab.inspection.fixed_camera import FixedCamera
 from mtv_world_ros.lab.inspection.motion_residual import ResidualSearch
 
 EPISODE = share_path('resource', 'demo_episode')

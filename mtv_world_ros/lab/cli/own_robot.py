@@ -404,12 +404,12 @@ def estimate_camera(
 
     from mtv_world_ros.errors import CalibrationError, EpisodeError
     from mtv_world_ros.geometry.robot.shape import moving_links
-    from mtv_world_ros.lab.inspection.clocks import JointTrack
-    from mtv_world_ros.lab.inspection.wrist_camera import (
+    from mtv_world_ros.lab.camera_calibration.wrist_camera import (
         find_mount,
         follow_scene,
         WristCamera,
     )
+    from mtv_world_ros.lab.inspection.clocks import JointTrack
 
     if episode.joint_states is None:
         raise EpisodeError(f"'{episode.info.path}' has no joint_states")
@@ -472,7 +472,7 @@ def _estimate_fixed(
 
     from mtv_world_ros.geometry.robot.shape import load_shape
     from mtv_world_ros.geometry.transforms import inverse
-    from mtv_world_ros.lab.inspection.fixed_camera import FixedCamera
+    from mtv_world_ros.lab.camera_calibration.fixed_camera import FixedCamera
 
     def rest(name: str) -> FloatArray:
         return robot.link_poses(name, np.zeros((1, len(robot.joint_names))))[0]

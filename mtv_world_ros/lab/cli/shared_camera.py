@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.data_types import CameraModel, FloatArray
     from mtv_world_ros.geometry.robot.model import RobotModel
     from mtv_world_ros.geometry.robot.shape import LinkShape
-    from mtv_world_ros.lab.inspection.shared_camera import SharedEstimate
+    from mtv_world_ros.lab.camera_calibration.shared_camera import SharedEstimate
 
 
 def is_shared(arguments: argparse.Namespace) -> bool:
@@ -48,7 +48,7 @@ def calibrate_shared(arguments: argparse.Namespace) -> int:
     """Runs the command on all recordings."""
     from mtv_world_ros.geometry.robot.file import load_robot
     from mtv_world_ros.geometry.robot.shape import load_shape
-    from mtv_world_ros.lab.inspection.shared_camera import load_points
+    from mtv_world_ros.lab.camera_calibration.shared_camera import load_points
 
     if arguments.mount_link or arguments.between:
         raise ConfigError('--mount-link and --between are for one recording')
@@ -74,7 +74,7 @@ def _write_page(
     arguments: argparse.Namespace, episodes: Sequence[Episode], robot: RobotModel
 ) -> int:
     from mtv_world_ros.files import write_whole
-    from mtv_world_ros.lab.inspection.points_page import points_page
+    from mtv_world_ros.lab.camera_calibration.points_page import points_page
 
     write_whole(arguments.click, points_page(episodes, arguments.views, robot))
     print(
@@ -93,7 +93,7 @@ def _estimate(
     parts: Sequence[LinkShape],
 ) -> None:
     """Estimates views that share their focal length, prints and writes them."""
-    from mtv_world_ros.lab.inspection.shared_camera import estimate_shared
+    from mtv_world_ros.lab.camera_calibration.shared_camera import estimate_shared
 
     unknown = [episode.unknown.get(view, '') for episode in episodes for view in views]
     if arguments.guess and any(unknown) and points is None:

@@ -13,10 +13,10 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.robot.shape import load_shape
+from mtv_world_ros.lab.camera_calibration.fixed_camera import FixedCamera
+from mtv_world_ros.lab.camera_calibration.wrist_camera import follow_scene, WristCamera
 from mtv_world_ros.lab.inspection.camera_pose import difference, moved, spread
 from mtv_world_ros.lab.inspection.clocks import JointTrack
-from mtv_world_ros.lab.inspection.fixed_camera import FixedCamera
-from mtv_world_ros.lab.inspection.wrist_camera import follow_scene, WristCamera
 from mtv_world_ros.lab.silhouettes import draw_silhouettes
 
 

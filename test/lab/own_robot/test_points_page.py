@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.lab.inspection.shared_camera import load_points
+from mtv_world_ros.lab.camera_calibration.shared_camera import load_points
 
 
 @pytest.fixture

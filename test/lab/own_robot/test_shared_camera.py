@@ -20,7 +20,7 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.lab.inspection import joint_camera
+from mtv_world_ros.lab.camera_calibration import joint_camera
 from mtv_world_ros.lab.inspection.camera_pose import moved
 from mtv_world_ros.lab.inspection.places import background, find_places, turn_between
 

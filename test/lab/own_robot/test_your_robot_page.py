@@ -26,7 +26,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.lab.inspection import joint_camera
+from mtv_world_ros.lab.camera_calibration import joint_camera
 from mtv_world_ros.lab.training.object_motion import contact_fit
 from mtv_world_ros.rendering.video import encode_video
 

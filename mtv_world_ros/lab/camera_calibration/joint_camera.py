@@ -16,8 +16,7 @@ from scipy.optimize import least_squares
 
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import project
-from mtv_world_ros.lab.inspection.camera_pose import moved, UNITS
-from mtv_world_ros.lab.inspection.fixed_camera import (
+from mtv_world_ros.lab.camera_calibration.fixed_camera import (
     Changes,
     FixedCamera,
     random_camera,
@@ -25,6 +24,7 @@ from mtv_world_ros.lab.inspection.fixed_camera import (
     READINGS,
     roughened,
 )
+from mtv_world_ros.lab.inspection.camera_pose import moved, UNITS
 from mtv_world_ros.lab.inspection.places import CameraPlaces, turn_between
 
 #: widths of the images and blurs [px], from coarse to fine

@@ -5,7 +5,7 @@ import pytest
 
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.shape import load_shape
-from mtv_world_ros.lab.inspection.finger_tips import tip_middles
+from mtv_world_ros.lab.camera_calibration.finger_tips import tip_middles
 
 #: an arm of one joint; its hand is 0.3 m up and has two fingers 0.1 m long
 ROBOT = """

@@ -17,10 +17,15 @@ from mtv_world_ros.errors import CalibrationError, ConfigError
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import LinkShape, moving_links
+from mtv_world_ros.lab.camera_calibration.finger_tips import tip_middles
+from mtv_world_ros.lab.camera_calibration.fixed_camera import FixedCamera
+from mtv_world_ros.lab.camera_calibration.joint_camera import (
+    JointCamera,
+    JointState,
+    SeenPoint,
+    through,
+)
 from mtv_world_ros.lab.inspection.clocks import JointTrack
-from mtv_world_ros.lab.inspection.finger_tips import tip_middles
-from mtv_world_ros.lab.inspection.fixed_camera import FixedCamera
-from mtv_world_ros.lab.inspection.joint_camera import JointCamera, JointState, SeenPoint, through
 from mtv_world_ros.lab.inspection.motion_residual import (
     measure_residual,
     MotionResidual,

@@ -1,0 +1,1 @@
+"""The poses of cameras, from recordings: `mtv-world calibrate-camera`."""
