@@ -19,8 +19,11 @@ from mtv_world_ros.processes import stop_process, STOPPED_S, StoppedProcesses
 
 @pytest.fixture
 def child():
-    """A process that waits, and takes signals by now."""
-    code = 'import time; print(flush=True); time.sleep(600)'
+    """A process that waits, and takes signals by now.
+
+    It sleeps in short pieces: Python sees a signal that arrives just before a sleep after it.
+    """
+    code = 'import time\nprint(flush=True)\nwhile True: time.sleep(0.05)'
     with subprocess.Popen([sys.executable, '-c', code], stdout=subprocess.PIPE) as process:
         assert process.stdout.readline()
         yield process
