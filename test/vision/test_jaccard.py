@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from square_masks import objects, square
 
-from mtv_world_ros.data_types import ObjectMasks
 from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.vision.jaccard import (
     held_masks,
@@ -12,18 +12,6 @@ from mtv_world_ros.vision.jaccard import (
     object_jaccard,
     score_statuses,
 )
-
-
-def square(x, y, size=27, shape=(60, 90)):
-    mask = np.zeros(shape, bool)
-    mask[y : y + size, x : x + size] = True
-    return mask
-
-
-def objects(masks, status=None, names=('red block', 'blue block')):
-    masks = np.asarray(masks, bool)
-    status = status or (('ok',) * masks.shape[1],) * masks.shape[0]
-    return ObjectMasks(names=names[: masks.shape[1]], masks=masks, status=status)
 
 
 def test_square_of_27_px_displaced_by_10_px_scores_0_46():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -53,6 +53,7 @@ _STILL_M = 0.02
 _ROUGH = 4
 #: without a guess: cameras tried around the robot, and how many of the best are looked at closely
 _NUM_TRIED, _NUM_KEPT = 1500, 6
+_Item = TypeVar('_Item')
 #: measurements that the pixels of all frames are worth
 _NUM_INDEPENDENT = 12
 #: first step of the search along poses that look alike, in `UNITS`
@@ -377,13 +378,7 @@ class FixedCamera:
             T = random_camera(self.centre, away, reach, generator)
             fits = self.rough_fits(T, changes[READINGS[0]], rough)
             tried.append((max(fits), len(tried), T, READINGS[int(np.argmax(fits))]))
-        tried.sort(reverse=True)
-        best: list[tuple[FloatArray, Reading]] = []
-        for _, _, T, reading in tried:
-            if all(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.15 * reach for other, _ in best):
-                best.append((T, reading))
-            if len(best) == _NUM_KEPT:
-                break
+        best = best_apart(tried, reach)
         steps = np.diag([0.25] * 3 + [0.1] * 3)
         improved = [
             (self._refined(T, changes[reading], steps, evaluations=70), reading)
@@ -431,6 +426,24 @@ def random_camera(
     aside = generator.normal(0, 0.25 * reach, 2)
     T[:3, 3] = centre - away * ahead + T[:3, :2] @ aside
     return T
+
+
+def best_apart(
+    tried: Sequence[tuple[float, int, FloatArray, _Item]], reach: float
+) -> list[tuple[FloatArray, _Item]]:
+    """Returns the best of some poses that stand apart, with what each was tried with.
+
+    Args:
+        tried: fit, number, T_base_camera (4, 4) and what it was tried with.
+        reach: of the robot [m]; poses nearer than 15 % of it count as one.
+    """
+    best: list[tuple[FloatArray, _Item]] = []
+    for _, _, T, item in sorted(tried, key=lambda one: one[:2], reverse=True):
+        if all(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.15 * reach for other, _ in best):
+            best.append((T, item))
+        if len(best) == _NUM_KEPT:
+            break
+    return best
 
 
 def _hardly_moves(view: str) -> CalibrationError:

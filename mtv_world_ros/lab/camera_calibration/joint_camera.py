@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.lab.camera_calibration.fixed_camera import (
+    best_apart,
     Changes,
     FixedCamera,
     random_camera,
@@ -33,8 +34,8 @@ _COARSE, _FIRST, _STAGES = (64, 1.5), (64, 3.0), ((80, 3.0), (120, 2.0), (160, 1
 _NEAR = 0.06
 #: difference of drawn and seen change from which on a pixel counts less
 _OUTLIER = 0.3
-#: cameras tried without a guess, how many of the best are improved, and then looked at closely
-_NUM_TRIED, _NUM_KEPT, _NUM_REFINED = 2400, 6, 2
+#: cameras tried without a guess, and how many of the best are looked at closely
+_NUM_TRIED, _NUM_REFINED = 2400, 2
 #: recordings that the search without a guess looks at
 _NUM_SEARCHED = 4
 #: cameras that points are fitted from
@@ -328,14 +329,7 @@ class JointCamera:
                 for one, each, cells in zip(chosen, changes, rough, strict=True)
             ]
             tried.append((float(np.mean(fits)), len(tried), T, lens))
-        tried.sort(reverse=True)
-        best: list[tuple[FloatArray, FloatArray]] = []
-        for _, _, T, lens in tried:
-            if all(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.15 * reach for other, _ in best):
-                best.append((T, lens))
-            if len(best) == _NUM_KEPT:
-                break
-        return best
+        return best_apart(tried, reach)
 
     def fits(
         self,

@@ -46,6 +46,8 @@ _LEAST_MATCH = 0.335
 #: of the points of a recording each third is left out of a first fit, and tells how good it is: on
 #: ten real recordings points that poses were fitted to are .5 and .9 px away, others 1.3 and 3.2
 _LEFT_OUT = 3
+#: of a view, to begin a search with
+_LEAST_POINTS = 4
 
 
 def expected_within(apart_px: FloatArray) -> float:
@@ -440,9 +442,6 @@ def load_points(path: Path, view: str) -> dict[str, list[FloatArray]]:
             'far apart: where the tool point is, seconds from the first joint state on'
         )
     return found
-
-
-_LEAST_POINTS = 4
 
 
 def _row(row: Any) -> FloatArray:

@@ -2,22 +2,10 @@
 
 import numpy as np
 import pytest
+from square_masks import objects, square
 
-from mtv_world_ros.data_types import ObjectMasks
 from mtv_world_ros.lab.evaluation.metrics.object_scores import boundary_f, moves, object_scores
 from mtv_world_ros.lab.evaluation.metrics.scores import keep_doubts
-
-
-def square(x, y, size=27, shape=(60, 90)):
-    mask = np.zeros(shape, bool)
-    mask[y : y + size, x : x + size] = True
-    return mask
-
-
-def objects(masks, status=None, names=('red block', 'blue block')):
-    masks = np.asarray(masks, bool)
-    status = status or (('ok',) * masks.shape[1],) * masks.shape[0]
-    return ObjectMasks(names=names[: masks.shape[1]], masks=masks, status=status)
 
 
 def test_union_and_object_mean_differ_when_objects_swap_identity():
