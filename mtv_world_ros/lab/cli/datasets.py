@@ -239,9 +239,12 @@ def _import_bag(arguments: argparse.Namespace) -> int:
 
 def _import_status(summary: ImportSummary[Any], name: Callable[[Any], str]) -> int:
     """Prints what came of an import, with the names of its recordings; returns the exit status."""
+    recordings: dict[str, list[str]] = {}  # by warning
     for one, lines in summary.warnings.items():
         for line in lines:
-            print(f'{name(one)}: {line}', file=sys.stderr)
+            recordings.setdefault(line, []).append(name(one))
+    for line, names in recordings.items():
+        print(f'{", ".join(names)}: {line}', file=sys.stderr)
     print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
     for one, reason in summary.failed.items():
         print(f'{name(one)}: {reason}', file=sys.stderr)

@@ -75,7 +75,8 @@ def test_frame_k_belongs_to_row_k_and_the_camera_is_marked(tmp_path, franka, pos
                  '--out', str(out)]) == 0  # fmt: skip
     said = capsys.readouterr()
     assert 'a: 2.2 s; frames: front 12' in said.out and '2 made' in said.out
-    assert 'calibrate-camera' in said.err
+    unknown = "a, b: view 'front': pose and intrinsics not known: mtv-world calibrate-camera "
+    assert f'{unknown}{out} --view front --click points.html' in said.err  # once for both
     episode = read_episode(out / 'b', robot=franka, unknown_mount=franka.base_link)
     assert episode.unknown == {'front': 'pose and intrinsics'}
     assert episode.info.instruction == 'lift it'

@@ -35,7 +35,8 @@ def test_unknown_poses_and_intrinsics_are_imported_and_marked(bag, tmp_path, cap
     more = MAPPING | {'views': views}
     assert run(tmp_path, bag, mapping=more, more=['--out', str(tmp_path / 'blind')]) == 0
     printed = capsys.readouterr()
-    assert "view 'door': pose not known: mtv-world calibrate-camera" in printed.err
+    clicks = f'mtv-world calibrate-camera {tmp_path / "blind"} --view door --click points.html'
+    assert f"view 'door': pose not known: {clicks}" in printed.err
     assert "view 'palm': pose and intrinsics not known" in printed.err
     assert 'wave: 1.9 s; frames: door 20, palm 20' in printed.out
     assert 'cameras not known: door, palm' in printed.out
