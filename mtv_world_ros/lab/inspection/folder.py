@@ -254,6 +254,21 @@ def table(found: FolderInspection) -> list[list[str]]:
     return rows
 
 
+def _conclusions(found: FolderInspection) -> list[str]:
+    """What concerns all episodes, and what was not checked, once for the episodes it holds for."""
+    unchecked: dict[str, list[str]] = {}
+    for name, inspection in found.episodes.items():
+        for section in (*inspection.views, inspection.recording):
+            for finding in section.findings:
+                if finding.verdict == 'not checked':
+                    unchecked.setdefault(f'{section.name}: {finding.text}', []).append(name)
+    return [
+        *(f'{finding.verdict}: {finding.text}' for finding in found.findings),
+        *(f'not checked in {" ".join(names)}: {text}' for text, names in unchecked.items()),
+        *found.notes,
+    ]
+
+
 def folder_text(found: FolderInspection) -> str:
     """The table as text, with what concerns all episodes below."""
     rows = table(found)
@@ -264,17 +279,14 @@ def folder_text(found: FolderInspection) -> str:
         )
         for row in rows
     ]
-    lines += [f'{finding.verdict}: {finding.text}' for finding in found.findings]
-    lines += found.notes
+    lines += _conclusions(found)
     return '\n'.join(line.rstrip() for line in lines)
 
 
 def folder_markdown(found: FolderInspection, picture: str) -> str:
     """The report of all episodes, in Markdown."""
     head, *rows = table(found)
-    lines = [f'# {found.verdict}', '']
-    lines += [f'- {finding.verdict}: {finding.text}' for finding in found.findings]
-    lines += [f'- {note}' for note in found.notes]
+    lines = [f'# {found.verdict}', '', *(f'- {line}' for line in _conclusions(found))]
     lines += ['', f'| {" | ".join(head)} |', f'|{"---|" * len(head)}']
     lines += [f'| {" | ".join(cell.replace("|", "/") for cell in row)} |' for row in rows]
     return '\n'.join([*lines, '', f'![all episodes]({picture})', ''])

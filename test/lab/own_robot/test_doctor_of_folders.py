@@ -1,6 +1,7 @@
 """`mtv-world doctor FOLDER`: each kind of bad recording is named, with its episode."""
 
 from dataclasses import replace
+from pathlib import Path
 import shutil
 
 from crane import (
@@ -24,8 +25,14 @@ from mtv_world_ros.data_types import JointTrajectory, WorldModelSpec
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.shape import load_shape
-from mtv_world_ros.lab.inspection.folder import folder_text, inspect_folder
+from mtv_world_ros.lab.inspection.folder import (
+    folder_markdown,
+    folder_text,
+    FolderInspection,
+    inspect_folder,
+)
 from mtv_world_ros.lab.inspection.inspect import Inspector
+from mtv_world_ros.lab.inspection.inspection_report import Inspection, not_checked, Section
 from mtv_world_ros.lab.inspection.motion_residual import ResidualSearch
 from mtv_world_ros.lab.inspection.stored_masks import check_masks
 from mtv_world_ros.lab.training.training_run import check_recording
@@ -161,6 +168,17 @@ def test_another_scene_before_the_right_camera_is_no_fault(tmp_path):
     text = folder_text(found)
     assert found.verdict == 'ok', text
     assert "painted: view 'door' shares no background" in text and 'another scene' in text
+
+
+def test_what_was_not_checked_is_said_once_with_its_episodes():
+    wrist = Section(name='wrist', findings=(not_checked('pose not known'),))
+    rest = Section(name='recording')
+    episode = Inspection(episode=Path('a'), robot='', views=(wrist,), recording=rest)
+    found = FolderInspection(
+        episodes={'a': episode, 'b': episode}, failed={}, places={}, members={}, findings=()
+    )
+    assert 'not checked in a b: wrist: pose not known' in folder_text(found).splitlines()
+    assert '- not checked in a b: wrist: pose not known' in folder_markdown(found, '').splitlines()
 
 
 @pytest.mark.parametrize('has_own_pose', [True, False])
