@@ -33,6 +33,7 @@ from mtv_world_ros.success.calibration import (
     HorizonCurve,
     load_fit,
 )
+from mtv_world_ros.success.doubts import Grounds
 from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.success.fitted_to import Setting
 from mtv_world_ros.success.task import load_task, load_tasks, TaskSpec
@@ -101,7 +102,8 @@ def load_pipeline(
             words of the instruction.
         serving: what makes the model faster or smaller, e.g. `compile=true`; see
             `ServingOptions`.
-        calibrated: use the checkpoint's calibration of the success estimate, where it has one.
+        calibrated: use the checkpoint's calibration of the success estimate, where it has one, and
+            abstain where an estimate rests on nothing; False = the bare estimate.
         adapter: LoRA adapter to use in place of the checkpoint's own.
         foresight: foresee where objects go, where the checkpoint can; False = the paper's way:
             trails and first masks alone are drawn, and pictures alone decide.
@@ -134,7 +136,8 @@ def load_pipeline(
         dtype=number_format,
         serving=options,
     )
-    return assemble(
+    calibration = load_fit(checkpoint_path(checkpoint), Calibration) if calibrated else None
+    pipeline = assemble(
         loaded.card,
         world_model,
         robot=model,
@@ -142,12 +145,16 @@ def load_pipeline(
         task=task,
         segmenter=choose_segmenter(segmenter, device=device),
         describer=asked_describer(describer),
-        calibration=load_fit(checkpoint_path(checkpoint), Calibration) if calibrated else None,
+        calibration=calibration,
         horizon=load_fit(checkpoint_path(checkpoint), HorizonCurve),
         object_motion=motion,
         camera_checker=CameraChecker(model, load_shape(model)) if camera_check else None,
         setting=fitting_setting(checkpoint, model),
     )
+    if not calibrated:  # to be fitted, or compared: the bare estimate
+        return pipeline
+    doubt = motion.settings.doubt if motion else ''
+    return replace(pipeline, grounds=Grounds.of(doubt, calibration is not None))
 
 
 def fitting_setting(checkpoint: str | Path, robot: RobotModel) -> Setting:

@@ -33,7 +33,7 @@ from mtv_world_ros.rendering.trajectory_video import (
 )
 from mtv_world_ros.rollout_state import RolloutState
 from mtv_world_ros.success.calibration import HorizonCurve
-from mtv_world_ros.success.doubts import doubted, widened
+from mtv_world_ros.success.doubts import doubted, Grounds, widened
 from mtv_world_ros.success.estimator import JudgedChunk, SuccessEstimator
 from mtv_world_ros.success.foreseen import ForeseenMotions
 from mtv_world_ros.success.rollout_memory import footage_of
@@ -105,6 +105,7 @@ class Pipeline:
         object_motion: foresees object motions, for models whose trajectory videos show them;
             None = objects are drawn where they were.
         camera_checker: compares the first frames with the arm's outline; None = no check.
+        grounds: what estimates that are not calibrated may rest on.
     """
 
     robot: RobotModel
@@ -118,6 +119,7 @@ class Pipeline:
     horizon: HorizonCurve | None = None
     object_motion: ObjectMotionModel | None = None
     camera_checker: CameraChecker | None = None
+    grounds: Grounds = Grounds()
 
     @property
     def spec(self) -> WorldModelSpec:
@@ -304,7 +306,8 @@ class Pipeline:
         judged = self.estimator.estimate(
             footage, episode.instruction, state.memory, foreseen, is_real=is_real
         )
-        estimate = doubted(judged.estimate, check.notes, check.refusal)
+        estimate = judged.estimate if is_real else self.grounds.bear(judged.estimate)
+        estimate = doubted(estimate, check.notes, check.refusal)
         return judged._replace(
             estimate=widened(estimate, episode.doubt) if episode.doubt else estimate
         )

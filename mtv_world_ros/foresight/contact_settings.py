@@ -30,8 +30,20 @@ class ContactSpread(Schema):
     )
 
 
+class ContactOrigin(Schema):
+    """What compared numbers of contact with recordings."""
+
+    by: str = Field(description='the command')
+    recordings: int = Field(ge=0, description='that were looked at')
+    telling: int = Field(ge=0, description='that say something of these numbers')
+
+
 class ContactSettings(Schema):
     """Numbers of contact, found in recorded episodes (`training/object_motion/contact_fit.py`)."""
+
+    fitted: ContactOrigin | None = Field(
+        default=None, description='what compared these numbers with recordings; None = nothing did'
+    )
 
     finger_stiffness: float = Field(ge=0.1, le=1e6, description='of each finger [N/m]')
     finger_damping: float = Field(ge=1e-3, le=1e5, description='of each finger [N s/m]')
@@ -69,3 +81,15 @@ class ContactSettings(Schema):
         default=ContactSpread(), description='how exactly all this is known'
     )
     num_motions: int = Field(default=4, ge=1, le=64, description='the last ones disturbed')
+
+    @property
+    def doubt(self) -> str:
+        """Why these numbers say nothing of a real place; empty = recordings there bear them."""
+        if self.fitted is None:
+            return 'numbers of contact (contact.json) were never fitted on recordings'
+        if self.fitted.telling:
+            return ''
+        return (
+            f'none of the {self.fitted.recordings} recordings that numbers of contact were fitted '
+            'on says anything of friction, density or stiffness of fingers'
+        )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import isfinite, nan
 
 import numpy as np
@@ -119,3 +119,49 @@ def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
         min(max(high, middle + _HALF_WIDTH), 1.0),
     )
     return replace(estimate, probability=middle, interval=interval, reasons=reasons)
+
+
+#: how an estimate that rests on nothing is mended
+_CALIBRATE = 'mtv-world calibrate CHECKPOINT EPISODES on episodes of known outcome'
+_FIT = 'mtv-world fit-contact RECORDINGS --checkpoint CHECKPOINT on recordings of this robot'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grounds:
+    """What an estimate of imagined frames that is not calibrated may rest on.
+
+    Attributes:
+        foreseen: why foreseen motions are no ground, as their numbers of contact are guessed;
+            empty = they are.
+        pictures: why imagined frames alone are none; empty = they are.
+    """
+
+    foreseen: str = ''
+    pictures: str = ''
+
+    @classmethod
+    def of(cls, contact: str, is_calibrated: bool) -> Grounds:
+        """Returns the grounds of a checkpoint.
+
+        Args:
+            contact: doubt about its numbers of contact; empty = there is none.
+            is_calibrated: whether it has a calibration, of whatever task and robot.
+        """
+        never = '' if is_calibrated else 'the estimate was never calibrated for this checkpoint'
+        return cls(
+            foreseen=contact
+            and f'{contact}, and the estimate is uncalibrated: run {_FIT}, or {_CALIBRATE}',
+            pictures=never and f'{never}, and no motion is foreseen: run {_CALIBRATE}, or {_FIT}',
+        )
+
+    def bear(self, estimate: SuccessEstimate) -> SuccessEstimate:
+        """Returns an estimate of imagined frames, without a verdict where it rests on nothing."""
+        if estimate.is_calibrated or not isfinite(estimate.probability):
+            return estimate
+        is_foreseen = isfinite(estimate.features.get('foreseen', nan))
+        refusal = self.foreseen if is_foreseen else self.pictures
+        if not refusal:
+            return estimate
+        low, high = estimate.interval
+        without = f'without this doubt {estimate.probability:.2f} [{low:.2f}, {high:.2f}]'
+        return doubted(estimate, refusal=f'{refusal}; {without}')

@@ -24,7 +24,7 @@ from mtv_world_ros.data_types import BoolArray, FloatArray
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.foresight.arm_response import PERIOD_S
 from mtv_world_ros.foresight.arms import Arms
-from mtv_world_ros.foresight.contact_settings import ContactSettings
+from mtv_world_ros.foresight.contact_settings import ContactOrigin, ContactSettings
 from mtv_world_ros.foresight.course import CoursePlanner, SUBSTEPS
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.futures import Future
@@ -393,7 +393,13 @@ def fit_contact(
             f'{deciding:.1f} draws decide: these numbers are likely together, but their intervals '
             'are too narrow'
         )
-    return first.model_copy(update={**values, 'spread': spread}), [table, delay, *found, hold]
+    origin = ContactOrigin(
+        by='mtv-world fit-contact',
+        recordings=len(recordings),
+        telling=max(one.count for one in (*found, hold)),
+    )
+    update = {**values, 'spread': spread, 'fitted': origin}
+    return first.model_copy(update=update), [table, delay, *found, hold]
 
 
 def settings_of_place(

@@ -17,6 +17,7 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.foresight.arms import Arms
+from mtv_world_ros.foresight.contact_settings import ContactOrigin
 from mtv_world_ros.foresight.engine import Engine
 from mtv_world_ros.foresight.loading import CONTACT_FILE, load_contact, load_foresight
 from mtv_world_ros.foresight.solid_foresight import SolidForesight
@@ -128,6 +129,7 @@ def test_numbers_that_make_up_for_each_other_are_within_their_intervals(
     )
     assert not by_name['grip_friction'].apart
     assert 'not told apart from the other numbers by these' in str(by_name['grip_friction'])
+    assert found.fitted == ContactOrigin(by='mtv-world fit-contact', recordings=3, telling=3)
     # futures differ by what is not known once the others are
     assert found.spread.grip < 0.5 * np.log(
         by_name['grip_friction'].high / by_name['grip_friction'].low
