@@ -16,6 +16,12 @@ class ContactSpread(Schema):
     """Standard deviations of what futures begin with."""
 
     place_m: float = Field(default=0.001, ge=0, le=1, description='of where objects are [m]')
+    camera_m: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.1,
+        description='of where the cameras see everything, alike for all objects [m]',
+    )
     turn_rad: float = Field(default=0.02, ge=0, le=4, description='of how they are turned [rad]')
     size: float = Field(default=0.015, ge=0, le=1, description='of their sizes, relative')
     friction: float = Field(default=0.2, ge=0, le=3, description='of what rubs, relative')

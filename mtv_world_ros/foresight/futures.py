@@ -6,7 +6,7 @@ Shape letters: O solids, D degrees of freedom of the arms.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -28,19 +28,20 @@ class Future:
         solids: O.
         zeros: (D,) by which the arms are elsewhere than they report [rad or m].
         delay_s: by which they follow later.
+        shift: (3,) by which the cameras see all solids elsewhere; `solids` have it [m].
     """
 
     settings: ContactSettings
     solids: tuple[Solid, ...]
     zeros: FloatArray
     delay_s: float = 0.0
+    shift: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 def draw_futures(
     settings: ContactSettings,
     solids: Sequence[Solid],
     drives: Drives,
-    camera_m: float = 0.0,
 ) -> tuple[Future, ...]:
     """Returns `settings.num_motions` futures; in the first all is as it was found.
 
@@ -50,12 +51,9 @@ def draw_futures(
         settings: of contact; their spread says how far futures differ.
         solids: O, as found.
         drives: of the arms.
-        camera_m: standard deviation of where the cameras see everything, which moves all solids
-            together [m].
     """
     return tuple(
-        _drawn(settings, solids, drives, camera_m, number)
-        for number in range(settings.num_motions)
+        _drawn(settings, solids, drives, number) for number in range(settings.num_motions)
     )
 
 
@@ -63,7 +61,6 @@ def _drawn(
     settings: ContactSettings,
     solids: Sequence[Solid],
     drives: Drives,
-    camera_m: float,
     number: int,
 ) -> Future:
     rng, spread, share = np.random.default_rng((2, number)), settings.spread, float(number > 0)
@@ -84,26 +81,33 @@ def _drawn(
     )
     zeros = share * spread.zero_rad * rng.normal(size=len(drives.names))
     delay_s = settings.delay_s + share * spread.delay_s * abs(float(rng.normal()))
-    moved = share * camera_m * rng.normal(size=2)
+    shift = share * spread.camera_m * np.array([*rng.normal(size=2), 0.0])
+    if settings.table_varies:  # else its height is known, whatever the cameras say
+        shift[2] = share * spread.camera_m * np.random.default_rng((3, number)).normal()
     return Future(
-        settings=changed,
-        solids=tuple(_disturbed(solid, changed, share, moved, rng) for solid in solids),
+        settings=changed.model_copy(update={'table_m': settings.table_m + shift[2]}),
+        solids=tuple(shifted(_disturbed(solid, changed, share, rng), shift) for solid in solids),
         zeros=np.where(drives.fingers, 0.0, zeros),
         delay_s=delay_s,
+        shift=shift,
     )
+
+
+def shifted(solid: Solid, shift: FloatArray) -> Solid:
+    """Returns a solid that is elsewhere by a shift (3,) [m]."""
+    return replace(solid, centre=solid.centre + shift)
 
 
 def _disturbed(
     solid: Solid,
     settings: ContactSettings,
     share: float,
-    moved: FloatArray,
     rng: np.random.Generator,
 ) -> Solid:
     """A solid a little elsewhere, of a little other size; what stands on the table still does."""
     noise, spread = share * rng.normal(size=5), settings.spread
     wide, long, high = solid.size * np.exp(spread.size * noise[[0, 0, 1]])
-    x, y = solid.centre[:2] + spread.place_m * noise[2:4] + moved
+    x, y = solid.centre[:2] + spread.place_m * noise[2:4]
     bottom = solid.bottom
     if abs(bottom - settings.table_m) < STANDS_M:
         bottom = settings.table_m

@@ -53,7 +53,6 @@ class SolidForesight:
         response: of the arms to their commands; None = not known yet.
         settings: of contact.
         threads: number of computing threads.
-        camera_m: standard deviation of where the cameras see everything [m].
 
     Raises:
         RobotError: contact of the robot cannot be computed, see `Arms`.
@@ -65,10 +64,9 @@ class SolidForesight:
         response: ArmResponse | None,
         settings: ContactSettings,
         threads: int = 1,
-        camera_m: float = 0.0,
     ) -> None:
         self.robot, self.response, self.settings = robot, response, settings
-        self._threads, self.camera_m = threads, camera_m
+        self._threads = threads
         self.engine = Engine(Arms(robot, response), threads)
         self.engine.scene_of(())
 
@@ -79,7 +77,7 @@ class SolidForesight:
 
     def with_robot(self, robot: RobotModel) -> SolidForesight:
         """Returns the same for a robot of the same joints and tools."""
-        return SolidForesight(robot, self.response, self.settings, self._threads, self.camera_m)
+        return SolidForesight(robot, self.response, self.settings, self._threads)
 
     def find(
         self,
@@ -277,7 +275,9 @@ class TrackedSolids:
         num, known = self.foresight.settings.num_motions, self._known
         points = np.full((num, rows + 1, len(self.solids), 3), np.nan)
         turns = np.tile(np.eye(3), (num, rows + 1, len(self.solids), 1, 1))
-        points[:, :, known] = motion.points
+        # the cameras will see them where they see them now
+        shifts = np.stack([future.shift for future in batch.futures])
+        points[:, :, known] = motion.points - shifts[:, None, None]
         upright = [_upright(solid) for future in batch.futures for solid in future.solids]
         first = np.reshape(upright, (num, len(known), 3, 3))  # also of none
         turns[:, :, known] = motion.rotations @ np.swapaxes(first, -1, -2)[:, None]
@@ -322,7 +322,7 @@ class TrackedSolids:
             return self.batch.futures
         solids = [solid for solid in self.solids if solid is not None]
         drives = self.foresight.engine.arms.drives
-        return draw_futures(self.foresight.settings, solids, drives, self.foresight.camera_m)
+        return draw_futures(self.foresight.settings, solids, drives)
 
 
 def table_in(

@@ -221,7 +221,7 @@ class SuccessEstimator:
             reasons.append('gripper not checked')
         elif features['released'] == 0.0:
             low = 0.0
-            reasons.append('a gripper is still closed')
+            reasons.append('a gripper is still closed (a task with `gripper: any` allows it)')
         elsewhere = self._elsewhere(views, ends is not None) if weights else ''
         reasons.append(basis or self._origin(elsewhere, is_real))
         return SuccessEstimate(

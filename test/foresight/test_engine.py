@@ -57,7 +57,7 @@ def test_arms_that_pass_by_move_as_they_would_by_dynamics(lift, monkeypatch):
 
 
 def test_futures_differ_in_what_is_not_known_and_the_first_does_not(lift):
-    futures = draw_futures(SETTINGS, (BLOCK,), Arms(lift, None).drives, camera_m=0.01)
+    futures = draw_futures(SETTINGS, (BLOCK,), Arms(lift, None).drives)
     first, *others = futures
     assert first.settings == SETTINGS and first.delay_s == 0 and not first.zeros.any()
     np.testing.assert_array_equal(first.solids[0].centre, BLOCK.centre)
@@ -66,8 +66,38 @@ def test_futures_differ_in_what_is_not_known_and_the_first_does_not(lift):
         assert future.settings.density != SETTINGS.density
         assert future.delay_s > 0 and future.zeros[0] != 0
         assert future.solids[0].centre[2] == future.solids[0].size[2] / 2  # it stands
-    again = draw_futures(SETTINGS, (BLOCK,), Arms(lift, None).drives, camera_m=0.01)
+    again = draw_futures(SETTINGS, (BLOCK,), Arms(lift, None).drives)
     np.testing.assert_array_equal(again[1].solids[0].centre, others[0].solids[0].centre)
+
+
+@pytest.mark.parametrize('table_varies', [False, True])
+def test_an_error_of_the_cameras_moves_all_objects_alike(lift, table_varies):
+    sure = ContactSpread(**dict.fromkeys(ContactSpread.model_fields, 0.0) | {'camera_m': 0.01})
+    settings = SETTINGS.replace(spread=sure, table_varies=table_varies, num_motions=64)
+    first, *others = draw_futures(settings, (BLOCK, AWAY), Arms(lift, None).drives)
+    assert not first.shift.any()
+    shifts = np.stack([future.shift for future in others])
+    for future in others:
+        for solid, found in zip(future.solids, (BLOCK, AWAY), strict=True):
+            np.testing.assert_allclose(solid.centre, found.centre + future.shift, atol=1e-12)
+            # it stands on the table in every future
+            assert solid.bottom == pytest.approx(future.settings.table_m, abs=1e-12)
+    deviations = shifts.std(0)
+    assert deviations[:2] == pytest.approx([0.01, 0.01], rel=0.3)
+    # a table of known height says how high they are, whatever the cameras say
+    assert deviations[2] == pytest.approx(0.01 if table_varies else 0.0, rel=0.3)
+
+
+def test_what_cameras_see_elsewhere_is_foreseen_where_they_see_it(lift):
+    sure = ContactSpread(**dict.fromkeys(ContactSpread.model_fields, 0.0) | {'camera_m': 0.01})
+    settings = SETTINGS.replace(spread=sure, table_varies=True)
+    foresight = SolidForesight(lift, None, settings)
+    tracked = TrackedSolids(foresight=foresight, names=('block',), solids=(AWAY,))
+    motions, _ = tracked.advance(picking())  # nothing touches it
+    assert len(motions) == 4
+    for motion in motions:
+        np.testing.assert_allclose(motion.points[0, 0], AWAY.centre, atol=1e-4)
+        np.testing.assert_allclose(motion.points[-1, 0], AWAY.centre, atol=1e-3)
 
 
 def test_nothing_differs_where_all_is_known(lift):

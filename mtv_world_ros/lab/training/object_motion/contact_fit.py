@@ -27,10 +27,16 @@ from mtv_world_ros.foresight.arms import Arms
 from mtv_world_ros.foresight.contact_settings import ContactOrigin, ContactSettings
 from mtv_world_ros.foresight.course import CoursePlanner, SUBSTEPS
 from mtv_world_ros.foresight.engine import Engine
-from mtv_world_ros.foresight.futures import Future
+from mtv_world_ros.foresight.futures import Future, shifted
 from mtv_world_ros.foresight.scene import CompiledScene
 from mtv_world_ros.foresight.solid_foresight import COMMANDS_A_STEP, STEP_S, table_in
 from mtv_world_ros.foresight.solids import bottom_of, fit_solid, is_box, is_vessel, Solid
+from mtv_world_ros.geometry.mask_geometry import (
+    block_size,
+    CENTROID_NOISE_PX,
+    centroids,
+    locate,
+)
 from mtv_world_ros.geometry.resample import nearest_rows
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.training.object_motion.tracks import (
@@ -155,6 +161,7 @@ _WORDS = {
     'finger_stiffness': 'stiffness of fingers [N/m]',
     'delay_s': 'commands arrive late by [s]',
     'table_m': 'height of the table [m]',
+    'camera_m': 'cameras see objects elsewhere by [m]',
     'hold': 'friction x stiffness of fingers / density: whether things slip [N m^2/kg]',
 }
 #: exponents of numbers that make up for each other: an object slips where this product is small
@@ -177,6 +184,8 @@ _WIDER, _LEAST = 1.3, 0.08
 _SAYS = 0.5
 #: delays that are tried [s]
 _DELAYS = np.arange(0.0, 0.31, PERIOD_S)
+#: masks of larger objects have no common middle in two views [m]
+_SMALL_M = 0.1
 #: outlines of masks are no more exact than this, however many there are [m]
 _EXACT_M = 0.0005
 #: heights that differ by more are of several tables [m]
@@ -356,9 +365,18 @@ def fit_contact(
     if first is None:
         first = fit_fingers([r.grippers for r in recordings], arms, first_settings(arms))
     table, delay = find_table(recordings), find_delay(recordings, arms)
-    report(str(table))
-    report(str(delay))
-    first = first.model_copy(update={'table_m': table.value, 'delay_s': delay.value})
+    cameras = find_cameras(recordings)
+    for one in (table, delay, cameras):
+        report(str(one))
+    spread = first.spread.model_copy(
+        update={
+            'camera_m': cameras.value if cameras.count else first.spread.camera_m,
+            'delay_s': max(delay.spread, first.spread.delay_s),
+        }
+    )
+    first = first.model_copy(
+        update={'table_m': table.value, 'delay_s': delay.value, 'spread': spread}
+    )
     first = settings_of_place(first, recordings, report)
     engine = Engine(arms, threads)
     trials = [_Trial.of(one, first) for one in recordings]
@@ -382,9 +400,7 @@ def fit_contact(
         key: float(np.clip(one.spread, _LEAST_SPREAD, _MOST_SPREAD))
         for key, one in zip(('grip', 'friction', 'weight', 'force'), found, strict=True)
     }
-    spread = first.spread.model_copy(
-        update={**spreads, 'delay_s': max(delay.spread, first.spread.delay_s)}
-    )
+    spread = first.spread.model_copy(update=spreads)
     for one in (*found, hold):
         report(str(one))
     deciding = _effective_draws(weights)
@@ -399,7 +415,7 @@ def fit_contact(
         telling=max(one.count for one in (*found, hold)),
     )
     update = {**values, 'spread': spread, 'fitted': origin}
-    return first.model_copy(update=update), [table, delay, *found, hold]
+    return first.model_copy(update=update), [table, delay, cameras, *found, hold]
 
 
 def settings_of_place(
@@ -611,15 +627,16 @@ class _Trial:
     def likelihoods(self, engine: Engine, settings: Sequence[ContactSettings]) -> FloatArray:
         """Returns (N,) log likelihoods of where masks show the objects."""
         still = np.zeros(len(engine.arms.drives.names))
-        futures = [
-            Future(
-                settings=one.model_copy(update={'table_m': self.table_m}),
-                solids=self.solids,
-                zeros=still,
-                delay_s=one.delay_s,
+        drawn = np.random.default_rng(_SEED).normal(size=(len(settings), 3))
+        futures = []
+        for one, draw in zip(settings, drawn, strict=True):
+            # where the cameras see all of it is not known: each draw has a shift of its own
+            shift = one.spread.camera_m * draw * [1, 1, one.table_varies]
+            changed = one.model_copy(update={'table_m': self.table_m + shift[2]})
+            solids = tuple(shifted(solid, shift) for solid in self.solids)
+            futures.append(
+                Future(settings=changed, solids=solids, zeros=still, delay_s=one.delay_s)
             )
-            for one in settings
-        ]
         motion, state = engine.begin(futures).advance(self.positions, COMMANDS_A_STEP)
         rows = min(motion.points.shape[1], len(self.displacements))
         # how it ends counts: at first nothing has moved whatever the settings
@@ -658,6 +675,40 @@ def _delay_errors(recording: ContactRecording, arms: Arms) -> FloatArray:
         off = np.abs(late - recording.recorded)[moving]
         errors.append(float(np.mean(off)) if len(off) else np.nan)
     return np.array(errors)
+
+
+def find_cameras(recordings: Sequence[ContactRecording]) -> FittedNumber:
+    """Returns how far from where they are the cameras see objects, alike for all of a scene.
+
+    Errors of cameras let the rays of two views pass each other: where each ray is off by a
+    deviation, they pass by that times the square root of two. Large objects are left out, whose
+    masks in two views have no common middle.
+    """
+    found = [gap for recording in recordings for gap in _ray_gaps(recording.frame)]
+    known = np.array([gap for gap in found if np.isfinite(gap)])
+    return _resampled(
+        'camera_m', known, len(found), 'objects', lambda gaps: np.sqrt((gaps**2).mean() / 2)
+    )
+
+
+def _ray_gaps(frame: FirstFrame) -> list[float]:
+    """By how far the views' rays to each object pass each other [m]; NaN = it does not tell.
+
+    What the middle of a mask is uncertain by is left out, so that it is 0 where cameras are right.
+    """
+    gaps, pixels = [], centroids(frame.masks)
+    for item in range(frame.masks.shape[1]):
+        place = locate(frame.cameras, frame.poses, pixels[:, item])
+        if place is None or not np.isfinite(place.point).all():
+            gaps.append(np.nan)
+            continue
+        areas = frame.masks[:, item].sum((-2, -1)).astype(np.float64)
+        edge = block_size(frame.cameras, frame.poses, areas, place.point)
+        # each ray passes the point between them at half the gap
+        own = (CENTROID_NOISE_PX / max(place.residual_px, CENTROID_NOISE_PX)) ** 2
+        gap = 2 * place.sigma_m * np.sqrt(1 - own)
+        gaps.append(gap if edge < _SMALL_M else np.nan)
+    return gaps
 
 
 def find_table(recordings: Sequence[ContactRecording]) -> FittedNumber:

@@ -66,6 +66,22 @@ def test_objects_are_where_masks_show_them_and_no_recorded_pose_is_read(recordin
     assert np.isfinite(recording.displacements[:5]).all()
 
 
+def test_cameras_that_are_off_are_as_far_off_as_their_rays_pass_each_other(recording):
+    found = contact_fit.find_cameras([recording] * 3)
+    assert found.value < 0.001  # those of the simulator are right
+    frame = recording.frame
+    points = frame.points()
+    rays = [points - pose[:3, 3] for pose in frame.poses]
+    aside = np.cross(rays[0][0], rays[1][0])
+    moved = frame.poses[0].copy()
+    moved[:3, 3] += 0.014 * aside / np.linalg.norm(aside)
+    off = replace(recording, frame=replace(frame, poses=(moved, frame.poses[1])))
+    found = contact_fit.find_cameras([off] * 3)
+    # one of the two rays is off by 14 mm: as if either were by 10
+    assert found.value == pytest.approx(0.014 / np.sqrt(2), rel=0.15)
+    assert (found.count, found.of) == (6, 6)
+
+
 def test_slippery_fingers_are_unlikely_where_a_block_was_carried(
     recording, robot, response, settings
 ):
