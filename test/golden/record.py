@@ -48,7 +48,8 @@ TASKS = 'place_bread_plate,shake_bottle'
 PART = [1, 1]
 #: keys of results that differ from run to run, and texts with a path or a time in them
 _RUN_KEYS = re.compile(
-    r'(^|_)(seconds|s|date|time|times|created|path|version|machine|host|commit)$|memory|per_second'
+    r'(^|_)(seconds|s|date|time|times|created|path|version|machine|host|commit)$'
+    r'|memory|per_second|^seconds|an hour|^real_time_factor'
 )
 _RUN_TEXT = re.compile(r'\S*/golden_\S*')
 
