@@ -30,23 +30,41 @@ def tip_middles(
         arm: number of the tool.
     """
     tools = robot.tool_poses(positions)[arm]
+    ends = _tips(robot, shapes, positions, arm)
+    if not ends:
+        return np.asarray(tools[:, :3, 3])
+    return np.stack([np.mean(found, axis=0) for found in ends])
+
+
+def num_tips(robot: RobotModel, shapes: Sequence[LinkShape], arm: int = 0) -> int:
+    """Returns how many finger tips the tool has, halfway open; 1 = the tool point alone."""
+    tool = robot.tools[arm]
+    positions = np.clip(np.zeros((1, len(robot.joint_names))), robot.lower, robot.upper)
+    if tool.gripper_joint is not None:
+        column = robot.joint_names.index(tool.gripper_joint)
+        positions[0, column] = (tool.gripper_open + tool.gripper_closed) / 2
+    return max([1, *map(len, _tips(robot, shapes, positions, arm))])
+
+
+def _tips(
+    robot: RobotModel, shapes: Sequence[LinkShape], positions: FloatArray, arm: int
+) -> list[list[FloatArray]]:
+    """Of each of T states, the (3,) tips in the base link; empty without fingers or shapes."""
     links = gripper_links(robot, robot.tools[arm])
     parts = [part for part in shapes if part.link in links]
     if not parts:
-        return np.asarray(tools[:, :3, 3])
+        return []
     poses = robot.forward_kinematics(positions)
-    return np.stack(
-        [
-            _middle(parts, {link: T[row] for link, T in poses.items() if link in links}, tool)
-            for row, tool in enumerate(tools)
-        ]
-    )
+    return [
+        _ends(parts, {link: T[row] for link, T in poses.items() if link in links}, tool)
+        for row, tool in enumerate(robot.tool_poses(positions)[arm])
+    ]
 
 
-def _middle(
+def _ends(
     parts: Sequence[LinkShape], poses: dict[str, FloatArray], tool: FloatArray
-) -> FloatArray:
-    """(3,) of one state; the tool's z axis points away from the arm."""
+) -> list[FloatArray]:
+    """(3,) of each tip in one state; the tool's z axis points away from the arm."""
     by_link: dict[str, list[FloatArray]] = {}
     for part in parts:
         T = poses[part.link]
@@ -57,6 +75,4 @@ def _middle(
         reach = (points - tool[:3, 3]) @ tool[:3, 2]
         ends.append((reach.max(), points[reach > reach.max() - _TIP_M].mean(axis=0)))
     farthest = max(reach for reach, _ in ends)
-    return np.asarray(
-        np.mean([end for reach, end in ends if reach > farthest - _BESIDE_TIP_M], axis=0)
-    )
+    return [end for reach, end in ends if reach > farthest - _BESIDE_TIP_M]

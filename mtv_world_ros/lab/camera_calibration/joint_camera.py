@@ -82,11 +82,13 @@ class SeenPoint:
 
     Attributes:
         recording: number of the recording.
+        seconds: after its first joint state [s].
         position: (3,) of the tool point, by the joint states, in the base link [m].
         pixel: (2,) where it was seen [px].
     """
 
     recording: int
+    seconds: float
     position: FloatArray
     pixel: FloatArray
 

@@ -1,4 +1,4 @@
-"""A page of frames on which somebody clicks where the tool point is seen."""
+"""A page of frames on which somebody clicks where the finger tips are seen."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from mtv_world_ros.lab.inspection.clocks import JointTrack
 _NUM_FRAMES = 4
 
 
-def points_page(episodes: Sequence[Episode], views: Sequence[str], robot: RobotModel) -> str:
+def points_page(
+    episodes: Sequence[Episode], views: Sequence[str], robot: RobotModel, tips: int
+) -> str:
     """Returns the page, in HTML.
 
     Of each recording it has the frames in which the tool is farthest from where it was in the
@@ -27,6 +29,7 @@ def points_page(episodes: Sequence[Episode], views: Sequence[str], robot: RobotM
         episodes: with joint states.
         views: whose frames are shown.
         robot: of the recordings.
+        tips: of its tool's fingers, each of which is clicked; what is saved is their middle.
 
     Raises:
         EpisodeError: a recording has no frame within its joint states.
@@ -35,8 +38,9 @@ def points_page(episodes: Sequence[Episode], views: Sequence[str], robot: RobotM
         view: [frame for episode in episodes for frame in _frames(episode, view, robot)]
         for view in views
     }
-    title = f'Where is the tool point? {", ".join(views)}'
-    return render('points.html.j2', title=title, file='points.yaml', views=shown)
+    what = 'is the tool point' if tips == 1 else 'are the finger tips'
+    title = f'Where {what}? {", ".join(views)}'
+    return render('points.html.j2', title=title, file='points.yaml', views=shown, tips=tips)
 
 
 def _frames(episode: Episode, view: str, robot: RobotModel) -> list[dict[str, object]]:

@@ -74,9 +74,12 @@ def _write_page(
     arguments: argparse.Namespace, episodes: Sequence[Episode], robot: RobotModel
 ) -> int:
     from mtv_world_ros.files import write_whole
+    from mtv_world_ros.geometry.robot.shape import load_shape
+    from mtv_world_ros.lab.camera_calibration.finger_tips import num_tips
     from mtv_world_ros.lab.camera_calibration.points_page import points_page
 
-    write_whole(arguments.click, points_page(episodes, arguments.views, robot))
+    tips = num_tips(robot, load_shape(robot).parts)
+    write_whole(arguments.click, points_page(episodes, arguments.views, robot, tips))
     print(
         f'page: {arguments.click}\nopen it in a browser, click, save, and give what it saves as '
         '--points'
@@ -208,6 +211,16 @@ def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_kno
         lines.append(
             'no error is stated: of three or more --points of a recording each third is left out '
             'of a first fit, and tells it'
+        )
+    if estimate.strays:
+        names = [episode.info.path.name for episode in episodes]
+        lines.append(
+            'look again at seen points that contradict the others, correct them or leave them out '
+            'where a finger is hidden: '
+            + ', '.join(
+                f'{names[point.recording]} at {point.seconds:g} s ({apart:.1f} px)'
+                for point, apart in estimate.strays
+            )
         )
     if estimate.kept_guess:
         lines.append("the guess fits better by the doctor's measure and is kept")

@@ -5,7 +5,7 @@ import pytest
 
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.shape import load_shape
-from mtv_world_ros.lab.camera_calibration.finger_tips import tip_middles
+from mtv_world_ros.lab.camera_calibration.finger_tips import num_tips, tip_middles
 
 #: an arm of one joint; its hand is 0.3 m up and has two fingers 0.1 m long
 ROBOT = """
@@ -65,6 +65,12 @@ def test_fingers_that_turn_reach_less_far_when_they_open(robot):
         reach = np.full(3, 0.09)  # the tool point
     wanted = np.array([[0, 0, 0.3 + reach[0]], [0, 0, 0.3 + reach[1]], [reach[2], 0, 0.3]])
     np.testing.assert_allclose(found, wanted, atol=1e-9)
+
+
+def test_each_finger_has_a_tip(robot):
+    parts = load_shape(robot).parts
+    assert num_tips(robot, parts) == (2 if robot.tools[0].gripper_joint else 1)
+    assert num_tips(robot, []) == 1
 
 
 def test_without_shapes_it_is_the_tool_point(robot):

@@ -11,6 +11,15 @@ import pytest
 from mtv_world_ros.cli import main
 from mtv_world_ros.lab.camera_calibration.shared_camera import load_points
 
+#: of frame f, number k of all, `at` clicks a pixel of the recorded image (320 px wide)
+CLICK = (
+    "const all = [...document.querySelectorAll('.frame')];"
+    'for (const [k, f] of all.entries()) {'
+    "const i = f.querySelector('img'), b = i.getBoundingClientRect(), s = b.width / 320;"
+    "const at = (x, y) => i.dispatchEvent(new MouseEvent('click', {bubbles: true,"
+    'clientX: b.left + (x + .5) * s, clientY: b.top + (y + .5) * s}));'
+)
+
 
 @pytest.fixture
 def page(tmp_path, capsys):
@@ -36,13 +45,8 @@ def test_what_it_saves_is_where_the_clicks_were(page, tmp_path):
     browser = Browser(tmp_path / 'profile')
     try:
         browser.open(page.as_uri())
-        # a click at known pixels of each frame, as a user's: on the screen, at another scale
-        browser.run(
-            "for (const [k, f] of [...document.querySelectorAll('.frame')].entries()) {"
-            "const i = f.querySelector('img'), b = i.getBoundingClientRect(), s = b.width / 320;"
-            "i.dispatchEvent(new MouseEvent('click', {bubbles: true,"
-            'clientX: b.left + (100.5 + k) * s, clientY: b.top + (60.5 + 2 * k) * s}))}; 0'
-        )
+        # both finger tips at known pixels, as a user clicks: on the screen, at another scale
+        browser.run(CLICK + 'at(90 + k, 55 + 2 * k); at(110 + k, 65 + 2 * k)}; 0')
         frames = browser.run(
             "[...document.querySelectorAll('.frame')].map(f => [f.dataset.episode,"
             'Number(f.dataset.seconds)])'
@@ -64,3 +68,22 @@ def test_what_it_saves_is_where_the_clicks_were(page, tmp_path):
         np.testing.assert_allclose(
             row, [seconds, 100 + k, 60 + 2 * k], atol=0.6
         )  # whole pixels of the screen
+
+
+def test_a_click_is_corrected_and_a_frame_that_lacks_a_finger_tip_is_not_saved(page, tmp_path):
+    browser = Browser(tmp_path / 'profile')
+    try:
+        browser.open(page.as_uri())
+        # both tips of all frames but the last, and the second one corrected by a third click
+        browser.run(CLICK + 'at(100, 60); if (k + 1 < all.length) {at(140, 90); at(120, 80)}}; 0')
+        count, told, marks = browser.run(
+            "[document.querySelectorAll('.frame').length,"
+            "document.getElementById('count').textContent, document.querySelectorAll('i').length]"
+        )
+        saved = browser.run('saved()')
+    finally:
+        browser.close()
+    assert told == f'{count - 1} points, 1 frames lack a finger tip' and marks == 2 * count - 1
+    rows = [row for rows in saved['door'].values() for row in rows]
+    assert len(rows) == count - 1
+    np.testing.assert_allclose(np.array(rows)[:, 1:], [[110, 70]] * (count - 1), atol=0.6)
