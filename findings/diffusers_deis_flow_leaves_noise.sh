@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
 # diffusers 0.42.1: a flow model sampled with DEIS keeps a seventh of the noise in its videos.
 #
-# Wan's schedule (UniPCMultistepScheduler, use_flow_sigmas, flow_shift 3) is given to other samplers
-# by from_config, as its pages on schedulers show. Expected of each, written down before the run:
-# noise levels that end at 0, so that a model whose velocity is noise - video, the same everywhere,
-# gives back the video. What happens: UniPC and DPM++ do; DEIS does not hear of
-# final_sigmas_type="zero" and repeats its last level instead (.136 of 20 steps, .75 of 2), so that
-# the video comes back with that much of the noise, without a word.
+# Wan's schedule (UniPCMultistepScheduler, use_flow_sigmas, flow_shift 3) is given to other
+# samplers by from_config, the library's way to change samplers. Expected of each: noise levels
+# that end at 0, so that a model whose velocity is noise - video, the same everywhere, gives back
+# the video. What happens: UniPC and DPM++ do; DEIS does not hear of final_sigmas_type="zero" and
+# repeats its last level instead (.136 of 20 steps, .75 of 2), so that the video comes back with
+# that much of the noise, without a word.
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # A joint of MJCF with a range and a ref: Pinocchio 4.1.0 holds the limits off by the ref.
 #
-# ref is the joint's number in the pose that the file draws, and range is in the same numbers, says
-# MuJoCo's reference. Expected of Pinocchio, written down before the run: MuJoCo 4.0.0's poses at
-# the same numbers, and its limits. What happens: the pose is the same, but range .5 2.5 with ref
-# 1.5 becomes limits -1 .. 1, so that the pose the file draws (1.5) is out of them and three
-# quarters of what is allowed are refused; and with two such joints in one body the
+# ref is the joint's number in the pose that the file draws, says MuJoCo's reference; its limits
+# hold in the same numbers. Expected of Pinocchio: MuJoCo 4.0.0's poses (the guess that was written
+# down before the run) and its limits at the same numbers. What happens: the pose is the same, but
+# range .5 2.5 with ref 1.5 becomes limits -1 .. 1, so that the pose the file draws (1.5) is out of
+# them and three quarters of what is allowed are refused; and with two such joints in one body the
 # pose is off as well. No word of either.
 set -eu
 place=$(mktemp -d)

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
 # mujoco 4.0.0: a camera's principal point: its sensor has none, and its picture has it mirrored.
 #
-# A camera of 640 x 480 with focalpixel 600 looks at a site at .3 .2 2, right, down and ahead of it.
-# Expected with principalpixel="40 30", an offset from the image's centre, written down before the
-# run: pixel 450 330 = 320 + 40 + 600 * .3 / 2, ..., as of a calibrated camera with cx = 360 and
-# cy = 270; and of the sensor camprojection ("projected onto the camera image, in pixel
-# coordinates") the pixel where the picture shows the site. What happens: the frustum that pictures
-# are drawn with shows it at 370 270 (cx = 320 - 40), and the sensor says 410 300, as if the
-# principal point were in the middle: 50 pixels from the picture and 50 from the calibrated camera.
+# A camera of 640 x 480 with focalpixel 600 looks at a site at .3 .2 2, right, down and ahead of
+# it. Expected with principalpixel="40 30", an offset from the image's centre: pixel 450 330 = 320
+# + 40 + 600 * .3 / 2, ..., as of a calibrated camera with cx = 360 and cy = 270; and of the sensor
+# camprojection ("projected onto the camera image, in pixel coordinates") the pixel where the
+# picture shows the site. What happens: the frustum that pictures are drawn with shows it at 370
+# 270 (cx = 320 - 40), and the sensor says 410 300, as if the principal point were in the middle:
+# 50 pixels from the picture and 50 from the calibrated camera.
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT

@@ -1,12 +1,11 @@
 #!/usr/bin/env bash
 # mujoco 4.0.0: a capsule that pierces a box is far from it, and there is no contact.
 #
-# A robot's link as a capsule stands upright in a table top of 2 cm. Expected of mj_geomDistance and
-# of the contacts, written down before the run: the deeper, the more negative, as with the same
-# table top as a mesh. What happens: up to 5 cm deep both agree; half through it the box says 0, and
-# with the link's middle in the table top +10 cm and no contact: whoever asks whether a pose is
-# free is told yes. (The like of it for a sphere in a box, issue 2206, is mended.) Releases 3.3.7
-# and 3.17.0 do the same.
+# A robot's link as a capsule stands upright in a table top of 2 cm. Expected of mj_geomDistance
+# and of the contacts: the deeper, the more negative, as with the same table top as a mesh. What
+# happens: up to 5 cm deep both agree; half through it the box says 0, and with the link's middle
+# in the table top +10 cm and no contact: whoever asks whether a pose is free is told yes. (The
+# like of it for a sphere in a box, issue 2206, is mended.) Releases 3.3.7 and 3.17.0 do the same.
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT

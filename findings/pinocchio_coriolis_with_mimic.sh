@@ -3,10 +3,10 @@
 #
 # A model that was read with mimic=True has fewer velocities; rnea, crba and nonLinearEffects of it
 # agree with the full robot's, and algorithms that cannot (aba, computeKineticEnergy, ...) refuse:
-# "This algorithm does not support Joint Mimic type". Expected of computeCoriolisMatrix, written
-# down before the run: C v = nonLinearEffects - gravity, or that refusal. What happens: a matrix
-# with another product, without a word. Locking the joint that is mimicked (buildReducedModel), as
-# a closed gripper is, ends in "Should never happen".
+# "This algorithm does not support Joint Mimic type". Expected of computeCoriolisMatrix: C v =
+# nonLinearEffects - gravity, or that refusal. What happens: a matrix with another product, without
+# a word. Locking the joint that is mimicked (buildReducedModel), as a closed gripper is, ends in
+# "Should never happen".
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT

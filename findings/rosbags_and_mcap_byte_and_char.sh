@@ -2,9 +2,9 @@
 # byte and char of a ROS 2 message: rosbags 0.11.9 and mcap-ros2-support 0.6.0 disagree in the sign.
 #
 # Both are numbers from 0 to 255 in ROS 2: an octet and a uint8, says its design page "Interface
-# definition using .msg files", "Mapping to IDL types". Expected of both, written down before the
-# run: 200 is read as 200. What happens: each has one of the two signed, and not the same one, so
-# that 200 becomes -56 without a word, and each refuses to write the 200 that the other one takes.
+# definition using .msg files", "Mapping to IDL types". Expected of both: 200 is read as 200. What
+# happens: each has one of the two signed, and not the same one, so that 200 becomes -56 without a
+# word, and each refuses to write the 200 that the other one takes.
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT
