@@ -234,7 +234,7 @@ class Inspector:
 
         found = []
         there = match(*mirrored(track, camera), joints, self.shape.parts)
-        if there > residual.match_here + _MIRRORED_GAIN:
+        if there > max(residual.match_here + _MIRRORED_GAIN, _MIN_MATCH):
             found.append(broken(_instead(_MIRRORED, there, residual.match_here)))
         for tool in self.robot.tools:
             moved = gripper_links(self.robot, tool)

@@ -136,6 +136,14 @@ def test_what_is_wrong_is_named_in_its_own_row(inspected, name, verdict, said):
     assert said in row and verdict in row, row
 
 
+def test_pictures_of_something_else_are_not_called_mirrored(inspected):
+    """Of two unrelated motions one always correlates more; .02 against -.05 says nothing."""
+    found, _ = inspected
+    for name in ('mixed', 'unseen', 'slow', 'longer'):
+        said = [str(finding) for view in found.episodes[name].views for finding in view.findings]
+        assert not [text for text in said if 'moves like the mirrored image' in text], said
+
+
 def test_good_episodes_are_not_blamed(inspected):
     found, text = inspected
     for name in ('good0', 'good1'):
