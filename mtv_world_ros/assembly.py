@@ -182,6 +182,7 @@ def assemble(
 ) -> Pipeline:
     """Puts the main path around a world model trained as the card says."""
     segmenter = segmenter or choose_segmenter()
+    rendering = TrajectoryVideoConfig(**card.rendering)
     return Pipeline(
         robot=robot,
         world_model=world_model,
@@ -192,13 +193,14 @@ def assemble(
             segmenter=segmenter,
             setting=setting,
         ),
-        rendering=TrajectoryVideoConfig(**card.rendering),
+        rendering=rendering,
         object_mask=card.object_mask,
         objects=objects,
         describer=describer,
         horizon=horizon,
         object_motion=object_motion,
         camera_checker=camera_checker,
+        parts=load_shape(robot).parts if rendering.arm_pictures else (),
     )
 
 

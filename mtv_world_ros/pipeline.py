@@ -25,8 +25,10 @@ from mtv_world_ros.geometry.camera import tools_in_view
 from mtv_world_ros.geometry.chunk_plan import ChunkPlan
 from mtv_world_ros.geometry.object_motion import ObjectMotionModel
 from mtv_world_ros.geometry.robot.model import LIMIT_TOLERANCE, RobotModel
+from mtv_world_ros.geometry.robot.shape import LinkShape
 from mtv_world_ros.imagined_episode import ImaginedEpisode
 from mtv_world_ros.prediction import Prediction, StageClock
+from mtv_world_ros.rendering.arm_pictures import arm_pictures
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
@@ -106,6 +108,7 @@ class Pipeline:
             None = objects are drawn where they were.
         camera_checker: compares the first frames with the arm's outline; None = no check.
         grounds: what estimates that are not calibrated may rest on.
+        parts: shapes of the robot's links, for `rendering.arm_pictures`.
     """
 
     robot: RobotModel
@@ -120,6 +123,7 @@ class Pipeline:
     object_motion: ObjectMotionModel | None = None
     camera_checker: CameraChecker | None = None
     grounds: Grounds = Grounds()
+    parts: tuple[LinkShape, ...] = ()
 
     @property
     def spec(self) -> WorldModelSpec:
@@ -195,7 +199,8 @@ class Pipeline:
         )
         pictures = objects.pictures(plan, start)
         clock.lap('object motion')
-        control = self.draw(start.cameras, plan.positions, plan.times, start_masks, pictures)
+        arms = self._arms(start, plan.positions)
+        control = self.draw(start.cameras, plan.positions, plan.times, start_masks, pictures, arms)
         clock.lap('trajectory video')
         frames = self.world_model.predict(
             start.frames,
@@ -254,6 +259,7 @@ class Pipeline:
         times: FloatArray,
         start_masks: ObjectMasks,
         objects: ByteArray | None = None,
+        arms: ByteArray | None = None,
     ) -> MultiViewVideo:
         """Returns the 1 + T frames of the trajectory video, at the cameras' size.
 
@@ -263,6 +269,7 @@ class Pipeline:
             times: (1 + T,) [s].
             start_masks: of the start frame.
             objects: (V, 1 + T, H, W, 4) of `moved_pictures`, in place of the masks.
+            arms: (V, 1 + T, H, W, 4) of `arm_pictures`.
         """
         return render_trajectory_video(
             cameras=cameras,
@@ -271,8 +278,14 @@ class Pipeline:
             times=times,
             object_masks=start_masks.masks[:, :, 0] if self.object_mask else None,
             objects=objects,
+            arms=arms,
             config=self.rendering,
         )
+
+    def _arms(self, start: Observation, positions: FloatArray) -> ByteArray | None:
+        if not self.rendering.arm_pictures:
+            return None
+        return arm_pictures(self.parts, self.robot, start.cameras, start.frames, positions)
 
     def follow(
         self,

@@ -24,6 +24,7 @@ from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.mask_geometry import centroids, locate
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.lab.evaluation.imagined_stretches import (
     imagine_stretch,
     last_chunk,
@@ -34,6 +35,7 @@ from mtv_world_ros.lab.recordings import cached_recording
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.rendering.arm_pictures import arm_pictures
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.vision.describers.describer import DescribedObject
 
@@ -533,6 +535,21 @@ def test_control_frame_zero_shows_the_observed_state(pipeline, world_model, reco
         chunk.start_masks,
     )
     assert np.array_equal(world_model.trajectories[0][:, :2], drawn.frames)
+
+
+def test_arms_are_drawn_as_the_frame_that_each_chunk_starts_from_shows_them(
+    world_model, recording
+):
+    card = CARD.replace(rendering={'arm_pictures': True})
+    chunks = imagine(assemble(card, world_model, robot=YAM), recording, 3.2)
+    parts = load_shape(YAM).parts
+    for chunk, control in zip(chunks, world_model.trajectories, strict=True):
+        start = chunk.start.frames
+        arms = arm_pictures(parts, YAM, chunk.start.cameras, start, chunk.start.positions[None])
+        (visible,) = np.moveaxis(arms[:, :, ..., 3] > 0, 1, 0)
+        assert visible.mean() > 0.05
+        # trails and objects lie over some of it
+        assert (control[:, 0][visible] == start[visible]).all(axis=-1).mean() > 0.7
 
 
 def test_the_objects_are_those_of_the_instruction(pipeline, recording):

@@ -91,6 +91,11 @@ class TrajectoryVideoConfig(Schema):
         description='width of a line along each finger [m], white and magenta, as far apart as '
         'the gripper is commanded to open; null = none, as in the paper',
     )
+    arm_pictures: bool = Field(
+        default=False,
+        description='each link of the robot is drawn as the start frame shows it, under the '
+        'trails, where the commands move it; else as lines, or as in the paper not at all',
+    )
     object_motion: bool = Field(
         default=False,
         description='objects are drawn as they look, over the trails, where they are expected to '
@@ -120,6 +125,7 @@ def render_trajectory_video(
     object_masks: BoolArray | None,
     config: TrajectoryVideoConfig,
     objects: ByteArray | None = None,
+    arms: ByteArray | None = None,
 ) -> MultiViewVideo:
     """Draws the trajectory into each view, at the cameras' size.
 
@@ -131,6 +137,7 @@ def render_trajectory_video(
         object_masks: (V, O, H, W) masks of the first frame, held over all frames; or None.
         objects: (V, T, H, W, 4) uint8 of `moved_pictures`, in place of masks; or None.
         config: widths, colours and fading of the trails.
+        arms: (V, T, H, W, 4) uint8 of `arm_pictures`, over the arms' lines; or None.
 
     Returns:
         (V, T, H, W, 3) frames.
@@ -142,15 +149,16 @@ def render_trajectory_video(
     positions, times = np.asarray(positions, np.float64), np.asarray(times, np.float64)
     _check(cameras, positions, times, object_masks)
     motion = tool_motion(robot, positions, times, config.points_per_frame, config.max_gap_m)
-    arms = () if config.link_width_m is None else robot.arm_points(positions)
+    lines = () if config.link_width_m is None else robot.arm_points(positions)
     shape = (len(cameras), len(times), cameras[0].height, cameras[0].width, 3)
     frames = np.zeros(shape, np.uint8)
     for view, camera in enumerate(cameras):
         masks = () if object_masks is None or objects is not None else object_masks[view]
         fills = _fills(camera, masks, config)
         poses = camera_poses(camera, robot, positions)
-        shown = None if objects is None else objects[view]
-        _draw_view(frames[view], fills, camera, poses, arms, motion, config, shown)
+        links = ArmLinks(camera, poses, lines, config.link_width_m)
+        over = [None if pictures is None else pictures[view] for pictures in (arms, objects)]
+        _draw_view(frames[view], fills, camera, poses, links, motion, config, *over)
     return MultiViewVideo(views=tuple(c.view for c in cameras), times=times, frames=frames)
 
 
@@ -206,12 +214,13 @@ def _draw_view(
     fills: tuple[Box, ByteArray],
     camera: CameraModel,
     poses: FloatArray,
-    arms: Sequence[FloatArray],
+    links: ArmLinks,
     motion: ToolMotion,
     config: TrajectoryVideoConfig,
+    arms: ByteArray | None,
     objects: ByteArray | None,
 ) -> None:
-    """Draws one view onto black (T, H, W, 3) frames; links where `arms` has points."""
+    """Draws one view onto black (T, H, W, 3) frames."""
     num_arms = len(motion.points)
     heads, depths = project(camera, poses, motion.points[:, motion.shown_at])
     core_sigmas = np.maximum(_CORE_SHARE * _sigmas(camera, depths, config), _LEAST_CORE_PX)
@@ -224,19 +233,20 @@ def _draw_view(
     trails = [_trail_frames(camera, poses, motion, arm, config) for arm in range(num_arms)]
     colours = [arm_colour(arm, num_arms) for arm in range(num_arms)]
     paints = [_Paint(colour) for colour in colours]
-    links = ArmLinks(camera, poses, arms, config.link_width_m)
     fingers = ArmLinks(camera, poses, motion.fingers, config.finger_width_m)
     white = _Paint(_WHITE)
     # far arms first; one that is behind the camera cannot hide another
     orders = np.argsort(-np.where(depths > 0, depths, np.inf), axis=0, kind='stable').T.tolist()
     for image in frames:
         region(image, fills[0])[...] = fills[1]
-    painted = fills[0] if config.link_width_m is None else (0, camera.height, 0, camera.width)
+    is_bare = config.link_width_m is None and arms is None
+    painted = fills[0] if is_bare else (0, camera.height, 0, camera.width)
     for k, (image, order, glows) in enumerate(
         zip(frames, orders, zip(*trails, strict=True), strict=True)
     ):
         for arm in order:
             links.draw(image, arm, k, _LINK_SHARE * colours[arm])
+        _cover(image, arms, k)
         drawn = [painted]
         for arm in order:
             box, glow = glows[arm]
@@ -246,9 +256,16 @@ def _draw_view(
                 white.lay(image, box, glow, drawn)
         for arm in order:
             _draw_fingers(fingers, image, arm, k)
-        if objects is not None:
-            cover = 255 - objects[k][..., 3:].astype(np.uint16)
-            image[...] = objects[k][..., :3] + (image * cover // 255).astype(np.uint8)
+        _cover(image, objects, k)
+
+
+def _cover(image: ByteArray, pictures: ByteArray | None, frame: int) -> None:
+    """Lays one of (T, H, W, 4) pictures, weighed by their cover, over an (H, W, 3) image."""
+    if pictures is None:
+        return
+    picture = pictures[frame]
+    rest = 255 - picture[..., 3:].astype(np.uint16)
+    image[...] = picture[..., :3] + (image * rest // 255).astype(np.uint8)
 
 
 def _draw_fingers(fingers: ArmLinks, image: ByteArray, arm: int, frame: int) -> None:

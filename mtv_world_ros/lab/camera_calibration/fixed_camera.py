@@ -23,6 +23,7 @@ from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot.mesh_pieces import outermost
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import fill, LinkShape, moving_links
+from mtv_world_ros.geometry.silhouettes import project_points
 from mtv_world_ros.geometry.transforms import looking_along
 from mtv_world_ros.lab.inspection.camera_pose import (
     aligned,
@@ -36,7 +37,6 @@ from mtv_world_ros.lab.inspection.camera_pose import (
     with_pose,
 )
 from mtv_world_ros.lab.inspection.clocks import JointTrack
-from mtv_world_ros.lab.silhouettes import project_points
 
 #: widths of the images and blurs [px] of the steps of the search, from coarse to fine
 _COARSE, _WIDE, _MIDDLE, _NEAR, _FINE = (64, 1.5), (120, 5.0), (120, 2.0), (160, 1.0), (240, 1.5)

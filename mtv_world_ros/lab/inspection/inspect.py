@@ -24,6 +24,7 @@ from mtv_world_ros.geometry.robot.shape import (
     moving_links,
     RobotShape,
 )
+from mtv_world_ros.geometry.silhouettes import draw_silhouettes
 from mtv_world_ros.geometry.transforms import inverse
 from mtv_world_ros.lab.inspection.clocks import (
     check_commands,
@@ -50,7 +51,6 @@ from mtv_world_ros.lab.inspection.motion_residual import (
 from mtv_world_ros.lab.inspection.pictures import check_frozen, check_lengths, mirrored
 from mtv_world_ros.lab.inspection.places import keeps_place
 from mtv_world_ros.lab.inspection.stored_masks import check_masks
-from mtv_world_ros.lab.silhouettes import draw_silhouettes
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,
     render_trajectory_video,

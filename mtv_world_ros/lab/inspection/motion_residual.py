@@ -17,9 +17,9 @@ from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import fill, LinkShape, moving_links
+from mtv_world_ros.geometry.silhouettes import project_part
 from mtv_world_ros.lab.inspection.camera_pose import shrunk
 from mtv_world_ros.lab.inspection.clocks import JointTrack
-from mtv_world_ros.lab.silhouettes import project_part
 
 FloatImage = NDArray[np.float32]
 

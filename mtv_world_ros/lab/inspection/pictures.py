@@ -13,10 +13,10 @@ from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import load_shape, RobotShape
+from mtv_world_ros.geometry.silhouettes import project_part
 from mtv_world_ros.geometry.transforms import looking_along
 from mtv_world_ros.lab.inspection.clocks import JointTrack, Stamps
 from mtv_world_ros.lab.inspection.inspection_report import broken, Finding, suspicious
-from mtv_world_ros.lab.silhouettes import project_part
 
 _SIZE, _FOCAL = 480, 520.0
 #: colours of x, y and z axes

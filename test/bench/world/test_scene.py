@@ -17,7 +17,7 @@ from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.shape import load_shape
-from mtv_world_ros.lab.silhouettes import draw_silhouettes
+from mtv_world_ros.geometry.silhouettes import draw_silhouettes
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data_types import CameraModel
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.shape import load_shape, rods
+from mtv_world_ros.geometry.silhouettes import draw_silhouettes
 from mtv_world_ros.lab.inspection.clocks import JointTrack
 from mtv_world_ros.lab.inspection.inspect import delays, Inspector, load_inspector
 from mtv_world_ros.lab.inspection.motion_residual import (
@@ -21,7 +22,6 @@ from mtv_world_ros.lab.inspection.motion_residual import (
     MotionResidual,
     ResidualSearch,
 )
-from mtv_world_ros.lab.silhouettes import draw_silhouettes
 
 QUICK = ResidualSearch(max_pairs=25, lags_s=(0.0,), rolls_deg=(), zooms=())
 

@@ -15,7 +15,7 @@ from mtv_world_ros.geometry.camera import camera_poses, project
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import load_shape
-from mtv_world_ros.lab.silhouettes import project_part
+from mtv_world_ros.geometry.silhouettes import project_part
 
 START_NS = 1_700_000_000_000_000_000
 WIDTH, HEIGHT, FPS = 320, 240, 10

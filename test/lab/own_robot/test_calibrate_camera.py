@@ -13,11 +13,11 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.geometry.robot.shape import load_shape
+from mtv_world_ros.geometry.silhouettes import draw_silhouettes
 from mtv_world_ros.lab.camera_calibration.fixed_camera import FixedCamera
 from mtv_world_ros.lab.camera_calibration.wrist_camera import follow_scene, WristCamera
 from mtv_world_ros.lab.inspection.camera_pose import difference, moved, spread
 from mtv_world_ros.lab.inspection.clocks import JointTrack
-from mtv_world_ros.lab.silhouettes import draw_silhouettes
 
 
 def test_a_fixed_camera_is_found_from_a_guess_in_a_part_of_the_recording(tmp_path, capsys):

@@ -16,8 +16,8 @@ from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.data_types import BoolArray, ByteArray, CameraModel, FloatArray
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import LinkShape, moving_links
+from mtv_world_ros.geometry.silhouettes import draw_silhouettes
 from mtv_world_ros.lab.evaluation.metrics.picture_scores import changed
-from mtv_world_ros.lab.silhouettes import draw_silhouettes
 
 #: frames of a recording whose median the scene without the arm is
 _MOST_FRAMES = 60

@@ -21,6 +21,7 @@ from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.data_types import ByteArray
 from mtv_world_ros.errors import TrainingError
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.lab.jobs import run_job, WorkerPool
 from mtv_world_ros.lab.recordings import clip_starts, cut_clip
 from mtv_world_ros.lab.training.clips.clip_controls import (
@@ -120,6 +121,7 @@ class BatchSource:
             segmenter=segmenter,
             rendering=config.rendering,
             object_mask=config.video.object_mask,
+            parts=load_shape(robot).parts if config.rendering.arm_pictures else (),
         )
         self._spec, self._augment, self._seed = spec, config.augment, seed
         self._history = config.history

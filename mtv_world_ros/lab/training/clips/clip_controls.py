@@ -13,8 +13,10 @@ from mtv_world_ros.data_types import BoolArray, ByteArray, History, WorldModelSp
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.object_motion import cut_outs, moved_pictures, ObjectMotion
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.robot.shape import LinkShape
 from mtv_world_ros.lab.recordings import Clip
 from mtv_world_ros.lab.training.training_config import HistoryConfig
+from mtv_world_ros.rendering.arm_pictures import arm_pictures
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
@@ -81,12 +83,14 @@ class ControlMaker:
         segmenter: finds the objects of the start frame.
         rendering: widths, colours and fading of trajectory videos.
         object_mask: whether they carry the objects' masks.
+        parts: shapes of the robot's links, for `rendering.arm_pictures`.
     """
 
     robot: RobotModel
     segmenter: Segmenter
     rendering: TrajectoryVideoConfig
     object_mask: bool
+    parts: tuple[LinkShape, ...] = ()
     # batches are prepared in one thread while the model's rollouts are drawn in another
     _lock: Lock = field(default_factory=Lock)
 
@@ -103,9 +107,17 @@ class ControlMaker:
             times=clip.times,
             object_masks=self._start_masks(clip, names) if self.object_mask else None,
             objects=self._objects(clip, names) if self.object_mask else None,
+            arms=self._arms(clip),
             config=self.rendering,
         )
         return video.frames
+
+    def _arms(self, clip: Clip) -> ByteArray | None:
+        if not self.rendering.arm_pictures:
+            return None
+        return arm_pictures(
+            self.parts, self.robot, clip.cameras, clip.frames[:, 0], clip.positions
+        )
 
     def _start_masks(self, clip: Clip, names: tuple[str, ...]) -> BoolArray:
         """(V, O, H, W) of a clip's start frame."""

@@ -7,6 +7,8 @@ import numpy as np
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.robot.shape import load_shape
+from mtv_world_ros.geometry.silhouettes import draw_silhouettes
 from mtv_world_ros.lab.recordings import cut_clip
 from mtv_world_ros.lab.training.clips.batches import BatchSource
 from mtv_world_ros.lab.training.clips.clip_controls import ControlMaker
@@ -74,3 +76,31 @@ def test_masks_that_came_with_the_episode_cut_objects_out(robot):
     shown = np.isin(recording.object_ids[:, 0], [1 + recording.objects.index(name)
                                                  for name in recording.names])  # fmt: skip
     assert (video[:, 0][shown] == recording.frames[:, 0][shown]).mean() > 0.99
+
+
+def test_arms_are_those_of_the_frame_that_a_clip_starts_from(robot):
+    config = load_training_config(
+        'small',
+        {
+            'rendering.arm_pictures': True,
+            'video.object_mask': False,
+            'augment.start_noise': 0.0,
+            'augment.colour_permutation': 0.0,
+        },
+    )
+    recording = load_recording(share_path('resource', 'demo_episode'), config.spec, robot)
+    source = BatchSource([recording], config, robot=robot, segmenter=ColourSegmenter(), seed=0)
+    batch = source.batch(0)
+    source.close()
+    frames, drawn = batch.frames.numpy(), batch.trajectory.numpy()
+    outlines = np.stack(
+        [
+            draw_silhouettes(load_shape(robot).parts, camera, robot, recording.positions) > 0
+            for camera in recording.cameras
+        ]
+    )
+    for clip, control in zip(frames, drawn, strict=True):
+        at = int(np.argmin(np.abs(recording.frames.astype(int) - clip[:, :1]).mean((0, 2, 3, 4))))
+        inside = outlines[:, at]
+        same = (control[:, 0] == clip[:, 0]).all(axis=-1)
+        assert same[inside].mean() > 0.6 and not control[:, 0][~inside].all(axis=-1).mean() > 0.05
