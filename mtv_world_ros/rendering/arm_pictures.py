@@ -6,7 +6,6 @@ V views, T frames, J joints, H W pixels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-import colorsys
 
 import cv2
 import numpy as np
@@ -18,8 +17,8 @@ from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import LinkShape
 from mtv_world_ros.geometry.silhouettes import project_part
 
-#: hue, its step from link to link, saturation and brightness of what the start frame hides
-_HUE, _HUE_STEP, _SATURATION, _VALUE = 0.55, 0.381966, 0.7, 0.6
+#: RGB of a robot of which the start frame shows nothing
+_GREY = 128
 #: points further than this many image sizes from its middle say nothing of a link's motion
 _FARTHEST = 4.0
 #: of the silhouettes whose pixels are moved
@@ -40,8 +39,9 @@ def arm_pictures(
     """Returns the robot alone, (V, T, H, W, 4) uint8 RGB and cover.
 
     The silhouette of each link has the start frame's pixels of that link, moved by the affine map
-    that fits its projected points best; where these were hidden or outside the image it has a
-    colour of its own. Near parts cover far ones, by the depths of their centres.
+    that fits its projected points best; where these were hidden or outside the image it has their
+    mean colour, or that of the whole robot. Near parts cover far ones, by the depths of their
+    centres.
 
     Args:
         parts: convex parts of the robot's links.
@@ -60,9 +60,10 @@ def arm_pictures(
         pixels = [project_part(part, poses[part.link], camera, T_base_camera) for part in parts]
         depths = _depths(parts, poses, camera, T_base_camera)
         seen = _seen_links(pixels, depths, numbers, camera)
+        whole = _mean_colour(frame, seen[0] > 0, np.full(3, _GREY))
         for number in range(len(links)):
             mine = [pixels[at] for at in np.flatnonzero(numbers == number)]
-            _draw_link(pictures, number, seen == number + 1, np.concatenate(mine, axis=1), frame)
+            _draw_link(pictures, seen == number + 1, np.concatenate(mine, axis=1), frame, whole)
     return shown
 
 
@@ -105,18 +106,22 @@ def _seen_links(
 
 
 def _draw_link(
-    pictures: ByteArray, number: int, seen: BoolArray, points: FloatArray, start_frame: ByteArray
+    pictures: ByteArray,
+    seen: BoolArray,
+    points: FloatArray,
+    start_frame: ByteArray,
+    hidden: NDArray[np.int_],
 ) -> None:
     """Draws a link into pictures (T, H, W, 4) where it is seen (T, H, W).
 
     Args:
         pictures: drawn upon.
-        number: of the link, for its colour.
         seen: where it is not hidden.
         points: (T, N, 2) pixels of points on it, NaN behind the camera.
         start_frame: (H, W, 3) uint8 RGB.
+        hidden: (3,) its colour where the start frame shows nothing of it.
     """
-    colour = (*_colour(number), 255)
+    colour = (*_mean_colour(start_frame, seen[0], hidden), 255)
     size = np.array(seen.shape[:0:-1])
     with np.errstate(invalid='ignore'):  # NaN
         near = (np.abs(points - size / 2) < _FARTHEST * size).all(axis=-1)
@@ -134,9 +139,10 @@ def _draw_link(
             picture[box][shown, :3] = moved[shown]
 
 
-def _colour(number: int) -> list[int]:
-    hue = (_HUE + number * _HUE_STEP) % 1.0
-    return [round(255 * c) for c in colorsys.hsv_to_rgb(hue, _SATURATION, _VALUE)]
+def _mean_colour(
+    frame: ByteArray, where: BoolArray, otherwise: NDArray[np.int_]
+) -> NDArray[np.int_]:
+    return np.rint(frame[where].mean(axis=0)).astype(int) if where.any() else otherwise
 
 
 def _affine(points: FloatArray, others: FloatArray) -> FloatArray:

@@ -173,7 +173,9 @@ def test_a_wrong_setting_names_the_nearest(override, message):
         load_training_config('small', override)
 
 
-@pytest.mark.parametrize(('preset', 'steps'), [('small', 1), ('wan-1.3b', 50), ('wan-14b', 50)])
+@pytest.mark.parametrize(
+    ('preset', 'steps'), [('small', 1), ('few_recordings', 1), ('wan-1.3b', 50), ('wan-14b', 50)]
+)
 def test_a_checkpoint_says_how_many_steps_it_is_made_for(preset, steps):
     assert load_training_config(preset).card({}).num_inference_steps == steps
     changed = load_training_config(preset, {'sampling.num_inference_steps': 7})
