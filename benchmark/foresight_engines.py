@@ -14,7 +14,8 @@ processor for finding and foreseeing a plan, medians; the ratio is of each episo
 median. What is chosen by this must not be measured by it: kinds of the split `test` are refused.
 
 `--robot` and `--contact` judge another robot's episodes with what fit-contact found, this version
-alone. The no-picture rule (commands and first masks alone: an object sticks to a gripper that closes
+alone; `--task` gives the files of tasks that are not bundled. Where no two outcomes are known, as of
+real recordings, shares stand alone. The no-picture rule (commands and first masks alone: an object sticks to a gripper that closes
 near it) stands beside it.
 
 With `--chunks N` both versions imagine N plans of 3.2 s of the bundled episode in turns, each whole
@@ -25,7 +26,7 @@ the machine does not count; in each turn the order is the other way round.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 import json
 import os
 from pathlib import Path
@@ -59,7 +60,7 @@ from mtv_world_ros.lab.splits import refuse_test_kinds
 from mtv_world_ros.lab.training.object_motion.tracks import fine_commands, first_frame
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.success.foreseen import foreseen_of
-from mtv_world_ros.success.task import load_tasks, match_task
+from mtv_world_ros.success.task import load_task, load_tasks, match_task
 
 OLD, RULE = '0.1.0: networks and DART', 'no-picture rule'
 #: plans begin so many frames apart, among the first frames of the bundled episode
@@ -144,6 +145,7 @@ def more(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--robot', help="YAML file or bundled name; default: the checkpoint's")
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
     parser.add_argument('--contact', default='bundled', help='checkpoint, or of fit-contact')
+    parser.add_argument('--task', type=Path, nargs='+', default=(), help='files of other tasks')
     parser.add_argument('--chunks', type=int, default=0, help='plans to imagine in turns')
     parser.add_argument('--futures', type=int, nargs='+', default=[16, 64])
 
@@ -216,9 +218,13 @@ class New:
         futures: numbers of them.
         contact: checkpoint, or folder of fit-contact.
         robot: whose it is; None = the checkpoint's.
+        tasks: files of tasks that are looked at before the bundled ones.
     """
 
-    def __init__(self, futures: list[int], contact: str, robot: str | None) -> None:
+    def __init__(
+        self, futures: list[int], contact: str, robot: str | None, tasks: Sequence[Path] = ()
+    ) -> None:
+        self._tasks = (*map(load_task, tasks), *load_tasks(share_path('config', 'tasks')))
         self.robot = checkpoint_robot(contact) if robot is None else load_robot(robot_path(robot))
         found = load_foresight(checkpoint_path(contact) / OBJECT_MOTION_FOLDER, self.robot)
         if found is None:
@@ -237,7 +243,7 @@ class New:
     ) -> tuple[bool, dict[str, tuple[float, float]]]:
         """Returns the outcome, and share and seconds by row; none = it cannot tell."""
         episode = read_episode(path, views=views)
-        found = match_task(load_tasks(share_path('config', 'tasks')), episode.info.instruction)
+        found = match_task(self._tasks, episode.info.instruction)
         success = episode.info.outcome == 'success'
         if found is None or episode.masks is None or episode.joint_states is None:
             return success, {}
@@ -277,7 +283,7 @@ def answers(options: argparse.Namespace, folder: Path | None) -> Iterator[tuple[
     paths = list_episodes(options.dataset)
     refuse_test_kinds(paths, 'the choice of an engine')
     order = np.random.default_rng(options.seed).permutation(len(paths))[: options.repeats]
-    new = New(options.futures, options.contact, options.robot)
+    new = New(options.futures, options.contact, options.robot, options.task)
     old = None if folder is None else Old(folder)
     for number, path in enumerate(paths[k] for k in order):
         success, said = new.ask(path, tuple(options.views))
@@ -316,8 +322,12 @@ def judged(options: argparse.Namespace, folder: Path | None) -> str:
     """Returns the table of what engines say of episodes."""
     found = list(answers(options, folder))
     real = np.array([success for success, _ in found])
+    if not found:
+        raise MtvWorldError(f"'{options.dataset}' has no episode of which all can tell")
     if len(set(real.tolist())) < 2:
-        raise MtvWorldError(f"'{options.dataset}' needs episodes that succeed and that fail")
+        shares = [[name, *(f'{said[name][0]:.2f}' for _, said in found)] for name in found[0][1]]
+        head = ('share of futures that succeed by', *map(str, range(len(found))))
+        return f'No two outcomes are known.\n\n{table(head, shares)}'
 
     def of(name: str, index: int) -> Any:
         return np.array([said[name][index] for _, said in found])

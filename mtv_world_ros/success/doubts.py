@@ -11,6 +11,8 @@ import numpy as np
 from scipy.special import bdtrc
 
 from mtv_world_ros.data_types import FloatArray, SuccessEstimate
+from mtv_world_ros.success.estimator import capped, stated_probability
+from mtv_world_ros.success.evidence import MAX_MARGIN
 
 #: an object nearer than this to one of its futures moved as foreseen [m]; masks of small pictures
 #: are no more exact
@@ -155,13 +157,33 @@ class Grounds:
         )
 
     def bear(self, estimate: SuccessEstimate) -> SuccessEstimate:
-        """Returns an estimate of imagined frames, without a verdict where it rests on nothing."""
+        """Returns an estimate of imagined frames by what it may rest on: none if by nothing.
+
+        Where pictures are no ground, foreseen motions alone decide.
+        """
         if estimate.is_calibrated or not isfinite(estimate.probability):
             return estimate
         is_foreseen = isfinite(estimate.features.get('foreseen', nan))
         refusal = self.foreseen if is_foreseen else self.pictures
         if not refusal:
-            return estimate
+            return _foreseen_alone(estimate) if self.pictures else estimate
         low, high = estimate.interval
         without = f'without this doubt {estimate.probability:.2f} [{low:.2f}, {high:.2f}]'
         return doubted(estimate, refusal=f'{refusal}; {without}')
+
+
+def _foreseen_alone(estimate: SuccessEstimate) -> SuccessEstimate:
+    """An estimate by foreseen motions; its interval holds whatever pictures could show."""
+    known = {name: estimate.features.get(name, nan) for name in ('foreseen', 'released')}
+    low, middle, high = (
+        capped(stated_probability({**known, 'margin': margin}), known)
+        for margin in (-MAX_MARGIN, nan, MAX_MARGIN)
+    )
+    low = 0.0 if known['released'] == 0 else low
+    text = 'by foreseen motions alone: imagined pictures of this checkpoint were never calibrated'
+    return replace(
+        estimate,
+        probability=middle,
+        interval=(low, high),
+        reasons=(text, *estimate.reasons),
+    )

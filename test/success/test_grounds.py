@@ -37,7 +37,6 @@ def estimate(foreseen: float, *, is_calibrated: bool = False) -> SuccessEstimate
     ('contact', 'is_calibrated', 'foreseen', 'says'),
     [
         ('guessed', False, -0.5, 'run mtv-world fit-contact'),  # of a checkpoint without any fit
-        ('', False, -0.5, ''),  # physics was fitted here: it has a verdict
         ('', False, nan, 'run mtv-world calibrate'),  # pictures alone, which nothing vouches for
         ('guessed', False, nan, 'run mtv-world calibrate'),
         ('guessed', True, -0.5, 'run mtv-world fit-contact'),  # calibrated for something else
@@ -55,6 +54,27 @@ def test_without_grounds_there_is_no_verdict(contact, is_calibrated, foreseen, s
     assert found.reasons[0].startswith('abstains: ')
     assert found.reasons[0].index(says) < found.reasons[0].index(', or mtv-world')
     assert found.reasons[0].endswith('without this doubt 0.21 [0.05, 0.40]')
+    assert found.reasons[1:] == given.reasons and found.features == given.features
+
+
+@pytest.mark.parametrize(
+    ('foreseen', 'released', 'probability'),
+    [
+        (1.0, 1.0, 0.817574),  # 1 / (1 + exp(-1.5)): all futures succeed
+        (-1.0, 1.0, 0.182426),
+        (0.0, nan, 0.5),
+        (1.0, 0.0, 0.1),  # a gripper that has to be open is closed
+    ],
+)
+def test_where_physics_was_fitted_here_foreseen_motions_alone_decide(
+    foreseen, released, probability
+):
+    given = estimate(foreseen)
+    given = replace(given, features={**given.features, 'released': released, 'margin': -3.0})
+    found = Grounds.of('', is_calibrated=False).bear(given)
+    assert found.probability == pytest.approx(probability, abs=1e-6)
+    assert found.interval[0] <= found.probability <= found.interval[1]
+    assert found.reasons[0].startswith('by foreseen motions alone')
     assert found.reasons[1:] == given.reasons and found.features == given.features
 
 
