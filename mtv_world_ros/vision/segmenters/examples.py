@@ -48,6 +48,12 @@ _STILL = (40, 10, 10)
 _OWN, _HIDDEN = 0.5, 0.25
 #: distance that an object may move between frames, as a share of the image's diagonal
 _REACH = 0.05
+#: margin around a mask that is to be cut out, as a share of the frame's width and at least [px]
+_MARGIN, _LEAST_MARGIN = 0.0125, 2
+#: larger masks, by their share of the frame, have little shade for their size, and take long
+_MOST_CUT = 0.01
+#: Jaccard index with what has its colours from which on what was cut out is that object
+_SAME_THING = 0.5
 #: pixels that are kept of a frame's surroundings
 _KEPT = 4000
 _TRACKING = TrackingConfig()
@@ -376,7 +382,7 @@ class _Follower:
         if self.look.stands_out:
             pixels = _opened(self.wide[_bins(frame)] & ~taken)
             found = track(pixels[None], None, _TRACKING)
-            return found.masks[0], found.status
+            return self._grown(frame, taken, found.masks[0]), found.status
         best, mask = 0.0, np.zeros(frame.shape[:2], np.bool_)
         for example in self.look.examples:
             picture, shape = example.patch(frame.shape[1], frame.shape[0])
@@ -388,6 +394,23 @@ class _Follower:
                 best, mask = score, np.zeros_like(mask)
                 mask[y : y + shape.shape[0], x : x + shape.shape[1]] = shape
         return mask & ~taken, 'ok' if best else 'absent'
+
+    def _grown(self, frame: ByteArray, taken: BoolArray, seed: BoolArray) -> BoolArray:
+        """(H, W) a mask with the sides in the shade, which have no colour of its own.
+
+        First those colours about it are added that are the object's where it is known to be, then
+        it is cut out of a box around both, as examples are.
+        """
+        if not seed.any():
+            return seed
+        coloured = self.near[_bins(frame)] & ~taken & _around(seed, 0)
+        grown = track(_opened(coloured | seed)[None], seed, _TRACKING).masks[0]
+        if not grown.any():
+            return seed
+        if np.count_nonzero(grown) > _MOST_CUT * grown.size:
+            return grown
+        cut = cut_out(frame, _box_around(grown)) & ~taken
+        return cut if jaccard(cut[None], grown[None])[0] >= _SAME_THING else grown
 
     def _continue(
         self,
@@ -413,6 +436,29 @@ class _Follower:
             gap = 0 if found.any() else gap + 1
             if not gap:
                 mask[...], last = found, found
+
+
+def cut_out(frame: ByteArray, box: Box) -> BoolArray:
+    """Returns the mask (H, W) of the object in a box, see `Example.in_box`."""
+    found = Example.in_box('', frame, box)
+    left, top, right, bottom = (round(edge) for edge in box)
+    x, y = max(0, left - (right - left)), max(0, top - (bottom - top))
+    mask = np.zeros(frame.shape[:2], np.bool_)
+    mask[y : y + found.mask.shape[0], x : x + found.mask.shape[1]] = found.mask
+    return mask
+
+
+def _box_around(mask: BoolArray) -> Box:
+    """The box of a mask (H, W), a little wider on all sides, within the frame."""
+    left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+    rows, columns = mask.shape
+    margin = max(_LEAST_MARGIN, round(_MARGIN * columns))
+    return (
+        max(0, left - margin),
+        max(0, top - margin),
+        min(columns, left + width + margin),
+        min(rows, top + height + margin),
+    )
 
 
 def _lab(frame: ByteArray) -> NDArray[np.int16]:

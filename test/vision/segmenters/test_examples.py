@@ -82,6 +82,27 @@ def test_what_stands_out_is_found_by_its_colours_anywhere_and_followed(segmenter
     assert jaccard(found.masks[0, 0], true['brown mug']).min() > 0.8
 
 
+def test_a_side_in_the_shade_belongs_to_what_stands_out():
+    """Its colour is also that of a cable elsewhere: by colours alone it is found in part."""
+
+    def shaded(left, top, seed):
+        frame, masks = scene(mug=(left, top), plate=None, seed=seed)
+        noise = np.random.default_rng(seed).normal(0, 2, (HEIGHT, WIDTH, 3))
+        dark = np.clip(np.array([52, 48, 46]) + noise, 0, 255).astype(np.uint8)
+        frame[top + 11 : top + 18, left : left + 24] = dark[top + 11 : top + 18, left : left + 24]
+        frame[112:] = dark[112:]
+        return frame, masks['brown mug']
+
+    frame, _ = shaded(30, 70, 0)
+    segmenter = ExampleSegmenter(ObjectExamples.of([(frame, {'brown mug': (28, 68, 56, 90)})]))
+    assert segmenter.stands_out['brown mug']
+    for left, top in ((90, 40), (120, 65), (40, 60)):
+        frame, true = shaded(left, top, left)
+        found = segmenter.segment(frame[None, None], ('brown mug',))
+        assert found.status == (('ok',),)
+        assert jaccard(found.masks[0, 0], true[None])[0] > 0.85
+
+
 def test_what_has_the_colours_of_the_table_is_found_by_its_picture(segmenter):
     """The camera was moved by some pixels since the box was drawn."""
     frames, true = video(*(scene(shift=(-9, 6), seed=k + 1) for k in range(3)))
