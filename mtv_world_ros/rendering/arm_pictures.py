@@ -124,9 +124,9 @@ def _draw_link(
     colour = (*_mean_colour(start_frame, seen[0], hidden), 255)
     size = np.array(seen.shape[:0:-1])
     with np.errstate(invalid='ignore'):  # NaN
-        near = (np.abs(points - size / 2) < _FARTHEST * size).all(axis=-1)
+        near: BoolArray = np.asarray((np.abs(points - size / 2) < _FARTHEST * size).all(axis=-1))
     # a pixel more than the silhouette, so that no seams show
-    was = cv2.dilate(seen[0].astype(np.uint8), _FRINGE)
+    was = np.asarray(cv2.dilate(seen[0].astype(np.uint8), _FRINGE), np.uint8)
     for picture, now, ends, known in zip(pictures, seen, points, near, strict=True):
         left, top, width, height = cv2.boundingRect(now.astype(np.uint8))
         box = np.s_[top : top + height, left : left + width]
@@ -148,7 +148,7 @@ def _mean_colour(
 def _affine(points: FloatArray, others: FloatArray) -> FloatArray:
     """(2, 3) the affine map that takes points (N, 2) to others best."""
     whole = np.column_stack([points, np.ones(len(points))])
-    return np.asarray(np.linalg.lstsq(whole, others, rcond=None)[0].T)
+    return np.asarray(np.linalg.lstsq(whole, others, rcond=None)[0].T, np.float64)
 
 
 def _warped(image: ByteArray, affine: FloatArray, size: tuple[int, int], how: int) -> ByteArray:
