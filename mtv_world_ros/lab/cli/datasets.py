@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.lab.importing.lerobot import EpisodeEntry
     from mtv_world_ros.lab.importing.recover import Recovered
     from mtv_world_ros.lab.importing.stored_objects import ObjectStage
+    from mtv_world_ros.vision.segmenters.examples import ObjectExamples
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -135,6 +136,7 @@ def _boxed_stage(
         )
     boxed = learn_objects(load_object_boxes(arguments.objects), found, read)
     file = arguments.out / 'objects.safetensors'
+    _refuse_others(arguments.out, file, boxed.examples, found)
     boxed.examples.save(file)
     segmenter = ExampleSegmenter(boxed.examples)
     for name, stands_out in segmenter.stands_out.items():
@@ -142,6 +144,25 @@ def _boxed_stage(
         print(f'object {name}: found by {how}')
     print(f'objects: {file}')
     return ObjectStage(segmenter=segmenter, boxed=boxed, key=arguments.objects.read_bytes())
+
+
+def _refuse_others(
+    out: Path, file: Path, examples: ObjectExamples, found: Mapping[str, Any]
+) -> None:
+    """Keeps the examples that masks of the episodes in a folder were made by."""
+    from mtv_world_ros.vision.segmenters.examples import ObjectExamples
+
+    there = [name for name in found if (out / name).exists()]
+    if file.is_file() and ObjectExamples.load(file).digest != examples.digest:
+        raise ConfigError(
+            f"'{file}' was learnt from other --objects, and found what is in the masks there; "
+            'choose another --out'
+        )
+    if there and not file.is_file():
+        raise ConfigError(
+            f"'{out / there[0]}' was imported without --objects; `mtv-world import-bag {out} "
+            '--objects FILE --out NEW` gives such episodes masks, and keeps their cameras'
+        )
 
 
 def _object_stage(arguments: argparse.Namespace) -> ObjectStage:

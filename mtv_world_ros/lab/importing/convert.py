@@ -71,8 +71,8 @@ def import_each(
                 summary.kept.append(item)
             else:
                 raise EpisodeError(
-                    f"'{path}' was imported with another mapping, calibration or robot; remove "
-                    'it or choose another --out'
+                    f"'{path}' was imported with another mapping, calibration, robot, describer "
+                    'or segmenter; remove it or choose another --out'
                 )
         except MtvWorldError as error:
             summary.failed[item] = str(error)

@@ -96,6 +96,32 @@ def test_a_box_in_one_recording_gives_masks_in_all(raw, capsys):
     assert (raw / 'data' / 'objects.safetensors').is_file()
 
 
+def test_other_boxes_leave_what_was_imported_with_the_first_ones(raw, capsys):
+    """The same again continues; others neither change the examples nor half of the masks."""
+    boxes(raw)
+    assert import_videos(raw) == 0
+    shutil.rmtree(raw / 'data' / 'b')  # stopped before it
+    assert import_videos(raw) == 0
+    assert '1 made, 1 kept' in capsys.readouterr().out
+    learnt = (raw / 'data' / 'objects.safetensors').read_bytes()
+    shutil.rmtree(raw / 'data' / 'b')
+    boxes(raw, rows=((0.0, 28, 58, 56, 82), (1.0, 36, 58, 64, 82)))
+    assert import_videos(raw) == 1
+    assert 'learnt from other --objects' in capsys.readouterr().err
+    assert (raw / 'data' / 'objects.safetensors').read_bytes() == learnt
+    assert not (raw / 'data' / 'b').exists()
+
+
+def test_boxes_for_episodes_without_objects_leave_nothing_behind(raw, capsys):
+    main(['import-videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml'),
+          '--out', str(raw / 'data')])  # fmt: skip
+    boxes(raw)
+    assert import_videos(raw) == 1
+    said = capsys.readouterr().err
+    assert 'imported without --objects' in said and f'import-bag {raw / "data"}' in said
+    assert not (raw / 'data' / 'objects.safetensors').exists()
+
+
 def test_imported_episodes_get_masks_by_a_second_import(raw, capsys):
     """After `calibrate-camera --apply`, say: nothing has to be calibrated again."""
     boxes(raw)
