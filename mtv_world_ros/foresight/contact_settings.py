@@ -36,6 +36,10 @@ class ContactSpread(Schema):
     )
 
 
+#: recordings that must say something of numbers of contact before verdicts rest on them
+ENOUGH_TELLING = 3
+
+
 class ContactOrigin(Schema):
     """What compared numbers of contact with recordings."""
 
@@ -93,9 +97,11 @@ class ContactSettings(Schema):
         """Why these numbers say nothing of a real place; empty = recordings there bear them."""
         if self.fitted is None:
             return 'numbers of contact (contact.json) were never fitted on recordings'
-        if self.fitted.telling:
+        telling, count = self.fitted.telling, self.fitted.recordings
+        if telling >= ENOUGH_TELLING:
             return ''
         return (
-            f'none of the {self.fitted.recordings} recordings that numbers of contact were fitted '
-            'on says anything of friction, density or stiffness of fingers'
+            f'{telling} of the {count} recordings that numbers of contact (contact.json) were '
+            'fitted on say something of friction, density or stiffness of fingers, fewer than '
+            f'{ENOUGH_TELLING}'
         )

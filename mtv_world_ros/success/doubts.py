@@ -164,9 +164,11 @@ class Grounds:
         if estimate.is_calibrated or not isfinite(estimate.probability):
             return estimate
         is_foreseen = isfinite(estimate.features.get('foreseen', nan))
+        if is_foreseen and self.pictures:
+            estimate = _foreseen_alone(estimate)
         refusal = self.foreseen if is_foreseen else self.pictures
         if not refusal:
-            return _foreseen_alone(estimate) if self.pictures else estimate
+            return estimate
         low, high = estimate.interval
         without = f'without this doubt {estimate.probability:.2f} [{low:.2f}, {high:.2f}]'
         return doubted(estimate, refusal=f'{refusal}; {without}')
