@@ -83,6 +83,31 @@ needs_checkpoint = pytest.mark.skipif(
 
 
 @needs_checkpoint
+@pytest.mark.parametrize(
+    ('package', 'extra'), [('accelerate', 'train'), ('torchmetrics.image', 'evaluate')]
+)
+def test_a_package_of_an_extra_that_is_missing_is_named(package, extra, capsys, monkeypatch):
+    """As after `make demo`, which installs what the demo needs."""
+
+    def handler(arguments):
+        raise ModuleNotFoundError(f"No module named '{package}'", name=package)
+
+    monkeypatch.setattr('mtv_world_ros.lab.cli.train._train', handler)
+    assert main(['train', 'data', '--out', 'runs']) == 1
+    said = capsys.readouterr().err
+    assert f'{package.partition(".")[0]} is not installed: make in the folder of' in said
+    assert f"pip install 'mtv_world_ros[{extra}]'" in said
+
+
+def test_a_module_that_no_extra_asks_for_is_no_error_of_the_user(monkeypatch):
+    def handler(arguments):
+        raise ModuleNotFoundError("No module named 'nowhere'", name='nowhere')
+
+    monkeypatch.setattr('mtv_world_ros.lab.cli.train._train', handler)
+    with pytest.raises(ModuleNotFoundError):
+        main(['train', 'data', '--out', 'runs'])
+
+
 def test_the_demo_runs_over_the_middleware_and_beats_the_held_frame(tmp_path):
     done = run('demo', '--out', 'out', '--threads', '1', cwd=tmp_path)
     assert done.returncode == 0, done.stderr

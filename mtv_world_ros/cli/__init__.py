@@ -18,6 +18,7 @@ import errno  # noqa: E402
 from importlib import import_module, metadata  # noqa: E402
 import os  # noqa: E402
 from pathlib import Path  # noqa: E402
+import re  # noqa: E402
 import shlex  # noqa: E402
 import sys  # noqa: E402
 from types import ModuleType  # noqa: E402
@@ -31,8 +32,6 @@ if _interrupt is signal.default_int_handler:
     with suppress(ValueError):
         signal.signal(signal.SIGINT, _interrupt)
 
-#: of the extra `evaluate`, which several commands need
-_EVALUATE_PACKAGES = ('matplotlib', 'scipy')
 _FULL = '; make room and run the command again'
 _READ_ONLY = '; choose another folder'
 #: modules of commands as `--help` shows them; those of other packages come last
@@ -172,12 +171,23 @@ def main(argv: list[str] | None = None) -> int:
         return _said(f'{error}{_advice(error)}', 1)
     except ModuleNotFoundError as error:
         package = (error.name or '').partition('.')[0]
-        if package not in _EVALUATE_PACKAGES:
+        extra = _extra_of(package)
+        if not extra:
             raise
-        return _said(f"{package} is not installed: pip install 'mtv_world_ros[evaluate]'", 1)
+        ways = f"make in the folder of mtv_world_ros, or pip install 'mtv_world_ros[{extra}]'"
+        return _said(f'{package} is not installed: {ways}', 1)
     except KeyboardInterrupt as stopped:
         number = getattr(stopped, 'signum', signal.SIGINT)
         return _said(f'stopped ({signal.Signals(number).name})', 128 + number)
+
+
+def _extra_of(package: str) -> str:
+    """The first extra of this package that asks for another one; empty = none does."""
+    for line in metadata.requires('mtv_world_ros') or ():
+        found = re.match(rf'{re.escape(package)}\b(?!-).*extra == .(\w+)', line)
+        if found and package:
+            return found[1]
+    return ''
 
 
 def _advice(error: Exception) -> str:
