@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+import json
 from math import isfinite
 from pathlib import Path
 import re
@@ -184,12 +185,14 @@ def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
 
     from mtv_world_ros.files import write_whole
     from mtv_world_ros.lab.inspection.folder import (
+        broken_parts,
         folder_markdown,
         folder_picture,
         folder_text,
         inspect_folder,
     )
     from mtv_world_ros.lab.inspection.inspect import load_inspector
+    from mtv_world_ros.lab.inspection.inspection_report import BROKEN
     from mtv_world_ros.rendering.images import write_png
 
     file, source = robot_file(arguments, paths[0])
@@ -211,6 +214,7 @@ def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
     if picture is not None:
         write_png(out / 'episodes.png', picture)
     write_whole(out / 'report.md', folder_markdown(found, 'episodes.png'))
+    write_whole(out / BROKEN, json.dumps(broken_parts(found), indent=2))
     print(folder_text(found))
     print(f"{found.verdict}: see '{out / 'report.md'}'")
     return _STATUS[found.verdict]

@@ -74,6 +74,13 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--device', default='cpu')
+    parser.add_argument(
+        '--doctor',
+        type=Path,
+        metavar='DIR',
+        help='what mtv-world doctor wrote about these episodes; those are left out of which the '
+        'recording or a view that is trained on is broken',
+    )
     add_options(parser, 'describer segmenter dtype')
     parser.add_argument(
         '--threads',
@@ -161,9 +168,11 @@ def _train(arguments: argparse.Namespace) -> int:
     refuse_test_kinds(paths, 'training')
     same = ('out', 'seed', 'device', 'dtype', 'save_every', 'save_minutes', 'cache')
     same += ('latent_cache', 'data_workers', 'peak_tflops')
+    broken = found_broken(arguments.doctor, paths, config.video.views) if arguments.doctor else {}
     run = TrainingRun(
         config=config,
         dataset=tuple(paths),
+        broken=broken,
         num_episodes=arguments.episodes,
         source=source,
         initial=checkpoint_path(arguments.init) if arguments.init else None,
@@ -183,6 +192,44 @@ def _train(arguments: argparse.Namespace) -> int:
     words = [model[0], dataset, *model[1:], '--out', str(out)]
     print(f'evaluate it with: {shlex.join(["mtv-world", "evaluate", *words])}')
     return 0
+
+
+def found_broken(report: Path, paths: Sequence[Path], views: Sequence[str]) -> dict[str, str]:
+    """Returns why episodes are broken, by path.
+
+    Args:
+        report: folder that `mtv-world doctor` wrote.
+        paths: of the episodes.
+        views: names of those that are trained on; others may be broken.
+
+    Raises:
+        ConfigError: it is no report of these episodes.
+    """
+    from pydantic import TypeAdapter
+
+    from mtv_world_ros.bounded_input import read_json
+    from mtv_world_ros.lab.inspection.inspection_report import BROKEN
+
+    try:
+        found = TypeAdapter(dict[str, dict[str, str]]).validate_python(read_json(report / BROKEN))
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"--doctor '{report}': {BROKEN} cannot be read ({error}); mtv-world doctor FOLDER "
+            '--out DIR writes it'
+        ) from error
+    unchecked = [path.name for path in paths if path.name not in found]
+    if unchecked:
+        raise ConfigError(
+            f"--doctor '{report}': {len(unchecked)} of the episodes were not checked, e.g. "
+            f"'{unchecked[0]}'; run mtv-world doctor on the folder again"
+        )
+    parts = {path: {n: t for n, t in found[path.name].items() if n in (*views, 'recording')}
+             for path in paths}  # fmt: skip
+    return {
+        str(path): '; '.join(f'{name}: {text}' for name, text in texts.items())
+        for path, texts in parts.items()
+        if texts
+    }
 
 
 def _use_threads(arguments: argparse.Namespace) -> None:

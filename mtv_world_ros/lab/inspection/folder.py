@@ -269,6 +269,19 @@ def _conclusions(found: FolderInspection) -> list[str]:
     ]
 
 
+def broken_parts(found: FolderInspection) -> dict[str, dict[str, str]]:
+    """Returns why views, or the `recording`, are broken, by episode and view."""
+    parts: dict[str, dict[str, str]] = {}
+    for name, inspection in found.episodes.items():
+        sections = (*inspection.views, inspection.recording)
+        texts = {
+            section.name: '; '.join(f.text for f in section.findings if f.verdict == 'broken')
+            for section in sections
+        }
+        parts[name] = {section: text for section, text in texts.items() if text}
+    return parts | {name: {'recording': why} for name, why in found.failed.items()}
+
+
 def folder_text(found: FolderInspection) -> str:
     """The table as text, with what concerns all episodes below."""
     rows = table(found)

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+#: file of a folder's report: what is broken, by episode and view
+BROKEN = 'broken.json'
 #: from best to worst
 VERDICTS = ('ok', 'not checked', 'suspicious', 'broken')
 _ADVICE = {

@@ -277,6 +277,9 @@ class TrainingRun(Schema):
     num_episodes: Count | None = Field(
         default=None, description='use this many episodes, spread evenly over the data set'
     )
+    broken: dict[str, str] = Field(
+        default={}, description='episodes to leave out, and why, by path'
+    )
     source: EpisodeSource = Field(
         default=EpisodeSource(),
         description="how episodes are read that are not this package's own",

@@ -11,6 +11,7 @@ import math
 from pathlib import Path
 import signal
 import threading
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -85,6 +86,7 @@ def load_recordings(
     cache: Path,
     source: EpisodeSource = DEFAULT,
     describer: Describer | None = None,
+    broken: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[list[Recording], dict[str, str]]:
     """Returns the usable recordings, and the reason for each one left out, by path.
 
@@ -96,6 +98,7 @@ def load_recordings(
         source: topics and calibration of the episodes.
         describer: names the objects; None = the names stored with the episodes, else those of
             the instructions.
+        broken: why episodes are to be left out, by path.
 
     Raises:
         TrainingError: none is usable.
@@ -104,6 +107,8 @@ def load_recordings(
     recordings, skipped = [], {}
     for path in tqdm(paths, desc='reading episodes', unit='ep', disable=None):
         try:
+            if str(path) in broken:
+                raise EpisodeError(broken[str(path)])
             with disk_errors_named(cache):
                 recording = cached_recording(path, spec, robot, cache, source)
             check_clips(recording, spec)
@@ -232,6 +237,7 @@ def train(
             run.cache or out / 'cache',
             run.source,
             describer,
+            run.broken,
         )
     _save_robot(robot, recordings, out / ROBOT_FOLDER, processes)
     source: BatchSource | CachedSource = BatchSource(

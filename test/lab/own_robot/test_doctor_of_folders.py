@@ -26,6 +26,7 @@ from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.shape import load_shape
 from mtv_world_ros.lab.inspection.folder import (
+    broken_parts,
     folder_markdown,
     folder_text,
     FolderInspection,
@@ -142,6 +143,15 @@ def test_pictures_of_something_else_are_not_called_mirrored(inspected):
     for name in ('mixed', 'unseen', 'slow', 'longer'):
         said = [str(finding) for view in found.episodes[name].views for finding in view.findings]
         assert not [text for text in said if 'moves like the mirrored image' in text], said
+
+
+def test_training_is_told_what_is_broken(inspected):
+    found, _ = inspected
+    parts = broken_parts(found)
+    assert parts['good0'] == parts['good1'] == parts['slow'] == {}
+    for name in ('frozen', 'mirrored', 'unseen', 'mixed', 'urdf'):
+        assert 'door' in parts[name], name
+    assert 'outside its limits' in ' '.join(parts['degrees'].values())
 
 
 def test_good_episodes_are_not_blamed(inspected):

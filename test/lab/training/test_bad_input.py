@@ -20,10 +20,11 @@ from mtv_world_ros.assembly import checkpoint_path
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
-from mtv_world_ros.errors import TrainingError
+from mtv_world_ros.errors import ConfigError, TrainingError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.lab.cli.train import set_overrides
+from mtv_world_ros.lab.cli.train import found_broken, set_overrides
+from mtv_world_ros.lab.inspection.inspection_report import BROKEN
 from mtv_world_ros.lab.training.resume import DiskError
 from mtv_world_ros.lab.training.training_config import TrainingRun
 from mtv_world_ros.lab.training.training_run import load_recordings, notes, train
@@ -102,6 +103,36 @@ def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
     said = "of robot 'yam_bimanual', and video.robot is 'franka'; give --set video.robot="
     with pytest.raises(TrainingError, match=said):
         load_recordings([episode], tiny.spec, franka, tmp_path / 'cache')
+
+
+@pytest.fixture
+def report(tmp_path):
+    """A report of `mtv-world doctor`: one view of `b` is broken, and the whole of `c`."""
+    broken = {'a': {}, 'b': {'wrist': 'mirrored'}, 'c': {'recording': 'degrees', 'low': 'frozen'}}
+    (tmp_path / BROKEN).write_text(json.dumps(broken))
+    return tmp_path
+
+
+def test_what_the_doctor_found_broken_is_left_out(report, episode, tiny, robot):
+    paths = [Path('data', name) for name in 'abc']
+    whole = {'data/c': 'recording: degrees; low: frozen'}
+    assert found_broken(report, paths, ('low', 'high')) == whole
+    assert found_broken(report, paths, ('low', 'wrist')) == {'data/b': 'wrist: mirrored'} | whole
+    with pytest.raises(TrainingError, match='no usable episode: 1 x wrist: mirrored'):
+        load_recordings(
+            [episode], tiny.spec, robot, report / 'cache', broken={str(episode): 'wrist: mirrored'}
+        )
+
+
+def test_a_report_of_other_episodes_is_refused(report):
+    with pytest.raises(ConfigError, match="1 of the episodes were not checked, e.g. 'd'"):
+        found_broken(report, [Path('data/a'), Path('data/d')], ('low',))
+    for text in ('', '[]', '{"a": "mirrored"}'):
+        (report / BROKEN).write_text(text)
+        with pytest.raises(ConfigError, match='cannot be read'):
+            found_broken(report, [Path('data/a')], ('low',))
+    with pytest.raises(ConfigError, match='mtv-world doctor FOLDER --out DIR writes it'):
+        found_broken(report / 'nothing', [Path('data/a')], ('low',))
 
 
 def test_weights_that_know_other_drawings_are_told(tiny, recording):
