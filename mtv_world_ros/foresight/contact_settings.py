@@ -36,7 +36,7 @@ class ContactSpread(Schema):
     )
 
 
-#: recordings that must say something of numbers of contact before verdicts rest on them
+#: recordings that must tell whether things slip before verdicts rest on numbers of contact
 ENOUGH_TELLING = 3
 
 
@@ -45,7 +45,7 @@ class ContactOrigin(Schema):
 
     by: str = Field(description='the command')
     recordings: int = Field(ge=0, description='that were looked at')
-    telling: int = Field(ge=0, description='that say something of these numbers')
+    telling: int = Field(ge=0, description='that tell whether things slip between fingers')
 
 
 class ContactSettings(Schema):
@@ -102,6 +102,6 @@ class ContactSettings(Schema):
             return ''
         return (
             f'{telling} of the {count} recordings that numbers of contact (contact.json) were '
-            'fitted on say something of friction, density or stiffness of fingers, fewer than '
+            'fitted on tell whether things slip between fingers, fewer than '
             f'{ENOUGH_TELLING}'
         )

@@ -412,7 +412,7 @@ def fit_contact(
     origin = ContactOrigin(
         by='mtv-world fit-contact',
         recordings=len(recordings),
-        telling=max(one.count for one in (*found, hold)),
+        telling=hold.count,
     )
     update = {**values, 'spread': spread, 'fitted': origin}
     return first.model_copy(update=update), [table, delay, cameras, *found, hold]
