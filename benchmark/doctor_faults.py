@@ -388,7 +388,7 @@ def _in_folder(
     inspection = found.episodes[path.name]
     texts = [
         f'{section.name}: {finding.text}'
-        for section in (*inspection.views, inspection.recording)
+        for section in inspection.sections
         for finding in section.findings
         if finding.verdict != 'not checked'
     ]

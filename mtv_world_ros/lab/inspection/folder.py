@@ -243,7 +243,7 @@ def table(found: FolderInspection) -> list[list[str]]:
     for name, inspection in found.episodes.items():
         texts = [
             f'{section.name}: {finding.text}'
-            for section in (*inspection.views, inspection.recording)
+            for section in inspection.sections
             for finding in section.findings
             if finding.verdict != 'not checked'
         ]
@@ -258,7 +258,7 @@ def _conclusions(found: FolderInspection) -> list[str]:
     """What concerns all episodes, and what was not checked, once for the episodes it holds for."""
     unchecked: dict[str, list[str]] = {}
     for name, inspection in found.episodes.items():
-        for section in (*inspection.views, inspection.recording):
+        for section in inspection.sections:
             for finding in section.findings:
                 if finding.verdict == 'not checked':
                     unchecked.setdefault(f'{section.name}: {finding.text}', []).append(name)
@@ -273,10 +273,9 @@ def broken_parts(found: FolderInspection) -> dict[str, dict[str, str]]:
     """Returns why views, or the `recording`, are broken, by episode and view."""
     parts: dict[str, dict[str, str]] = {}
     for name, inspection in found.episodes.items():
-        sections = (*inspection.views, inspection.recording)
         texts = {
             section.name: '; '.join(f.text for f in section.findings if f.verdict == 'broken')
-            for section in sections
+            for section in inspection.sections
         }
         parts[name] = {section: text for section, text in texts.items() if text}
     return parts | {name: {'recording': why} for name, why in found.failed.items()}

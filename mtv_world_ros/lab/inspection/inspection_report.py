@@ -89,9 +89,14 @@ class Inspection:
     recording: Section
 
     @property
+    def sections(self) -> tuple[Section, ...]:
+        """Those of the views, then the recording's."""
+        return (*self.views, self.recording)
+
+    @property
     def verdict(self) -> str:
         """The worst of all sections."""
-        return worst([section.verdict for section in (*self.views, self.recording)])
+        return worst([section.verdict for section in self.sections])
 
 
 def to_markdown(inspection: Inspection, pictures: Mapping[str, str]) -> str:
@@ -104,9 +109,8 @@ def to_markdown(inspection: Inspection, pictures: Mapping[str, str]) -> str:
         '| | verdict | reason |',
         '|---|---|---|',
     ]
-    sections = (*inspection.views, inspection.recording)
-    lines += [f'| {s.name} | {s.verdict} | {_reasons(s)} |' for s in sections]
-    for section in sections:
+    lines += [f'| {s.name} | {s.verdict} | {_reasons(s)} |' for s in inspection.sections]
+    for section in inspection.sections:
         lines += ['', f'## {section.name}', '']
         if section.name in pictures:
             lines += [f'![{section.name}]({pictures[section.name]})', '']
@@ -121,7 +125,7 @@ def to_markdown(inspection: Inspection, pictures: Mapping[str, str]) -> str:
 def to_text(inspection: Inspection) -> str:
     """Returns a line for each section, and one for each finding."""
     lines = []
-    for section in (*inspection.views, inspection.recording):
+    for section in inspection.sections:
         residual = section.measures.get('residual')
         lines.append(f'{section.name}: {section.verdict}' + (f' ({residual})' if residual else ''))
         lines += [f'  {finding.verdict}: {finding.text}' for finding in section.findings]
