@@ -108,7 +108,7 @@ class Pipeline:
             None = objects are drawn where they were.
         camera_checker: compares the first frames with the arm's outline; None = no check.
         grounds: what estimates that are not calibrated may rest on.
-        parts: shapes of the robot's links, for `rendering.arm_pictures`.
+        parts: shapes of the robot's links, for `rendering.arm_pictures`; empty = none are drawn.
     """
 
     robot: RobotModel
@@ -199,7 +199,7 @@ class Pipeline:
         )
         pictures = objects.pictures(plan, start)
         clock.lap('object motion')
-        arms = self._arms(start, plan.positions)
+        arms = arm_pictures(self.parts, self.robot, start.cameras, start.frames, plan.positions)
         control = self.draw(start.cameras, plan.positions, plan.times, start_masks, pictures, arms)
         clock.lap('trajectory video')
         frames = self.world_model.predict(
@@ -281,11 +281,6 @@ class Pipeline:
             arms=arms,
             config=self.rendering,
         )
-
-    def _arms(self, start: Observation, positions: FloatArray) -> ByteArray | None:
-        if not self.rendering.arm_pictures:
-            return None
-        return arm_pictures(self.parts, self.robot, start.cameras, start.frames, positions)
 
     def follow(
         self,

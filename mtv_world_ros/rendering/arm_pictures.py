@@ -35,8 +35,8 @@ def arm_pictures(
     cameras: Sequence[CameraModel],
     start_frame: ByteArray,
     positions: FloatArray,
-) -> ByteArray:
-    """Returns the robot alone, (V, T, H, W, 4) uint8 RGB and cover.
+) -> ByteArray | None:
+    """Returns the robot alone, (V, T, H, W, 4) uint8 RGB and cover; None without parts.
 
     The silhouette of each link has the start frame's pixels of that link, moved by the affine map
     that fits its projected points best; where these were hidden or outside the image it has their
@@ -50,6 +50,8 @@ def arm_pictures(
         start_frame: (V, H, W, 3) uint8 RGB.
         positions: (T, J) [rad or m]; row 0 those of the start frame.
     """
+    if not parts:
+        return None
     links = list(dict.fromkeys(part.link for part in parts))
     numbers = np.array([links.index(part.link) for part in parts])
     poses = robot.forward_kinematics(positions)

@@ -83,7 +83,7 @@ class ControlMaker:
         segmenter: finds the objects of the start frame.
         rendering: widths, colours and fading of trajectory videos.
         object_mask: whether they carry the objects' masks.
-        parts: shapes of the robot's links, for `rendering.arm_pictures`.
+        parts: shapes of the robot's links, for `rendering.arm_pictures`; empty = none are drawn.
     """
 
     robot: RobotModel
@@ -107,17 +107,12 @@ class ControlMaker:
             times=clip.times,
             object_masks=self._start_masks(clip, names) if self.object_mask else None,
             objects=self._objects(clip, names) if self.object_mask else None,
-            arms=self._arms(clip),
+            arms=arm_pictures(
+                self.parts, self.robot, clip.cameras, clip.frames[:, 0], clip.positions
+            ),
             config=self.rendering,
         )
         return video.frames
-
-    def _arms(self, clip: Clip) -> ByteArray | None:
-        if not self.rendering.arm_pictures:
-            return None
-        return arm_pictures(
-            self.parts, self.robot, clip.cameras, clip.frames[:, 0], clip.positions
-        )
 
     def _start_masks(self, clip: Clip, names: tuple[str, ...]) -> BoolArray:
         """(V, O, H, W) of a clip's start frame."""
