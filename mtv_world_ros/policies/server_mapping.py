@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import cv2
@@ -11,8 +11,14 @@ from pydantic import BeforeValidator, Field, model_validator, PrivateAttr
 
 from mtv_world_ros.bounded_input import check_limit, LimitError
 from mtv_world_ros.config import expected, ListOf, Schema
-from mtv_world_ros.data_types import ByteArray, FloatArray, JointTrajectory, Observation
-from mtv_world_ros.errors import ConfigError, PolicyError
+from mtv_world_ros.data_types import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    JointTrajectory,
+    Observation,
+)
+from mtv_world_ros.errors import ConfigError, nearest, PolicyError
 from mtv_world_ros.geometry.robot.joint_columns import (
     JointColumn,
     JointTable,
@@ -20,6 +26,9 @@ from mtv_world_ros.geometry.robot.joint_columns import (
     to_positions,
 )
 from mtv_world_ros.geometry.robot.model import RobotModel
+
+#: offset of a velocity below which 0 means rest; rounding of a range such as [-1, 1] [rad/s, m/s]
+_ZERO = 1e-9
 
 
 def _parts(value: Any) -> Any:
@@ -103,18 +112,75 @@ class ActionOutput(JointTable):
         le=10_000,
         description='actions a second; action k is where the joints are (k + 1) / rate_hz later',
     )
+    action: Literal['position', 'velocity'] = Field(
+        default='position',
+        description='meaning of the values: positions, or joint velocities [unit / s]',
+    )
+    positions: ListOf[str] | None = Field(
+        default=None,
+        description='with `action: velocity`: joints whose values are positions; null = grippers',
+    )
     relative: bool = Field(default=False, description='positions count from the observed ones')
     clip: bool = Field(
-        default=False, description="beyond a joint's limits means at them, as in a robot's driver"
+        default=False,
+        description="beyond a joint's limits (with `action: velocity`: speed limit) means at "
+        "them, as in a robot's driver",
     )
-    _limits: tuple[FloatArray, FloatArray] = PrivateAttr()
+    _limits: tuple[FloatArray, FloatArray, FloatArray] = PrivateAttr()
+    _moves: BoolArray = PrivateAttr()
+
+    @property
+    def is_velocity(self) -> bool:
+        """Whether the values of joints are velocities."""
+        return self.action == 'velocity'
 
     def _of(self, robot: RobotModel) -> tuple[JointColumn, ...]:
-        self._limits = robot.lower, robot.upper
-        return super()._of(robot)
+        columns = super()._of(robot)
+        self._limits = robot.lower, robot.upper, robot.velocity_limits
+        still = self._position_joints(robot)
+        self._moves = np.array([c.column is not None and c.joint not in still for c in columns])
+        offsets = [c.joint for c in columns if self.is_velocity and self._has_offset(c, still)]
+        if offsets:
+            raise ValueError(
+                f"joint '{offsets[0]}': its values are velocities, and 0 must mean that it rests; "
+                "leave 'offset' out, or list the joint under 'positions' if its values are "
+                'positions'
+            )
+        return columns
+
+    @staticmethod
+    def _has_offset(column: JointColumn, still: Collection[str]) -> bool:
+        is_velocity = column.column is not None and column.joint not in still
+        return is_velocity and abs(column.offset) > _ZERO
+
+    def _position_joints(self, robot: RobotModel) -> set[str]:
+        """Joints whose values are positions with `action: velocity`."""
+        if self.positions is None:
+            return {tool.gripper_joint for tool in robot.tools if tool.gripper_joint}
+        if not self.is_velocity:
+            raise ValueError("'positions' is for 'action: velocity'; all values are positions")
+        for joint in self.positions:
+            if joint not in robot.joint_names:
+                known = robot.joint_names
+                raise ValueError(
+                    f"positions: '{joint}' is not among {list(known)}{nearest(joint, known)}"
+                )
+        return set(self.positions)
+
+    @model_validator(mode='after')
+    def _velocities_are_not_relative(self) -> Self:
+        if self.relative and self.is_velocity:
+            raise ValueError(
+                "'relative' is for positions; with 'action: velocity' they always count from the "
+                'observed ones'
+            )
+        return self
 
     def trajectory(self, actions: Any, observation: Observation) -> JointTrajectory:
-        """The actions as commands.
+        """Return the actions as commands.
+
+        Velocities are summed up from the observed positions: position k is position k - 1 plus
+        velocity k / `rate_hz`, kept within the joint's limits at each step.
 
         Raises:
             PolicyError: not a table of finite numbers, or a column is missing.
@@ -136,16 +202,35 @@ class ActionOutput(JointTable):
             positions = to_positions(values, self.names, self.columns, '/'.join(self.key))
         except ConfigError as error:
             raise PolicyError(str(error)) from error
-        if self.relative:
-            moving = [joint.column is not None for joint in self.columns]
-            positions[:, moving] += observation.positions[moving]
+        self._make_absolute(positions, observation.positions)
         if self.clip:
-            positions = positions.clip(*self._limits)
+            positions = positions.clip(*self._limits[:2])
         return JointTrajectory(
             joint_names=tuple(joint.joint for joint in self.columns),
             times=np.arange(1, len(values) + 1) / self.rate_hz,
             positions=positions,
         )
+
+    def _make_absolute(self, values: FloatArray, observed: FloatArray) -> None:
+        """Replace values (T, J) that count from `observed` (J,) by positions."""
+        if self.is_velocity:
+            self._integrate(values, observed)
+        elif self.relative:
+            moving = [joint.column is not None for joint in self.columns]
+            values[:, moving] += observed[moving]
+
+    def _integrate(self, values: FloatArray, observed: FloatArray) -> None:
+        """Replace velocities in `values` (T, J) by positions, from `observed` (J,) on."""
+        lower, upper, fastest = (limit[self._moves] for limit in self._limits)
+        reached = observed[self._moves]
+        # a joint that rests beyond a limit may stay there or come back, and go no further
+        lower, upper = np.minimum(lower, reached), np.maximum(upper, reached)
+        for row in values:
+            speeds = row[self._moves]
+            if self.clip:
+                speeds = speeds.clip(-fastest, fastest)
+            reached = (reached + speeds / self.rate_hz).clip(lower, upper)
+            row[self._moves] = reached
 
 
 class ServerMapping(Schema):

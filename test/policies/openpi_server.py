@@ -35,9 +35,34 @@ def from_wire(value):
     return value
 
 
+#: joint velocities of the stand-in for a DROID checkpoint, in its unit of 0.2 rad a step
+DROID_VELOCITIES = np.array([0.5, -0.25, 0.0, 1.0, -1.0, 0.1, 0.0])
+
+
+def infer_droid(request):
+    """Returns a chunk as DROID checkpoints do: (15, 8) joint velocities and gripper positions.
+
+    Velocities have the other sign from the eighth action on; the gripper closes from there on.
+    """
+    if request['observation/joint_position'].shape != (7,):
+        raise ValueError('observation/joint_position must have 7 values')
+    if request['observation/gripper_position'].shape != (1,):
+        raise ValueError('observation/gripper_position must have 1 value')
+    for view in ('exterior_image_1_left', 'wrist_image_left'):
+        image = request[f'observation/{view}']
+        if image.shape != (224, 224, 3) or image.dtype != np.uint8:
+            raise ValueError(f'{view} is {image.shape}, {image.dtype}')
+    actions = np.zeros((15, 8))
+    actions[:7, :7], actions[7:, :7] = DROID_VELOCITIES, -DROID_VELOCITIES
+    actions[7:, 7] = 1.0
+    return {'actions': actions, 'server_timing': {'infer_ms': 1.0}}
+
+
 def infer(request):
     """Moves every joint by 0.01 an action; the prompt says what goes wrong."""
     prompt = request['prompt']
+    if 'observation/joint_position' in request:
+        return infer_droid(request)
     if prompt == 'fail':
         raise KeyError('no such checkpoint')
     if prompt == 'sleep':
