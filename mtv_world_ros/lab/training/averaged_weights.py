@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from diffusers.training_utils import EMAModel
 import torch
 from torch import nn, Tensor
@@ -67,6 +70,17 @@ class AveragedWeights:
             if worker.grad is not None:
                 master.grad += worker.grad
             worker.grad = None
+
+    @contextmanager
+    def averaged_worker(self) -> Iterator[MultiViewWanTransformer]:
+        """Yields the working copy with the averaged weights, which are those that will serve."""
+        with torch.no_grad():
+            for (worker, _), average in zip(self._pairs, self.ema.shadow_params, strict=True):
+                worker.copy_(average)
+        try:
+            yield self.worker
+        finally:
+            self.share()
 
     def averages(self) -> dict[str, Tensor]:
         """Returns the averaged float32 weights by name."""

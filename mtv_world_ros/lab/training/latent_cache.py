@@ -407,6 +407,7 @@ def _check(config: TrainingConfig) -> None:
         'augment.start_noise': augment.start_noise,
         'augment.colour_permutation': augment.colour_permutation,
         'augment.failure_share': augment.failure_share,
+        'self_rollout.share': config.self_rollout.share,
     }
     for name, value in disturbed.items():
         if value:

@@ -42,6 +42,7 @@ from mtv_world_ros.lab.training.resume import (
     save_state,
     STATE,
 )
+from mtv_world_ros.lab.training.self_rollout import SelfRollout
 from mtv_world_ros.lab.training.training_config import OptimizerConfig, TrainingConfig
 from mtv_world_ros.model.card import OPTIONAL_KEYS, ROBOT_FOLDER
 from mtv_world_ros.model.checkpoint import (
@@ -222,11 +223,15 @@ class Trainer:
             TrainingError: the loss is not finite, the device is out of memory, a state cannot be
                 written, or another process is gone; the last saved state stays whole.
         """
+        rollout = self._self_rollout(source)
         saved, stops = time.monotonic(), False
         while self.step < self.config.optimizer.steps and not stops:
             started = time.perf_counter()
             batch = source.batch(self.step)
             waited = time.perf_counter() - started
+            if rollout is not None and isinstance(batch, ClipBatch) and any(batch.lead_ins):
+                with self.weights.averaged_worker() as transformer:
+                    batch = rollout.apply(batch, transformer)
             with memory_errors_named(self.device):
                 report = self.train_step(batch)
             self.step += 1
@@ -238,6 +243,19 @@ class Trainer:
                 self.save_state()
                 on_save(self.step)
                 saved = time.monotonic()
+
+    def _self_rollout(self, source: BatchSource | CachedSource) -> SelfRollout | None:
+        """What imagines the start frames of clips; None where all start from recorded ones."""
+        if not self.config.self_rollout.share or not isinstance(source, BatchSource):
+            return None
+        return SelfRollout(
+            source.controls,
+            self.encoders,
+            build_scheduler(self.config.scheduler),
+            num_inference_steps=self.config.sampling.num_inference_steps,
+            seed=self.seed,
+            device=self.device,
+        )
 
     def loss(self, batch: ClipBatch | EncodedBatch) -> Loss:
         """The loss of a batch, or of a part of one."""

@@ -140,6 +140,22 @@ class HistoryConfig(HistorySettings):
         return self
 
 
+class SelfRolloutConfig(Schema):
+    """Clips that start from the end of the model's own rollout; see `self_rollout.py`."""
+
+    section: ClassVar = 'self_rollout'
+
+    share: Share = Field(
+        default=0.0,
+        description="probability of a clip that starts where the model's own rollout of the "
+        'chunks before it ends, if the episode is long enough; 0 = off',
+    )
+    max_chunks: Count = Field(
+        default=2, description='longest rollout [chunks]; all lengths from 1 on are equally likely'
+    )
+    start_step: int = Field(default=0, ge=0, description='first training step with such clips')
+
+
 class SamplingConfig(Schema):
     """How its checkpoints are sampled unless told otherwise."""
 
@@ -234,6 +250,7 @@ class TrainingConfig(Schema):
     objective: ObjectiveConfig = ObjectiveConfig()
     augment: AugmentConfig = AugmentConfig()
     history: HistoryConfig = HistoryConfig()
+    self_rollout: SelfRolloutConfig = SelfRolloutConfig()
     sampling: SamplingConfig = SamplingConfig()
     lora: LoraSettings = LoraSettings()
     optimizer: OptimizerConfig = OptimizerConfig()

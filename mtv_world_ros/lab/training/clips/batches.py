@@ -26,8 +26,10 @@ from mtv_world_ros.lab.jobs import run_job, WorkerPool
 from mtv_world_ros.lab.recordings import clip_starts, cut_clip
 from mtv_world_ros.lab.training.clips.clip_controls import (
     ControlMaker,
+    draw_lead_in,
     draw_past,
     history_before,
+    LeadIn,
     Past,
 )
 from mtv_world_ros.lab.training.training_config import TrainingConfig
@@ -47,6 +49,8 @@ class ClipBatch:
             history; see `draw_past`.
         history: (B, V, N, H, W, 3) uint8 RGB frames before the clip, in such models.
         history_sigmas: (B,) float32 noise levels of those, 1 = there are none.
+        lead_ins: B entries: the chunks to imagine before a clip, None = the clip starts from its
+            recorded frame; empty = all do.
         step: of the training, from 0.
         numbers: of its clips within the step's whole batch, which processes and accumulation
             split; each clip's noise depends on its own.
@@ -59,6 +63,7 @@ class ClipBatch:
     anchor: Tensor | None = None
     history: Tensor | None = None
     history_sigmas: Tensor | None = None
+    lead_ins: tuple[LeadIn | None, ...] = ()
     step: int = 0
     numbers: Sequence[int] = ()
 
@@ -80,6 +85,7 @@ class _Sample(NamedTuple):
     trajectory: ByteArray
     object_ids: ByteArray | None
     past: Past | None
+    lead_in: LeadIn | None
 
 
 class BatchSource:
@@ -124,7 +130,7 @@ class BatchSource:
             parts=load_shape(robot).parts if config.rendering.arm_pictures else (),
         )
         self._spec, self._augment, self._seed = spec, config.augment, seed
-        self._history = config.history
+        self._history, self._self_rollout = config.history, config.self_rollout
         self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._workers = ClipWorkers(self._clip, workers) if workers else None
@@ -167,6 +173,7 @@ class BatchSource:
             start_frame=torch.from_numpy(np.stack([s.start_frame for s in samples])),
             trajectory=torch.from_numpy(np.stack([s.trajectory for s in samples])),
             object_ids=_stacked([s.object_ids for s in samples]),
+            lead_ins=tuple(s.lead_in for s in samples),
             **pasts([s.past for s in samples]),
         )
 
@@ -174,8 +181,12 @@ class BatchSource:
         rng = np.random.default_rng((self._seed, step, number))
         recording, starts = self._choose(rng)
         start = int(starts[rng.integers(len(starts))])
-        clip = cut_clip(recording, start, self._spec)
-        past = self._past(recording, start, rng)
+        lead_in = draw_lead_in(recording, start, self._spec, self._self_rollout, step, rng)
+        if lead_in is None:
+            clip = cut_clip(recording, start, self._spec)
+        else:
+            clip = lead_in.chunk(lead_in.num_chunks)
+        past = self._past(recording, start, lead_in, rng)
         names = recording.names
         if rng.random() < self._augment.name_dropout:
             names = tuple(name for name in names if rng.random() < 0.5)
@@ -185,17 +196,24 @@ class BatchSource:
             colours = rng.permutation(3)
             frames = frames[..., colours]
             past = past and Past(past.anchor[..., colours], past.frames[..., colours], past.sigma)
+            lead_in = lead_in and replace(lead_in, colours=tuple(colours.tolist()))
         start = frames[:, 0]
         if rng.random() < self._augment.start_noise:
             start = _disturb(start, self._augment.start_noise_std, rng)
         whole = np.ascontiguousarray(frames)
-        return _Sample(whole, start.copy(), trajectory, clip.object_ids, past)
+        lead_in = lead_in and replace(lead_in, names=names)
+        return _Sample(whole, start.copy(), trajectory, clip.object_ids, past, lead_in)
 
-    def _past(self, recording: Recording, start: int, rng: np.random.Generator) -> Past | None:
+    def _past(
+        self, recording: Recording, start: int, lead_in: LeadIn | None, rng: np.random.Generator
+    ) -> Past | None:
         """Anchor and history of the clip, in models that take them."""
         if not self._history.on:  # nothing is drawn: runs without history keep their clips
             return None
-        history = history_before(recording, start, self._spec, self._history, rng)
+        if lead_in is None:
+            history = history_before(recording, start, self._spec, self._history, rng)
+        else:
+            history = lead_in.history(self._history.num_frames)
         return draw_past(history, self._history, rng)
 
     def _choose(self, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from threading import Lock
 from typing import NamedTuple
 
@@ -14,8 +14,8 @@ from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.object_motion import cut_outs, moved_pictures, ObjectMotion
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import LinkShape
-from mtv_world_ros.lab.recordings import Clip
-from mtv_world_ros.lab.training.training_config import HistoryConfig
+from mtv_world_ros.lab.recordings import Clip, cut_clip
+from mtv_world_ros.lab.training.training_config import HistoryConfig, SelfRolloutConfig
 from mtv_world_ros.rendering.arm_pictures import arm_pictures
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
@@ -75,6 +75,79 @@ def frame_before(recording: Recording, start: int, seconds: float) -> int | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LeadIn:
+    """A clip of several chunks: the model imagines the first ones and is trained on the last.
+
+    Attributes:
+        clip: (num_chunks + 1) * T frames after its first one.
+        num_chunks: chunks to imagine.
+        names: of the objects.
+        colours: order of the colour channels of the clip that is trained on.
+    """
+
+    clip: Clip
+    num_chunks: int
+    names: tuple[str, ...] = ()
+    colours: tuple[int, ...] = (0, 1, 2)
+
+    @property
+    def num_frames(self) -> int:
+        """T, frames of a chunk."""
+        return (len(self.clip.times) - 1) // (self.num_chunks + 1)
+
+    def chunk(self, index: int) -> Clip:
+        """Returns one of the chunks with the frame before it.
+
+        Its first position is the command of that frame, as in a rollout of chained chunks.
+        """
+        clip, first = self.clip, index * self.num_frames
+        window = slice(first, first + self.num_frames + 1)
+        ids, poses = clip.object_ids, clip.object_poses
+        return replace(
+            clip,
+            times=clip.times[: self.num_frames + 1],
+            frames=clip.frames[:, window],
+            object_ids=None if ids is None else ids[:, window],
+            positions=clip.positions[window],
+            object_poses=None if poses is None else poses[window],
+        )
+
+    def history(self, num_frames: int) -> History:
+        """Returns the recorded frames before the chunk that is trained on."""
+        shown = self.clip.frames[:, : self.num_chunks * self.num_frames]
+        kept = max(shown.shape[1] - num_frames, 0)
+        return History(anchor=shown[:, 0], frames=shown[:, kept:])
+
+
+def draw_lead_in(
+    recording: Recording,
+    start: int,
+    spec: WorldModelSpec,
+    config: SelfRolloutConfig,
+    step: int,
+    rng: np.random.Generator,
+) -> LeadIn | None:
+    """Returns the chunks to imagine before the clip at recorded frame `start`.
+
+    A rollout is shorter where the episode is too short before the clip. The clip that is trained
+    on then starts at the recorded frame next to `start` on the rollout's clock.
+
+    Returns:
+        None with the configured probability, before the configured step, or without any room.
+    """
+    # nothing is drawn while it is off: such runs keep their clips
+    if step < config.start_step or config.share == 0 or rng.random() >= config.share:
+        return None
+    for num_chunks in range(int(rng.integers(config.max_chunks)) + 1, 0, -1):
+        first = frame_before(recording, start, num_chunks * spec.chunk_seconds)
+        num_frames = (num_chunks + 1) * spec.num_frames
+        if first is None or frame_indices(recording, first, spec, num_frames) is None:
+            continue
+        return LeadIn(clip=cut_clip(recording, first, spec, num_frames), num_chunks=num_chunks)
+    return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ControlMaker:
     """Makes the control input of a clip, as serving does.
 
@@ -94,28 +167,38 @@ class ControlMaker:
     # batches are prepared in one thread while the model's rollouts are drawn in another
     _lock: Lock = field(default_factory=Lock)
 
-    def make(self, clip: Clip, names: tuple[str, ...]) -> ByteArray:
+    def make(
+        self, clip: Clip, names: tuple[str, ...], start: ByteArray | None = None
+    ) -> ByteArray:
         """Returns the trajectory video (V, 1 + T, H, W, 3) uint8 RGB of a clip.
 
         Objects are searched in its first frame, unless this segmenter made the masks that are
         stored with the episode.
+
+        Args:
+            clip: the chunk.
+            names: of the objects.
+            start: (V, H, W, 3) uint8 RGB imagined frame in place of the clip's first one.
         """
+        first = clip.frames[:, 0] if start is None else start
         video = render_trajectory_video(
             cameras=clip.cameras,
             robot=self.robot,
             positions=clip.positions,
             times=clip.times,
-            object_masks=self._start_masks(clip, names) if self.object_mask else None,
+            object_masks=self._start_masks(clip, names, start) if self.object_mask else None,
             objects=self._objects(clip, names) if self.object_mask else None,
-            arms=arm_pictures(
-                self.parts, self.robot, clip.cameras, clip.frames[:, 0], clip.positions
-            ),
+            arms=arm_pictures(self.parts, self.robot, clip.cameras, first, clip.positions),
             config=self.rendering,
         )
         return video.frames
 
-    def _start_masks(self, clip: Clip, names: tuple[str, ...]) -> BoolArray:
-        """(V, O, H, W) of a clip's start frame."""
+    def _start_masks(
+        self, clip: Clip, names: tuple[str, ...], start: ByteArray | None
+    ) -> BoolArray:
+        """(V, O, H, W) of a clip's start frame, or of an imagined one."""
+        if start is not None:
+            return self._masks(start, names)
         ids = clip.object_ids
         return self._stored(clip, names, clip.frames[:, 0], None if ids is None else ids[:, 0])
 

@@ -185,6 +185,7 @@ def test_too_little_space_is_said_before_anything_is_encoded(
     [
         ({'augment.start_noise': 0.5}, r'augment.start_noise is 0.5, but a latent cache holds'),
         ({'augment.failure_share': 0.3}, r'augment.failure_share is 0.3'),
+        ({'self_rollout.share': 0.5}, r'self_rollout.share is 0.5'),
     ],
 )
 def test_what_a_cache_cannot_hold_is_refused(source, config, base, tmp_path, changes, message):
