@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from mtv_world_ros.config import Length, ListOf, read_yaml, Schema, Seconds, validated
+from mtv_world_ros.config import Length, ListOf, Number, read_yaml, Schema, Seconds, validated
 from mtv_world_ros.data.episode import check_outcome
 from mtv_world_ros.data.tool_targets import ToolTargets
 
@@ -67,6 +67,9 @@ class BagMapping(Written):
     joint_states: str = 'joint_states'
     joints: dict[str, str] = Field(
         default={}, description="the robot's name of a joint, by the recorded one"
+    )
+    constants: dict[str, Number] = Field(
+        default={}, description='positions of joints that are not measured, by name [rad or m]'
     )
     action: str = Field(
         default='joint_trajectory',

@@ -10,7 +10,6 @@ import re
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.image_decoding import check_image, to_ids, to_rgb
@@ -41,6 +40,7 @@ from mtv_world_ros.data.episode import (
     Track,
 )
 from mtv_world_ros.data.joint_plans import complete_plans, following, join_streams, read_plan
+from mtv_world_ros.data.measured_joints import merge_joint_states
 from mtv_world_ros.data.tool_targets import joints_of_tools, ToolTrack
 from mtv_world_ros.data.transform_tree import Mount, pose_track, read_tree, TransformTree
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
@@ -276,7 +276,9 @@ class _EpisodeReader:
     def _states(self) -> JointStates | None:
         topic = self.topics.joint_states
         taken = self._own_states(topic, self._take(topic, messages.JOINT_STATE))
-        states = merge_joint_states(topic, taken, self.warnings)
+        states = merge_joint_states(
+            topic, taken, self.warnings, self.robot, self._renamed, self.mapping.constants
+        )
         if states is None:
             others = self._topics_of(messages.JOINT_STATE)
             if others and topic not in others:
@@ -284,8 +286,7 @@ class _EpisodeReader:
                     f"no joint states at '{topic}'; there are some at {_listed(others)}: name "
                     'the topic in `joint_states`'
                 )
-            return None
-        return replace(states, joint_names=self._renamed(states.joint_names))
+        return states
 
     def _own_states(self, topic: str, taken: Stamped) -> Stamped:
         """Messages that name a joint of the robot; all, where none does or it is not known."""
@@ -359,11 +360,10 @@ class _EpisodeReader:
             return [] if states is None else following(states, self.mapping.chunk_s, self.seen_ns)
         if self.types.get(topic) == messages.JOINT_STATE:
             taken = self._take(topic, messages.JOINT_STATE)
-            leader = merge_joint_states(topic, taken, self.warnings)
+            leader = merge_joint_states(topic, taken, self.warnings, renamed=self._renamed)
             if leader is None:
                 return []
-            named = replace(leader, joint_names=self._renamed(leader.joint_names))
-            return following(named, self.mapping.chunk_s, self.seen_ns)
+            return following(leader, self.mapping.chunk_s, self.seen_ns)
         plans = self._parsed(topic, messages.JOINT_TRAJECTORY, self._plan)
         if topic not in self.types and (others := self._topics_of(messages.JOINT_TRAJECTORY)):
             self._warn_once(f"no trajectories at '{topic}'; there are some at {_listed(others)}")
@@ -725,44 +725,3 @@ def in_order(
         repeated = len(given) - len(kept)
         warnings.append(f"'{topic}': {repeated} stamps came twice; the later message was kept")
     return list(kept.items())
-
-
-def merge_joint_states(
-    topic: str, messages: Sequence[tuple[int, Any]], warnings: list[str]
-) -> JointStates | None:
-    """One table of sensor_msgs/JointState messages, also of several publishers.
-
-    Joints that a message does not name keep their last position; rows before every joint was
-    named once are left out.
-
-    Returns:
-        None where no row is left.
-    """
-    ordered = sorted(messages, key=lambda item: item[0])
-    whole = [
-        (s, m)
-        for s, m in ordered
-        if len(m.name) == len(m.position) > 0 and np.isfinite(m.position).all()
-    ]
-    if len(whole) < len(ordered):
-        count = len(ordered) - len(whole)
-        warnings.append(f"'{topic}': {count} messages without a position per joint were left out")
-    names = tuple(dict.fromkeys(name for _, message in whole for name in message.name))
-    column = {name: index for index, name in enumerate(names)}
-    current = np.full(len(names), np.nan)
-    seen = np.zeros(len(names), bool)
-    rows: list[tuple[int, NDArray[np.float64]]] = []
-    for stamp, message in whole:
-        columns = [column[name] for name in message.name]
-        current[columns] = message.position
-        seen[columns] = True
-        if seen.all():
-            rows.append((stamp, current.copy()))
-    kept = in_order(topic, rows, warnings)
-    if not kept:
-        return None
-    return JointStates(
-        stamps_ns=np.array([stamp for stamp, _ in kept], np.int64),
-        joint_names=names,
-        positions=np.stack([row for _, row in kept]),
-    )

@@ -324,6 +324,13 @@ def _measured(
         times=np.asarray(seconds, np.float64),
         positions=states.positions,
     )
+    missing = [name for name in robot.joint_names if name not in states.joint_names]
+    if missing:
+        raise TrajectoryError(
+            f"joints {missing} of robot '{robot.name}' are not in the joint states, which have "
+            f"{list(states.joint_names)}; rename recorded ones by 'joints' in the mapping, or "
+            f"give what is not measured: 'constants: {{{missing[0]}: 0.0}}'"
+        )
     positions = match_joints(table, robot).positions
     _check(robot, positions, mapping, 'joint states')
     return states.stamps_ns, positions

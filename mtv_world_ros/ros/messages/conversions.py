@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 import struct
@@ -20,6 +19,7 @@ from trajectory_msgs.msg import JointTrajectoryPoint
 
 from mtv_world_ros.bounded_input import check_limit
 from mtv_world_ros.data.joint_plans import read_plan
+from mtv_world_ros.data.measured_joints import JointSample, read_sample
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
@@ -111,11 +111,15 @@ def to_trajectory_message(trajectory: JointTrajectory, header: Header) -> JointT
     return JointTrajectoryMsg(header=header, joint_names=names, points=points)
 
 
-def to_positions(message: JointState) -> dict[str, float]:
-    """Returns position by joint name [rad or m].
+def to_sample(message: JointState, joints: Collection[str] | None = None) -> JointSample:
+    """Returns the positions of a message by joint, and the joints whose position is no number.
+
+    Args:
+        message: of one or several joints.
+        joints: those that matter; None = all.
 
     Raises:
-        Rejection: no positions, not one a name, names repeated, or not finite.
+        Rejection: no positions, or not one a name.
     """
     if not message.position or len(message.position) != len(message.name):
         raise Rejection(
@@ -125,17 +129,29 @@ def to_positions(message: JointState) -> dict[str, float]:
         )
     with rejected_as(Reason.JOINT_STATE_INVALID):
         check_limit('joint_names', len(message.name), 'the joint state')
-    counts = Counter(message.name)
-    repeated = sorted(name for name, count in counts.items() if count > 1)
-    if repeated:
-        raise Rejection(Reason.JOINT_STATE_INVALID, f'joint names {repeated} occur more than once')
-    positions = dict(zip(message.name, message.position, strict=True))
-    wrong = [name for name, value in positions.items() if not np.isfinite(value)]
-    if wrong:
-        raise Rejection(
-            Reason.JOINT_STATE_INVALID, f'the positions of joints {wrong} are not finite'
-        )
-    return positions
+    return read_sample(message.name, message.position, joints)
+
+
+def check_sample(sample: JointSample) -> None:
+    """Refuses a sample in which a joint has no position that can be used.
+
+    Raises:
+        Rejection: names the joints.
+    """
+    if sample.faults:
+        joints = '; '.join(f"joint '{name}': {why}" for name, why in sample.faults.items())
+        raise Rejection(Reason.JOINT_STATE_INVALID, f'the joint state is incomplete: {joints}')
+
+
+def to_positions(message: JointState) -> dict[str, float]:
+    """Returns position by joint name [rad or m].
+
+    Raises:
+        Rejection: no positions, not one a name, a joint twice with two positions, or not finite.
+    """
+    sample = to_sample(message)
+    check_sample(sample)
+    return sample.positions
 
 
 def to_joint_state(names: Sequence[str], positions: FloatArray, header: Header) -> JointState:

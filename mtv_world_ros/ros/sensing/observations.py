@@ -19,7 +19,7 @@ from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.geometry.image_window import window_of, windowed_camera
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.ros.messages import image_messages
-from mtv_world_ros.ros.messages.conversions import NANO, to_ns, to_positions
+from mtv_world_ros.ros.messages.conversions import check_sample, NANO, to_ns, to_sample
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 from mtv_world_ros.ros.parameters import NodeSettings
 
@@ -130,11 +130,18 @@ class ObservationBuffer:
     def add_joint_state(self, message: JointState) -> None:
         """Stores positions; several publishers may each give some of the joints.
 
+        A joint without a position that can be used does not take the others with it, and joints
+        that are not the robot's do not matter.
+
         Raises:
-            Rejection: no positions, not one a name, or not finite.
+            Rejection: no positions, not one a name, or a joint of the robot has none.
         """
         stamp_ns = to_ns(message.header.stamp)
-        positions = {n: p for n, p in to_positions(message).items() if n in self._joints}
+        sample = to_sample(message, self._joints.keys())
+        self._add_positions(stamp_ns, sample.positions)
+        check_sample(sample)
+
+    def _add_positions(self, stamp_ns: int, positions: Mapping[str, float]) -> None:
         before, self._received = self._received, {**self._received, **positions}
         for name, position in positions.items():
             self._check_speed(name, stamp_ns, position, before.get(name, position))

@@ -165,3 +165,27 @@ def test_cameras_that_swap_their_views_are_refused_until_a_reset(make_buffer, ro
     assert refused.value.reason is Reason.CAMERA_POSE_CHANGED
     buffer.accept_cameras(list(buffer._intrinsics._calibrated.values()))
     buffer.observe(NOW + MS)
+
+
+def test_a_joint_without_a_number_does_not_blind_the_others(make_buffer):
+    buffer = make_buffer()
+    with pytest.raises(Rejection, match="joint 'b': its position is nan") as refused:
+        buffer.add_joint_state(joints(NOW, a=0.1, b=float('nan')))
+    assert refused.value.reason == Reason.JOINT_STATE_INVALID
+    texts = buffer.problems(NOW)
+    assert 'no fresh joint_states of b' in texts
+
+
+def test_a_joint_named_twice_does_not_blind_the_others(make_buffer):
+    buffer = make_buffer()
+    twice = JointState(header=make_header(NOW), name=['a', 'b', 'b'], position=[0.1, 0.2, 0.3])
+    with pytest.raises(Rejection, match="joint 'b': it is named twice, at 0.2 and at 0.3"):
+        buffer.add_joint_state(twice)
+    assert 'no fresh joint_states of b' in buffer.problems(NOW)
+
+
+def test_joints_of_another_device_do_not_matter(make_buffer):
+    buffer = make_buffer()
+    names, values = ['wheel', 'a', 'wheel', 'b'], [float('nan'), 0.1, 2.0, 0.2]
+    buffer.add_joint_state(JointState(header=make_header(NOW), name=names, position=values))
+    assert not [text for text in buffer.problems(NOW) if 'joint_states' in text]

@@ -1,0 +1,477 @@
+"""Measured joint positions: one check of JointState messages for recordings and the live node.
+
+A JointState is per joint: one that has no number, or two, does not take the others with it.
+N samples, J joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtv_world_ros.data.episode import JointStates
+from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.geometry.robot.model import RobotModel
+
+Stamps = NDArray[np.int64]
+NANO = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class ReachSettings:
+    """Thresholds beyond which a measured joint cannot have moved between two samples."""
+
+    #: noise of an encoder [rad or m], and the same as a fraction of the joint's range
+    noise: float = 0.05
+    noise_of_range: float = 0.1
+    #: measured speed that is still possible, in speed limits of the joint
+    speed_factor: float = 3.0
+    #: speed limit of a joint whose description gives none [rad/s or m/s]
+    default_speed: float = 2 * math.pi
+    #: longest run of samples that counts as a glitch [s]
+    glitch_s: float = 0.5
+    #: fraction of the samples up to which those out of reach are glitches
+    glitch_ratio: float = 0.05
+    #: a publisher whose joints vary by less stands still [rad or m]
+    still: float = 1e-3
+    #: publishers that are told apart at most
+    num_publishers: int = 32
+
+
+REACH = ReachSettings()
+#: a joint's last position is held in silence for up to this time [s] and number of its periods
+HELD_S = 2.0
+HELD_PERIODS = 5.0
+#: joints that a warning names at most
+MAX_NAMES = 8
+
+
+class JointSample(NamedTuple):
+    """Positions that one JointState gives.
+
+    Attributes:
+        positions: by joint name [rad or m]; those that can be used.
+        faults: reason by name of each joint whose position cannot.
+    """
+
+    positions: dict[str, float]
+    faults: dict[str, str]
+
+
+def read_sample(
+    names: Sequence[str], positions: Sequence[float], joints: Collection[str] | None = None
+) -> JointSample:
+    """Return the positions of a JointState by joint.
+
+    Args:
+        names: of the message.
+        positions: one a name.
+        joints: those that matter; the others are ignored, whatever they hold. None = all.
+    """
+    found: dict[str, float] = {}
+    faults: dict[str, str] = {}
+    for name, value in zip(names, positions, strict=True):
+        if joints is not None and name not in joints:
+            continue
+        if not math.isfinite(value):
+            faults[name] = f'its position is {value}'
+        elif name in found and found[name] != value:
+            faults[name] = f'it is named twice, at {found[name]:g} and at {value:g}'
+        found.setdefault(name, value)
+    return JointSample({n: v for n, v in found.items() if n not in faults}, faults)
+
+
+class JointReach:
+    """Limits of how far the joints of a robot move between two samples.
+
+    Args:
+        robot: the robot; its grippers are left out, because drivers of grippers report steps.
+
+    Attributes:
+        noise: (J,) [rad or m]; inf for grippers.
+        speed: (J,) [rad/s or m/s].
+        is_endless: (J,) joints that turn without end: positions a turn apart are equal.
+    """
+
+    def __init__(self, robot: RobotModel, settings: ReachSettings = REACH) -> None:
+        self.settings = settings
+        self.names = robot.joint_names
+        ranges = robot.upper - robot.lower
+        self.is_endless = ~np.isfinite(ranges)
+        self.noise = np.minimum(settings.noise, settings.noise_of_range * ranges)
+        given = np.isfinite(robot.velocity_limits) & (robot.velocity_limits > 0)
+        limits = np.where(given, robot.velocity_limits, settings.default_speed)
+        self.speed = settings.speed_factor * limits
+        grippers = {tool.gripper_joint for tool in robot.tools}
+        self.noise[[name in grippers for name in self.names]] = np.inf
+
+    def distance(
+        self, before: FloatArray, after: FloatArray, chosen: Any = slice(None)
+    ) -> FloatArray:
+        """Return (..., K) the distances between positions of `chosen` joints [rad or m]."""
+        moved = np.abs(after - before)
+        turned = np.abs((moved + np.pi) % (2 * np.pi) - np.pi)
+        return np.asarray(np.where(self.is_endless[chosen], turned, moved), np.float64)
+
+
+class Unreachable(NamedTuple):
+    """Samples that the joints cannot have moved to.
+
+    Attributes:
+        rows: (N,) which of the samples.
+        text: joint, size, time and number of them; empty = none.
+    """
+
+    rows: BoolArray
+    text: str
+
+
+def find_unreachable(
+    topic: str, stamps_ns: Stamps, positions: FloatArray, reach: JointReach
+) -> Unreachable:
+    """Return the samples that no joint can have moved to: glitches, or a second publisher.
+
+    Samples are sorted into sources within which every step is possible. Short and rare ones are
+    glitches. Of two that last, the one that moves is the robot.
+
+    Args:
+        topic: for texts.
+        stamps_ns: (N,) in increasing order.
+        positions: (N, J) in the order of `reach` [rad or m]; NaN = not in the message.
+        reach: of the robot.
+
+    Raises:
+        EpisodeError: it cannot be told which samples are the robot's.
+    """
+    times = (stamps_ns - stamps_ns[0]) * 1e-9 if len(stamps_ns) else np.zeros(0)
+    first = _first_jump(times, positions, reach)
+    if first is None:
+        return Unreachable(np.zeros(len(times), bool), '')
+    row, before, joint = first
+    step = (
+        f"joint '{reach.names[joint]}' jumps from {positions[before, joint]:.4g} to "
+        f'{positions[row, joint]:.4g} within {times[row] - times[before]:.4g} s at '
+        f'{times[row]:.4g} s, which no joint can'
+    )
+    sources = _sources(times, positions, reach)
+    kept = _robot_source(topic, times, positions, sources, step, reach.settings)
+    is_out = np.ones(len(times), bool)
+    is_out[kept] = False
+    if not is_out.any():
+        return Unreachable(is_out, '')
+    text = (
+        f"'{topic}': {int(is_out.sum())} of {len(times)} messages are out of reach of the others "
+        f'and were left out: {step} (glitches of a sensor, or a second publisher)'
+    )
+    return Unreachable(is_out, text)
+
+
+def _first_jump(
+    times: FloatArray, positions: FloatArray, reach: JointReach
+) -> tuple[int, int, int] | None:
+    """Row, the row before it and the joint of the first step that is out of reach."""
+    found: list[tuple[int, int, int]] = []
+    for joint in np.flatnonzero(np.isfinite(reach.noise)):
+        given = np.flatnonzero(np.isfinite(positions[:, joint]))
+        values, seconds = positions[given, joint], np.diff(times[given])
+        moved = reach.distance(values[:-1], values[1:], joint)
+        jumps = np.flatnonzero(moved > reach.noise[joint] + reach.speed[joint] * seconds)
+        if len(jumps):
+            found.append((int(given[jumps[0] + 1]), int(given[jumps[0]]), int(joint)))
+    return min(found, default=None)
+
+
+def _sources(
+    times: FloatArray, positions: FloatArray, reach: JointReach
+) -> list[NDArray[np.intp]]:
+    """Return the rows of each source; a sample goes to the nearest of those that reach it."""
+    rows: list[list[int]] = []
+    last = np.full((0, positions.shape[1]), np.nan)
+    last_s = np.zeros_like(last)
+    for row, (seconds, values) in enumerate(zip(times, positions, strict=True)):
+        given = np.isfinite(values)
+        moved = np.nan_to_num(reach.distance(last[:, given], values[given], given))
+        allowed = reach.noise[given] + reach.speed[given] * (seconds - last_s[:, given])
+        fits = (moved <= allowed).all(axis=1)
+        if fits.any():
+            away = np.where(fits, (moved / reach.noise[given]).max(axis=1, initial=0.0), np.inf)
+            best = int(away.argmin())
+        elif len(rows) < reach.settings.num_publishers:
+            best = len(rows)
+            rows.append([])
+            last = np.vstack([last, np.full_like(values, np.nan)])
+            last_s = np.vstack([last_s, np.full_like(values, seconds)])
+        else:
+            continue
+        last[best, given], last_s[best, given] = values[given], seconds
+        rows[best].append(row)
+    return [np.array(each, np.intp) for each in rows]
+
+
+def _robot_source(
+    topic: str,
+    times: FloatArray,
+    positions: FloatArray,
+    sources: Sequence[NDArray[np.intp]],
+    step: str,
+    settings: ReachSettings,
+) -> NDArray[np.intp]:
+    """Return the rows of the source that is the robot.
+
+    Raises:
+        EpisodeError: several may be.
+    """
+    ordered = sorted(sources, key=len, reverse=True)
+    lasting = [rows for rows in ordered if len(rows) > settings.glitch_ratio * len(times)]
+    moving = [rows for rows in lasting if _moves(positions[rows], settings)]
+    kept = moving[0] if len(lasting) > 1 and len(moving) == 1 else ordered[0]
+    if len(lasting) > 1 and len(moving) != 1:
+        counts = ' and '.join(str(len(rows)) for rows in lasting[:4])
+        raise EpisodeError(
+            f"'{topic}': {step}; {counts} of {len(times)} messages belong together: two "
+            'publishers, or an encoder whose zero changed. Leave one publisher out (give the '
+            "robot's own topic as 'joint_states' in the mapping), or cut the recording there"
+        )
+    if not _is_interleaved(times, kept, settings):
+        raise EpisodeError(
+            f"'{topic}': {step}, and it stays there for more than {settings.glitch_s:g} s: an "
+            'encoder whose zero changed, or another robot. Cut the recording there'
+        )
+    return kept
+
+
+def _moves(positions: FloatArray, settings: ReachSettings) -> bool:
+    """Whether a tenth of the samples are away from the median position."""
+    with np.errstate(invalid='ignore'):
+        away = np.nan_to_num(np.abs(positions - np.nanmedian(positions, axis=0)))
+    return bool(np.quantile(away.max(axis=1), 0.9) > settings.still)
+
+
+def _is_interleaved(times: FloatArray, rows: NDArray[np.intp], settings: ReachSettings) -> bool:
+    """Whether the samples that are not among `rows` are short stretches."""
+    is_out = np.ones(len(times), bool)
+    is_out[rows] = False
+    runs = [[row for row, _ in run] for out, run in groupby(enumerate(is_out), _second) if out]
+    return all(times[run[-1]] - times[run[0]] <= settings.glitch_s for run in runs)
+
+
+def _second(item: tuple[int, bool]) -> bool:
+    return item[1]
+
+
+@dataclass(frozen=True, slots=True)
+class _Names:
+    """Columns of the names of a message; `doubled` = (column, positions of it in the message)."""
+
+    columns: NDArray[np.intp]
+    first: NDArray[np.intp]
+    doubled: tuple[tuple[int, list[int]], ...]
+
+
+def _no_change(names: Sequence[str]) -> Sequence[str]:
+    return names
+
+
+def merge_joint_states(
+    topic: str,
+    messages: Sequence[tuple[int, Any]],
+    warnings: list[str],
+    robot: RobotModel | None = None,
+    renamed: Callable[[Sequence[str]], Sequence[str]] = _no_change,
+    constants: Mapping[str, float] | None = None,
+) -> JointStates | None:
+    """Return one table of JointState messages, also of several publishers.
+
+    Joints that a message does not name, or without a finite position in it, keep their last
+    position. Rows before every joint has one are left out; only a gripper has its first position
+    from the start. Each repair is a line in `warnings`.
+
+    Args:
+        topic: for texts.
+        messages: (stamp [ns], sensor_msgs/JointState), in the order received.
+        warnings: gets what was odd and how it was handled.
+        robot: samples that its joints cannot have moved to are left out; None = not checked.
+        renamed: gives the robot's names of the recorded ones.
+        constants: positions of joints that are not recorded [rad or m].
+
+    Returns:
+        None where no row is left.
+
+    Raises:
+        EpisodeError: samples contradict each other, see `find_unreachable`; a joint of the robot
+            is named but never has a position.
+    """
+    ordered = sorted(messages, key=lambda item: item[0])
+    whole = [(s, m) for s, m in ordered if len(m.name) == len(m.position) > 0]
+    if len(whole) < len(ordered):
+        count = len(ordered) - len(whole)
+        warnings.append(f"'{topic}': {count} messages without a position per joint were left out")
+    if not whole:
+        return None
+    constants = constants or {}
+    given = [message for _, message in whole]
+    names, table = _table(topic, given, renamed, warnings, robot, constants)
+    names, table = _own_columns(names, table, robot, constants)
+    stamps = np.array([stamp for stamp, _ in whole], np.int64)
+    if robot is not None and set(names) >= set(robot.joint_names):
+        columns = [names.index(name) for name in robot.joint_names]
+        found = find_unreachable(topic, stamps, table[:, columns], JointReach(robot))
+        if found.text:
+            warnings.append(found.text)
+            stamps, table = stamps[~found.rows], table[~found.rows]
+    grippers = () if robot is None else tuple(tool.gripper_joint for tool in robot.tools)
+    _warn_of_repeats(topic, stamps, np.isfinite(table), warnings)
+    stamps, table = _filled(topic, stamps, names, table, grippers, warnings)
+    is_last = np.append(np.diff(stamps) > 0, True)[: len(stamps)]
+    stamps, table = stamps[is_last], table[is_last]
+    if not len(stamps):
+        return None
+    return JointStates(stamps_ns=stamps, joint_names=names, positions=table)
+
+
+def _table(
+    topic: str,
+    messages: Sequence[Any],
+    renamed: Callable[[Sequence[str]], Sequence[str]],
+    warnings: list[str],
+    robot: RobotModel | None,
+    constants: Collection[str],
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Joint names, and positions (N, J); NaN where a message has none that can be used."""
+    kinds = {tuple(message.name): None for message in messages}
+    known = {given: tuple(renamed(given)) for given in kinds}
+    names = tuple(dict.fromkeys(name for each in known.values() for name in each))
+    places = {given: _places(each, names) for given, each in known.items()}
+    table = np.full((len(messages), len(names)), np.nan)
+    num_given = np.zeros(len(names), int)
+    doubled: set[int] = set()
+    for row, message in enumerate(messages):
+        place, values = places[tuple(message.name)], np.asarray(message.position, np.float64)
+        table[row, place.columns] = values[place.first]
+        num_given[place.columns] += 1
+        for column, at in place.doubled:
+            if np.ptp(values[at]) > 0:
+                table[row, column] = np.nan
+                doubled.add(column)
+    table[~np.isfinite(table)] = np.nan
+    unusable = num_given - np.isfinite(table).sum(axis=0)
+    wanted = set(names if robot is None else robot.joint_names) - set(constants)
+    for column in np.flatnonzero(unusable):
+        if names[column] in wanted:
+            why = 'named twice with different positions' if column in doubled else 'not finite'
+            share = f'{unusable[column]} of {num_given[column]}'
+            text = f"'{topic}': joint '{names[column]}' is {why} in {share} messages"
+            warnings.append(_unusable(text, names[column], unusable[column] < num_given[column]))
+    return names, table
+
+
+def _own_columns(
+    names: tuple[str, ...],
+    table: FloatArray,
+    robot: RobotModel | None,
+    constants: Mapping[str, float],
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Set constants; leave out joints of others where all of the robot's are there."""
+    for joint, value in constants.items():
+        if joint not in names:
+            names, table = (*names, joint), np.column_stack([table, np.zeros(len(table))])
+        table[:, names.index(joint)] = value
+    used = np.isfinite(table).any(axis=0)
+    if robot is not None and set(robot.joint_names) <= set(names):
+        used &= np.isin(names, robot.joint_names)
+    return tuple(np.array(names, object)[used]), table[:, used]
+
+
+def _unusable(text: str, joint: str, has_others: bool) -> str:
+    """Return what is done about positions that cannot be used.
+
+    Raises:
+        EpisodeError: the joint has no others.
+    """
+    if has_others:
+        return f'{text}; the positions before and after stand in'
+    raise EpisodeError(
+        f'{text}, so that it has no position at all. Where it is not measured, give its position '
+        f"in the mapping (--topics): 'constants: {{{joint}: 0.0}}'"
+    )
+
+
+def _places(known: Sequence[str], names: Sequence[str]) -> _Names:
+    at: dict[str, list[int]] = {}
+    for place, name in enumerate(known):
+        at.setdefault(name, []).append(place)
+    columns = [names.index(name) for name in at]
+    doubled = [(names.index(name), all_) for name, all_ in at.items() if len(all_) > 1]
+    first = np.array([all_[0] for all_ in at.values()], np.intp)
+    return _Names(np.array(columns, np.intp), first, tuple(doubled))
+
+
+def _filled(
+    topic: str,
+    stamps: Stamps,
+    names: Sequence[str],
+    table: FloatArray,
+    grippers: Sequence[str],
+    warnings: list[str],
+) -> tuple[Stamps, FloatArray]:
+    """Hold last positions; drop rows before every joint has one, but for grippers."""
+    given = np.isfinite(table)
+    firsts = given.argmax(axis=0)
+    begin = max(
+        (int(f) for f, n in zip(firsts, names, strict=True) if n not in grippers), default=0
+    )
+    for column, name in enumerate(names):
+        _warn_of_holding(topic, name, stamps, given[:, column], warnings)
+        late_s = (stamps[firsts[column]] - stamps[begin]) / NANO if len(stamps) else 0.0
+        if firsts[column] > begin:
+            value = table[firsts[column], column]
+            table[begin : firsts[column], column] = value
+            if late_s > HELD_S / 10:
+                warnings.append(
+                    f"'{topic}': joint '{name}' has no position for the first {late_s:.3g} s; its "
+                    f'first one, {value:.4g}, stands in'
+                )
+    lost_s = (stamps[begin] - stamps[0]) / NANO if len(stamps) else 0.0
+    if lost_s > HELD_S / 10:
+        late = [n for f, n in zip(firsts, names, strict=True) if f == begin]
+        warnings.append(
+            f"'{topic}': joint '{late[0]}' has no position for the first {lost_s:.3g} s; the "
+            f'{begin} messages before are left out'
+        )
+    rows = np.arange(len(table))[:, None]
+    last = np.maximum.accumulate(np.where(np.isfinite(table), rows, 0), axis=0)
+    held = np.take_along_axis(table, last, axis=0)
+    return stamps[begin:], held[begin:]
+
+
+def _warn_of_holding(
+    topic: str, name: str, stamps: Stamps, given: BoolArray, warnings: list[str]
+) -> None:
+    """Say where a joint is no longer published while others are."""
+    at = stamps[given]
+    if len(at) < 2:
+        return
+    gaps = np.diff(np.append(at, stamps[-1])) / NANO
+    longest = int(gaps.argmax())
+    if gaps[longest] > max(HELD_S, HELD_PERIODS * float(np.median(np.diff(at))) / NANO):
+        others = stamps[(stamps > at[longest]) & ~given]
+        if len(others) > 1:
+            warnings.append(
+                f"'{topic}': joint '{name}' has no position for {gaps[longest]:.3g} s from "
+                f'{(at[longest] - stamps[0]) / NANO:.3g} s on, while other joints have; its last '
+                'one is held'
+            )
+
+
+def _warn_of_repeats(topic: str, stamps: Stamps, given: BoolArray, warnings: list[str]) -> None:
+    """Say how often a joint has two positions at one stamp."""
+    repeated = int(((np.diff(stamps) == 0) & (given[1:] & given[:-1]).any(axis=1)).sum())
+    if repeated:
+        warnings.append(f"'{topic}': {repeated} stamps came twice; the later message was kept")
