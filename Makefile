@@ -54,7 +54,7 @@ kills: $(STAMP)  ## kill nodes, recorder and player at random moments (an hour);
 soak: $(STAMP)  ## 10,000 rollouts with faults (an hour); memory, threads, latency under out/soak/
 	$(BIN)/python test/robustness/soak.py
 
-attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, hostile paths (three hours)
+attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, open ports, hostile paths (three hours)
 	@mkdir -p out
 	$(BIN)/python test/robustness/rate.py
 	$(BIN)/python test/robustness/cycles.py --bundled
@@ -62,6 +62,7 @@ attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy 
 	$(BIN)/python test/robustness/policy_servers.py --json out/servers.json
 	$(BIN)/python test/robustness/children.py
 	$(BIN)/python test/robustness/interrupts.py
+	$(BIN)/python test/robustness/listeners.py
 	MTV_WORLD_ATTACKS=all $(BIN)/python -m pytest -q test/robustness/test_commands.py test/robustness/test_examples.py
 
 format: $(STAMP)  ## sort imports and format the code

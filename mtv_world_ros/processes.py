@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -160,6 +161,15 @@ def start_process(
             env={**(os.environ if environment is None else environment), **parent},
             start_new_session=True,
         )
+
+
+def ending_with_this_process(command: Sequence[str]) -> list[str]:
+    """Returns a command that is killed with this process, where the system can do that.
+
+    To be started from the main thread: the kernel looks at the thread.
+    """
+    program = shutil.which('setpriv')
+    return [*([program, '--pdeathsig', 'KILL', '--'] if program else []), *command]
 
 
 def last_line(log: Path, otherwise: str) -> str:

@@ -12,6 +12,8 @@ import platform
 import shlex
 from typing import Any, TYPE_CHECKING
 
+from mtv_world_ros.viewing.viewer_process import PageAddress
+
 if TYPE_CHECKING:
     from mtv_world_ros.pipeline import Pipeline
 
@@ -157,9 +159,10 @@ def add_watch(parser: argparse.ArgumentParser, what: str) -> None:
         type=Watch.parse,
         nargs='?',
         const=Watch(),
-        metavar='PORT|FILE.rrd',
-        help=f'show {what} in the Rerun viewer while it runs: in a browser (default: port '
-        f'{Watch().port}; the data take the one above it), or as a file for mtv-world view',
+        metavar='[ADDRESS:]PORT|FILE.rrd',
+        help=f'show {what} in the Rerun viewer while it runs: in a browser on this machine '
+        f'(default: port {Watch().address}; the data take the one above it), to others with an '
+        'address, e.g. 0.0.0.0:9090, or as a file for mtv-world view',
     )
 
 
@@ -173,12 +176,13 @@ def watch_arguments(arguments: argparse.Namespace) -> tuple[str, ...] | None:
     if watch is None:
         return None
     from mtv_world_ros.files import check_free
-    from mtv_world_ros.viewing.rerun_log import check_installed, check_ports
+    from mtv_world_ros.viewing.rerun_log import check_installed
+    from mtv_world_ros.viewing.viewer_process import check_ports
 
     check_installed()
     if watch.file is None:
-        check_ports(watch.port, '--watch PORT')
-        return '--port', str(watch.port)
+        check_ports(watch.address, '--watch PORT')
+        return '--port', str(watch.address)
     check_free(watch.file, arguments.overwrite, '--watch FILE.rrd')
     return '--save', str(watch.file)
 
@@ -188,11 +192,11 @@ class Watch:
     """Target of a live view.
 
     Attributes:
-        port: of the page for browsers.
+        address: of the page for browsers.
         file: is written instead; None = no file.
     """
 
-    port: int = 9090
+    address: PageAddress = PageAddress()
     file: Path | None = None
 
     @classmethod
@@ -200,11 +204,10 @@ class Watch:
         """Returns the value of `--watch`."""
         if text.endswith('.rrd'):
             return cls(file=Path(text))
-        if not text.isdecimal() or not 1024 <= int(text) < 65535:
-            raise argparse.ArgumentTypeError(
-                f"'{text}' is neither a port from 1024 to 65534 nor a file that ends in .rrd"
-            )
-        return cls(port=int(text))
+        try:
+            return cls(address=PageAddress.parse(text))
+        except argparse.ArgumentTypeError as error:
+            raise argparse.ArgumentTypeError(f'{error}; or a file that ends in .rrd') from error
 
 
 def threads_of_workers(arguments: argparse.Namespace) -> int:

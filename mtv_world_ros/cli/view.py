@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from mtv_world_ros.cli.shared_options import add_options
 from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.files import check_free
+from mtv_world_ros.viewing.viewer_process import PageAddress
 
 if TYPE_CHECKING:
     from mtv_world_ros.viewing.scored_rollout import ScoredRollout
@@ -36,7 +37,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--live', action='store_true', help='show topics beside a running node, until Ctrl-C'
     )
     parser.add_argument(
-        '--port', type=int, default=9090, help='of the viewer for browsers on this machine'
+        '--port',
+        type=PageAddress.parse,
+        default=PageAddress(),
+        metavar='[ADDRESS:]PORT',
+        help='of the viewer for browsers on this machine; with an address, e.g. 0.0.0.0:9090, '
+        'others can see what is shown and write to it (default: %(default)s)',
     )
     parser.add_argument(
         '--save', type=Path, metavar='FILE.rrd', help='write a file for the viewer, then exit'

@@ -18,6 +18,7 @@ from mtv_world_ros.ros.qos_profiles import best_offer
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.viewing import rerun_log
 from mtv_world_ros.viewing.streams import shown_as, Streams, take
+from mtv_world_ros.viewing.viewer_process import PageAddress
 
 #: new topics are looked for this often [s]
 _LOOK_PERIOD_S = 0.5
@@ -116,7 +117,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Shows topics until Ctrl-C; returns the exit status."""
     arguments = list(sys.argv if args is None else ('live_viewer', *args))
     parser = argparse.ArgumentParser(prog='live_viewer', description=__doc__)
-    parser.add_argument('--port', type=int, default=9090)
+    parser.add_argument('--port', type=PageAddress.parse, default=PageAddress())
     parser.add_argument('--save', type=Path)
     parser.add_argument('--native', action='store_true')
     parser.add_argument('--by-episode', action='store_true')

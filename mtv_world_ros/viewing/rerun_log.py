@@ -16,11 +16,13 @@ from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.rendering.video import KINDS
 from mtv_world_ros.viewing.scored_rollout import ScoredRollout, StoredRollout
 from mtv_world_ros.viewing.streams import Streams
+from mtv_world_ros.viewing.viewer_process import open_window, PageAddress, serve
 
 APPLICATION = 'mtv_world'
 #: RGB of outlines, by number of the object
 _COLOURS = ((230, 60, 60), (60, 140, 240), (60, 190, 90), (240, 180, 40), (180, 90, 220))
 _TIMELINE = 'time'
+_OPEN_TO_OTHERS = 'Whoever reaches this address can see and copy what is shown, and write to it.'
 
 
 def check_installed() -> None:
@@ -199,13 +201,15 @@ def _tab(root: str, shown: Streams | ScoredRollout, rrb: Any) -> Any:
     return rrb.Vertical(*rows, rrb.Horizontal(*below), row_shares=[3] * len(rows) + [2], name=name)
 
 
-def open_viewer(stream: Any, blueprint: Any, port: int, save: Path | None, is_native: bool) -> str:
+def open_viewer(
+    stream: Any, blueprint: Any, address: PageAddress, save: Path | None, is_native: bool
+) -> str:
     """Opens the viewer for what is logged from here on; returns a line for the user.
 
     Args:
         stream: of `recording`.
         blueprint: of `layout`; None = the viewer's own.
-        port: of the page for browsers.
+        address: of the page for browsers.
         save: write a file for `rerun FILE` instead.
         is_native: open a window instead.
 
@@ -219,9 +223,10 @@ def open_viewer(stream: Any, blueprint: Any, port: int, save: Path | None, is_na
             stream.save(str(save), default_blueprint=blueprint)
         return f'written: {save}'
     if is_native:
-        stream.spawn(default_blueprint=blueprint)
+        open_window(stream, blueprint)
         return 'opened a window'
-    return f'open {serve(stream, blueprint, port)}'
+    line = f'open {serve(stream, blueprint, address)}'
+    return line if address.is_local else f'{line}\n{_OPEN_TO_OTHERS}'
 
 
 def flush(stream: Any, save: Path | None) -> None:
@@ -246,42 +251,3 @@ def _disk_errors(save: Path | None) -> Iterator[None]:
         raise MtvWorldError(
             f"'{save}' cannot be written: {error}; is its disk full? Make room, or choose another"
         ) from error
-
-
-def serve(stream: Any, blueprint: Any, port: int) -> str:
-    """Serves the viewer to browsers on this machine; returns its address.
-
-    Raises:
-        ConfigError: the port, or the one above it for the data, is taken.
-    """
-    import rerun
-
-    check_ports(port)
-    data = stream.serve_grpc(grpc_port=port + 1, default_blueprint=blueprint)
-    rerun.serve_web_viewer(web_port=port, open_browser=False, connect_to=data)
-    return f'http://localhost:{port}/?url={data}'
-
-
-def check_ports(port: int, option: str = '--port') -> None:
-    """Raises a `ConfigError` where the page's port or the one above it is taken.
-
-    Args:
-        port: of the page for browsers.
-        option: of the command, which sets it.
-    """
-    for number in (port, port + 1):
-        _check_port(number, option)
-
-
-def _check_port(port: int, option: str) -> None:
-    import socket
-
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(('127.0.0.1', port))
-        except OSError as error:
-            raise ConfigError(
-                f'port {port} cannot be used ({error.strerror}): another viewer may still be '
-                f'served there; give another {option} (the data take the one above it)'
-            ) from error

@@ -119,17 +119,19 @@ def test_the_command_writes_a_file_for_the_viewer(tmp_path, capsys):
 
 def test_browsers_get_the_viewer_and_a_port_in_use_is_told(tmp_path):
     pytest.importorskip('rerun')
-    from mtv_world_ros.viewing import rerun_log
+    from mtv_world_ros.viewing import rerun_log, viewer_process
+    from mtv_world_ros.viewing.viewer_process import PageAddress
 
     with socket.socket() as taken:
         taken.bind(('127.0.0.1', 0))
         port = taken.getsockname()[1]
         taken.listen()
         with pytest.raises(ConfigError, match=f'port {port} cannot be used .*another --port'):
-            rerun_log.serve(rerun_log.recording('a'), None, port)
+            viewer_process.serve(rerun_log.recording('a'), None, PageAddress(port=port))
     streams = read_streams([write_predictions(tmp_path / 'predictions')])
     stream = rerun_log.recording('b')
-    address = rerun_log.serve(stream, rerun_log.layout({'/bag': streams}), port)
+    layout = rerun_log.layout({'/bag': streams})
+    address = viewer_process.serve(stream, layout, PageAddress(port=port))
     rerun_log.log_streams(stream, streams, '/bag')
     page = urllib.request.urlopen(address.partition('?')[0]).read()
     assert b're_viewer' in page

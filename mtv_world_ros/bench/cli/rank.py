@@ -198,7 +198,7 @@ def _viewer(arguments: argparse.Namespace) -> LiveRanking | None:
 
     stream = rerun_log.recording('ranking')
     watch = arguments.watch
-    print(rerun_log.open_viewer(stream, None, watch.port, watch.file, False), flush=True)
+    print(rerun_log.open_viewer(stream, None, watch.address, watch.file, False), flush=True)
     return LiveRanking(stream, arguments.out, watch.file)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 import os
 from pathlib import Path
-import shutil
 import signal
 import socket
 import subprocess
@@ -13,7 +12,12 @@ import time
 import weakref
 
 from mtv_world_ros.errors import PolicyServerError
-from mtv_world_ros.processes import last_line, start_process, StoppedProcesses
+from mtv_world_ros.processes import (
+    ending_with_this_process,
+    last_line,
+    start_process,
+    StoppedProcesses,
+)
 
 #: stands for the port in a command
 PORT = '{port}'
@@ -81,7 +85,7 @@ class ServerProcess:
         self._log = self._logs / f'{log_name}.log'
         command = [part.replace(PORT, str(self.port)) for part in self._command]
         try:
-            self._process = start_process(log_name, [*_tie(), *command], self._logs)
+            self._process = start_process(log_name, ending_with_this_process(command), self._logs)
         except OSError as error:
             raise PolicyServerError(
                 f"the server of policy '{self._name}' cannot be started: {error}"
@@ -111,12 +115,6 @@ class ServerProcess:
             f"{self._start_timeout_s:g} s ('start_timeout_s'); its command must use {PORT}, its "
             f"log is '{self._log}'"
         )
-
-
-def _tie() -> list[str]:
-    """Command prefix that ends a process with the one that started it, where the system can."""
-    program = shutil.which('setpriv')
-    return [program, '--pdeathsig', 'KILL', '--'] if program else []
 
 
 def _free_port() -> int:
