@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from mtv_world_ros.data_types import FloatArray
 from mtv_world_ros.errors import RobotError
-from mtv_world_ros.geometry.robot.mesh_pieces import convex_pieces
+from mtv_world_ros.geometry.robot.mesh_pieces import convex_pieces, MissingMeshError
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import (
     element_shapes,
@@ -169,8 +169,8 @@ def _parts_of(link: ElementTree.Element, kind: str, urdf: Path, is_grip: bool) -
             for element in link.findall(kind)
             for shape in element_shapes(element, name, urdf, cut)
         ]
-    except FileNotFoundError as error:
-        raise RobotError(f"'{urdf}': mesh {error} is missing; contact needs it") from error
+    except MissingMeshError as error:
+        raise RobotError(f"'{urdf}': mesh {error}; contact needs it") from error
 
 
 def _part(element: ElementTree.Element, shape: LinkShape) -> Part:

@@ -26,11 +26,16 @@ def speed_limits(robot: RobotModel) -> FloatArray:
     `DEFAULT_SLIDE`. Policies command a gripper to open or close from one row to the next, so its
     speed has no limit.
     """
-    given = np.asarray(robot.velocity_limits)
-    free = np.where(robot.slides, DEFAULT_SLIDE, DEFAULT_TURN)
-    limits = SPEED_RATIO * np.where((given > 0) & np.isfinite(given), given, free)
+    limits = SPEED_RATIO * joint_speeds(robot)
     grippers = [tool.gripper_joint or '' for tool in robot.tools]
     return np.where(np.isin(robot.joint_names, grippers), np.inf, limits)
+
+
+def joint_speeds(robot: RobotModel) -> FloatArray:
+    """Return (J,) the speed limits of the description, or the defaults [rad/s or m/s]."""
+    given = robot.velocity_limits
+    free = np.where(robot.slides, DEFAULT_SLIDE, DEFAULT_TURN)
+    return np.where(np.isfinite(given), given, free)
 
 
 def check_plan(

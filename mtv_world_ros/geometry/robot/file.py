@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
+from dataclasses import dataclass
 import os
 from pathlib import Path
 import re
@@ -23,13 +24,13 @@ from mtv_world_ros.errors import ConfigError, RobotError
 from mtv_world_ros.files import whole_folder
 from mtv_world_ros.geometry.robot.mesh_pieces import (
     convex_pieces,
-    edges_of,
     find_mesh,
     load_mesh,
+    MissingMeshError,
     write_convex_hull,
 )
 from mtv_world_ros.geometry.robot.model import Mimic, RobotModel, Tool
-from mtv_world_ros.geometry.robot.shape import grip_links
+from mtv_world_ros.geometry.robot.shape import grip_links, load_shape
 from mtv_world_ros.geometry.transforms import denavit_hartenberg, pose
 
 #: a calibrated robot differs from its nominal description by less than this [m], [rad]
@@ -280,18 +281,29 @@ def _movable(model: pin.Model, followers: set[str]) -> list[str]:
 ROBOT_YAML, _URDF, _MESHES, _PIECES = 'robot.yaml', 'robot.urdf', 'meshes', 'pieces'
 
 
-def save_robot(file: Path, folder: Path) -> Path:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SavedRobot:
+    """Copy of a robot file with everything it names.
+
+    Attributes:
+        file: YAML of the copy.
+        notes: meshes that are missing or cannot be read, and links whose size is doubtful.
+    """
+
+    file: Path
+    notes: tuple[str, ...] = ()
+
+
+def save_robot(file: Path, folder: Path) -> SavedRobot:
     """Copies a robot file, its URDF and the shapes in it; the copy can be moved anywhere.
 
     Meshes are stored as their convex hulls, which is all that drawing a robot uses; what touches
-    things in a gripper as convex pieces, made here once. The name of a missing mesh is kept.
+    things in a gripper as convex pieces, made here once. The name of a mesh that is missing or
+    cannot be read is kept.
 
     Args:
         file: robot YAML.
         folder: to make; one that is there is replaced.
-
-    Returns:
-        The copy of the YAML.
 
     Raises:
         ConfigError, RobotError: the robot cannot be used.
@@ -299,17 +311,22 @@ def save_robot(file: Path, folder: Path) -> Path:
     robot = load_robot(file)
     values = read_yaml(file, 'robot file', 'robot_file')
     values['base_link'] = robot.base_link
+    missing: list[str] = []
     with whole_folder(folder) as partial:
         if values.get('urdf'):
-            tree = _with_hulls(file.parent / values['urdf'], partial, grip_links(robot))
+            urdf = file.parent / values['urdf']
+            tree = _with_hulls(urdf, partial, grip_links(robot), missing)
             tree.write(partial / _URDF, encoding='utf-8', xml_declaration=True)
             values['urdf'] = _URDF
         text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, allow_unicode=True)
         (partial / ROBOT_YAML).write_text(text, encoding='utf-8')
-    return folder / ROBOT_YAML
+    copy = folder / ROBOT_YAML
+    doubts = load_shape(load_robot(copy)).doubts
+    return SavedRobot(file=copy, notes=(*(f'mesh {text}' for text in missing), *doubts))
 
 
-def _with_hulls(urdf: Path, folder: Path, grips: set[str]) -> Any:
+def _with_hulls(urdf: Path, folder: Path, grips: set[str], missing: list[str]) -> Any:
+    """Return the URDF with stored hulls in place of meshes; add those that are missing."""
     tree = ElementTree.parse(urdf)
     stored: dict[Path, str] = {}
     made: list[str] = []
@@ -317,14 +334,33 @@ def _with_hulls(urdf: Path, folder: Path, grips: set[str]) -> Any:
         if link.get('name') in grips:
             made += _split_collisions(link, urdf, folder, len(made))
     for mesh in tree.iter('mesh'):
-        file = find_mesh(mesh.get('filename', ''), urdf)
-        if file is None or mesh.get('filename') in made:
+        name = mesh.get('filename', '')
+        if name in made:
             continue
-        if file not in stored:
-            stored[file] = f'{_MESHES}/{len(stored)}_{file.stem}.stl'
-            write_convex_hull(np.asarray(load_mesh(file).vertices()), folder / stored[file])
+        try:
+            file = _present_mesh(name, urdf)
+            if file not in stored:
+                vertices = load_mesh(file).vertices
+                stored[file] = f'{_MESHES}/{len(stored)}_{file.stem}.stl'
+                write_convex_hull(vertices, folder / stored[file])
+        except MissingMeshError as error:
+            if str(error) not in missing:
+                missing.append(str(error))
+            continue
         mesh.set('filename', stored[file])
     return tree
+
+
+def _present_mesh(name: str, urdf: Path) -> Path:
+    """Return the file of a mesh.
+
+    Raises:
+        MissingMeshError: it is not there.
+    """
+    file = find_mesh(name, urdf)
+    if file is None:
+        raise MissingMeshError(f"'{name}' is not there")
+    return file
 
 
 def _split_collisions(link: Any, urdf: Path, folder: Path, first: int) -> list[str]:
@@ -336,12 +372,15 @@ def _split_collisions(link: Any, urdf: Path, folder: Path, first: int) -> list[s
             link.append(drawn)
     for element in link.findall('collision'):
         mesh = element.find('geometry/mesh')
-        file = None if mesh is None else find_mesh(mesh.get('filename', ''), urdf)
-        if mesh is None or file is None:
+        if mesh is None:
             continue
-        loaded = load_mesh(file)
+        try:
+            file = _present_mesh(mesh.get('filename', ''), urdf)
+            loaded = load_mesh(file)
+        except MissingMeshError:  # the caller names it, as its name stays
+            continue
         scale = np.array(mesh.get('scale', '1 1 1').split(), float)
-        pieces = convex_pieces(np.asarray(loaded.vertices()) * scale, edges_of(loaded))
+        pieces = convex_pieces(loaded.vertices * scale, loaded.edges())
         link.remove(element)
         for points in pieces:
             made.append(name := f'{_PIECES}/{first + len(made)}_{file.stem}.stl')

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import os
 from pathlib import Path
 import struct
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,28 +56,105 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def load_mesh(path: Path) -> Any:
-    """Reads a mesh (STL, DAE, OBJ).
+class MissingMeshError(RobotError):
+    """A mesh that is not there or cannot be read; the text names the file and the reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """Triangle mesh of a file, in metres, before the scale that a URDF gives.
+
+    Attributes:
+        vertices: (N, 3) [m].
+        triangles: Coal's mesh, which has the triangles.
+    """
+
+    vertices: FloatArray
+    triangles: Any
+
+    def edges(self) -> NDArray[np.int64]:
+        """Return (E, 2) vertices that edges of triangles join."""
+        mesh = self.triangles
+        count = range(mesh.num_tris)
+        faces = np.array([[mesh.tri_indices(n)[k] for k in range(3)] for n in count])
+        pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        return np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)
+
+
+def load_mesh(path: Path) -> Mesh:
+    """Read a mesh (STL, DAE, OBJ); the `<unit meter>` of a DAE file is applied.
 
     Raises:
-        FileNotFoundError: nothing here reads meshes.
-        RobotError: the file cannot be read.
+        MissingMeshError: the file cannot be read as a mesh, or nothing here reads meshes.
     """
     try:
         import coal  # comes with Pinocchio, but not with every build of it
     except ImportError as error:
-        raise FileNotFoundError(f"reader: '{path.name}' needs the module coal") from error
+        raise MissingMeshError(f"'{path.name}' needs the module coal") from error
+    if problem := _not_a_mesh(path):
+        raise MissingMeshError(f"'{path}' {problem}")
     try:
-        return coal.MeshLoader().load(str(path), np.ones(3))
+        mesh = coal.MeshLoader().load(str(path), np.ones(3))
+        vertices = np.asarray(mesh.vertices(), np.float64)
     except (ValueError, RuntimeError) as error:
-        raise RobotError(f"mesh '{path}' cannot be read: {error}") from error
+        raise MissingMeshError(f"'{path}' cannot be read: {_short_reason(error)}") from error
+    if not mesh.num_tris or not vertices.size:
+        raise MissingMeshError(f"'{path}' holds no triangles")
+    unit = _collada_unit_m(path) if path.suffix.lower() == '.dae' else 1.0
+    return Mesh(vertices * unit, mesh)
 
 
-def edges_of(mesh: Any) -> NDArray[np.int64]:
-    """Returns (E, 2) vertices that edges of triangles join."""
-    faces = np.array([[mesh.tri_indices(n)[k] for k in range(3)] for n in range(mesh.num_tris)])
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    return np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)
+#: beginning of a file that is enough to tell what it is [bytes]
+_HEAD_BYTES = 512
+
+
+def _not_a_mesh(path: Path) -> str:
+    """Return what a file is that takes a mesh's place, and the remedy; empty if it may be one."""
+    try:
+        with path.open('rb') as file:
+            head = file.read(_HEAD_BYTES).lstrip().lower()
+    except OSError as error:
+        return f'cannot be read: {error.strerror or error}'
+    if not head:
+        return 'is empty'
+    if head.startswith(b'version https://git-lfs.github.com/'):
+        return "is a pointer of Git LFS, not the mesh: run 'git lfs pull' in its repository"
+    if head.startswith((b'<!doctype html', b'<html')):
+        return 'is an HTML page, not a mesh: its download failed; fetch the file itself'
+    return ''
+
+
+def _short_reason(error: Exception) -> str:
+    """Return the reason that Coal's message of several lines states."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    kept = [line.removeprefix('message: ') for line in lines if line]
+    dropped = ('From file:', 'in function:', 'at line:', 'Hint:', 'Could not load resource')
+    return '; '.join(line for line in kept if not line.startswith(dropped)) or 'unknown reason'
+
+
+def _collada_unit_m(path: Path) -> float:
+    """Return the length of a DAE file's unit [m], which Coal does not apply.
+
+    URDF tools apply the unit and take no notice of `<up_axis>` (rviz#853).
+
+    Raises:
+        MissingMeshError: the unit is no positive number.
+    """
+    try:
+        for _, element in ElementTree.iterparse(path, events=('start',)):
+            tag = element.tag.rpartition('}')[2]
+            if tag == 'unit':
+                unit = float(element.get('meter', '1'))
+                break
+            if tag.startswith('library_') or tag == 'scene':
+                return 1.0
+        else:
+            return 1.0
+    except (ElementTree.ParseError, ValueError, OSError) as error:
+        raise MissingMeshError(f"'{path}': its <unit> cannot be read: {error}") from error
+    if not 0 < unit < np.inf:
+        raise MissingMeshError(f"'{path}': <unit meter> is {unit:g}, must be positive")
+    return unit
 
 
 def outermost(points: FloatArray, directions: int = _DIRECTIONS) -> FloatArray:

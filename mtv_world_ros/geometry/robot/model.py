@@ -86,7 +86,8 @@ class RobotModel:
         joint_names: J names.
         lower: (J,) smallest positions [rad or m]; -inf for joints that turn without end.
         upper: (J,) largest positions [rad or m].
-        velocity_limits: (J,) largest speeds [rad/s or m/s]; inf where not given.
+        velocity_limits: (J,) largest speeds [rad/s or m/s]; inf where not given, which a URDF
+            may also write as 0.
         tools: one per arm, in the order of all A axes.
         mimics: joints that follow commanded ones.
         pinocchio_model: the model, with every joint of the description.
@@ -265,6 +266,7 @@ class RobotModel:
         for name, low, high in zip(self.joint_names, lower, upper, strict=True):
             check_can_move(name, low, high, f"robot '{self.name}'")
         speeds = np.array([model.velocityLimit[joint.velocity] for joint in joints])
+        speeds = np.where(speeds > 0, speeds, np.inf)
         for array in (lower, upper, speeds):
             array.flags.writeable = False
         return lower, upper, speeds

@@ -18,10 +18,10 @@ from mtv_world_ros.bounded_input import parse_yaml, read_text
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import RobotError
 from mtv_world_ros.geometry.robot.mesh_pieces import (
-    edges_of,
     even_directions,
     find_mesh,
     load_mesh,
+    MissingMeshError,
     outermost,
     slices,
 )
@@ -33,6 +33,15 @@ _CORNERS = 16
 ROD_RADIUS_M = 0.03
 #: no vertex of a robot's mesh is further from its link than this [m]
 _MOST_M = 1e4
+#: size above which a link that moves, and one that rests, does not fit the arm [arm lengths]
+_LARGE_MOVING, _LARGE_RESTING = 3.0, 15.0
+#: size below which a link does not fit the arm [arm lengths]
+_SMALL = 1e-3
+_TOO_LARGE = (
+    'is its mesh in millimetres or centimetres? Set scale="0.001 0.001 0.001" or '
+    '"0.01 0.01 0.01" at the mesh in the URDF'
+)
+_TOO_SMALL = 'does the URDF scale a mesh that is in metres, or has a <unit> of its own?'
 #: links closer together than this get no rod between them [m]
 _SHORTEST_ROD_M = 0.01
 #: pixels are drawn with this many fractional bits
@@ -65,13 +74,15 @@ class RobotShape:
         parts: of its links.
         source: origin of the shapes, for reports.
         is_known: False where rods stand for the links.
-        missing: shapes of the URDF that are not among the parts, and why.
+        missing: meshes that are not there or cannot be read, and why.
+        doubts: links whose size does not fit the arm.
     """
 
     parts: tuple[LinkShape, ...]
     source: str
     is_known: bool = True
     missing: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
 
 def urdf_path(robot: RobotModel) -> Path | None:
@@ -94,12 +105,13 @@ def urdf_links(robot: RobotModel) -> tuple[Path, dict[str, ElementTree.Element]]
 def load_shape(robot: RobotModel) -> RobotShape:
     """Returns the robot's shape.
 
-    The URDF's visual elements; for links where it has none, or where their meshes are not there,
-    its collision elements. Rods from joint to joint where the robot is given by a
-    Denavit-Hartenberg table or made in code, and where a link that moves has none of its shapes.
+    The URDF's visual elements; for links where it has none, or where their meshes are not there
+    or cannot be read, its collision elements. Rods from joint to joint where the robot is given
+    by a Denavit-Hartenberg table or made in code, and where a link that moves has none of its
+    shapes.
 
     Raises:
-        RobotError: a mesh cannot be read, or an element has a shape that no URDF has.
+        RobotError: a mesh is damaged, or an element has a shape that no URDF has.
     """
     if robot.file is None:
         return rods(robot, 'the robot has no file')
@@ -110,13 +122,55 @@ def load_shape(robot: RobotModel) -> RobotShape:
     found = {name: link_shapes(link, path, sliced=True) for name, link in links.items()}
     moving = moving_links(robot)
     parts = tuple(part for shapes, _ in found.values() for part in shapes)
-    missing = tuple(dict.fromkeys(text for name in moving for text in found[name][1]))
-    if missing:
-        where = _PACKAGES if 'package://' in missing[0] else ''
-        return rods(robot, f'there is no mesh {missing[0]}{where}', missing)
+    missing = tuple(dict.fromkeys(text for _, texts in found.values() for text in texts))
+    bare = [text for name in links if name in moving and not found[name][0]
+            for text in found[name][1]]  # fmt: skip
+    if bare:
+        where = _PACKAGES if 'package://' in bare[0] else ''
+        return rods(robot, f'no mesh: {bare[0]}{where}', missing)
     if not any(part.link in moving for part in parts):
         return rods(robot, f"'{path.name}' has no shapes")
-    return RobotShape(parts=parts, source=f"the shapes of '{path.name}'")
+    return RobotShape(
+        parts=parts,
+        source=f"the shapes of '{path.name}'",
+        missing=missing,
+        doubts=size_doubts(robot, parts),
+    )
+
+
+def size_doubts(robot: RobotModel, parts: Sequence[LinkShape]) -> tuple[str, ...]:
+    """Return the links whose shapes are far larger or far smaller than the arm, and the remedy.
+
+    A mesh in millimetres whose URDF gives no scale is 1000 times too large.
+    """
+    moving = moving_links(robot)
+    points: dict[str, list[FloatArray]] = {}
+    for part in parts:
+        points.setdefault(part.link, []).append(part.points)
+    sizes = {
+        link: float(np.linalg.norm(np.ptp(np.concatenate(found), axis=0)))
+        for link, found in points.items()
+    }
+    reach = _arm_length(robot)
+    doubts = []
+    for link, size in sizes.items():
+        large = (_LARGE_MOVING if link in moving else _LARGE_RESTING) * reach
+        if size > large or size < _SMALL * reach:
+            advice = _TOO_LARGE if size > large else _TOO_SMALL
+            text = f"link '{link}' is {size:.3g} m large and the arm {reach:.3g} m long"
+            doubts.append(f'{text}: {advice}')
+    return tuple(doubts)
+
+
+def _arm_length(robot: RobotModel) -> float:
+    """Return the length of the longest arm from its first joint to its tool [m]."""
+    middle = np.clip(0.0, robot.lower, robot.upper)[None]
+    lengths = [
+        float(np.linalg.norm(np.diff(points[:, 0], axis=0), axis=-1).sum())
+        for points in robot.arm_points(middle)
+    ]
+    ranges = (robot.upper - robot.lower)[robot.slides]
+    return max(lengths, default=0.0) + float(ranges[np.isfinite(ranges)].sum())
 
 
 def moving_links(robot: RobotModel) -> set[str]:
@@ -192,7 +246,7 @@ def _rod(link: str, start: FloatArray, end: FloatArray) -> LinkShape | None:
 def link_shapes(
     link: ElementTree.Element, urdf: Path, *, sliced: bool = False
 ) -> tuple[list[LinkShape], list[str]]:
-    """Returns a link's shapes, and why there are none; collisions stand in for visuals.
+    """Returns a link's shapes, and meshes that are missing; collisions stand in for visuals.
 
     With `sliced`, a mesh that is far from convex is given in slices.
 
@@ -205,11 +259,11 @@ def link_shapes(
         try:
             found = [element_shapes(one, name, urdf, cut) for one in link.findall(kind)]
             shapes = list(chain.from_iterable(found))
-        except FileNotFoundError as error:
+        except MissingMeshError as error:
             missing.append(str(error))
             continue
         if shapes:
-            return shapes, []
+            return shapes, missing
     return [], missing
 
 
@@ -229,7 +283,7 @@ def element_shapes(
             hull stands for it.
 
     Raises:
-        FileNotFoundError: a mesh is not there.
+        MissingMeshError: a mesh is not there or cannot be read.
         RobotError: see `load_shape`.
     """
     geometry = element.find('geometry')
@@ -257,15 +311,15 @@ def _pieces(
     scale = np.array(shape.attrib.get('scale', '1 1 1').split(), float)
     file = find_mesh(shape.attrib['filename'], urdf)
     if file is None:
-        raise FileNotFoundError(f"'{shape.attrib['filename']}'")
+        raise MissingMeshError(f"'{shape.attrib['filename']}' is not there")
     mesh = load_mesh(file)
-    vertices = np.asarray(mesh.vertices(), np.float64) * scale
+    vertices = mesh.vertices * scale
     if not (np.abs(vertices) < _MOST_M).all():
         raise RobotError(
             f"'{file}': a vertex is further than {_MOST_M:g} m away or no number; is the file "
             "damaged, or the 'scale' of the mesh in the URDF wrong?"
         )
-    return [outermost(vertices)] if cut is None else cut(vertices, edges_of(mesh))
+    return [outermost(vertices)] if cut is None else cut(vertices, mesh.edges())
 
 
 def _points(shape: ElementTree.Element, urdf: Path) -> FloatArray:

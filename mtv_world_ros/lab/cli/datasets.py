@@ -266,6 +266,8 @@ def _import_status(summary: ImportSummary[Any], name: Callable[[Any], str]) -> i
             recordings.setdefault(line, []).append(name(one))
     for line, names in recordings.items():
         print(f'{", ".join(names)}: {line}', file=sys.stderr)
+    for note in summary.robot_notes:
+        print(f'robot: {note}', file=sys.stderr)
     print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
     for one, reason in summary.failed.items():
         print(f'{name(one)}: {reason}', file=sys.stderr)

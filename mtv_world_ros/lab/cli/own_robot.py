@@ -74,7 +74,9 @@ def _robot(arguments: argparse.Namespace) -> int:
     robot = load_robot(path)
     print(describe(robot))
     shape = load_shape(robot)
-    print(f'shapes: {shape.source}', *(f'missing: {name}' for name in shape.missing), sep='\n')
+    print(f'shapes: {shape.source}')
+    print(*(f'missing: {name}\n' for name in shape.missing), sep='', end='')
+    print(*(f'suspicious: {text}\n' for text in shape.doubts), sep='', end='')
     picture = arguments.picture or Path('out/robot') / f'{robot.name}.png'
     _draw_robot(robot, picture)
     print(f'robot file: {path}\npicture: {picture}')
@@ -108,7 +110,8 @@ def describe(robot: RobotModel) -> str:
     rows = zip(robot.joint_names, robot.lower, robot.upper, robot.velocity_limits, strict=True)
     for name, lower, upper, speed in rows:
         limits = f'{lower:.4g} .. {upper:.4g}' if np.isfinite(lower) else 'turns without end'
-        lines.append(f'  joint {name}: {limits}, at most {speed:.3g} a second')
+        fastest = f'at most {speed:.3g} a second' if np.isfinite(speed) else 'no speed limit given'
+        lines.append(f'  joint {name}: {limits}, {fastest}')
     for tool in robot.tools:
         x, y, z = (float(v) for v in tool.T_link_tool[:3, 3])
         lines.append(f"  tool of '{tool.arm}': ({x:.4g}, {y:.4g}, {z:.4g}) m in '{tool.link}'")

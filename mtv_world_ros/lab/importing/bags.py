@@ -109,7 +109,8 @@ def described_robot(bag: Path, mapping: BagMapping, folder: Path) -> tuple[Path,
         try:
             guessed = guess_robot(urdf)
             file.write_text(yaml.safe_dump(guessed.values, sort_keys=False), encoding='utf-8')
-            return save_robot(file, folder), (*chosen, *guessed.notes)
+            saved = save_robot(file, folder)
+            return saved.file, (*chosen, *guessed.notes, *saved.notes)
         except (RobotError, ConfigError) as error:
             source, reason = f"'{topic}' of '{bag}'", str(error)
             for temporary in (urdf, file):
@@ -182,15 +183,17 @@ def import_bags(
         ConfigError, RobotError: the robot cannot be used at all.
     """
     robot = load_robot(robot_file)
-    inside = out / 'robot'
+    inside, notes = out / 'robot', ()
     if robot_file.parent.resolve() != inside.resolve():
-        save_robot(robot_file, inside)
+        notes = save_robot(robot_file, inside).notes
     key = digest_of(robot_file, calibration, start=stage.key + mapping.model_dump_json().encode())
 
     def convert(bag: Path, path: Path) -> tuple[str, ...]:
         return convert_bag(bag, path, mapping, robot, calibration, key, stage)
 
-    return import_each(progress(bags), key, lambda bag: out / episode_name(bag), convert)
+    summary = import_each(progress(bags), key, lambda bag: out / episode_name(bag), convert)
+    summary.robot_notes = notes
+    return summary
 
 
 def episode_name(bag: Path) -> str:

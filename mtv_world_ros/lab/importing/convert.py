@@ -18,6 +18,7 @@ from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.errors import ConfigError, EpisodeError, MtvWorldError, TrajectoryError
 from mtv_world_ros.geometry.camera import camera_poses
+from mtv_world_ros.geometry.plan_limits import joint_speeds
 from mtv_world_ros.geometry.robot.file import save_robot
 from mtv_world_ros.geometry.robot.joint_columns import to_positions
 from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
@@ -38,12 +39,14 @@ class ImportSummary(Generic[Item]):
         kept: were there already.
         failed: why.
         warnings: problems and how they were handled.
+        robot_notes: problems of the robot's description.
     """
 
     made: list[Item] = field(default_factory=list)
     kept: list[Item] = field(default_factory=list)
     failed: dict[Item, str] = field(default_factory=dict)
     warnings: dict[Item, tuple[str, ...]] = field(default_factory=dict)
+    robot_notes: tuple[str, ...] = ()
 
 
 def import_each(
@@ -172,7 +175,7 @@ def import_dataset(
         progress(wanted), key, lambda number: out / episode_name(number), convert
     )
     if summary.made or summary.kept:
-        save_robot(chosen.robot_file, out / 'robot')
+        summary.robot_notes = save_robot(chosen.robot_file, out / 'robot').notes
     return summary
 
 
@@ -385,14 +388,17 @@ _JUMP = 2.0
 
 def jumps(commands: Iterable[JointTrajectory], robot: RobotModel) -> list[str]:
     """Returns joints whose commands are faster than they can move, and how often."""
-    counts = np.zeros(len(robot.joint_names), int)
+    counts, limits = np.zeros(len(robot.joint_names), int), joint_speeds(robot)
     for trajectory in commands:
         if len(trajectory.times) > 1:
             speeds = np.diff(trajectory.positions, axis=0) / np.diff(trajectory.times)[:, None]
-            counts += (np.abs(speeds) > _JUMP * robot.velocity_limits).sum(axis=0)
+            counts += (np.abs(speeds) > _JUMP * limits).sum(axis=0)
+    given = np.isfinite(robot.velocity_limits)
+    rows = zip(robot.joint_names, counts, given, limits, strict=True)
     return [
-        f"commands of joint '{name}' jump {count} times (over {_JUMP:g} times its speed limit)"
-        for name, count in zip(robot.joint_names, counts, strict=True)
+        f"commands of joint '{name}' jump {count} times (over {_JUMP:g} times "
+        f'{"its speed limit" if is_given else f"{limit:g} a second, as no speed limit is given"})'
+        for name, count, is_given, limit in rows
         if count
     ]
 

@@ -153,7 +153,7 @@ def import_videos(
         EpisodeError: there is no recording.
     """
     recordings = find_recordings(folder, mapping)
-    save_robot(mapping.robot_file, out / 'robot')
+    saved = save_robot(mapping.robot_file, out / 'robot')
     text = mapping.model_dump_json(exclude={'robot'}).encode()
     key = digest_of(mapping.robot_file, calibration, start=stage.key + text)
 
@@ -162,7 +162,9 @@ def import_videos(
         written = mapping.written()
         return write_imported(episode, one.name, path, written, mapping.robot, key, stage)
 
-    return import_each(progress(recordings), key, lambda one: out / one.name, convert)
+    summary = import_each(progress(recordings), key, lambda one: out / one.name, convert)
+    summary.robot_notes = saved.notes
+    return summary
 
 
 def read_recording(

@@ -333,7 +333,7 @@ class Inspector:
             checks.append(check_commands(commands, origin, frames_ns, joints))
         except MtvWorldError as error:
             checks.append(({}, [broken(f'commands: {error}')]))
-        warnings = [suspicious(text) for text in episode.warnings]
+        warnings = [suspicious(text) for text in (*episode.warnings, *self.shape.doubts)]
         return _section('recording', [*checks, ({}, warnings)], ())
 
     def _commands(self, episode: Episode, origin_ns: int) -> JointTrajectory | None:

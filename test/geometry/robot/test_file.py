@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 import yaml
 
-from mtv_world_ros.errors import ConfigError, RobotError
-from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.data_types import JointTrajectory
+from mtv_world_ros.errors import ConfigError, RobotError, TrajectoryError
+from mtv_world_ros.geometry.plan_limits import check_plan
+from mtv_world_ros.geometry.robot.file import described_robot, load_robot
+from mtv_world_ros.lab.cli.own_robot import describe
+from mtv_world_ros.lab.importing.convert import jumps
 
 PLANAR = """<robot name="two">
   <link name="root"/><link name="upper"/><link name="lower"/><link name="finger"/>
@@ -114,6 +118,33 @@ def test_a_urdf_with_continuous_and_mimic_joints(tmp_path):
     np.testing.assert_allclose(robot.tool_poses(positions)[0, 0, :3, 3], elbow + ahead, atol=1e-9)
     lower, finger = (robot.link_poses(link, positions)[0] for link in ('lower', 'finger'))
     np.testing.assert_allclose(finger[:3, 3], lower[:3, 3] - 0.1 * lower[:3, 2], atol=1e-9)
+
+
+def test_a_speed_limit_of_zero_is_none_everywhere(tmp_path):
+    urdf = PLANAR.replace('effort="1" velocity="3"', 'effort="1" velocity="0"')
+    given = load_robot(write(tmp_path, planar()))
+    robot = load_robot(write(tmp_path, planar(), urdf))
+    assert given.velocity_limits[1] == 3.0 and robot.velocity_limits[1] == np.inf
+    live, _ = described_robot(given, urdf)  # as from /robot_description
+    assert live.velocity_limits[1] == np.inf
+    assert 'joint elbow: -1 .. 2, no speed limit given' in describe(robot)
+    # 2 rad/s in the elbow
+    plan = JointTrajectory(
+        joint_names=robot.joint_names,
+        times=np.array([0.1, 0.2, 0.3]),
+        positions=np.array([[0, 0.2], [0, 0.4], [0, 0.6]]),
+    )
+    check_plan(robot, plan, np.zeros(2))
+    assert jumps([plan], robot) == []
+    fast = JointTrajectory(
+        joint_names=robot.joint_names,
+        times=np.array([0.1, 0.12]),
+        positions=np.array([[0, 0.2], [0, 0.9]]),
+    )
+    with pytest.raises(TrajectoryError, match='elbow'):
+        check_plan(robot, fast, np.zeros(2))
+    (said,) = jumps([fast], robot)
+    assert said.startswith("commands of joint 'elbow' jump 1 times (over 2 times 10 a second")
 
 
 def test_joints_take_the_order_of_the_file(tmp_path):
