@@ -443,17 +443,25 @@ class _EpisodeReader:
     def _moving(self, camera: CameraModel, track: Track) -> CameraModel:
         """The camera of an episode, with the poses that /tf has of its frame in its mount."""
         frame = optical_frame(camera.view)
-        if not read_tree(self._tf()).moves_in(camera.mount_link, frame):
+        moving, static = self._tf()
+        if not read_tree(moving, static=static).moves_in(camera.mount_link, frame):
             return camera
-        found = pose_track(self._tf(), frame, {camera.mount_link}, track.stamps_ns)
+        stamps = track.stamps_ns
+        found = pose_track(moving, frame, {camera.mount_link}, stamps, static=static)
         self.tracks[camera.view] = found.T_link_frame
         return replace(camera, T_mount_camera=found.T_link_frame[0])
 
-    def _tf(self) -> list[Any]:
-        return [m for topic in TF_TOPICS for _, m in self._take(topic, messages.TF_MESSAGE)]
+    def _tf(self) -> tuple[list[Any], list[Any]]:
+        """Messages of /tf and of /tf_static."""
+        moving, static = (
+            [message for _, message in self._take(topic, messages.TF_MESSAGE)]
+            for topic in TF_TOPICS
+        )
+        return moving, static
 
     def _tree(self) -> TransformTree:
-        tree = read_tree(self._tf(), self.mapping.tf_prefix)
+        moving, static = self._tf()
+        tree = read_tree(moving, self.mapping.tf_prefix, static)
         self.warnings += tree.problems
         return tree
 
@@ -484,7 +492,9 @@ class _EpisodeReader:
             mount = Mount(unknown_mount, np.eye(4), None)
             self.unknown[view] = 'pose'
         elif tree.is_moving(frame, links):
-            found = pose_track(self._tf(), frame, links, images.stamps_ns, self.mapping.tf_prefix)
+            moving, static = self._tf()
+            prefix = self.mapping.tf_prefix
+            found = pose_track(moving, frame, links, images.stamps_ns, prefix, static)
             mount = Mount(found.link, found.T_link_frame[0], None)
             self.tracks[view] = found.T_link_frame
             self._warn_once(

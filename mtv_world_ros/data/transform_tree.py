@@ -96,11 +96,44 @@ class _Edge:
         return _between(low, high, stamp_ns, ends[0][0], ends[1][0])
 
 
+class _Replacement(NamedTuple):
+    """The last change of a static transform.
+
+    Attributes:
+        count: changes.
+        old_parent: frame that the child was in before.
+        parent: frame that it is in.
+        before: (4, 4) the transform before [m].
+        after: (4, 4) the newest one.
+    """
+
+    count: int
+    old_parent: str
+    parent: str
+    before: FloatArray
+    after: FloatArray
+
+    def text(self, child: str) -> str:
+        """Return what was replaced, how often and by how much."""
+        times = 'once' if self.count == 1 else f'{self.count} times'
+        begin = f"/tf_static: the transform '{self.parent}' -> '{child}' was replaced {times}"
+        if self.old_parent != self.parent:
+            return f"{begin}, the last time that of '{self.old_parent}'; the newest holds for good"
+        between = inverse(self.before) @ self.after
+        away_m = float(np.linalg.norm(self.after[:3, 3] - self.before[:3, 3]))
+        turn = math.acos(min(max((float(np.trace(between[:3, :3])) - 1) / 2, -1.0), 1.0))
+        return (
+            f'{begin}, the last time by one {1000 * away_m:.1f} mm and {math.degrees(turn):.2f} '
+            'degrees away; the newest holds for good'
+        )
+
+
 class TransformTree:
     """Frames and the transforms between them, in bounded memory.
 
     What cannot be used (a frame's second parent, a transform that is no pose) is counted in
-    `problems`, and the rest is kept. Frames in a circle are named there, too.
+    `problems`, and the rest is kept. Frames in a circle and static transforms that were replaced
+    are named there, too.
 
     Args:
         prefix: of frame names, removed.
@@ -109,6 +142,7 @@ class TransformTree:
     def __init__(self, prefix: str = '') -> None:
         self._prefix = prefix
         self._edges: dict[tuple[str, str], _Edge] = {}
+        self._replaced: dict[str, _Replacement] = {}
         self._unusable: dict[str, int] = defaultdict(int)
 
     def add(self, message: Any, *, latched: bool = False) -> None:
@@ -116,7 +150,7 @@ class TransformTree:
 
         Args:
             message: of /tf or /tf_static.
-            latched: the transform holds until it is published again, as on a live /tf_static.
+            latched: of /tf_static; the transforms hold for all times, and the newest wins.
         """
         for item in message.transforms:
             edge = self.name(item.header.frame_id), self.name(item.child_frame_id)
@@ -137,11 +171,26 @@ class TransformTree:
         is_new = edge is None or stamp_ns is None and (numbers, None) != (edge.last, edge.stamp_ns)
         if edge is None or is_new:
             T = pose(numbers[:3], numbers[3:])
+            if stamp_ns is None:
+                self._replace(names, T)
             self._edges[names] = _Edge(T, numbers, T, T, stamp_ns)
             return
         edge.see(numbers, stamp_ns)
         if edge.stamp_ns is not None and stamp_ns is not None:
             edge.stamp_ns = max(edge.stamp_ns, stamp_ns)
+
+    def _replace(self, names: tuple[str, str], T: FloatArray) -> None:
+        """Note that a static transform replaces others: as in tf2, the newest holds for good."""
+        parent, child = names
+        others = [n for n, e in self._edges.items() if n[1] == child and e.stamp_ns is None]
+        for other in others:
+            before = self._edges[other].T
+            if other == names and np.abs(before - T).max() <= STILL:
+                continue
+            count = self._replaced[child].count + 1 if child in self._replaced else 1
+            self._replaced[child] = _Replacement(count, other[0], parent, before, T)
+            if other != names:
+                del self._edges[other]
 
     def forget_moving(self) -> None:
         """Forgets what /tf said (the clock jumped); /tf_static holds for good."""
@@ -163,6 +212,7 @@ class TransformTree:
             f'/tf: {count} transforms {edge} are no poses and were left out'
             for edge, count in self._unusable.items()
         ]
+        lines += [found.text(child) for child, found in self._replaced.items()]
         kept = self._parents()
         for (parent, child), edge in self._edges.items():
             if kept[child] != parent:
@@ -256,6 +306,10 @@ class TransformTree:
         edge = self._edges.get((self.name(link), self.name(frame)))
         return edge is not None and not edge.is_still
 
+    def still(self, link: str, frame: str) -> FloatArray:
+        """Return the transform (4, 4) from a link to a frame that does not move in it [m]."""
+        return self._edges[self.name(link), self.name(frame)].T
+
     def path(self, frame: str, link: str) -> list[tuple[str, str]]:
         """Returns the transforms, (parent, child), that lead from a frame to a link."""
         parents = self._parents()
@@ -330,20 +384,22 @@ def pose_track(
     links: Collection[str],
     stamps_ns: NDArray[np.int64],
     prefix: str = '',
+    static: Sequence[Any] = (),
 ) -> Mount:
     """Returns the poses of a frame that moves against every link of the robot.
 
     Args:
-        messages: TFMessages of /tf and /tf_static.
+        messages: TFMessages of /tf.
         frame: e.g. a camera's optical frame.
         links: of the robot; the nearest one counts.
         stamps_ns: (N,) when the poses are wanted; between two transforms they are interpolated.
         prefix: of frame names, removed.
+        static: TFMessages of /tf_static, in the order received.
 
     Raises:
         CalibrationError: TF does not lead to the robot, or has no transform near a stamp.
     """
-    tree = read_tree(messages, prefix)
+    tree = read_tree(messages, prefix, static)
     link = tree.moving_mount(frame, links).link
     T = {name: np.tile(np.eye(4), (len(stamps_ns), 1, 1)) for name in (frame, link)}
     series = _series(messages, tree, set(tree.path(frame, link)))
@@ -361,18 +417,15 @@ def pose_track(
 def _series(
     messages: Sequence[Any], tree: TransformTree, edges: set[tuple[str, str]]
 ) -> dict[tuple[str, str], dict[int, FloatArray]]:
-    """Transforms by stamp [ns] of each edge; of one that never moves the first alone, at 0."""
-    found: dict[tuple[str, str], dict[int, FloatArray]] = {edge: {} for edge in edges}
+    """Transforms by stamp [ns] of each edge; of one that never moves the one that holds, at 0."""
+    found = {edge: {} if tree.moves_in(*edge) else {0: tree.still(*edge)} for edge in edges}
     for item in (item for message in messages for item in message.transforms):
         edge = tree.name(item.header.frame_id), tree.name(item.child_frame_id)
-        if edge in found and (tree.moves_in(*edge) or not found[edge]):
+        if edge in found and tree.moves_in(*edge):
             p, q = item.transform.translation, item.transform.rotation
             stamp = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
-            if not _is_pose((p.x, p.y, p.z, q.x, q.y, q.z, q.w)):
-                continue
-            found[edge][stamp if tree.moves_in(*edge) else 0] = pose(
-                (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
-            )
+            if _is_pose((p.x, p.y, p.z, q.x, q.y, q.z, q.w)):
+                found[edge][stamp] = pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
     return found
 
 
@@ -409,9 +462,13 @@ def _between(
     return np.array(pin.SE3.Interpolate(pin.SE3(low), pin.SE3(high), share).homogeneous)
 
 
-def read_tree(messages: Iterable[Any], prefix: str = '') -> TransformTree:
-    """Returns the tree of TFMessages."""
+def read_tree(
+    messages: Iterable[Any], prefix: str = '', static: Iterable[Any] = ()
+) -> TransformTree:
+    """Return the tree of TFMessages of /tf and, in the order received, of /tf_static."""
     tree = TransformTree(prefix)
+    for message in static:
+        tree.add(message, latched=True)
     for message in messages:
         tree.add(message)
     return tree

@@ -5,7 +5,7 @@ from types import SimpleNamespace as Message
 import numpy as np
 import pytest
 
-from mtv_world_ros.data.transform_tree import pose_track, TransformTree
+from mtv_world_ros.data.transform_tree import pose_track, read_tree, TransformTree
 from mtv_world_ros.errors import CalibrationError
 
 LINKS = ('base', 'hand')
@@ -136,3 +136,41 @@ def test_frames_in_a_circle_are_named_and_counted_and_the_rest_is_kept():
     assert tree.mount('good', LINKS).link == 'base'
     with pytest.raises(CalibrationError, match="'optical': it hangs in a circle, 'c' -> 'a'"):
         tree.mount('optical', LINKS)
+
+
+def test_the_newest_static_transform_holds_for_all_times_and_is_said():
+    static = [message(edge('base', 'optical', x, stamp_s=k)) for k, x in enumerate((0.3, 0.35))]
+    tree = read_tree([], static=static)
+    mount = tree.mount('optical', LINKS)
+    assert mount.stamp_ns is None
+    np.testing.assert_allclose(mount.T_link_frame[:3, 3], (0.35, 0, 0))
+    (text,) = tree.problems
+    assert "/tf_static: the transform 'base' -> 'optical' was replaced once" in text
+    assert '50.0 mm and 0.00 degrees away; the newest holds for good' in text
+
+
+def test_the_turn_of_a_replaced_static_transform_is_said():
+    static = [message(edge('base', 'optical')), message(edge('base', 'optical', turn=TURNED))]
+    (text,) = read_tree([], static=static).problems
+    assert '0.0 mm and 28.65 degrees' in text  # 0.5 rad
+
+
+@pytest.mark.parametrize('change', [0.0, 1e-9], ids=['equal', 'rounded'])
+def test_a_static_transform_that_is_published_again_is_no_news(change):
+    static = [message(edge('base', 'optical', 0.3 + change * k, stamp_s=k)) for k in range(6)]
+    assert read_tree([], static=static).problems == []
+
+
+def test_a_static_transform_with_a_new_parent_replaces_the_old_one():
+    static = [message(edge('base', 'optical', 0.1)), message(edge('hand', 'optical', 0.2))]
+    tree = read_tree([], static=static)
+    assert tree.mount('optical', LINKS).link == 'hand'
+    (text,) = tree.problems
+    assert "'hand' -> 'optical' was replaced once, the last time that of 'base'" in text
+
+
+def test_a_static_transform_that_was_replaced_does_not_break_the_poses_of_a_moving_camera():
+    static = [message(edge('pan', 'optical', x, stamp_s=0)) for x in (0.5, 0.1)]
+    moving = [message(edge('base', 'pan', 0.2 * k, stamp_s=0.2 * k)) for k in range(6)]
+    track = pose_track(moving, 'optical', LINKS, np.array([0, 10**9]), static=static)
+    np.testing.assert_allclose(track.T_link_frame[:, 0, 3], (0.1, 1.1))
