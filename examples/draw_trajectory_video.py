@@ -14,6 +14,7 @@ import numpy as np
 
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration
+from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
@@ -36,9 +37,7 @@ positions[:, [0, 7]] = 0.5 * np.sin(2 * times)[:, None]
 positions[:, [6, 13]] += 0.015 * np.sin(6 * times)[:, None]
 
 video = render_trajectory_video(
-    cameras=tuple(cameras.values()),
-    robot=robot,
-    positions=positions,
+    motion=Motion.of(robot, cameras.values(), positions),
     times=times,
     object_masks=None,
     config=TrajectoryVideoConfig(link_width_m=0.02),

@@ -35,14 +35,22 @@ DISTORTION_MODELS = {
 }
 
 
-def _freeze(
+def freeze_array(
     owner: Any,
     field: str,
     shape: tuple[int | None, ...],
     dtype: type,
     error: type[MtvWorldError] = MtvWorldError,
 ) -> None:
-    """Casts, checks the shape of, and sets read-only one array field (None = any length)."""
+    """Cast an array field of a frozen dataclass, check its shape and make it read-only.
+
+    Args:
+        owner: the instance, in its `__post_init__`.
+        field: name of the field.
+        shape: expected shape; None = any length.
+        dtype: type of the numbers.
+        error: raised where the field is no such array.
+    """
     given = getattr(owner, field)
     try:
         array = np.asarray(given, dtype=dtype)
@@ -86,9 +94,9 @@ class CameraModel:
     T_mount_camera: FloatArray
 
     def __post_init__(self) -> None:
-        _freeze(self, 'K', (3, 3), np.float64, CalibrationError)
-        _freeze(self, 'T_mount_camera', (4, 4), np.float64, CalibrationError)
-        _freeze(self, 'distortion', (None,), np.float64, CalibrationError)
+        freeze_array(self, 'K', (3, 3), np.float64, CalibrationError)
+        freeze_array(self, 'T_mount_camera', (4, 4), np.float64, CalibrationError)
+        freeze_array(self, 'distortion', (None,), np.float64, CalibrationError)
         if self.width < 1 or self.height < 1:
             raise CalibrationError(
                 f"camera '{self.view}' has size {self.width}x{self.height}; both must be positive"
@@ -141,11 +149,11 @@ class JointTrajectory:
     def __post_init__(self) -> None:
         object.__setattr__(self, 'joint_names', tuple(self.joint_names))
         num_joints = len(self.joint_names)
-        _freeze(self, 'times', (None,), np.float64, TrajectoryError)
+        freeze_array(self, 'times', (None,), np.float64, TrajectoryError)
         num_points = len(self.times)
-        _freeze(self, 'positions', (num_points, num_joints), np.float64, TrajectoryError)
+        freeze_array(self, 'positions', (num_points, num_joints), np.float64, TrajectoryError)
         if self.velocities is not None:
-            _freeze(self, 'velocities', (num_points, num_joints), np.float64, TrajectoryError)
+            freeze_array(self, 'velocities', (num_points, num_joints), np.float64, TrajectoryError)
         if num_points == 0:
             raise TrajectoryError('the trajectory is empty: it needs at least one point')
         if not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
@@ -188,8 +196,10 @@ class Observation:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'cameras', tuple(self.cameras))
-        _freeze(self, 'frames', (len(self.cameras), None, None, 3), np.uint8, ObservationError)
-        _freeze(self, 'positions', (None,), np.float64, ObservationError)
+        freeze_array(
+            self, 'frames', (len(self.cameras), None, None, 3), np.uint8, ObservationError
+        )
+        freeze_array(self, 'positions', (None,), np.float64, ObservationError)
         height, width = self.frames.shape[1:3]
         for camera in self.cameras:
             if (camera.width, camera.height) != (width, height):
@@ -270,8 +280,8 @@ class MultiViewVideo:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'views', tuple(self.views))
-        _freeze(self, 'times', (None,), np.float64)
-        _freeze(self, 'frames', (len(self.views), len(self.times), None, None, 3), np.uint8)
+        freeze_array(self, 'times', (None,), np.float64)
+        freeze_array(self, 'frames', (len(self.views), len(self.times), None, None, 3), np.uint8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -296,7 +306,9 @@ class ObjectMasks:
     def __post_init__(self) -> None:
         object.__setattr__(self, 'names', tuple(self.names))
         object.__setattr__(self, 'status', tuple(tuple(row) for row in self.status))
-        _freeze(self, 'masks', (len(self.status), len(self.names), None, None, None), np.bool_)
+        freeze_array(
+            self, 'masks', (len(self.status), len(self.names), None, None, None), np.bool_
+        )
         if any(len(row) != len(self.names) for row in self.status):
             raise MtvWorldError(f'status has rows of other length than {len(self.names)} objects')
 
@@ -328,7 +340,7 @@ class SuccessEstimate:
     def __post_init__(self) -> None:
         object.__setattr__(self, 'reasons', tuple(self.reasons))
         object.__setattr__(self, 'features', MappingProxyType(dict(self.features)))
-        _freeze(self, 'jaccard', (None, None), np.float64)
+        freeze_array(self, 'jaccard', (None, None), np.float64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,6 +19,7 @@ from mtv_world_ros.data_types import (
 )
 from mtv_world_ros.errors import RolloutPreempted
 from mtv_world_ros.geometry.chunk_plan import ChunkPlan, plan_chunks
+from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.geometry.plan_limits import check_plan
 from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.prediction import mean_of_seeds, Prediction
@@ -150,8 +151,9 @@ class ImaginedEpisode:
         frames = np.stack([resize_frames(view, spec.width, spec.height) for view in frames])
         start_masks = self.pipeline.find(self, state)
         masks = self.pipeline.follow(self, state, start_masks, frames)
+        motion = Motion.of(self.pipeline.robot, state.observation.cameras, positions)
         success, memory = self.pipeline.judge(
-            self, state, positions, start_masks, masks, is_real=True
+            self, state, motion, start_masks, masks, is_real=True
         )
         stamp_ns = state.observation.stamp_ns + round(frames.shape[1] / spec.fps * 1e9)
         state = state.after(

@@ -7,12 +7,9 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Protocol
 
-import numpy as np
-
 from mtv_world_ros.data_types import (
     BoolArray,
     ByteArray,
-    CameraModel,
     FloatArray,
     History,
     MultiViewVideo,
@@ -21,8 +18,8 @@ from mtv_world_ros.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.foresight.episode_objects import Majority, ObjectForesight
-from mtv_world_ros.geometry.camera import tools_in_view
 from mtv_world_ros.geometry.chunk_plan import ChunkPlan
+from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.geometry.object_motion import ObjectMotionModel
 from mtv_world_ros.geometry.robot.model import LIMIT_TOLERANCE, RobotModel
 from mtv_world_ros.geometry.robot.shape import LinkShape
@@ -185,7 +182,9 @@ class Pipeline:
         """Returns one chunk of one rollout, stage by stage, and the rollout's state after it."""
         start, clock = state.observation, StageClock()
         num_steps = episode.num_inference_steps or self.spec.num_inference_steps
-        shown = [tools_in_view(c, self.robot, plan.positions) for c in start.cameras]
+        links = {part.link for part in self.parts}
+        motion = Motion.of(self.robot, start.cameras, plan.positions, links)
+        in_view = motion.tools_in_view()
         start_masks = self.find(episode, state)
         clock.lap('start masks')
         objects = state.objects.foresee(
@@ -197,10 +196,10 @@ class Pipeline:
             state.is_begun,
             episode.should_stop,
         )
-        pictures = objects.pictures(plan, start)
+        pictures = objects.pictures(plan, motion)
         clock.lap('object motion')
-        arms = arm_pictures(self.parts, self.robot, start.cameras, start.frames, plan.positions)
-        control = self.draw(start.cameras, plan.positions, plan.times, start_masks, pictures, arms)
+        arms = arm_pictures(self.parts, motion, start.frames)
+        control = self.draw(motion, plan.times, start_masks, pictures, arms)
         clock.lap('trajectory video')
         frames = self.world_model.predict(
             start.frames,
@@ -214,23 +213,23 @@ class Pipeline:
         clock.lap('model')
         masks = self.follow(episode, state, start_masks, frames)
         clock.lap('masks')
-        positions = plan.positions[: plan.num_frames + 1]
+        motion = motion.first(plan.num_frames + 1)
         foreseen = objects.motions(plan, state.is_begun)
-        success, memory = self.judge(episode, state, positions, start_masks, masks, foreseen)
-        unseen = () if any(shown) else (_UNSEEN,)
+        success, memory = self.judge(episode, state, motion, start_masks, masks, foreseen)
+        unseen = () if in_view.any() else (_UNSEEN,)
         success = doubted(success, (*objects.reasons, *unseen))
         success = doubted(success, refusal=objects.refusal)
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
         state = state.after(
-            frames, positions[-1], stamp_ns, self.spec.num_history, memory, objects
+            frames, motion.positions[-1], stamp_ns, self.spec.num_history, memory, objects
         )
         prediction = Prediction(
             start=start,
             video=MultiViewVideo(views=start.views, times=times, frames=frames),
             seed=seed,
-            positions=positions[1:],
+            positions=motion.positions[1:],
             trajectory_video=control,
             start_masks=start_masks,
             masks=masks,
@@ -243,7 +242,7 @@ class Pipeline:
             segmenter=self.segmenter.name,
             num_inference_steps=num_steps,
             foreseen=None if foreseen is None else foreseen.at_frames(plan),
-            in_view=np.array(shown),
+            in_view=in_view,
             seconds=MappingProxyType(clock.seconds),
         )
         return prediction, state
@@ -254,8 +253,7 @@ class Pipeline:
 
     def draw(
         self,
-        cameras: tuple[CameraModel, ...],
-        positions: FloatArray,
+        motion: Motion,
         times: FloatArray,
         start_masks: ObjectMasks,
         objects: ByteArray | None = None,
@@ -264,17 +262,14 @@ class Pipeline:
         """Returns the 1 + T frames of the trajectory video, at the cameras' size.
 
         Args:
-            cameras: V cameras.
-            positions: (1 + T, J) [rad or m].
+            motion: 1 + T states of the robot, seen by V cameras.
             times: (1 + T,) [s].
             start_masks: of the start frame.
             objects: (V, 1 + T, H, W, 4) of `moved_pictures`, in place of the masks.
             arms: (V, 1 + T, H, W, 4) of `arm_pictures`.
         """
         return render_trajectory_video(
-            cameras=cameras,
-            robot=self.robot,
-            positions=positions,
+            motion=motion,
             times=times,
             object_masks=start_masks.masks[:, :, 0] if self.object_mask else None,
             objects=objects,
@@ -301,16 +296,16 @@ class Pipeline:
         self,
         episode: ImaginedEpisode,
         state: RolloutState,
-        positions: FloatArray,
+        motion: Motion,
         start_masks: ObjectMasks,
         masks: ObjectMasks,
         foreseen: ForeseenMotions | None = None,
         *,
         is_real: bool = False,
     ) -> JudgedChunk:
-        """Returns the estimate after a chunk with joints at (1 + T, J), and what it remembers."""
-        cameras, check = state.observation.cameras, episode.camera_check
-        footage = footage_of(self.robot, cameras, positions, start_masks, masks)
+        """Returns the estimate after a chunk of 1 + T states, and what it remembers."""
+        check = episode.camera_check
+        footage = footage_of(motion, start_masks, masks)
         judged = self.estimator.estimate(
             footage, episode.instruction, state.memory, foreseen, is_real=is_real
         )

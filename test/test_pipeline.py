@@ -22,6 +22,7 @@ from mtv_world_ros.foresight import solid_foresight
 from mtv_world_ros.foresight.loading import load_foresight
 from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.mask_geometry import centroids, locate
+from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.geometry.object_motion import ObjectMotion
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.shape import load_shape
@@ -324,11 +325,10 @@ def test_the_last_chunk_alone_is_imagined_from_what_was_seen(pipeline, world_mod
     assert world_model.seeds == [3]
     drawn = world_model.trajectories[0][:, 0].astype(int)
     masks = pipeline.segmenter.segment(stretch.frames[:, :1], ())
+    motions = [Motion.of(YAM, recording.cameras, row[None]) for row in stretch.positions]
     away = [
-        np.abs(
-            pipeline.draw(recording.cameras, row[None], np.zeros(1), masks).frames[:, 0] - drawn
-        ).mean()
-        for row in stretch.positions
+        np.abs(pipeline.draw(motion, np.zeros(1), masks).frames[:, 0] - drawn).mean()
+        for motion in motions
     ]
     assert np.argmin(away) == stretch.num_frames - SPEC.num_frames
 
@@ -528,12 +528,9 @@ def test_an_engine_that_diverges_is_named_and_there_is_no_verdict(
 def test_control_frame_zero_shows_the_observed_state(pipeline, world_model, recording):
     """And frame k the state after command k: a later start shifts the frames, not the first."""
     (chunk,) = imagine(pipeline, recording, 1.6)
-    drawn = pipeline.draw(
-        recording.cameras,
-        np.stack([recording.positions[0], chunk.positions[0]]),
-        np.array([0.0, 0.2]),
-        chunk.start_masks,
-    )
+    rows = np.stack([recording.positions[0], chunk.positions[0]])
+    motion = Motion.of(YAM, recording.cameras, rows)
+    drawn = pipeline.draw(motion, np.array([0.0, 0.2]), chunk.start_masks)
     assert np.array_equal(world_model.trajectories[0][:, :2], drawn.frames)
 
 
@@ -545,7 +542,8 @@ def test_arms_are_drawn_as_the_frame_that_each_chunk_starts_from_shows_them(
     parts = load_shape(YAM).parts
     for chunk, control in zip(chunks, world_model.trajectories, strict=True):
         start = chunk.start.frames
-        arms = arm_pictures(parts, YAM, chunk.start.cameras, start, chunk.start.positions[None])
+        rows, links = chunk.start.positions[None], {part.link for part in parts}
+        arms = arm_pictures(parts, Motion.of(YAM, chunk.start.cameras, rows, links), start)
         (visible,) = np.moveaxis(arms[:, :, ..., 3] > 0, 1, 0)
         assert visible.mean() > 0.05
         # trails and objects lie over some of it

@@ -8,12 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
-from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray, ObjectMasks, Observation
+from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks, Observation
 from mtv_world_ros.errors import RolloutPreempted
-from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.chunk_plan import ChunkPlan
+from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.geometry.object_motion import FoundObjects, ObjectMotionModel
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.rendering.images import resize_frames
@@ -98,12 +96,17 @@ class ObjectForesight:
             after, found=replace(found, shown=shown, shown_before=self._shown_before(shown))
         )
 
-    def pictures(self, plan: ChunkPlan, observation: Observation) -> ByteArray | None:
-        """Returns the objects on their way through a chunk (V, 1 + T, H, W, 4); None = unknown."""
+    def pictures(self, plan: ChunkPlan, motion: Motion) -> ByteArray | None:
+        """Returns the objects on their way through a chunk (V, 1 + T, H, W, 4); None = unknown.
+
+        Args:
+            plan: the chunk.
+            motion: of the robot and the cameras at its 1 + T states.
+        """
         if self.found is None:
             return None
-        poses = _camera_poses(self.robot, plan.positions, observation)
-        return self.found.pictures(plan.times - plan.times[0], observation.cameras, poses)
+        times = plan.times - plan.times[0]
+        return self.found.pictures(times, motion.cameras, motion.camera_poses)
 
     def motions(self, plan: ChunkPlan, is_begun: bool) -> ForeseenMotions | None:
         """Returns the futures until the end of what is kept of a chunk; None = they do not count.
@@ -193,17 +196,10 @@ class ObjectForesight:
         """
         assert self.model is not None
         sharp = self.segmenter.segment(source.frames[:, None], names).masks[:, :, 0]
-        poses = _camera_poses(self.robot, source.positions[None], source)[:, 0]
+        poses = Motion.of(self.robot, source.cameras, source.positions[None]).camera_poses[:, 0]
         given = names, sharp, source.cameras, list(poses)
         if whole is None:
             return FoundObjects.at(names, frames, masks, poses, self.model.find(*given))
         tracked, same, hidden = self.model.find_again(whole.tracked, *given)
         found = FoundObjects.at(names, frames, masks, poses, tracked).shown_as(whole, hidden)
         return replace(found, is_whole=bool(same.all()))
-
-
-def _camera_poses(
-    robot: RobotModel, positions: FloatArray, observation: Observation
-) -> FloatArray:
-    """(V, N, 4, 4) T_base_camera of an observation's cameras at positions (N, J)."""
-    return np.stack([camera_poses(camera, robot, positions) for camera in observation.cameras])

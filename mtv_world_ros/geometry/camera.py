@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray
+from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.transforms import inverse
@@ -30,14 +30,14 @@ _LARGEST_COEFFICIENT = 1e4
 _PARALLEL = 1e9
 
 
-def camera_poses(camera: CameraModel, robot: RobotModel, positions: FloatArray) -> FloatArray:
-    """Returns T_base_camera (T, 4, 4) for positions (T, J); constant for a fixed camera.
+def check_mount(camera: CameraModel, robot: RobotModel) -> None:
+    """Check that the robot's joints determine the pose of the link that carries a camera.
 
     Raises:
         CalibrationError: a joint carries it that is not among the robot's joints.
     """
     if camera.mount_link == robot.base_link:
-        return np.repeat(camera.T_mount_camera[None], len(positions), axis=0)
+        return
     unknown = robot.unknown_joints(camera.mount_link)
     if unknown:
         raise CalibrationError(
@@ -46,6 +46,17 @@ def camera_poses(camera: CameraModel, robot: RobotModel, positions: FloatArray) 
             "it to 'joints' of the robot's YAML, take the pose from /tf, or give it in a link "
             'that the joint does not move'
         )
+
+
+def camera_poses(camera: CameraModel, robot: RobotModel, positions: FloatArray) -> FloatArray:
+    """Returns T_base_camera (T, 4, 4) for positions (T, J); constant for a fixed camera.
+
+    Raises:
+        CalibrationError: a joint carries it that is not among the robot's joints.
+    """
+    if camera.mount_link == robot.base_link:
+        return np.repeat(camera.T_mount_camera[None], len(positions), axis=0)
+    check_mount(camera, robot)
     return robot.link_poses(camera.mount_link, positions) @ camera.T_mount_camera
 
 
@@ -74,33 +85,6 @@ def project(
     elif camera.distortion.any():
         xy = distort(camera.distortion, xy)
     return xy @ camera.K[:2, :2].T + camera.K[:2, 2], depth
-
-
-def tools_in_view(camera: CameraModel, robot: RobotModel, positions: FloatArray) -> float:
-    """Returns the share of the states (T, J) in which the image shows a tool point of any arm.
-
-    Raises:
-        CalibrationError: a tool is not in the image though without the lens' distortion it would
-            be in the inner half of it, which no lens does: the distortion is wrong.
-    """
-    poses = camera_poses(camera, robot, positions)
-    points = robot.tool_poses(positions)[..., :3, 3]
-    size = np.array([camera.width, camera.height])
-
-    def is_within(seen_by: CameraModel, margin: float) -> BoolArray:
-        pixels, _ = project(seen_by, poses, points)
-        with np.errstate(invalid='ignore'):  # NaN: not in front of the camera
-            inside = np.abs(pixels - (size - 1) / 2) <= (0.5 - margin) * size
-        return np.asarray(inside.all(axis=-1))
-
-    seen = is_within(camera, 0.0)
-    pinhole = replace(camera, distortion_model='none', distortion=np.zeros(0))
-    if (is_within(pinhole, 0.25) & ~seen).any():
-        raise CalibrationError(
-            f"the tool should be in the middle of view '{camera.view}', but its distortion "
-            f'{camera.distortion.tolist()} moves it out of the image; calibrate the lens again'
-        )
-    return float(seen.any(axis=0).mean())
 
 
 def unproject(camera: CameraModel, pixels: FloatArray) -> FloatArray:

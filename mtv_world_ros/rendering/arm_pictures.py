@@ -5,15 +5,15 @@ V views, T frames, J joints, H W pixels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mtv_world_ros.data_types import BoolArray, ByteArray, CameraModel, FloatArray
-from mtv_world_ros.geometry.camera import camera_poses, project
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.camera import project
+from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.geometry.robot.shape import LinkShape
 from mtv_world_ros.geometry.silhouettes import project_part
 
@@ -30,11 +30,7 @@ _SHIFT = 4
 
 
 def arm_pictures(
-    parts: Sequence[LinkShape],
-    robot: RobotModel,
-    cameras: Sequence[CameraModel],
-    start_frame: ByteArray,
-    positions: FloatArray,
+    parts: Sequence[LinkShape], motion: Motion, start_frame: ByteArray
 ) -> ByteArray | None:
     """Returns the robot alone, (V, T, H, W, 4) uint8 RGB and cover; None without parts.
 
@@ -45,20 +41,20 @@ def arm_pictures(
 
     Args:
         parts: convex parts of the robot's links.
-        robot: its kinematics.
-        cameras: V cameras at the frames' size.
+        motion: T states of the robot with the parts' links, row 0 at the start frame; V cameras
+            at the frames' size.
         start_frame: (V, H, W, 3) uint8 RGB.
-        positions: (T, J) [rad or m]; row 0 those of the start frame.
     """
     if not parts:
         return None
     links = list(dict.fromkeys(part.link for part in parts))
     numbers = np.array([links.index(part.link) for part in parts])
-    poses = robot.forward_kinematics(positions)
-    size = (len(positions), cameras[0].height, cameras[0].width, 4)
+    poses, cameras = motion.links, motion.cameras
+    size = (len(motion.positions), cameras[0].height, cameras[0].width, 4)
     shown = np.zeros((len(cameras), *size), np.uint8)
-    for pictures, camera, frame in zip(shown, cameras, start_frame, strict=True):
-        T_base_camera = camera_poses(camera, robot, positions)
+    for pictures, camera, T_base_camera, frame in zip(
+        shown, cameras, motion.camera_poses, start_frame, strict=True
+    ):
         pixels = [project_part(part, poses[part.link], camera, T_base_camera) for part in parts]
         depths = _depths(parts, poses, camera, T_base_camera)
         seen = _seen_links(pixels, depths, numbers, camera)
@@ -71,7 +67,7 @@ def arm_pictures(
 
 def _depths(
     parts: Sequence[LinkShape],
-    poses: dict[str, FloatArray],
+    poses: Mapping[str, FloatArray],
     camera: CameraModel,
     T_base_camera: FloatArray,
 ) -> FloatArray:

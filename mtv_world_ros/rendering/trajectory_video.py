@@ -24,8 +24,8 @@ from mtv_world_ros.data_types import (
     MultiViewVideo,
 )
 from mtv_world_ros.errors import ObservationError, TrajectoryError
-from mtv_world_ros.geometry.camera import camera_poses, project
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.camera import project
+from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.rendering.glow import (
     Box,
     FAINTEST,
@@ -118,9 +118,7 @@ _FINGER_COLOURS = (_WHITE, np.array([1.0, 0.0, 1.0]))
 
 def render_trajectory_video(
     *,
-    cameras: Sequence[CameraModel],
-    robot: RobotModel,
-    positions: FloatArray,
+    motion: Motion,
     times: FloatArray,
     object_masks: BoolArray | None,
     config: TrajectoryVideoConfig,
@@ -130,9 +128,8 @@ def render_trajectory_video(
     """Draws the trajectory into each view, at the cameras' size.
 
     Args:
-        cameras: V cameras of one size.
-        robot: gives the tool points.
-        positions: (T, J) joint positions; frame k shows row k, row 0 is the current state.
+        motion: T states of the robot, and V cameras of one size; frame k shows state k, state 0
+            is the current one.
         times: (T,) [s], increasing.
         object_masks: (V, O, H, W) masks of the first frame, held over all frames; or None.
         objects: (V, T, H, W, 4) uint8 of `moved_pictures`, in place of masks; or None.
@@ -143,22 +140,22 @@ def render_trajectory_video(
         (V, T, H, W, 3) frames.
 
     Raises:
-        TrajectoryError: positions and times do not fit together.
+        TrajectoryError: motion and times do not fit together.
         ObservationError: cameras of different sizes, or masks of another size.
     """
-    positions, times = np.asarray(positions, np.float64), np.asarray(times, np.float64)
-    _check(cameras, positions, times, object_masks)
-    motion = tool_motion(robot, positions, times, config.points_per_frame, config.max_gap_m)
-    lines = () if config.link_width_m is None else robot.arm_points(positions)
+    cameras, times = motion.cameras, np.asarray(times, np.float64)
+    _check(motion, times, object_masks)
+    tools = tool_motion(motion, times, config.points_per_frame, config.max_gap_m)
+    lines = () if config.link_width_m is None else motion.arm_points
     shape = (len(cameras), len(times), cameras[0].height, cameras[0].width, 3)
     frames = np.zeros(shape, np.uint8)
     for view, camera in enumerate(cameras):
         masks = () if object_masks is None or objects is not None else object_masks[view]
         fills = _fills(camera, masks, config)
-        poses = camera_poses(camera, robot, positions)
+        poses = motion.camera_poses[view]
         links = ArmLinks(camera, poses, lines, config.link_width_m)
         over = [None if pictures is None else pictures[view] for pictures in (arms, objects)]
-        _draw_view(frames[view], fills, camera, poses, links, motion, config, *over)
+        _draw_view(frames[view], fills, camera, poses, links, tools, config, *over)
     return MultiViewVideo(views=tuple(c.view for c in cameras), times=times, frames=frames)
 
 
@@ -172,13 +169,9 @@ def object_colour(index: int, fill: float) -> FloatArray:
     return np.array(colorsys.hsv_to_rgb((0.36 + index * 0.381966) % 1.0, 0.7, fill))
 
 
-def _check(
-    cameras: Sequence[CameraModel],
-    positions: FloatArray,
-    times: FloatArray,
-    masks: BoolArray | None,
-) -> None:
-    if positions.ndim != 2 or times.shape != positions.shape[:1] or len(times) == 0:
+def _check(motion: Motion, times: FloatArray, masks: BoolArray | None) -> None:
+    cameras, positions = motion.cameras, motion.positions
+    if times.shape != positions.shape[:1] or len(times) == 0:
         raise TrajectoryError(
             f'positions {positions.shape} and times {times.shape} do not fit together; they must '
             'be (T, J) and (T,) with T >= 1'
@@ -381,47 +374,43 @@ class ToolMotion:
 
 
 def tool_motion(
-    robot: RobotModel,
-    positions: FloatArray,
-    times: FloatArray,
-    points_per_frame: int,
-    max_gap_m: float | None,
+    motion: Motion, times: FloatArray, points_per_frame: int, max_gap_m: float | None
 ) -> ToolMotion:
     """Interpolates the joints between the frames, so that trails follow the arms' arcs.
 
     Args:
-        robot: gives the tool points.
-        positions: (T, J) at the frames [rad or m].
+        motion: at the T frames.
         times: (T,) of the frames [s].
         points_per_frame: least number of points from one frame to the next.
         max_gap_m: largest distance of neighbouring points [m]; None = any.
     """
     counts = np.full(len(times) - 1, points_per_frame)
     if max_gap_m is not None:
-        points = robot.tool_poses(positions)[..., :3, 3]
-        steps = np.linalg.norm(np.diff(points, axis=1), axis=-1).max(axis=0, initial=0.0)
+        steps = np.linalg.norm(np.diff(motion.tool_points, axis=1), axis=-1).max(
+            axis=0, initial=0.0
+        )
         needed = np.ceil(np.minimum(steps / max_gap_m, _MOST_POINTS)).astype(int)
         counts = np.maximum(counts, needed)
     shown_at = np.concatenate([[0], np.cumsum(counts)])
     fine = np.interp(np.arange(shown_at[-1] + 1), shown_at, np.arange(len(times)))
     left = np.minimum(fine.astype(int), max(len(times) - 2, 0))
     right, share = np.minimum(left + 1, len(times) - 1), fine - left
+    positions = motion.positions
     dense = (1 - share)[:, None] * positions[left] + share[:, None] * positions[right]
     return ToolMotion(
         times=(1 - share) * times[left] + share * times[right],
-        points=robot.tool_poses(dense)[..., :3, 3],
-        closed=1.0 - robot.gripper_openings(positions),
-        fingers=_fingers(robot, positions),
+        points=motion.robot.tool_poses(dense)[..., :3, 3],
+        closed=1.0 - motion.openings,
+        fingers=_fingers(motion),
         shown_at=shown_at,
     )
 
 
-def _fingers(robot: RobotModel, positions: FloatArray) -> tuple[FloatArray, ...]:
+def _fingers(motion: Motion) -> tuple[FloatArray, ...]:
     """Two points along each finger, (2, T, 3) [m]: of each arm the left, then the right one."""
-    poses, openings = robot.tool_poses(positions), robot.gripper_openings(positions)
     lines = []
-    for tool, pose, opening in zip(robot.tools, poses, openings, strict=True):
-        apart = np.full(len(positions), np.nan)
+    for tool, pose, opening in zip(motion.robot.tools, motion.tools, motion.openings, strict=True):
+        apart = np.full(len(pose), np.nan)
         if tool.finger_travel_m is not None:
             apart = tool.finger_travel_m * opening
         for side in (1.0, -1.0):

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray, ObjectMasks
-from mtv_world_ros.geometry.camera import camera_poses, project
+from mtv_world_ros.geometry.camera import project
 from mtv_world_ros.geometry.mask_geometry import centroids, lean, locate_all
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.geometry.motion import Motion
 
 #: frames whose places are kept; the start is kept whatever follows
 MAX_FRAMES = 2000
@@ -62,21 +62,15 @@ class Footage:
         return ok.reshape(masks.shape[:2]) & masks.any((-2, -1))
 
 
-def footage_of(
-    robot: RobotModel,
-    cameras: Sequence[CameraModel],
-    positions: FloatArray,
-    start_masks: ObjectMasks,
-    masks: ObjectMasks,
-) -> Footage:
-    """Returns the footage of a chunk at joint positions (1 + T, J), row 0 at the start masks."""
+def footage_of(motion: Motion, start_masks: ObjectMasks, masks: ObjectMasks) -> Footage:
+    """Returns the footage of a chunk of 1 + T states, the first at the start masks."""
     return Footage(
         masks=masks,
         start_masks=start_masks,
-        cameras=cameras,
-        poses=np.stack([camera_poses(camera, robot, positions) for camera in cameras]),
-        tools=robot.tool_poses(positions)[..., :3, 3],
-        openings=robot.gripper_openings(positions),
+        cameras=motion.cameras,
+        poses=motion.camera_poses,
+        tools=motion.tool_points,
+        openings=motion.openings,
     )
 
 

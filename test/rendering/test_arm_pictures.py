@@ -5,6 +5,7 @@ import numpy as np
 
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.files import share_path
+from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.geometry.robot.shape import LinkShape, load_shape
 from mtv_world_ros.lab.recordings import cut_clip
 from mtv_world_ros.lab.training.training_config import load_training_config
@@ -40,7 +41,12 @@ def drawn(robot, camera, tools, frame, parts=None):
     """(T, H, W, 4) of one view, for tool points (T, 3)."""
     positions = np.column_stack([np.asarray(tools, float), np.ones(len(tools))])
     parts = parts or [LinkShape(link='hand0', points=PLATE)]
-    return arm_pictures(parts, robot, [camera], frame[None], positions)[0]
+    return pictures_of(parts, robot, [camera], frame[None], positions)[0]
+
+
+def pictures_of(parts, robot, cameras, frames, positions):
+    links = {part.link for part in parts}
+    return arm_pictures(parts, Motion.of(robot, cameras, positions, links), frames)
 
 
 def test_a_link_goes_where_the_camera_will_see_it(one_arm, make_camera):
@@ -82,7 +88,7 @@ def test_near_links_cover_far_ones(two_arms, make_camera):
     for first, covers in ((near, False), (far, True)):
         second = near if covers else far
         positions = np.array([[*first, 1, *side, 1], [*first, 1, *second, 1]], float)
-        picture = arm_pictures(parts, two_arms, [camera], frame[None], positions)[0, 1]
+        picture = pictures_of(parts, two_arms, [camera], frame[None], positions)[0, 1]
         seen = np.abs(picture[72, 90, :3].astype(int) - PAINT).max() < 12
         assert seen == covers
 
@@ -94,7 +100,7 @@ def test_drawn_arms_are_nearer_to_the_recorded_frame_than_held_ones(robot):
     errors = []
     for start in range(0, 40, 8):
         clip = cut_clip(recording, start, spec)
-        pictures = arm_pictures(
+        pictures = pictures_of(
             load_shape(robot).parts, robot, clip.cameras, clip.frames[:, 0], clip.positions
         )
         moved = (pictures[:, -1, ..., 3] > 0) & (pictures[:, 0, ..., 3] == 0)
@@ -113,7 +119,7 @@ def test_trails_lie_over_the_arms(one_arm, make_camera):
     arms = drawn(one_arm, camera, tools, start_frame(camera, tools[0]))
     video = {
         name: render_trajectory_video(
-            cameras=[camera], robot=one_arm, positions=positions, times=np.arange(2) / 5,
+            motion=Motion.of(one_arm, [camera], positions), times=np.arange(2) / 5,
             object_masks=None, config=TrajectoryVideoConfig(), arms=pictures,
         ).frames[0]
         for name, pictures in (('trails', None), ('arms', arms[None]))

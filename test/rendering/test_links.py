@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,
     render_trajectory_video,
@@ -21,9 +22,7 @@ def render(robot, camera, tools, config=LINKS):
     tools = np.asarray(tools, float)
     positions = np.concatenate([tools, np.ones((*tools.shape[:2], 1))], axis=2)
     return render_trajectory_video(
-        cameras=[camera],
-        robot=robot,
-        positions=positions.reshape(len(tools), -1),
+        motion=Motion.of(robot, [camera], positions.reshape(len(tools), -1)),
         times=np.arange(len(tools)) / 5,
         object_masks=None,
         config=config,

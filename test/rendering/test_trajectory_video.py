@@ -7,6 +7,7 @@ import pytest
 
 from mtv_world_ros.errors import ConfigError, ObservationError, TrajectoryError
 from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.geometry.robot.model import RobotModel, Tool
 from mtv_world_ros.rendering.trajectory_video import (
     arm_colour,
@@ -26,10 +27,10 @@ def render(robot, cameras, points, times=None, *, grips=OPEN, masks=None, config
     num_arms, num_frames, _ = points.shape
     grips = np.broadcast_to(grips, (num_arms, num_frames))
     positions = np.concatenate([points, grips[..., None]], axis=2)
+    cameras = [cameras] if not isinstance(cameras, list) else cameras
+    rows = positions.transpose(1, 0, 2).reshape(num_frames, -1)
     video = render_trajectory_video(
-        cameras=[cameras] if not isinstance(cameras, list) else cameras,
-        robot=robot,
-        positions=positions.transpose(1, 0, 2).reshape(num_frames, -1),
+        motion=Motion.of(robot, cameras, rows),
         times=np.arange(num_frames) / 5 if times is None else np.asarray(times, float),
         object_masks=masks,
         config=config,
@@ -330,7 +331,7 @@ def test_a_wrist_camera_redraws_the_past_from_where_it_is_now(two_arms, make_cam
 def test_views_times_and_frames_belong_together(two_arms, make_camera):
     cameras = [make_camera(), make_camera(view='side', T_mount_camera=np.diag([-1.0, 1, -1, 1]))]
     video = render_trajectory_video(
-        cameras=cameras, robot=two_arms, positions=np.zeros((3, 8)), times=np.array([0, 0.2, 0.4]),
+        motion=Motion.of(two_arms, cameras, np.zeros((3, 8))), times=np.array([0, 0.2, 0.4]),
         object_masks=None, config=TrajectoryVideoConfig(),
     )  # fmt: skip
     assert video.views == ('front', 'side')
@@ -352,10 +353,11 @@ def test_views_times_and_frames_belong_together(two_arms, make_camera):
 )
 def test_what_does_not_fit_together_is_refused(one_arm, make_camera, changes, error, says):
     given = {'sizes': ((96, 72),), 'times': (0, 1, 2), 'masks': None, **changes}
+    cameras = [make_camera(*size) for size in given['sizes']]
     with pytest.raises(error, match=says):
         render_trajectory_video(
-            cameras=[make_camera(*size) for size in given['sizes']], robot=one_arm,
-            positions=np.zeros((3, 4)), times=np.array(given['times'], float),
+            motion=Motion.of(one_arm, cameras, np.zeros((3, 4))),
+            times=np.array(given['times'], float),
             object_masks=given['masks'] and np.zeros(given['masks'], bool), config=PLAIN,
         )  # fmt: skip
 

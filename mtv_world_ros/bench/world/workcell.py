@@ -110,7 +110,7 @@ def workcell_of(robot: RobotModel) -> Workcell:
     arms = [tool.arm for tool in robot.tools]
     if list(file.arms) != arms:
         raise SimulatorError(f"'{path}' has arms {list(file.arms)}, the robot has {arms}")
-    points = robot.arm_points(np.zeros((1, len(robot.joint_names))))
+    points = robot.kinematics(np.zeros((1, len(robot.joint_names)))).arm_points
     return Workcell(
         base_link=robot.base_link,
         bases={arm: _plane(chain[0, 0]) for arm, chain in zip(arms, points, strict=True)},

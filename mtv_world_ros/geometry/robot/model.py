@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,6 +68,23 @@ class Mimic:
     source: str
     multiplier: float = 1.0
     offset: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kinematics:
+    """Poses of a robot in its base link, for T positions of its joints.
+
+    Attributes:
+        links: T_base_link (T, 4, 4) by name [m].
+        tools: (A, T, 4, 4) T_base_tool of the tool centre points [m].
+        arm_points: for each arm points (N, T, 3) along it: the origins of the joints that carry
+            its tool, from the base on, and the tool centre point; lines between them are a
+            skeleton of the arm [m].
+    """
+
+    links: Mapping[str, FloatArray]
+    tools: FloatArray
+    arm_points: tuple[FloatArray, ...]
 
 
 class RobotModel:
@@ -158,38 +175,41 @@ class RobotModel:
 
     def forward_kinematics(self, positions: FloatArray) -> dict[str, FloatArray]:
         """Returns base_T_link (T, 4, 4) of every link for positions (T, J)."""
-        return dict(zip(self._frames, self._poses(positions, self.link_names), strict=True))
+        return self._placements(positions, self.link_names)[0]
 
     def link_poses(self, link: str, positions: FloatArray) -> FloatArray:
         """Returns base_T_link (T, 4, 4) of one link for positions (T, J)."""
-        return self._poses(positions, (link,))[0]
+        return self._placements(positions, (link,))[0][link]
 
     def tool_poses(self, positions: FloatArray) -> FloatArray:
         """Returns base_T_tool (A, T, 4, 4) of the tool centre points for positions (T, J)."""
-        offsets = np.stack([tool.T_link_tool for tool in self.tools])
-        return self._poses(positions, [tool.link for tool in self.tools]) @ offsets[:, None]
+        links = [tool.link for tool in self.tools]
+        return self._tool_poses(self._placements(positions, links)[0])
 
-    def arm_points(self, positions: FloatArray) -> list[FloatArray]:
-        """Returns, for each arm, points (N, T, 3) along it for positions (T, J).
+    def kinematics(self, positions: FloatArray, links: Sequence[str] = ()) -> Kinematics:
+        """Return the poses of tools and links and the points along each arm, in one pass.
 
-        They are the origins of the joints that carry its tool, from the base on, and the tool
-        centre point; lines between them are a skeleton of the arm [m].
+        Args:
+            positions: (T, J) [rad or m].
+            links: names of the links.
+
+        Raises:
+            RobotError: there is no such link, or the positions have another shape.
         """
-        model, data = self.pinocchio_model, self.pinocchio_model.createData()
-        frames = [self._frame(tool.link) for tool in self.tools]
-        chains = [list(model.supports[model.frames[frame].parentJoint])[1:] for frame in frames]
-        base = self._frame(self.base_link)
-        configurations = self.configurations(positions)
-        arms = [np.empty((len(chain) + 1, len(configurations), 3)) for chain in chains]
-        for t, configuration in enumerate(configurations):
-            pin.forwardKinematics(model, data, configuration)
-            to_base = pin.updateFramePlacement(model, data, base).inverse()
-            for points, chain, frame, tool in zip(arms, chains, frames, self.tools, strict=True):
-                for n, joint in enumerate(chain):
-                    points[n, t] = to_base.act(data.oMi[joint].translation)
-                link = to_base * pin.updateFramePlacement(model, data, frame)
-                points[-1, t] = link.act(tool.T_link_tool[:3, 3])
-        return arms
+        wanted = (*links, *(tool.link for tool in self.tools))
+        chains = self._chains()
+        joints = sorted({joint for chain in chains for joint in chain})
+        poses, origins = self._placements(positions, wanted, joints)
+        tools = self._tool_poses(poses)
+        arm_points = (
+            np.stack([*(origins[joint] for joint in chain), tool[:, :3, 3]])
+            for chain, tool in zip(chains, tools, strict=True)
+        )
+        return Kinematics(
+            links={name: poses[name] for name in links},
+            tools=tools,
+            arm_points=tuple(arm_points),
+        )
 
     def gripper_openings(self, positions: FloatArray) -> FloatArray:
         """Returns (A, T) openings in [0, 1] for positions (T, J); 1 where there is no gripper."""
@@ -217,18 +237,39 @@ class RobotModel:
             follows[setter.velocity, setter.column] = setter.multiplier
         return follows
 
-    def _poses(self, positions: FloatArray, links: Sequence[str]) -> FloatArray:
-        """(len(links), T, 4, 4)."""
+    def _tool_poses(self, links: Mapping[str, FloatArray]) -> FloatArray:
+        """(A, T, 4, 4) T_base_tool from the poses of the tools' links."""
+        return np.stack([links[tool.link] @ tool.T_link_tool for tool in self.tools])
+
+    def _chains(self) -> list[list[int]]:
+        """Numbers of the joints that carry each tool, from the base on."""
+        model = self.pinocchio_model
+        parents = [model.frames[self._frame(tool.link)].parentJoint for tool in self.tools]
+        return [list(model.supports[parent])[1:] for parent in parents]
+
+    def _placements(
+        self, positions: FloatArray, links: Sequence[str], joints: Sequence[int] = ()
+    ) -> tuple[dict[str, FloatArray], dict[int, FloatArray]]:
+        """T_base_link (T, 4, 4) by link and origins (T, 3) by joint, for positions (T, J)."""
         model, data = self.pinocchio_model, self.pinocchio_model.createData()
-        frames = [self._frame(link) for link in (*links, self.base_link)]
+        names = tuple(dict.fromkeys((*links, self.base_link)))
+        frames = [self._frame(link) for link in names]
         configurations = self.configurations(positions)
         poses = np.empty((len(frames), len(configurations), 4, 4))
+        origins = np.empty((len(joints), len(configurations), 3))
         for t, configuration in enumerate(configurations):
             pin.forwardKinematics(model, data, configuration)
             for f, frame in enumerate(frames):
                 # .homogeneous is a copy; .translation would alias Pinocchio's buffer
                 poses[f, t] = pin.updateFramePlacement(model, data, frame).homogeneous
-        return inverse(poses[-1]) @ poses[:-1]
+            for j, joint in enumerate(joints):
+                origins[j, t] = data.oMi[joint].translation
+        to_base = inverse(poses[names.index(self.base_link)])
+        turned = (to_base[:, :3, :3] @ origins[..., None])[..., 0] + to_base[:, :3, 3]
+        return (
+            dict(zip(names, to_base @ poses, strict=True)),
+            dict(zip(joints, turned, strict=True)),
+        )
 
     def configurations(self, positions: FloatArray) -> FloatArray:
         """Pinocchio's (T, nq) for positions (T, J): mimics follow, endless joints as cos, sin."""

@@ -14,6 +14,7 @@ from mtv_world_ros.data.recording import stitch
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.geometry.camera import camera_poses, project
+from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.geometry.robot.model import RobotModel
@@ -547,9 +548,7 @@ def _with_trails(
     if stamps is None:
         return frame
     video = render_trajectory_video(
-        cameras=(camera,),
-        robot=robot,
-        positions=joints.at(stamps),
+        motion=Motion.of(robot, (camera,), joints.at(stamps)),
         times=np.asarray((stamps - start) * 1e-9, np.float64),
         object_masks=None,
         config=TrajectoryVideoConfig(half_life_s=1.0, point_radius_m=0.006, max_gap_m=0.005),
@@ -562,8 +561,8 @@ def _with_trails(
 def _draw_crosses(
     frame: ByteArray, camera: CameraModel, robot: RobotModel, positions: FloatArray
 ) -> None:
-    points = robot.tool_poses(positions)[:, 0, :3, 3]
-    pixels, _ = project(camera, camera_poses(camera, robot, positions)[0], points)
+    motion = Motion.of(robot, (camera,), positions)
+    pixels, _ = project(camera, motion.camera_poses[0, 0], motion.tool_points[:, 0])
     size = max(7, camera.width // 40)
     for arm, pixel in enumerate(pixels):
         if np.isfinite(pixel).all() and (np.abs(pixel) < 10 * camera.width).all():

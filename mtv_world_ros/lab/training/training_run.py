@@ -167,7 +167,7 @@ def check_recording(recording: Recording, robot: RobotModel) -> None:
 
 def _check_arm_is_seen(recording: Recording, robot: RobotModel) -> None:
     moving = moving_links(robot)
-    points = np.concatenate(robot.arm_points(recording.positions))
+    points = np.concatenate(robot.kinematics(recording.positions).arm_points)
     for camera in recording.cameras:
         if camera.mount_link in moving or camera.view in recording.camera_tracks:
             continue

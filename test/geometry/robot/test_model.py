@@ -99,7 +99,7 @@ def test_the_points_along_an_arm_are_those_of_its_links_and_its_tool(yam):
     positions = np.linspace(yam.lower, yam.upper, 5) * 0.7
     links, tools = yam.forward_kinematics(positions), yam.tool_poses(positions)
     origins = np.stack([poses[:, :3, 3] for poses in links.values()])
-    arms = yam.arm_points(positions)
+    arms = yam.kinematics(positions).arm_points
     assert len(arms) == len(yam.tools)
     for points, tool in zip(arms, tools, strict=True):
         assert points.shape[1:] == (5, 3) and len(points) >= 7

@@ -10,7 +10,7 @@ import numpy as np
 
 from mtv_world_ros.data.recording import frame_indices, Recording
 from mtv_world_ros.data_types import BoolArray, ByteArray, History, WorldModelSpec
-from mtv_world_ros.geometry.camera import camera_poses
+from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.geometry.object_motion import cut_outs, moved_pictures, ObjectMotion
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import LinkShape
@@ -181,14 +181,14 @@ class ControlMaker:
             start: (V, H, W, 3) uint8 RGB imagined frame in place of the clip's first one.
         """
         first = clip.frames[:, 0] if start is None else start
+        links = {part.link for part in self.parts}
+        motion = Motion.of(self.robot, clip.cameras, clip.positions, links)
         video = render_trajectory_video(
-            cameras=clip.cameras,
-            robot=self.robot,
-            positions=clip.positions,
+            motion=motion,
             times=clip.times,
             object_masks=self._start_masks(clip, names, start) if self.object_mask else None,
-            objects=self._objects(clip, names) if self.object_mask else None,
-            arms=arm_pictures(self.parts, self.robot, clip.cameras, first, clip.positions),
+            objects=self._objects(clip, motion, names) if self.object_mask else None,
+            arms=arm_pictures(self.parts, motion, first),
             config=self.rendering,
         )
         return video.frames
@@ -216,7 +216,9 @@ class ControlMaker:
         with self._lock:
             return self.segmenter.segment(frames[:, None], names).masks[:, :, 0]
 
-    def _objects(self, clip: Clip, names: tuple[str, ...]) -> ByteArray | None:
+    def _objects(
+        self, clip: Clip, clip_motion: Motion, names: tuple[str, ...]
+    ) -> ByteArray | None:
         """(V, 1 + T, H, W, 4) objects that go where they went; None = they are held as masks.
 
         They are those of the episode's first frame, as in a rollout of chained chunks.
@@ -233,11 +235,11 @@ class ControlMaker:
             points=poses[..., :3, 3],
             rotations=poses[..., :3, :3] @ np.swapaxes(first[:, :3, :3], -1, -2),
         )
-        at_first = origin.positions[None]
+        at_first = Motion.of(self.robot, clip.cameras, origin.positions[None])
         return moved_pictures(
             cut_outs(origin.frames, self._stored(clip, names, origin.frames, origin.object_ids)),
             motion,
             clip.cameras,
-            np.stack([camera_poses(camera, self.robot, at_first) for camera in clip.cameras]),
-            np.stack([camera_poses(c, self.robot, clip.positions) for c in clip.cameras]),
+            at_first.camera_poses,
+            clip_motion.camera_poses,
         )
