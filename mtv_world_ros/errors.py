@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from enum import StrEnum
 
 
 class MtvWorldError(Exception):
@@ -24,6 +25,32 @@ class CalibrationError(MtvWorldError):
 
 class TrajectoryError(MtvWorldError):
     """A joint trajectory is rejected."""
+
+
+class PlanFault(StrEnum):
+    """Reason why a plan is rejected, as counted in `/diagnostics` and `~/report`."""
+
+    EMPTY = 'trajectory_empty'
+    MALFORMED = 'trajectory_malformed'
+    NOT_FINITE = 'trajectory_not_finite'
+    TIMES = 'trajectory_times'
+    STALE = 'trajectory_stale'
+    TOO_LONG = 'trajectory_too_long'
+    NAMES = 'joint_names'
+    LIMITS = 'joint_limits'
+    SPEEDS = 'joint_speeds'
+
+
+class PlanError(TrajectoryError):
+    """A plan is rejected.
+
+    Attributes:
+        fault: the reason as it is counted.
+    """
+
+    def __init__(self, fault: PlanFault, text: str) -> None:
+        super().__init__(text)
+        self.fault = fault
 
 
 class ObservationError(MtvWorldError):

@@ -18,10 +18,8 @@ from mtv_world_ros.data_types import (
     SuccessEstimate,
 )
 from mtv_world_ros.errors import RolloutPreempted
-from mtv_world_ros.geometry.chunk_plan import ChunkPlan, plan_chunks
+from mtv_world_ros.geometry.chunk_plan import Plan, PlanLimits
 from mtv_world_ros.geometry.motion import Motion
-from mtv_world_ros.geometry.plan_limits import check_plan
-from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.prediction import mean_of_seeds, Prediction
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.rollout_state import RolloutState
@@ -103,13 +101,13 @@ class ImaginedEpisode:
             )
         return self._described[self.instruction]
 
-    def extend(self, trajectory: JointTrajectory) -> Iterator[Prediction]:
+    def extend(self, trajectory: JointTrajectory | Plan) -> Iterator[Prediction]:
         """Imagines a trajectory from where the episode stands; yields each chunk once it is ready.
 
         An error leaves the episode at the end of the last chunk that was completed.
 
         Args:
-            trajectory: times count from the stamp of `observation`.
+            trajectory: times count from the stamp of `observation`; or a plan that was checked.
 
         Raises:
             TrajectoryError: the trajectory does not fit the robot.
@@ -118,7 +116,7 @@ class ImaginedEpisode:
             RolloutPreempted: `should_stop` said so.
             ModelMemoryError: the device ran out of memory.
         """
-        for plan in self._chunks(trajectory):
+        for plan in self._plan(trajectory).chunks(self.pipeline.spec):
             if plan.chunk and self.should_stop():
                 raise RolloutPreempted('stopped between two chunks')
             # rollouts of further seeds branch off from the first one
@@ -188,11 +186,10 @@ class ImaginedEpisode:
         state = RolloutState.at(observation, self.pipeline.spec, objects)
         return replace(self, _rollouts=(replace(state, memory=before.memory),))
 
-    def _chunks(self, trajectory: JointTrajectory) -> list[ChunkPlan]:
-        """The trajectory on the model's clock, cut into chunks."""
-        robot, spec, start = self.pipeline.robot, self.pipeline.spec, self.observation
-        trajectory = match_joints(trajectory, robot)
-        check_plan(robot, trajectory, start.positions, tolerance=self.limit_tolerance)
-        return plan_chunks(
-            trajectory, start.positions, start.stamp_ns, num_frames=spec.num_frames, fps=spec.fps
-        )
+    def _plan(self, trajectory: JointTrajectory | Plan) -> Plan:
+        """The plan from where the episode stands."""
+        start = self.observation
+        if isinstance(trajectory, Plan):
+            return trajectory.after(start)
+        limits = PlanLimits(tolerance=self.limit_tolerance)
+        return Plan.of(trajectory, self.pipeline.robot, start, limits)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from enum import StrEnum
 from itertools import groupby, pairwise
 from typing import Any
 
@@ -13,9 +12,9 @@ import numpy as np
 from mtv_world_ros.bounded_input import check_limit, LimitError
 from mtv_world_ros.data.episode import JointStates
 from mtv_world_ros.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.errors import TrajectoryError
-from mtv_world_ros.geometry.resample import interpolated, match_joints, resample, SAME_S
-from mtv_world_ros.geometry.robot.model import check_positions, RobotModel
+from mtv_world_ros.errors import PlanError, PlanFault, TrajectoryError
+from mtv_world_ros.geometry.resample import interpolated, resample, SAME_S
+from mtv_world_ros.geometry.robot.model import RobotModel
 
 Plan = tuple[int, JointTrajectory]
 
@@ -29,31 +28,12 @@ _PERIOD_S = 0.02
 _MOVED = 1e-3
 
 
-class PlanFault(StrEnum):
-    """Why a plan is rejected, as counted in `/diagnostics` and `~/report`."""
-
-    EMPTY = 'trajectory_empty'
-    MALFORMED = 'trajectory_malformed'
-    NOT_FINITE = 'trajectory_not_finite'
-    TIMES = 'trajectory_times'
-    NAMES = 'joint_names'
-    LIMITS = 'joint_limits'
-
-
-class PlanError(TrajectoryError):
-    """A plan is rejected; `fault` is the reason as it is counted."""
-
-    def __init__(self, fault: PlanFault, text: str) -> None:
-        super().__init__(text)
-        self.fault = fault
-
-
 def read_plan(message: Any) -> JointTrajectory:
     """Returns the trajectory of a message, of rclpy's or rosbags' class.
 
     Times count from the message's stamp. Velocities are kept where every point has them. Limits
     are not checked, as recorded commands are facts; before a plan is imagined they are
-    (`check_plan_joints`, `plan_limits.check_plan`).
+    (`Plan.of`).
 
     Raises:
         PlanError: empty, names repeated, points of the wrong length, NaN, times not increasing.
@@ -108,23 +88,6 @@ def _rows(names: Sequence[str], points: Iterable[Any], field: str) -> FloatArray
             'value must be finite',
         )
     return values
-
-
-def check_plan_joints(plan: JointTrajectory, robot: RobotModel, tolerance: float) -> None:
-    """Checks that a plan's joints are the robot's and in their limits, up to a tolerance.
-
-    Raises:
-        PlanError: an unknown joint, or a position outside of its limits.
-    """
-    home = np.clip(0.0, robot.lower, robot.upper)
-    try:
-        whole = match_joints(plan, robot, home)
-    except TrajectoryError as error:
-        raise PlanError(PlanFault.NAMES, str(error)) from error
-    try:
-        check_positions(robot, whole.positions, tolerance=tolerance)
-    except TrajectoryError as error:
-        raise PlanError(PlanFault.LIMITS, str(error)) from error
 
 
 def following(states: JointStates, chunk_s: float, start_ns: int) -> list[Plan]:

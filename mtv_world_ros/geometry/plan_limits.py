@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from mtv_world_ros.data_types import BoolArray, FloatArray, JointTrajectory
-from mtv_world_ros.errors import TrajectoryError
+from mtv_world_ros.errors import PlanError, PlanFault
 from mtv_world_ros.geometry.resample import resample
-from mtv_world_ros.geometry.robot.model import check_positions, LIMIT_TOLERANCE, RobotModel
+from mtv_world_ros.geometry.robot.model import LIMIT_TOLERANCE, RobotModel
 
 #: commands may run ahead of a joint that lags: they are refused from this many times its speed on
 SPEED_RATIO = 2.0
@@ -38,25 +38,26 @@ def joint_speeds(robot: RobotModel) -> FloatArray:
     return np.where(np.isfinite(given), given, free)
 
 
-def check_plan(
+def check_speeds(
     robot: RobotModel,
     plan: JointTrajectory,
     start_positions: FloatArray,
     *,
     tolerance: float = LIMIT_TOLERANCE,
 ) -> None:
-    """Checks a plan from time 0 on; points before it are past.
+    """Check the speeds of a plan from time 0 on, and its curve between points.
+
+    Points before time 0 are past.
 
     Args:
         robot: the robot.
-        plan: its joints in its order; times count from now [s].
+        plan: its joints in its order, in their limits; times count from now [s].
         start_positions: (J,) where the joints are now [rad or m].
         tolerance: how far outside the limits points are still accepted [rad or m].
 
     Raises:
-        TrajectoryError: names the joint, its position or speed, and the limit.
+        PlanError: names the joint, its speed or the end of its swing, and the limit.
     """
-    check_positions(robot, plan.positions, tolerance=tolerance)
     limits = speed_limits(robot)
     _check_way_there(robot, plan, start_positions, limits)
     if len(plan.times) < 2:
@@ -64,16 +65,16 @@ def check_plan(
     widths, ways = np.diff(plan.times)[:, None], np.diff(plan.positions, axis=0)
     ahead = plan.times[1:] > 0
     if plan.velocities is None:
-        _check_speeds(robot, (np.abs(ways) / widths)[ahead], limits, plan.times[1:][ahead])
+        _refuse_faster(robot, (np.abs(ways) / widths)[ahead], limits, plan.times[1:][ahead])
         return
-    _check_speeds(robot, np.abs(plan.velocities), limits, plan.times)
+    _refuse_faster(robot, np.abs(plan.velocities), limits, plan.times)
     starts, ends = plan.velocities[:-1], plan.velocities[1:]
     # the speed in a segment of a cubic is a parabola over its share s: starts + s b + s^2 c
     c = 3 * (starts + ends) - 6 * ways / widths
     b = ends - starts - c
     middle = np.clip(_ratio(-b, 2 * c), 0.0, 1.0)
     fastest = np.abs(starts + middle * (b + middle * c))
-    _check_speeds(robot, fastest[ahead], limits, plan.times[1:][ahead])
+    _refuse_faster(robot, fastest[ahead], limits, plan.times[1:][ahead])
     root = np.sqrt(np.maximum(b * b - 4 * c * starts, 0.0))
     turns = [_ratio(-b + root, 2 * c), _ratio(-b - root, 2 * c), _ratio(-starts, b)]
     for share in turns:
@@ -81,7 +82,7 @@ def check_plan(
         part = starts + share * (b / 2 + share * c / 3)
         peaks = plan.positions[:-1] + widths * share * part
         slack = tolerance + _SWING * (robot.upper - robot.lower)
-        _check_swing(robot, peaks[ahead], slack, plan.times[1:][ahead])
+        _refuse_wider(robot, peaks[ahead], slack, plan.times[1:][ahead])
 
 
 def _ratio(over: FloatArray, under: FloatArray) -> FloatArray:
@@ -96,32 +97,34 @@ def _check_way_there(
     first_s = max(float(plan.times[0]), 0.0)
     first = resample(plan, start_positions, np.array([first_s]))
     speeds = np.abs(first - start_positions) / max(first_s, CATCH_UP_S)
-    _check_speeds(robot, speeds, limits, np.array([first_s]))
+    _refuse_faster(robot, speeds, limits, np.array([first_s]))
 
 
-def _check_speeds(
+def _refuse_faster(
     robot: RobotModel, speeds: FloatArray, limits: FloatArray, times: FloatArray
 ) -> None:
     wrong: BoolArray = ~(speeds <= limits)
     if wrong.any():
         row, joint = np.argwhere(wrong)[0]
         unit = 'm/s' if robot.slides[joint] else 'rad/s'
-        raise TrajectoryError(
+        raise PlanError(
+            PlanFault.SPEEDS,
             f"joint '{robot.joint_names[joint]}' is to move at {speeds[row, joint]:.4g} {unit} "
             f'before {times[row]:.4g} s; at most {limits[joint]:.4g} {unit} are accepted, '
             f"{SPEED_RATIO:g} times its limit (set in the description of robot '{robot.name}'; "
-            f'where it has none, {DEFAULT_TURN:g} rad/s or {DEFAULT_SLIDE:g} m/s)'
+            f'where it has none, {DEFAULT_TURN:g} rad/s or {DEFAULT_SLIDE:g} m/s)',
         )
 
 
-def _check_swing(
+def _refuse_wider(
     robot: RobotModel, peaks: FloatArray, slack: FloatArray, times: FloatArray
 ) -> None:
     wrong = (peaks < robot.lower - slack) | (peaks > robot.upper + slack)
     if wrong.any():
         row, joint = np.argwhere(wrong)[0]
-        raise TrajectoryError(
+        raise PlanError(
+            PlanFault.SPEEDS,
             f"joint '{robot.joint_names[joint]}' swings to {peaks[row, joint]:.5g} before "
             f'{times[row]:.4g} s, by the velocities of the points; its limits are '
-            f'{robot.lower[joint]:.5g} .. {robot.upper[joint]:.5g}'
+            f'{robot.lower[joint]:.5g} .. {robot.upper[joint]:.5g}',
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import DEFAULT, frame_indices, Recording
 from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation, SuccessEstimate
 from mtv_world_ros.errors import EpisodeError, MtvWorldError, ObservationError
+from mtv_world_ros.geometry.chunk_plan import Plan
 from mtv_world_ros.geometry.resample import match_joints
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline
@@ -128,9 +129,6 @@ def replay_offline(
             until = starts[index + 1] if index + 1 < len(starts) else None
             try:
                 observation = observe(episode, pipeline, stamp)
-                # its times count from the observation
-                times = trajectory.times + (stamp - observation.stamp_ns) / 1e9
-                shifted = replace(trajectory, times=times)
                 before = starts[index - 1] if index else stamp
                 for seen in _seen_between(episode, pipeline, before, stamp):
                     observed.see(seen)
@@ -138,7 +136,8 @@ def replay_offline(
                 imagined = observed.begin(observation, instruction=text, objects=stored)
                 imagined.seed = seed + 1000 * index
                 imagined.num_inference_steps = num_inference_steps
-                _write_rollout(writer, imagined.extend(shifted), summary, until, spec.fps)
+                plan = Plan.of(trajectory, pipeline.robot, imagined.observation, stamp_ns=stamp)
+                _write_rollout(writer, imagined.extend(plan), summary, until, spec.fps)
             except MtvWorldError as error:
                 summary.rejected.append((stamp, str(error)))
                 writer.write_report(stamp, ERROR, f'rejected: {error}', {})

@@ -22,6 +22,7 @@ import yaml
 
 from mtv_world_ros.config import ListOf, Model, Schema
 from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest
+from mtv_world_ros.geometry.chunk_plan import PlanLimits
 
 Span = tuple[float, float]
 Mode = Literal['observe', 'imagine']
@@ -199,6 +200,16 @@ class Settings(NodeSettings):
         True, 'Publish the control video (when subscribed).'
     )
     publish_masks: bool = parameter(True, 'Publish the object masks (when subscribed).')
+
+    @property
+    def plan_limits(self) -> PlanLimits:
+        """Limits within which a plan is accepted."""
+        return PlanLimits(
+            tolerance=self.limit_tolerance,
+            max_age_s=self.max_trajectory_age_s,
+            max_horizon_s=self.max_horizon_s,
+            may_omit_joints=True,
+        )
 
 
 def help_text(name: str, kind: type[Schema]) -> str:

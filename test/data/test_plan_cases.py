@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.data.bag import messages
-from mtv_world_ros.data.joint_plans import check_plan_joints, read_plan
+from mtv_world_ros.data.joint_plans import read_plan
+from mtv_world_ros.data_types import Observation
 from mtv_world_ros.errors import TrajectoryError
-from mtv_world_ros.geometry.plan_limits import check_plan
-from mtv_world_ros.geometry.resample import match_joints
-from mtv_world_ros.geometry.robot.model import LIMIT_TOLERANCE
+from mtv_world_ros.geometry.chunk_plan import Plan
 
 HOME = np.array([0.0, 1.047, 1.047, 0.0, 0.0, 0.0, 0.03] * 2)
 NAN = float('nan')
@@ -76,6 +75,6 @@ def test_who_refuses_a_plan(name, robot):
     with refused('reader'):
         read_plan(message)
     with refused('node'):
-        read = read_plan(message)
-        check_plan_joints(read, robot, LIMIT_TOLERANCE)
-        check_plan(robot, match_joints(read, robot, HOME), HOME)
+        none = np.zeros((0, 1, 1, 3), np.uint8)
+        start = Observation(cameras=(), frames=none, positions=HOME, stamp_ns=0)
+        Plan.of(read_plan(message), robot, start)

@@ -21,9 +21,7 @@ def cameras(yam: RobotModel) -> tuple[CameraModel, ...]:
     T = np.eye(4)
     T[:3, 3] = (0.02, 0.0, -0.05)
     values = {field: getattr(fixed['low'], field) for field in ('width', 'height', 'K')}
-    wrist = CameraModel(
-        view='wrist', mount_link=yam.tools[1].link, T_mount_camera=T, **values
-    )
+    wrist = CameraModel(view='wrist', mount_link=yam.tools[1].link, T_mount_camera=T, **values)
     return (*fixed.values(), wrist)
 
 

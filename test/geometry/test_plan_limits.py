@@ -8,7 +8,7 @@ import pytest
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import TrajectoryError
 from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.plan_limits import check_plan, speed_limits
+from mtv_world_ros.geometry.plan_limits import check_speeds, speed_limits
 from mtv_world_ros.geometry.robot.file import load_robot
 
 #: speeds in the URDF of the bundled robot's shoulders and wrists [rad/s], twice that is accepted
@@ -45,12 +45,12 @@ def test_twice_the_speed_of_the_description_is_accepted_and_no_more(yam, joint, 
     for share, times in ((1.99, (0.2, 0.225)), (2.01, (0.2, 0.225))):
         plan, start = plan_of(yam, joint, times, (0.0, share * speed * 0.025))
         if share < 2:
-            check_plan(yam, plan, start)
+            check_speeds(yam, plan, start)
         else:
             with pytest.raises(
                 TrajectoryError, match=rf"'{joint}'.*{2 * speed:g} rad/s.*accepted"
             ):
-                check_plan(yam, plan, start)
+                check_speeds(yam, plan, start)
 
 
 def test_a_joint_without_a_speed_has_the_default_and_a_gripper_any(yam, tmp_path):
@@ -66,34 +66,34 @@ def test_a_joint_without_a_speed_has_the_default_and_a_gripper_any(yam, tmp_path
 
 def test_a_gripper_may_close_from_one_row_to_the_next(yam):
     plan, start = plan_of(yam, 'left_gripper', (0.02, 0.04, 0.06), (0.018, -0.018, 0.018))
-    check_plan(yam, plan, start)
+    check_speeds(yam, plan, start)
 
 
 def test_an_arm_that_lags_may_catch_up_and_does_not_jump(yam):
     near, start = plan_of(yam, 'left_joint1', (0.0, 0.1), (0.3, 0.3))
-    check_plan(yam, near, start)
+    check_speeds(yam, near, start)
     far, start = plan_of(yam, 'left_joint1', (0.0, 0.1), (2.5, 2.5))
     with pytest.raises(TrajectoryError, match='12.5 rad/s'):
-        check_plan(yam, far, start)
+        check_speeds(yam, far, start)
 
 
 def test_what_is_over_is_not_looked_at(yam):
     plan, start = plan_of(yam, 'left_joint1', (-0.2, -0.1, 0.1), (2.5, 0.0, 0.0))
-    check_plan(yam, plan, start)
+    check_speeds(yam, plan, start)
 
 
 def test_velocities_of_points_are_held_to_the_limit(yam):
     plan, start = plan_of(yam, 'left_joint1', (0.1, 0.2), (0.0, 0.0), (0.0, 1e300))
     with pytest.raises(TrajectoryError, match=r"'left_joint1' is to move at 1e\+300"):
-        check_plan(yam, plan, start)
+        check_speeds(yam, plan, start)
 
 
 def test_a_curve_is_held_to_the_limits_between_its_points(yam):
     # a cubic with velocities of 5 rad/s at both ends, 6 s apart: 4 / 27 * 5 * 6 = 4.4 rad away
     plan, start = plan_of(yam, 'left_joint1', (0.2, 6.2), (0.0, 0.0), (5.0, 0.0))
     with pytest.raises(TrajectoryError, match="'left_joint1' swings to 4.6"):
-        check_plan(yam, plan, start)
+        check_speeds(yam, plan, start)
     # from rest to rest it is fastest in the middle: 1.5 times the mean of 2.8 rad in 0.05 s
     plan, start = plan_of(yam, 'left_joint4', (0.2, 0.25), (-1.4, 1.4), (0.0, 0.0))
     with pytest.raises(TrajectoryError, match="'left_joint4' is to move at 84 rad/s"):
-        check_plan(yam, plan, start)
+        check_speeds(yam, plan, start)

@@ -12,7 +12,7 @@ pytest.importorskip('websockets', reason='websockets is not installed (pip insta
 from mtv_world_ros.assembly import assemble_policy, robot_path
 from mtv_world_ros.data_types import CameraModel, Observation
 from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.geometry.plan_limits import check_plan
+from mtv_world_ros.geometry.chunk_plan import Plan
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.policies.server_mapping import ActionOutput
@@ -62,7 +62,7 @@ def test_the_bundled_file_drives_a_franka_by_a_server_that_answers_droid_velocit
         expected.append(at)
     np.testing.assert_allclose(answer.positions[:, :7], expected, atol=1e-6)
     np.testing.assert_allclose(answer.positions[:, 7], [0.04] * 7 + [0.0] * 8, atol=1e-9)
-    check_plan(FRANKA, answer, HOME)  # the node accepts it
+    Plan.of(answer, FRANKA, observe())  # the node accepts it
 
 
 def test_positions_are_the_observed_ones_plus_the_sum_of_velocities():

@@ -21,8 +21,8 @@ from mtv_world_ros.data_types import (
     Observation,
     SuccessEstimate,
 )
-from mtv_world_ros.geometry.plan_limits import check_plan
-from mtv_world_ros.geometry.resample import match_joints, resample
+from mtv_world_ros.geometry.chunk_plan import Plan
+from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.pipeline import ImaginedEpisode
 from mtv_world_ros.policies.policy import first_part, Policy
 from mtv_world_ros.prediction import Prediction
@@ -216,9 +216,8 @@ class SimulatedWorld:
     def execute(self, answer: JointTrajectory) -> None:
         """Executes an answer; the arms hold up to a whole frame."""
         before = self.observation
-        matched = match_joints(answer, self._sim.robot)
-        # as in imagination
-        check_plan(self._sim.robot, matched, before.positions)
+        # checked as in imagination
+        matched = Plan.of(answer, self._sim.robot, before).trajectory
         num_frames = max(1, ceil(float(matched.times[-1]) * self._fps - 1e-6))
         num = round(num_frames / self._fps / CONTROL_PERIOD_S)
         times = np.linspace(CONTROL_PERIOD_S, num * CONTROL_PERIOD_S, num)

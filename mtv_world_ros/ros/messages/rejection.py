@@ -7,8 +7,7 @@ from contextlib import contextmanager
 from enum import StrEnum
 
 from mtv_world_ros.bounded_input import LimitError
-from mtv_world_ros.data.joint_plans import PlanError
-from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.errors import MtvWorldError, PlanError
 
 
 class Reason(StrEnum):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import importlib
 from math import isnan
 from typing import Any
@@ -19,7 +19,6 @@ from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 from trajectory_msgs.msg import JointTrajectoryPoint
 
 from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.geometry.resample import match_joints, resample
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
@@ -38,13 +37,11 @@ class Goal:
     Attributes:
         handle: rclpy's goal handle.
         request: the plan that it became; None = it waits to become one.
-        start: (J,) positions that the plan starts from, in the robot's order [rad or m].
         violation: name of the code and text of a tolerance that is violated.
     """
 
     handle: ServerGoalHandle
     request: Request | None = None
-    start: FloatArray | None = None
     violation: tuple[str, str] | None = None
 
     @property
@@ -156,16 +153,13 @@ class FollowJointTrajectory:
 
     def _follow(self, goal: Goal, chunk: Chunk) -> None:
         """Publishes the feedback of a chunk and holds it to the goal's tolerances."""
-        prediction, request = chunk.prediction, chunk.request
-        if goal.start is None:
-            goal.start = prediction.start.positions
-        offset_s = (request.stamp_ns - prediction.stamp_ns) / NANO if request.stamp_ns else 0.0
-        path = match_joints(request.trajectory, self._robot, goal.start)
-        path = replace(path, times=path.times + offset_s)
+        prediction, request, plan = chunk.prediction, chunk.request, chunk.plan
+        path, offset_s = plan.trajectory, (plan.given_ns - plan.stamp_ns) / NANO
         times, actual = prediction.video.times, prediction.positions
         if prediction.chunk == 0:  # where the robot is when the plan begins
-            times, actual = np.concatenate([[0.0], times]), np.vstack([goal.start, actual])
-        desired = resample(path, goal.start, times)
+            times = np.concatenate([[0.0], times])
+            actual = np.vstack([plan.start_positions, actual])
+        desired = plan.positions_at(times)
         is_over = prediction.chunk == prediction.num_chunks - 1
         goal.violation = _violation(
             'PATH', goal.handle.request.path_tolerance, path.joint_names, desired, actual
@@ -176,7 +170,7 @@ class FollowJointTrajectory:
             ) if is_over else None
         )  # fmt: skip
         time_s, names = float(times[-1]), self._robot.joint_names
-        moved = [at for at, name in enumerate(names) if name in request.trajectory.joint_names]
+        moved = [at for at, name in enumerate(names) if name in plan.given.joint_names]
         feedback = self._action.Feedback(
             header=make_header(prediction.stamp_ns + round(time_s * NANO)),
             joint_names=[names[column] for column in moved],

@@ -17,10 +17,8 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
 from mtv_world_ros.bounded_input import check_limit
-from mtv_world_ros.data.joint_plans import check_plan_joints
-from mtv_world_ros.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.geometry.plan_limits import check_plan
-from mtv_world_ros.geometry.resample import match_joints
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.geometry.chunk_plan import Plan
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.ros.messages.conversions import to_ns, to_trajectory
@@ -44,7 +42,7 @@ from mtv_world_ros.ros.world_model.loading import (
 )
 from mtv_world_ros.ros.world_model.prediction_publisher import PredictionPublisher
 from mtv_world_ros.ros.world_model.reporter import Reporter
-from mtv_world_ros.ros.world_model.worker import from_observation, Request, RolloutWorker
+from mtv_world_ros.ros.world_model.worker import Request, RolloutWorker
 
 #: measured joints may be beyond their limits by this, and by this share of their range
 _MEASURED_SLACK = 0.1
@@ -90,20 +88,22 @@ class RequestMaker:
         Raises:
             Rejection: the trajectory or the present observation cannot be used.
         """
-        settings = self._settings()
+        settings, stamp_ns = self._settings(), to_ns(message.header.stamp)
         trajectory = to_trajectory(message)
-        with rejected_as(Reason.JOINT_NAMES):
-            check_plan_joints(trajectory, self.robot, settings.limit_tolerance)
-        stamp_ns = to_ns(message.header.stamp)
         last = self._last_scene() if self.imagine else None
         scene = last or self._real_scene(now_ns)
-        seen = scene.observation
-        from_now = from_observation(trajectory, stamp_ns, seen.stamp_ns, settings)
-        self._check_speeds(from_now, seen.positions, settings.limit_tolerance)
+        with rejected_as(Reason.ROLLOUT_INVALID):
+            plan = Plan.of(
+                trajectory,
+                self.robot,
+                scene.observation,
+                settings.plan_limits,
+                stamp_ns=stamp_ns or None,
+            )
         self.num_requests += 1
         return Request(
             rollout=self.num_requests,
-            trajectory=trajectory,
+            plan=plan,
             stamp_ns=stamp_ns,
             scene=scene,
             imagine=self.imagine,
@@ -112,16 +112,6 @@ class RequestMaker:
             received_s=received_s,
             received_ns=now_ns,
         )
-
-    def _check_speeds(
-        self, trajectory: JointTrajectory, positions: FloatArray, tolerance: float
-    ) -> None:
-        """Refuses a trajectory faster than the robot, from (J,) measured positions on."""
-        robot = self.robot
-        positions = np.clip(positions, robot.lower, robot.upper)
-        whole = match_joints(trajectory, robot, positions)
-        with rejected_as(Reason.JOINT_SPEEDS):
-            check_plan(robot, whole, positions, tolerance=tolerance)
 
     def _real_scene(self, now_ns: int) -> SensedScene:
         if now_ns == 0:

@@ -9,15 +9,15 @@ from threading import Condition, current_thread, Thread
 import time
 import traceback
 
-from mtv_world_ros.data_types import JointTrajectory, Observation
-from mtv_world_ros.errors import ModelMemoryError, MtvWorldError, RolloutPreempted
-from mtv_world_ros.geometry.resample import match_joints
+from mtv_world_ros.data_types import Observation
+from mtv_world_ros.errors import ModelMemoryError, MtvWorldError, PlanError, RolloutPreempted
+from mtv_world_ros.geometry.chunk_plan import Plan
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.ros.messages.conversions import NANO
-from mtv_world_ros.ros.messages.rejection import Reason, Rejection
+from mtv_world_ros.ros.messages.rejection import Reason
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.observations import SensedScene
 from mtv_world_ros.vision.camera_check import CameraCheck
@@ -32,8 +32,7 @@ class Request:
 
     Attributes:
         rollout: number of the rollout, counted from 1.
-        trajectory: of some or all of the robot's joints, in any order; the others stay where they
-            are when it starts. Times count from `stamp_ns`.
+        plan: the checked trajectory, from the scene on.
         stamp_ns: the trajectory's stamp [ns]; 0 = it starts at the observation.
         scene: the newest scene when it came in; its frames are real, or predicted.
         imagine: whether to start from the last predicted frames if there are newer ones, and
@@ -46,7 +45,7 @@ class Request:
     """
 
     rollout: int
-    trajectory: JointTrajectory
+    plan: Plan
     stamp_ns: int
     scene: SensedScene
     imagine: bool
@@ -58,9 +57,18 @@ class Request:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chunk:
-    """A predicted chunk of a request, the scene it started from, and when it was ready [s]."""
+    """A predicted chunk of a request.
+
+    Attributes:
+        request: the request.
+        plan: the plan from where the rollout started.
+        scene: the scene it started from.
+        prediction: frames, masks and estimate.
+        ready_s: time at which it was ready [s], of `time.monotonic`.
+    """
 
     request: Request
+    plan: Plan
     scene: SensedScene
     prediction: Prediction
     ready_s: float
@@ -338,8 +346,8 @@ class RolloutWorker:
         except (ModelMemoryError, MemoryError) as error:
             text = str(error) or 'out of memory'
             return self._ended(request, 'failed', Reason.OUT_OF_MEMORY, text)
-        except Rejection as error:
-            return self._ended(request, 'rejected', error.reason, str(error))
+        except PlanError as error:
+            return self._ended(request, 'rejected', Reason(error.fault), str(error))
         except MtvWorldError as error:
             return self._ended(request, 'rejected', Reason.ROLLOUT_INVALID, str(error))
         except Exception as error:  # the node outlives whatever the model raises
@@ -371,15 +379,16 @@ class RolloutWorker:
         episode.seed, episode.num_seeds = settings.seed, settings.num_seeds
         episode.num_inference_steps = settings.num_inference_steps
         episode.limit_tolerance = settings.limit_tolerance
-        start = episode.observation
-        trajectory = from_observation(
-            request.trajectory, request.stamp_ns, start.stamp_ns, settings
-        )
-        robot = self._pipeline.robot
-        trajectory = match_joints(trajectory, robot, start.positions)
-        for prediction in episode.extend(trajectory):
-            ready_s = time.monotonic()
-            chunk = Chunk(request=request, scene=scene, prediction=prediction, ready_s=ready_s)
+        # rollouts before this one may have moved the robot in imagination
+        plan = request.plan.after(episode.observation)
+        for prediction in episode.extend(plan):
+            chunk = Chunk(
+                request=request,
+                plan=plan,
+                scene=scene,
+                prediction=prediction,
+                ready_s=time.monotonic(),
+            )
             with self._changed:
                 if self._abandoned or self._closing or self._is_given_up:
                     raise RolloutPreempted('the rollout was given up')
@@ -411,40 +420,3 @@ class RolloutWorker:
     def _put(self, result: Result) -> None:
         self._results.append(result)
         self._notify()
-
-
-def from_observation(
-    trajectory: JointTrajectory, stamp_ns: int, observation_ns: int, settings: Settings
-) -> JointTrajectory:
-    """Returns the trajectory with times from the observation's stamp.
-
-    Args:
-        trajectory: its times count from `stamp_ns`.
-        stamp_ns: when it starts [ns]; 0 = at the observation.
-        observation_ns: stamp of the observation [ns].
-        settings: have the greatest age and length of a plan.
-
-    Raises:
-        Rejection: the plan starts too long ago, has ended already, or ends too late.
-    """
-    offset = (stamp_ns - observation_ns) / NANO if stamp_ns else 0.0
-    end = offset + float(trajectory.times[-1])
-    if -offset > settings.max_trajectory_age_s:
-        raise Rejection(
-            Reason.TRAJECTORY_STALE,
-            f'the trajectory is stamped {-offset:.3f} s before the observation it would start '
-            f"from; 'max_trajectory_age_s' allows {settings.max_trajectory_age_s:g} s",
-        )
-    if end < 0:
-        raise Rejection(
-            Reason.TRAJECTORY_STALE,
-            f'the trajectory ended {-end:.3f} s before the observation it would start from',
-        )
-    if end > settings.max_horizon_s:
-        raise Rejection(
-            Reason.TRAJECTORY_TOO_LONG,
-            f"the trajectory ends {end:.3f} s after its observation; 'max_horizon_s' allows "
-            f'{settings.max_horizon_s:g} s (do its stamp and the images come from the same '
-            'clock?)',
-        )
-    return replace(trajectory, times=trajectory.times + offset) if offset else trajectory

@@ -8,10 +8,8 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
-from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import RolloutPreempted
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.world_model.worker import Ended, Request, RolloutWorker
@@ -20,12 +18,10 @@ LONGEST_S = 120.0
 
 
 def request(number: int) -> Request:
-    plan = JointTrajectory(
-        joint_names=('joint',), times=np.array([0.1]), positions=np.zeros((1, 1))
-    )
     scene: Any = SimpleNamespace()
+    plan: Any = SimpleNamespace()  # `_imagine` is replaced, so nobody looks at it
     return Request(
-        rollout=number, trajectory=plan, stamp_ns=0, scene=scene, imagine=False, instruction='',
+        rollout=number, plan=plan, stamp_ns=0, scene=scene, imagine=False, instruction='',
         settings=Settings(), received_s=0.0,
     )  # fmt: skip
 
