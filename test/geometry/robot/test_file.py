@@ -6,7 +6,7 @@ import yaml
 
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.errors import ConfigError, RobotError, TrajectoryError
-from mtv_world_ros.geometry.plan_limits import check_plan
+from mtv_world_ros.geometry.plan_limits import check_speeds
 from mtv_world_ros.geometry.robot.file import described_robot, load_robot
 from mtv_world_ros.lab.cli.own_robot import describe
 from mtv_world_ros.lab.importing.convert import jumps
@@ -134,7 +134,7 @@ def test_a_speed_limit_of_zero_is_none_everywhere(tmp_path):
         times=np.array([0.1, 0.2, 0.3]),
         positions=np.array([[0, 0.2], [0, 0.4], [0, 0.6]]),
     )
-    check_plan(robot, plan, np.zeros(2))
+    check_speeds(robot, plan, np.zeros(2))
     assert jumps([plan], robot) == []
     fast = JointTrajectory(
         joint_names=robot.joint_names,
@@ -142,7 +142,7 @@ def test_a_speed_limit_of_zero_is_none_everywhere(tmp_path):
         positions=np.array([[0, 0.2], [0, 0.9]]),
     )
     with pytest.raises(TrajectoryError, match='elbow'):
-        check_plan(robot, fast, np.zeros(2))
+        check_speeds(robot, fast, np.zeros(2))
     (said,) = jumps([fast], robot)
     assert said.startswith("commands of joint 'elbow' jump 1 times (over 2 times 10 a second")
 
