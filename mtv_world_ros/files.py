@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import errno
+import fcntl
 import hashlib
 import json
 import math
 import os
 from pathlib import Path
+import re
 import shutil
 import sys
 from typing import Any
@@ -144,7 +146,7 @@ def write_whole(path: Path, content: bytes | str) -> None:
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, f"'{path}' is a folder; name a file")
     data = content.encode() if isinstance(content, str) else content
-    beside = path.with_name(f'.{path.name}.{os.getpid()}.part')  # others may write the same file
+    beside = _own_name(path, _NEW)  # others may write the same file
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         beside.write_bytes(data)
@@ -158,34 +160,120 @@ def write_whole(path: Path, content: bytes | str) -> None:
 def whole_folder(folder: Path) -> Iterator[Path]:
     """Yields an empty folder that gets the name `folder` when the block ends without an error.
 
-    A folder of that name stays until then. A process that is killed between the two renames
-    leaves it under the name `<folder>.old`; see `recover_folder`.
+    A folder of that name stays until then. What is written has a hidden name of its own beside it,
+    `.<folder>.mtv-new-<process>`, and what is replaced, `.<folder>.mtv-old-<process>`; nothing
+    else is touched. What a killed process left under those names is tidied up by the next call;
+    see `recover_folder`.
 
     Raises:
         OSError: the folder cannot be written; the old one is untouched.
     """
-    partial, old = (folder.with_name(f'{folder.name}.{word}') for word in ('partial', 'old'))
+    folder = Path(os.path.realpath(folder))  # a link stays a link
     recover_folder(folder)
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        yield partial
-        for file in partial.rglob('*'):
-            if file.is_file():
-                with file.open('rb') as stream:
-                    os.fsync(stream.fileno())  # the disk has its content before it gets its name
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)  # room for what is written next
-        raise
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)
-    partial.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
+    new, old, waste = (_own_name(folder, word) for word in _WORDS)
+    new.mkdir(parents=True)
+    with _locked(new):
+        try:
+            yield new
+            for file in new.rglob('*'):
+                if file.is_file():
+                    with file.open('rb') as stream:
+                        os.fsync(stream.fileno())  # the disk has its content before its name
+            if folder.exists():
+                with _locked(folder):
+                    folder.rename(old)
+                    new.rename(folder)
+                    old.rename(waste)
+            else:
+                new.rename(folder)
+        except BaseException:
+            shutil.rmtree(new, ignore_errors=True)  # room for what is written next
+            if old.exists() and not folder.exists():
+                old.rename(folder)
+            raise
+    shutil.rmtree(waste, ignore_errors=True)
 
 
 def recover_folder(folder: Path) -> None:
-    """Renames `<folder>.old` back if a process was killed while it replaced the folder."""
-    old = folder.with_name(f'{folder.name}.old')
-    if old.exists() and not folder.exists():
-        old.rename(folder)
+    """Tidies up what a process left that was killed while it wrote a folder by `whole_folder`.
+
+    A folder that was replaced, while the new one did not get its name, is renamed back. What
+    living processes write is left alone. Earlier versions left `<folder>.old` and, complete,
+    `<folder>.partial`: where both hold files of the same names and `folder` is missing, the first
+    is renamed back. Otherwise either may be somebody else's.
+    """
+    folder = Path(os.path.realpath(folder))
+    abandoned = [path for path in _own_folders(folder) if _is_abandoned(path)]
+    old = [path for path in abandoned if f'.{_OLD}-' in path.name]
+    if old and not folder.exists():
+        newest = max(old, key=lambda path: path.stat().st_mtime_ns)
+        newest.rename(folder)
+        abandoned.remove(newest)
+    for path in abandoned:
+        shutil.rmtree(path, ignore_errors=True)
+    earlier, partial = (folder.with_name(f'{folder.name}.{word}') for word in ('old', 'partial'))
+    if not folder.exists() and _names_in(earlier) == _names_in(partial) != set():
+        earlier.rename(folder)
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+#: words in the hidden names beside a folder: being written, replaced, to be removed
+_WORDS = _NEW, _OLD, _WASTE = 'mtv-new', 'mtv-old', 'mtv-waste'
+
+
+def _own_name(path: Path, word: str) -> Path:
+    """A hidden name beside a file or folder, of this package and process."""
+    return path.with_name(f'.{path.name}.{word}-{os.getpid()}')
+
+
+def _own_folders(folder: Path) -> list[Path]:
+    """The folders beside one that `whole_folder` made for it."""
+    name = re.compile(rf'\.{re.escape(folder.name)}\.({"|".join(_WORDS)})-\d+')
+    try:
+        beside = sorted(folder.parent.iterdir())
+    except FileNotFoundError:
+        return []
+    return [path for path in beside if name.fullmatch(path.name) and path.is_dir()]
+
+
+def _names_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Holds a folder's lock, which ends with the process; a file system may have no locks."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _is_abandoned(folder: Path) -> bool:
+    """True if no process of this machine writes the folder any more."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # no locks there: the number says who made it
+        return not _is_running(int(folder.name.rpartition('-')[2]))
+    finally:
+        os.close(descriptor)
+    return True
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # somebody else's process
+        return True
+    return pid != os.getpid()

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass
 import json
 from pathlib import Path
+import re
 import shutil
 from typing import Any
 
@@ -20,6 +21,8 @@ from mtv_world_ros.files import write_whole
 
 CARD_FILE = 'dataset.json'
 TASKS_SET, ZERO_SHOT_SET = 'tasks', 'zero_shot'
+#: folder of an episode in progress: its task, number, and a random word of the bag's writer
+_IN_PROGRESS = re.compile(r'\.\w+_\d{5}\.[a-z0-9_]{8}\.tmp')
 #: what to do where something cannot be written
 GO_ON = 'finished episodes are kept, so run the same command again once there is room'
 
@@ -152,7 +155,8 @@ def check_same_set(out: Path, kind: str, seed: int, config: dict[str, Any]) -> N
 def remove_leftovers(out: Path) -> None:
     """Removes the hidden folders of episodes whose recording was killed."""
     for folder in out.glob('.*_*.tmp'):
-        shutil.rmtree(folder, ignore_errors=True)
+        if _IN_PROGRESS.fullmatch(folder.name):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _counts(entries: Sequence[CardEntry]) -> dict[str, Any]:

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 import errno
 import os
 from pathlib import Path
+import secrets
 import shutil
-import tempfile
 from threading import Lock
 from types import TracebackType
 from typing import cast, IO, Self
@@ -202,10 +202,8 @@ class BagWriter:
         parent = self.path.absolute().parent
         try:
             parent.mkdir(parents=True, exist_ok=True)
-            folder = Path(
-                tempfile.mkdtemp(dir=parent, prefix=f'.{self.path.name}.', suffix='.tmp')
-            )
-            folder.chmod(0o755)
+            folder = parent / f'.{self.path.name}.{secrets.token_hex(4)}.tmp'
+            folder.mkdir()  # who may read it is the user's choice (umask)
             return folder, _Spool(folder / self._file_name, reserves=self._keep)
         except OSError as error:
             raise EpisodeError(f"cannot write '{self.path}': {error}") from error

@@ -56,7 +56,7 @@ def kill(child: int, out: Path, *, saving: bool, after: float) -> str | None:
             return None
         time.sleep(0.001)
     time.sleep(after)
-    while saving and not (out / 'state.partial').exists():
+    while saving and not any(out.glob('.state.mtv-new-*')):
         if finished(child):
             return None
     if finished(child):
