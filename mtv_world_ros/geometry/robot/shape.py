@@ -167,7 +167,7 @@ def _arm_length(robot: RobotModel) -> float:
     middle = np.clip(0.0, robot.lower, robot.upper)[None]
     lengths = [
         float(np.linalg.norm(np.diff(points[:, 0], axis=0), axis=-1).sum())
-        for points in robot.arm_points(middle)
+        for points in robot.kinematics(middle).arm_points
     ]
     ranges = (robot.upper - robot.lower)[robot.slides]
     return max(lengths, default=0.0) + float(ranges[np.isfinite(ranges)].sum())
