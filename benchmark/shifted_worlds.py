@@ -7,7 +7,7 @@ In each physics of `config/physics.yaml` the expert and faulty policies act in t
 simulator; kinds of faults have the size `--size`, a factor of what was drawn. Each plan is foreseen
 from the pictures of the first frame alone, as the node does: cameras are checked against the arm's
 outline, objects are found by the segmenter. Judges: *foreseen motions alone*, the share of futures
-that succeed; where `--pictures` says so, *pictures alone* (the paper's way) and *both* (the estimate);
+that succeed; where `--pictures` says so, *pictures alone* (no motion foreseen) and *both* (the estimate);
 where `--real` says so, *real frames*, the estimate on the simulator's; where `--contact FOLDER` has a
 folder `FOLDER/PHYSICS` that `fit-contact` wrote in that physics, *foreseen motions, fitted there*; the
 *no-picture rule*: an object sticks to a gripper that closes near it. From .75 on it is called a success,
@@ -71,8 +71,8 @@ from mtv_world_ros.lab.evaluation.metrics.statistics import clustered_wilson
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.rendering.images import encode_png, resize_frames
-from mtv_world_ros.success.doubts import NEAR_M, PhysicsWatch, unforeseen
-from mtv_world_ros.success.estimator import capped, verdict
+from mtv_world_ros.success.doubts import Grounds, NEAR_M, PhysicsWatch, unforeseen
+from mtv_world_ros.success.estimator import capped, stated_probability, verdict
 from mtv_world_ros.success.foreseen import foreseen_of
 from mtv_world_ros.success.situation import CannotTell
 from mtv_world_ros.vision.camera_check import CameraCheck
@@ -94,7 +94,7 @@ WATCHED = (
     'says so after rollouts: median [5 %, 95 %]', 'orders in which it never does',
 )  # fmt: skip
 FLIPPED = ('truth', 'imagined by', 'flips of contact that are imagined')
-FORESEEN, PICTURES, BOTH = 'foreseen motions alone', 'pictures alone (paper)', 'both'
+FORESEEN, PICTURES, BOTH = 'foreseen motions alone', 'pictures alone', 'both'
 REAL, RULE, FITTED = 'real frames', 'no-picture rule', 'foreseen motions, fitted there'
 #: random orders of rollouts in which the watch sees them
 _ORDERS = 100
@@ -163,7 +163,7 @@ def foreseen_by(
 ) -> Ahead:
     """Returns what is foreseen of commands (C, J)."""
     model, names = pipeline.object_motion, episode.names
-    assert model is not None
+    assert model is not None  # `Scenes._ask` asks only pipelines that foresee
     masks = pipeline.segmenter.segment(observation.frames[:, None], names).masks[:, :, 0]
     poses = np.stack(
         [
@@ -188,7 +188,7 @@ def foreseen_by(
 
 
 def features_of(estimate: SuccessEstimate) -> dict[str, float] | None:
-    """Returns what an estimate rests on; None = it abstains."""
+    """Return the features of an estimate, calibrated or not; None = it abstains."""
     return dict(estimate.features) if isfinite(estimate.probability) else None
 
 
@@ -351,6 +351,8 @@ class Scenes:
             pipeline = replace(whole, camera_checker=None, object_motion=motion)
             if judge == PICTURES:
                 pipeline = pipeline.without_foresight()
+            # features are logged whether or not weights were ever fitted to them
+            pipeline = replace(pipeline, grounds=Grounds())
             first = check.corrected_observation(first)
             begun = pipeline.begin(
                 first, instruction=instruction, seed=seed, num_inference_steps=1
@@ -382,6 +384,8 @@ class Scenes:
                 return {'value': None}
         if judge in IMAGINED:
             return imagined(pipeline, episode, commands)
+        if pipeline.object_motion is None:  # of a checkpoint that foresees nothing: no verdict
+            return {'value': None}
         return foreseen_by(pipeline, episode, first, commands)
 
 
@@ -433,13 +437,19 @@ def is_whole(known: dict[str, Any], judges: Sequence[str], names: Iterable[str])
 def estimated(pipeline: Pipeline, judge: str, said: Said) -> float:
     """Returns the probability of success that a judge gives; NaN = it abstains.
 
-    Estimates are those of the checkpoint as it is calibrated now.
+    Estimates are those of the checkpoint as it is calibrated now; of one that is not calibrated
+    for rollouts of this kind, those of the stated weights.
     """
     if said.get('value') is not None:
         return float(said['value'])
-    features, calibration = said.get('features'), pipeline.estimator.calibration
-    if features is None or calibration is None:
+    features, judging = said.get('features'), pipeline
+    if judge == PICTURES:
+        judging = pipeline.without_foresight()
+    if features is None:
         return nan
+    calibration = judging.estimator.calibration
+    if calibration is None:
+        return capped(stated_probability(features), features)
     weights = calibration.given(judge == REAL, isfinite(features.get('foreseen', nan)))
     return capped(weights.probability(features), features)
 

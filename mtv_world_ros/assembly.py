@@ -31,7 +31,7 @@ from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.success.calibration import (
     Calibration,
     HorizonCurve,
-    load_fit,
+    load_fits,
 )
 from mtv_world_ros.success.doubts import Grounds
 from mtv_world_ros.success.estimator import SuccessEstimator
@@ -105,8 +105,8 @@ def load_pipeline(
         calibrated: use the checkpoint's calibration of the success estimate, where it has one, and
             abstain where an estimate rests on nothing; False = the bare estimate.
         adapter: LoRA adapter to use in place of the checkpoint's own.
-        foresight: foresee where objects go, where the checkpoint can; False = the paper's way:
-            trails and first masks alone are drawn, and pictures alone decide.
+        foresight: foresee where objects go, where the checkpoint can; False = the imagined frames
+            alone decide, see `Pipeline.without_foresight`.
         camera_check: compare the first pictures of an episode with the arm's outline, correct
             small errors of the calibration and refuse a verdict on large ones.
 
@@ -127,16 +127,18 @@ def load_pipeline(
     if adapter is not None:
         loaded = replace(loaded, adapter=adapter)
     model = checkpoint_robot(checkpoint, robot)
-    motion = None
-    if foresight and loaded.object_motion is not None:
+    folder, motion = checkpoint_path(checkpoint), None
+    foresees = can_foresee(folder)
+    if foresight and foresees and loaded.object_motion is not None:
         motion = load_foresight(loaded.object_motion, model, num_threads or threads_each(1))
+    fits = load_fits(folder, of_pictures=foresees and not foresight)
     world_model = DiffusionWorldModel(
         loaded,
         device=device,
         dtype=number_format,
         serving=options,
     )
-    calibration = load_fit(checkpoint_path(checkpoint), Calibration) if calibrated else None
+    calibration = fits.calibration if calibrated else None
     pipeline = assemble(
         loaded.card,
         world_model,
@@ -146,7 +148,7 @@ def load_pipeline(
         segmenter=choose_segmenter(segmenter, device=device),
         describer=asked_describer(describer),
         calibration=calibration,
-        horizon=load_fit(checkpoint_path(checkpoint), HorizonCurve),
+        horizon=fits.horizon,
         object_motion=motion,
         camera_checker=CameraChecker(model, load_shape(model)) if camera_check else None,
         setting=fitting_setting(checkpoint, model),
@@ -154,7 +156,19 @@ def load_pipeline(
     if not calibrated:  # to be fitted, or compared: the bare estimate
         return pipeline
     doubt = motion.settings.doubt if motion else ''
-    return replace(pipeline, grounds=Grounds.of(doubt, calibration is not None))
+    return replace(
+        pipeline,
+        grounds=Grounds.of(doubt, calibration is not None),
+        picture_fits=load_fits(folder, of_pictures=True) if motion else None,
+    )
+
+
+def can_foresee(folder: Path) -> bool:
+    """Return whether a checkpoint foresees object motion and was trained to see it."""
+    from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
+
+    rendering = TrajectoryVideoConfig(**read_card(folder).rendering)
+    return rendering.object_motion and (folder / OBJECT_MOTION_FOLDER).is_dir()
 
 
 def fitting_setting(checkpoint: str | Path, robot: RobotModel) -> Setting:

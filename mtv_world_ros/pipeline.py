@@ -31,7 +31,7 @@ from mtv_world_ros.rendering.trajectory_video import (
     TrajectoryVideoConfig,
 )
 from mtv_world_ros.rollout_state import RolloutState
-from mtv_world_ros.success.calibration import HorizonCurve
+from mtv_world_ros.success.calibration import Fits, HorizonCurve
 from mtv_world_ros.success.doubts import doubted, Grounds, widened
 from mtv_world_ros.success.estimator import JudgedChunk, SuccessEstimator
 from mtv_world_ros.success.foreseen import ForeseenMotions
@@ -106,6 +106,8 @@ class Pipeline:
         camera_checker: compares the first frames with the arm's outline; None = no check.
         grounds: what estimates that are not calibrated may rest on.
         parts: shapes of the robot's links, for `rendering.arm_pictures`; empty = none are drawn.
+        picture_fits: fits to rollouts without foreseen object motion, for `without_foresight`;
+            None = the estimate stays as it is, e.g. bare.
     """
 
     robot: RobotModel
@@ -121,6 +123,7 @@ class Pipeline:
     camera_checker: CameraChecker | None = None
     grounds: Grounds = Grounds()
     parts: tuple[LinkShape, ...] = ()
+    picture_fits: Fits | None = None
 
     @property
     def spec(self) -> WorldModelSpec:
@@ -138,8 +141,24 @@ class Pipeline:
         )
 
     def without_foresight(self) -> Pipeline:
-        """Returns the paper's pipeline: draws trails and first masks, foresees no motion."""
-        return replace(self, object_motion=None)
+        """Return the pipeline without foreseen object motion: the imagined frames alone decide.
+
+        Trajectory videos show what else the model was trained with. A model that was trained with
+        the masks of the first frame gets them, which is the paper's method; one that was trained
+        with foreseen objects (`rendering.object_motion`) gets no objects.
+        """
+        if self.object_motion is None:
+            return self
+        fits = self.picture_fits
+        if fits is None:
+            return replace(self, object_motion=None)
+        return replace(
+            self,
+            object_motion=None,
+            estimator=self.estimator.with_calibration(fits.calibration),
+            horizon=fits.horizon,
+            grounds=Grounds.of('', fits.calibration is not None),
+        )
 
     def begin(
         self,

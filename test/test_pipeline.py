@@ -38,6 +38,8 @@ from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.rendering.arm_pictures import arm_pictures
 from mtv_world_ros.rendering.images import resize_frames
+from mtv_world_ros.success.calibration import Fits, load_fits
+from mtv_world_ros.success.doubts import Grounds
 from mtv_world_ros.vision.describers.describer import DescribedObject
 
 SPEC = WorldModelSpec(
@@ -806,3 +808,41 @@ def test_a_describer_is_asked_once_about_the_first_real_frame(pipeline, recordin
     np.testing.assert_array_equal(shown[1][0], recording.frames[0, 0])
     named = asking.begin(observe(recording), instruction='tidy up', objects=('red block',))
     assert named.names == ('red block',) and len(shown) == 2
+
+
+def test_without_foresight_a_model_is_drawn_what_it_was_trained_with(recording, world_model):
+    """Fills of the first masks are drawn for models that were trained with them alone."""
+    foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
+    trained = with_motion(world_model, foresight)
+    blind = assemble(CARD.replace(object_mask=False), world_model, robot=YAM)
+    paper = assemble(CARD, world_model, robot=YAM)
+    drawn = []
+    for pipeline in (trained.without_foresight(), blind, paper.without_foresight(), paper):
+        imagine(pipeline, recording, 1.6)
+        drawn.append(world_model.trajectories.pop())
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+    np.testing.assert_array_equal(drawn[2], drawn[3])
+    assert not np.array_equal(drawn[1], drawn[2])
+
+
+def test_without_foresight_the_fits_to_such_rollouts_are_used(recording, world_model):
+    foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
+    bare = with_motion(world_model, foresight)
+    assert bare.without_foresight().estimator is bare.estimator
+    assert bare.without_foresight().grounds == Grounds()
+    usual = load_fits(share_path('resource', 'checkpoint'))
+    own = usual.calibration.replace(bias=3.0, fitted_to=None)
+    whole = replace(
+        bare,
+        estimator=bare.estimator.with_calibration(usual.calibration),
+        horizon=usual.horizon,
+        picture_fits=Fits(own, None),
+    )
+    alone = whole.without_foresight()
+    assert alone.object_motion is None and alone.horizon is None
+    assert alone.estimator.calibration is own
+    assert whole.estimator.calibration is usual.calibration
+    assert alone.without_foresight() is alone
+    (chunk,) = imagine(replace(whole, picture_fits=Fits()).without_foresight(), recording, 1.6)
+    assert np.isnan(chunk.success.probability)
+    assert 'never calibrated' in chunk.success.reasons[0]

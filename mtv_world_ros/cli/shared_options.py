@@ -64,8 +64,9 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
         '--no-foresight': {
             'dest': 'foresight',
             'action': 'store_false',
-            'help': "the paper's way: trails and first masks are drawn, no object motion is "
-            'foreseen, and pictures alone decide',
+            'help': 'foresee no object motion: the imagined frames alone decide. A model that was '
+            "trained with the objects' first masks is shown them (the paper's method); one that "
+            'was trained with foreseen objects, as the bundled one, is shown none',
         },
         '--no-camera-check': {
             'dest': 'camera_check',

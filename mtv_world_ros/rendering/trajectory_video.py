@@ -99,8 +99,14 @@ class TrajectoryVideoConfig(Schema):
     object_motion: bool = Field(
         default=False,
         description='objects are drawn as they look, over the trails, where they are expected to '
-        'be; else as fills where they were, as in the paper',
+        'be; where their motion is not foreseen they are not drawn. false = the masks of the '
+        'first frame are drawn, as in the paper',
     )
+
+    @property
+    def draws_masks(self) -> bool:
+        """Whether a model of this rendering was trained with the masks of the first frame."""
+        return not self.object_motion
 
 
 #: the core that shows a closed gripper, as a share of the glow's standard deviation
@@ -131,7 +137,8 @@ def render_trajectory_video(
         motion: T states of the robot, and V cameras of one size; frame k shows state k, state 0
             is the current one.
         times: (T,) [s], increasing.
-        object_masks: (V, O, H, W) masks of the first frame, held over all frames; or None.
+        object_masks: (V, O, H, W) masks of the first frame, held over all frames; or None. Not
+            drawn with `config.object_motion`: such a model was never trained with them.
         objects: (V, T, H, W, 4) uint8 of `moved_pictures`, in place of masks; or None.
         config: widths, colours and fading of the trails.
         arms: (V, T, H, W, 4) uint8 of `arm_pictures`, over the arms' lines; or None.
@@ -149,8 +156,9 @@ def render_trajectory_video(
     lines = () if config.link_width_m is None else motion.arm_points
     shape = (len(cameras), len(times), cameras[0].height, cameras[0].width, 3)
     frames = np.zeros(shape, np.uint8)
+    has_fills = objects is None and config.draws_masks
     for view, camera in enumerate(cameras):
-        masks = () if object_masks is None or objects is not None else object_masks[view]
+        masks = object_masks[view] if has_fills and object_masks is not None else ()
         fills = _fills(camera, masks, config)
         poses = motion.camera_poses[view]
         links = ArmLinks(camera, poses, lines, config.link_width_m)

@@ -104,8 +104,8 @@ class Settings(NodeSettings):
     )
     foresight: bool = at_start(
         True,
-        "Foresee where objects go, where the checkpoint can; false = the paper's way: trails and "
-        'first masks are drawn, and pictures alone decide.',
+        'Foresee where objects go, where the checkpoint can; false = the imagined frames alone '
+        'decide, and the model is shown no objects that it was not trained with.',
     )
     camera_check: bool = at_start(
         True,

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import json
 from math import exp, isfinite, isnan, nan
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import Field, model_validator, WrapValidator
 
@@ -19,6 +19,9 @@ from mtv_world_ros.success.fitted_to import FittedTo, Setting
 
 CALIBRATION = 'success_calibration.json'
 HORIZON = 'horizon.json'
+#: end of the names of files that were fitted to rollouts without foreseen object motion, in the
+#: folder of a checkpoint that can foresee it
+PICTURES = '_pictures'
 #: features that only speak against success: how a moved object was grasped and carried. An object
 #: that never moves needs no grasp, which is no sign of success.
 DOUBTS = frozenset({'grasp', 'carry'})
@@ -113,8 +116,16 @@ class Calibration(Weights):
 
     def given(self, is_real: bool, is_foreseen: bool = True) -> Weights:
         """Returns the weights for real frames, or imagined ones with or without foresight."""
-        special = self.observed if is_real else None if is_foreseen else self.unforeseen
-        return special or self
+        if is_real:
+            return self.observed or self
+        if is_foreseen or self.is_of_pictures:
+            return self
+        return self.unforeseen or self
+
+    @property
+    def is_of_pictures(self) -> bool:
+        """Whether the weights were fitted to rollouts without foreseen object motion."""
+        return self.fitted_to is not None and not self.fitted_to.foresight
 
     def objection(self, task: str, segmenter: str) -> str:
         """Returns why the weights do not hold for a task and segmenter; empty = they hold."""
@@ -133,6 +144,8 @@ class Calibration(Weights):
         `FittedTo.objection`.
         """
         if self.fitted_to is not None:
+            if not (is_foreseen or self.is_of_pictures or self.unforeseen):
+                return 'fitted to rollouts with foreseen object motion'
             return self.fitted_to.objection(setting, cameras, is_foreseen=is_foreseen)
         if not is_foreseen:
             return ''
@@ -183,13 +196,26 @@ class HorizonCurve(Schema):
 _FILES: dict[type[Schema], str] = {Calibration: CALIBRATION, HorizonCurve: HORIZON}
 
 
-def save_fit(folder: Path, fit: Calibration | HorizonCurve) -> Path:
-    """Writes it into a checkpoint; returns the file.
+def fit_path(folder: Path, kind: type[Schema], *, of_pictures: bool = False) -> Path:
+    """Return the file of a `Calibration` or `HorizonCurve` in a checkpoint's folder.
+
+    Args:
+        folder: of the checkpoint.
+        kind: `Calibration` or `HorizonCurve`.
+        of_pictures: the fit to rollouts without foreseen object motion, of a checkpoint that can
+            foresee it.
+    """
+    path = Path(folder) / _FILES[kind]
+    return path.with_stem(path.stem + PICTURES) if of_pictures else path
+
+
+def save_fit(folder: Path, fit: Calibration | HorizonCurve, *, of_pictures: bool = False) -> Path:
+    """Writes it into a checkpoint; returns the file. Arguments as in `fit_path`.
 
     Raises:
         CheckpointError: the folder cannot be written to.
     """
-    path = Path(folder) / _FILES[type(fit)]
+    path = fit_path(folder, type(fit), of_pictures=of_pictures)
     try:
         write_whole(path, json.dumps(fit.model_dump(), indent=1) + '\n')
     except OSError as error:
@@ -201,13 +227,41 @@ def save_fit(folder: Path, fit: Calibration | HorizonCurve) -> Path:
     return path
 
 
-def load_fit(folder: Path, kind: type[Model]) -> Model | None:
+class Fits(NamedTuple):
+    """Fits of a checkpoint to rollouts of one kind; None = not fitted."""
+
+    calibration: Calibration | None = None
+    horizon: HorizonCurve | None = None
+
+
+def load_fits(folder: Path, *, of_pictures: bool = False) -> Fits:
+    """Return the fits of a checkpoint to rollouts of one kind. Arguments as in `fit_path`.
+
+    Before 0.3.0, `calibrate --no-foresight` wrote its fits to the files of fits with foresight.
+
+    Raises:
+        CheckpointError: as in `load_fit`.
+    """
+    found = Fits(
+        load_fit(folder, Calibration, of_pictures=of_pictures),
+        load_fit(folder, HorizonCurve, of_pictures=of_pictures),
+    )
+    if of_pictures and found.calibration is None:
+        older = load_fits(folder)
+        if older.calibration is not None and older.calibration.is_of_pictures:
+            return older
+    return found
+
+
+def load_fit(folder: Path, kind: type[Model], *, of_pictures: bool = False) -> Model | None:
     """Returns the `Calibration` or `HorizonCurve` of a checkpoint; None = it has none.
+
+    Arguments as in `fit_path`.
 
     Raises:
         CheckpointError: the file is not what `mtv-world calibrate` writes.
     """
-    path = Path(folder) / _FILES[kind]
+    path = fit_path(folder, kind, of_pictures=of_pictures)
     if not path.is_file():
         return None
     try:

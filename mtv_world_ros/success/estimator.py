@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from math import exp, isfinite, isnan, nan
 from typing import NamedTuple
 
@@ -110,6 +111,12 @@ class SuccessEstimator:
         self.calibration = calibration
         self.setting = setting
         self.segmenter = '' if segmenter is None else segmenter.name
+
+    def with_calibration(self, calibration: Calibration | None) -> SuccessEstimator:
+        """Return an estimator of the same tasks with other fitted weights; None = with none."""
+        other = copy(self)
+        other.calibration = calibration
+        return other
 
     def estimate(
         self,

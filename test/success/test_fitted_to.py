@@ -13,7 +13,7 @@ from mtv_world_ros.errors import ConfigError
 from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.calibration_file import load_calibration as load_cameras
 from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.success.calibration import Calibration, load_fit
+from mtv_world_ros.success.calibration import Calibration, Fits, load_fit, load_fits, save_fit
 from mtv_world_ros.success.fitted_to import CameraRange, FittedTo, Setting
 
 ROBOT = checkpoint_robot('bundled')
@@ -113,6 +113,39 @@ def test_the_bundled_estimate_is_calibrated_for_its_own_foresight_and_cameras():
     old = calibration.replace(fitted_to=None, made={'versions': 'mtv_world_ros 0.1.0, torch 2'})
     found = old.elsewhere(here, CAMERAS, is_foreseen=True)
     assert found == 'fitted with the foresight of mtv_world_ros 0.1.0'
+
+
+def test_weights_are_those_of_rollouts_of_the_same_kind():
+    calibration = load_fit(share_path('resource', 'checkpoint'), Calibration)
+    here = fitting_setting('bundled', ROBOT)
+    assert calibration.given(False, is_foreseen=False) is calibration.unforeseen
+    seen_alone = calibration.replace(unforeseen=None)
+    found = seen_alone.elsewhere(here, CAMERAS, is_foreseen=False)
+    assert found == 'fitted to rollouts with foreseen object motion'
+    pictures = calibration.replace(fitted_to=calibration.fitted_to.replace(foresight=''))
+    assert pictures.is_of_pictures and not calibration.is_of_pictures
+    assert pictures.given(False, is_foreseen=False) is pictures
+    assert pictures.elsewhere(here, CAMERAS, is_foreseen=False) == ''
+    assert 'another foresight' in pictures.elsewhere(here, CAMERAS, is_foreseen=True)
+
+
+def test_fits_to_rollouts_without_foresight_have_files_of_their_own(tmp_path):
+    calibration, horizon = load_fits(share_path('resource', 'checkpoint'))
+    pictures = calibration.replace(fitted_to=calibration.fitted_to.replace(foresight=''))
+    save_fit(tmp_path, calibration)
+    save_fit(tmp_path, horizon)
+    assert load_fits(tmp_path, of_pictures=True) == Fits(None, None)
+    save_fit(tmp_path, pictures, of_pictures=True)
+    assert load_fits(tmp_path) == Fits(calibration, horizon)
+    assert load_fits(tmp_path, of_pictures=True) == Fits(pictures, None)
+
+
+def test_older_fits_without_foresight_are_used_where_nothing_is_foreseen(tmp_path):
+    calibration, horizon = load_fits(share_path('resource', 'checkpoint'))
+    older = calibration.replace(fitted_to=calibration.fitted_to.replace(foresight=''))
+    save_fit(tmp_path, older)
+    save_fit(tmp_path, horizon)
+    assert load_fits(tmp_path, of_pictures=True) == Fits(older, horizon)
 
 
 def test_it_is_read_back_as_it_was_written():

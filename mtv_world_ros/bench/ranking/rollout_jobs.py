@@ -182,7 +182,7 @@ class Result:
         final: it held at the end; this is what counts as success.
         imagined: the estimate at the end of the imagined episode.
         foreseen: the share of its foreseen motions that succeed.
-        pictures: the estimate where none is foreseen, the paper's way.
+        pictures: the estimate from the imagined frames alone, with no motion foreseen.
         seen: the same estimator on the simulator's own frames: what is wrong with it is not the
             world model's fault.
         no_picture: the rule that sees the commands and the first frame alone.

@@ -44,7 +44,7 @@ RULE = 'no_picture'
 #: by field of a result
 JUDGES: Mapping[str, Judge] = {
     'foreseen': Judge(title='foreseen motions alone'),
-    'pictures': Judge(title='pictures alone (paper)'),
+    'pictures': Judge(title='pictures alone'),
     'imagined': Judge(title='both', column='imagination', episodes='imagined episodes'),
     RULE: Judge(title='no-picture rule', column='no pictures'),
     'seen': Judge(

@@ -24,8 +24,10 @@ if TYPE_CHECKING:
 _EPILOG = """\
 Every episode is imagined as a whole from its first frame with its own commands; the success
 estimate on the imagined frames is then fitted to the recorded outcomes. The checkpoint gets
-success_calibration.json and horizon.json; DIR gets calibration.md, reliability.html and
-calibration.json. Half of the episodes should be failures: mtv-world collect --failures-of-ten 5.
+success_calibration.json and horizon.json. With --no-foresight, a checkpoint that can foresee
+object motion gets success_calibration_pictures.json and horizon_pictures.json; they are used
+where no motion is foreseen. DIR gets calibration.md, reliability.html and calibration.json. Half
+of the episodes should be failures: mtv-world collect --failures-of-ten 5.
 Running the same command again continues an interrupted run. Exit status: 1 if an episode could
 not be scored; it is not in the fit.
 """
@@ -88,9 +90,10 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     if arguments.store:
         fitted_to = _fitted_to(arguments, selection)
         stored = found.calibration.replace(fitted_to=fitted_to)
+        of_pictures = _is_of_pictures(arguments, folder)
         if horizon is not None:  # first: with the calibration the checkpoint counts as calibrated
-            print(f'stored: {save_fit(folder, horizon)}')
-        print(f'stored: {save_fit(folder, stored)}')
+            print(f'stored: {save_fit(folder, horizon, of_pictures=of_pictures)}')
+        print(f'stored: {save_fit(folder, stored, of_pictures=of_pictures)}')
     print(text)
     return int(failed)
 
@@ -135,7 +138,7 @@ def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
 def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
     """Refuses to write into the installed package, and to replace an earlier calibration."""
     from mtv_world_ros.assembly import BUNDLED
-    from mtv_world_ros.success.calibration import CALIBRATION
+    from mtv_world_ros.success.calibration import Calibration, fit_path
 
     check_free(arguments.out / 'calibration.json', arguments.overwrite)
     if not arguments.store:
@@ -145,7 +148,15 @@ def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
             "'bundled' is part of the installed package, into which nothing is written; copy it "
             f"with 'cp -r {folder} DIR' and calibrate DIR, or give --no-store"
         )
-    check_free(folder / CALIBRATION, arguments.overwrite, 'checkpoint')
+    file = fit_path(folder, Calibration, of_pictures=_is_of_pictures(arguments, folder))
+    check_free(file, arguments.overwrite, 'checkpoint')
+
+
+def _is_of_pictures(arguments: argparse.Namespace, folder: Path) -> bool:
+    """Whether the fit is to rollouts without the object motion that the checkpoint foresees."""
+    from mtv_world_ros.assembly import can_foresee
+
+    return not arguments.foresight and can_foresee(folder)
 
 
 def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[EvaluationSummary]:

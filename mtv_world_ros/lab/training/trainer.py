@@ -165,7 +165,8 @@ class Trainer:
     def start_from(self, folder: Path) -> None:
         """Loads the weights of a checkpoint of the same architecture; the optimizer state is new.
 
-        Its object motion network comes along where robot and views are the same.
+        Its physics (`object_motion/`) comes along where robot and views are the same and
+        `rendering.object_motion` is on.
 
         Raises:
             CheckpointError: the folder holds no checkpoint.
@@ -173,7 +174,9 @@ class Trainer:
         """
         loaded = load_checkpoint(folder)
         theirs, video = loaded.card, self.config.video
-        if (theirs.robot, len(theirs.spec.views)) == (video.robot, len(video.views)):
+        if not self.config.rendering.object_motion:
+            self._object_motion = None  # its trajectory videos will not show what is foreseen
+        elif (theirs.robot, len(theirs.spec.views)) == (video.robot, len(video.views)):
             self._object_motion = loaded.object_motion
         elif loaded.object_motion is not None and self.processes.is_main:
             tqdm.write(

@@ -1,5 +1,7 @@
 """Picture scores against torchmetrics, and when a model is said to follow the commands."""
 
+from math import nan
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from mtv_world_ros.lab.evaluation.metrics.picture_scores import (
     picture_scores,
     ssim_map,
 )
+from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate
 
 
 def frames(seed=0):
@@ -75,6 +78,27 @@ def test_commands_are_followed_where_both_margins_are_shown(over_held, over_shuf
     found = following(picture_estimates(episodes(over_held, over_shuffled)))
     assert found.word == word
     assert found.line.startswith(f'follows the commands: {word} (')
+
+
+@pytest.mark.parametrize(
+    ('value', 'interval', 'num_episodes', 'word'),
+    [
+        (0.3, (0.2, 0.4), 4, 'yes'),
+        (-0.19, (-0.25, -0.12), 36, 'no'),
+        (0.1, (-0.1, 0.3), 4, 'cannot tell'),
+        (-0.1, (nan, nan), 4, 'cannot tell'),
+        (-0.2, (nan, nan), 2, 'yes'),
+        (nan, (nan, nan), 0, 'yes'),
+    ],
+)
+def test_commands_are_not_followed_where_objects_are_worse_than_held(
+    value, interval, num_episodes, word
+):
+    pictures = picture_estimates(episodes((2.0, 2.5, 2.2, 1.9), (3.0, 3.5, 2.6, 3.1)))
+    objects = Estimate(value=value, interval=interval, num_episodes=num_episodes)
+    found = following(pictures, objects)
+    assert found.word == word
+    assert ('J of moving objects' in found.why) == (num_episodes >= 3)
 
 
 def test_without_other_commands_nothing_is_said():

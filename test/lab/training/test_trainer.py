@@ -206,12 +206,24 @@ def test_the_object_motion_network_comes_along_to_the_same_robot_alone(
     first.export(tmp_path / 'checkpoint')
     (tmp_path / 'checkpoint' / 'object_motion').mkdir()
     (tmp_path / 'checkpoint' / 'object_motion' / 'config.json').write_text('{}')
+    tiny = tiny.replace(rendering=tiny.rendering.replace(object_motion=True))
     second = make_trainer(tiny.replace(video=tiny.video.replace(robot=name)), tmp_path / 'second')
     second.start_from(tmp_path / 'checkpoint')
     second.export(tmp_path / 'exported')
     is_same = tiny.video.robot == name
     assert (tmp_path / 'exported' / 'object_motion').is_dir() == is_same
     assert ("left out: it is of robot 'yam_bimanual'" in capsys.readouterr().out) != is_same
+
+
+def test_a_model_that_is_shown_no_foreseen_objects_keeps_no_physics(tiny, source, tmp_path):
+    first = make_trainer(tiny, tmp_path / 'first')
+    first.export(tmp_path / 'checkpoint')
+    (tmp_path / 'checkpoint' / 'object_motion').mkdir()
+    second = make_trainer(tiny, tmp_path / 'second')
+    assert not tiny.rendering.object_motion
+    second.start_from(tmp_path / 'checkpoint')
+    second.export(tmp_path / 'exported')
+    assert not (tmp_path / 'exported' / 'object_motion').exists()
 
 
 def test_weights_of_another_architecture_are_refused(tiny, source, tmp_path):

@@ -157,8 +157,32 @@ class Following:
         return f'follows the commands: {self.word} ({self.why})'
 
 
-def following(estimates: Mapping[str, Estimate]) -> Following:
-    """Decides by PSNR where the picture changes, against held frame and shuffled commands."""
+def following(estimates: Mapping[str, Estimate], objects: Estimate | None = None) -> Following:
+    """Decides by PSNR where the picture changes, against held frame and shuffled commands.
+
+    Args:
+        estimates: of `picture_estimates`.
+        objects: J of the moving objects minus that of the held first frame, paired within the
+            episodes; None = no episode names a moving object. A model below the held frame does
+            not follow the commands, whatever its pictures of the arm are like.
+    """
+    found = _following_by_pictures(estimates)
+    if objects is None or objects.num_episodes < MIN_EPISODES or found.word == 'no':
+        return found
+    why = f'{found.why}; J of moving objects {_against_held(objects)}'
+    if objects.interval[1] < 0:
+        return Following(word='no', why=why)
+    is_above = objects.value > 0 and not objects.interval[0] <= 0
+    return Following(word=found.word if is_above else 'cannot tell', why=why)
+
+
+def _against_held(margin: Estimate) -> str:
+    low, high = margin.interval
+    ends = f' [{low:+.2f}, {high:+.2f}]' if np.isfinite(low) else ''
+    return f'{margin.value:+.2f}{ends} against the held frame'
+
+
+def _following_by_pictures(estimates: Mapping[str, Estimate]) -> Following:
     shuffled = estimates.get(f'margin_over_{SHUFFLED}')
     held = estimates.get(f'margin_over_{HELD}')
     if shuffled is None or held is None or not np.isfinite([shuffled.value, held.value]).all():

@@ -170,8 +170,8 @@ class EvaluationSummary:
 
     @property
     def following(self) -> Following:
-        """Whether the model follows the commands, by pictures alone."""
-        return following(self.pictures[None])
+        """Whether the model follows the commands, by its pictures and its moving objects."""
+        return following(self.pictures[None], self.estimates(None).get('margin_moving'))
 
     @property
     def has_objects(self) -> bool:
