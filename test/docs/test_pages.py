@@ -24,7 +24,7 @@ from mtv_world_ros.success.relations import KINDS
 from mtv_world_ros.success.task import load_task
 
 ROOT = Path(__file__).resolve().parents[2]
-MOST_WORDS = 1200
+MOST_WORDS = 1350
 #: of the robot that docs/robots.md describes
 URDF = """
 <robot name="my_robot">
@@ -46,7 +46,7 @@ def test_the_readme_is_short():
 def test_results_are_few_and_short():
     words = (ROOT / 'docs' / 'results.md').read_text().split()
     tables = [line for line in (ROOT / 'docs' / 'results.md').open() if line.startswith('|--')]
-    assert len(words) <= 1000 and len(tables) == 1
+    assert len(words) <= 1350 and len(tables) == 1
     assert len(list((ROOT / 'benchmark' / 'results').glob('*.md'))) <= 15
 
 
