@@ -237,7 +237,8 @@ class Fits(NamedTuple):
 def load_fits(folder: Path, *, of_pictures: bool = False) -> Fits:
     """Return the fits of a checkpoint to rollouts of one kind. Arguments as in `fit_path`.
 
-    Builds before the release of 0.2.0: `calibrate --no-foresight` wrote its fits to the files of fits with foresight.
+    Before the release of 0.2.0, `calibrate --no-foresight` wrote its fits to the files of fits
+    with foresight.
 
     Raises:
         CheckpointError: as in `load_fit`.
