@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -17,6 +18,8 @@ import threading
 import time
 from typing import Any, Protocol, TypeVar
 
+from tqdm import tqdm
+
 from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.errors import ConfigError, MtvWorldError
 from mtv_world_ros.files import content_digest, plain
@@ -24,6 +27,8 @@ from mtv_world_ros.processes import STOPPED_S, StoppedProcesses
 
 #: between two looks of a pool at its workers, and of a worker at its parent [s]
 _LOOK_S = 0.5
+#: a job that was running when this many actors of a Ray cluster died is not tried again
+MAX_LOST_ACTORS = 3
 #: libraries that start threads read these when they are loaded
 _THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
@@ -228,6 +233,9 @@ class _Scoring:
         except MtvWorldError as error:
             return str(error)
 
+    def start(self) -> None:
+        """Return when this process is there and has its scorer."""
+
     def numbered(self, number: int, job: Any) -> tuple[int, Outcome]:
         return number, self(job)
 
@@ -263,7 +271,7 @@ def score_with_ray(
 
     Raises:
         ConfigError: Ray is not installed or cannot be reached, or less than one worker.
-        MtvWorldError: an actor died.
+        MtvWorldError: all actors died, or several of the same job.
     """
     if workers < 1:
         raise ConfigError(f'workers is {workers}; it must be at least 1')
@@ -280,16 +288,71 @@ def score_with_ray(
         ) from error
     try:
         actor = ray.remote(num_cpus=1)(_Scoring)
-        pool = ray.util.ActorPool([actor.remote(make_scorer) for _ in range(workers)])
-        numbered = list(enumerate(jobs))
-        done = pool.map_unordered(lambda a, one: a.numbered.remote(*one), numbered)
-        yield from ((jobs[number], outcome) for number, outcome in done)
+        actors = [actor.remote(make_scorer) for _ in range(min(workers, len(jobs)))]
+        yield from _Actors(ray, actors).run(jobs)
     except ray.exceptions.RayError as error:
         raise MtvWorldError(
-            f'a Ray worker died ({error}); what is done is kept: run the command again'
+            f'Ray failed ({error}); what is done is kept: run the command again'
         ) from error
     finally:
         ray.shutdown()
+
+
+class _Actors:
+    """Actors of a Ray cluster that run jobs; the job of one that dies goes to another.
+
+    An actor gets its first job when it has started: a cluster with less cores than actors starts
+    some of them later, or never.
+    """
+
+    def __init__(self, ray: Any, actors: Sequence[Any]) -> None:
+        self._ray, self._num_left = ray, len(actors)
+        #: what an actor is at: its job's number and the job; None = it starts
+        self._calls: dict[Any, tuple[Any, tuple[int, Any] | None]] = {
+            actor.start.remote(): (actor, None) for actor in actors
+        }
+        self._lost: Counter[int] = Counter()
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, Outcome]]:
+        """Yield jobs with their outcome.
+
+        Raises:
+            MtvWorldError: no actor is left, or MAX_LOST_ACTORS actors died of one job.
+        """
+        waiting, num_running, idle = deque(enumerate(jobs)), 0, list[Any]()
+        while waiting or num_running:
+            while waiting and idle:
+                actor, one = idle.pop(), waiting.popleft()
+                self._calls[actor.numbered.remote(*one)] = actor, one
+                num_running += 1
+            (done,), _ = self._ray.wait(list(self._calls))
+            actor, one = self._calls.pop(done)
+            num_running -= one is not None
+            try:
+                found = self._ray.get(done)
+            except self._ray.exceptions.RayActorError as error:
+                self._lose(one, error)
+                waiting.extendleft([] if one is None else [one])
+                continue
+            idle.append(actor)
+            if one is not None:
+                yield one[1], found[1]
+
+    def _lose(self, one: tuple[int, Any] | None, error: Exception) -> None:
+        """Count an actor that died, and say so."""
+        self._num_left -= 1
+        if one is not None:
+            self._lost[one[0]] += 1
+        if one is not None and self._lost[one[0]] == MAX_LOST_ACTORS:
+            raise MtvWorldError(
+                f'{MAX_LOST_ACTORS} Ray workers died of the same job ({error}), most likely of '
+                'lack of memory; what is done is kept: run the command again'
+            ) from error
+        if not self._num_left:
+            raise MtvWorldError(
+                f'all Ray workers died ({error}); what is done is kept: run the command again'
+            ) from error
+        tqdm.write(f'a Ray worker died; {self._num_left} go on')
 
 
 def _ray() -> Any:

@@ -1,0 +1,1 @@
+"""Tests of the package; helpers that tests share are in `test.support`."""
