@@ -7,7 +7,7 @@ limit that is too low for you is raised with an environment variable, e.g.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 import errno
@@ -16,6 +16,7 @@ import json
 import math
 import os
 from pathlib import Path
+import re
 import stat
 import struct
 import sys
@@ -31,6 +32,12 @@ from mtv_world_ros.errors import CheckpointError, ConfigError
 PREFIX = 'MTV_WORLD_MAX_'
 #: plain YAML values may be numbers, whose digits cost quadratic time
 _LONGEST_NUMBER = 4_000
+#: characters of a template, as of a path on Linux (PATH_MAX)
+_LONGEST_TEMPLATE = 4_096
+#: a field, braces that stand for themselves, or a lone brace with what follows
+_FIELD = re.compile(
+    r'\{\{|\}\}|\{(?P<name>[A-Za-z_]\w*)(?::(?P<width>\d{1,2})d)?\}|\{[^{}]*\}?|\}'
+)
 _LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _MERGE = 'tag:yaml.org,2002:merge'
 
@@ -201,6 +208,42 @@ def _whole_number(digits: str) -> int:
     if len(digits) > sys.float_info.max_10_exp:
         raise LimitError(f'a whole number has {len(digits)} digits')
     return int(digits)
+
+
+def fill_template(template: object, values: Mapping[str, int | str]) -> str:
+    """Returns a template's text with its fields filled in, e.g. `episode_{episode_index:06d}.mp4`.
+
+    Fields are `{name}`, or `{name:6d}` and `{name:06d}` for whole numbers; `{{` and `}}` stand for
+    braces. Python's own format strings reach attributes of objects and make texts of any length.
+
+    Args:
+        template: from a file.
+        values: of the fields.
+
+    Raises:
+        ValueError: it is no text, too long, or has another field or format, or a lone brace.
+    """
+    if not isinstance(template, str):
+        raise ValueError(f'it is {type(template).__name__}, no text')
+    if len(template) > _LONGEST_TEMPLATE:
+        raise LimitError(
+            f'it has {len(template)} characters; at most {_LONGEST_TEMPLATE} are read'
+        )
+
+    def filled(match: re.Match[str]) -> str:
+        part, name, width = match[0], match['name'], match['width']
+        if part in ('{{', '}}'):
+            return part[0]
+        if name not in values:
+            known = ', '.join(f'{{{key}}}' for key in values)
+            raise ValueError(f"'{part}' is no field of it; fields are {known}")
+        if width is None:
+            return str(values[name])
+        if not isinstance(values[name], int):
+            raise ValueError(f"'{part}': {name} is no whole number; write {{{name}}}")
+        return f'{values[name]:{width}d}'
+
+    return _FIELD.sub(filled, template)
 
 
 def read_arrays(path: Path | str, limit: str = 'array_bytes') -> dict[str, np.ndarray]:

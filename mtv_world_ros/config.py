@@ -247,7 +247,8 @@ def _valid(error: ErrorDetails) -> str:
     context = error.get('ctx', {})
     if error['type'] == 'greater_than':
         return f'above {context["gt"]:g}' if context['gt'] else 'positive'
-    return _VALID.get(error['type'], error['msg']).format(**context)
+    template = _VALID.get(error['type'])
+    return error['msg'] if template is None else template.format(**context)  # no text of a file
 
 
 def read_yaml(

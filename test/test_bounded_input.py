@@ -16,7 +16,14 @@ import numpy as np
 import pytest
 import yaml
 
-from mtv_world_ros.bounded_input import Limits, limits, parse_yaml, read_bytes, read_json
+from mtv_world_ros.bounded_input import (
+    fill_template,
+    Limits,
+    limits,
+    parse_yaml,
+    read_bytes,
+    read_json,
+)
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data_types import JointTrajectory
@@ -266,3 +273,54 @@ def test_wild_metadata_is_a_problem_not_an_error(tmp_path, text):
     os.mkfifo(tmp_path / 'b.mcap')
     (tmp_path / 'metadata.yaml').write_text(text)
     assert list(BagReader(tmp_path).messages()) == []
+
+
+@pytest.mark.parametrize(
+    ('template', 'text'),
+    [
+        ('chunk-{chunk:03d}/episode_{episode:06d}.mp4', 'chunk-007/episode_000042.mp4'),
+        ('{key}/{chunk}-{chunk:4d}', 'front/7-   7'),
+        ('a {{b}} {{{chunk}}}', 'a {b} {7}'),
+        ('', ''),
+    ],
+)  # fmt: skip
+def test_a_template_has_fields_of_texts_and_whole_numbers(template, text):
+    values = {'chunk': 7, 'episode': 42, 'key': 'front'}
+    assert fill_template(template, values) == text
+    assert template.format(**values) == text  # as LeRobot fills them
+
+
+@pytest.mark.parametrize(
+    'template',
+    [
+        '{episode:>3000000000}',
+        '{episode:03000000000d}',
+        '{episode:100d}',
+        '{episode:{episode}d}',
+        '{episode!r}',
+        '{episode.real}',
+        '{episode.__class__.__mro__}',
+        '{key[0]}',
+        '{key:06d}',
+        '{0}',
+        '{}',
+        '{other}',
+        '{',
+        '}',
+        '{episode',
+        'episode}',
+        '{episode:.2f}',
+        'x' * 5000,
+        7,
+        None,
+        ['{episode}'],
+    ],
+)
+def test_a_template_with_anything_else_is_refused_in_time_and_memory(template):
+    tracemalloc.start()
+    begin_s = time.perf_counter()
+    with pytest.raises(ValueError, match='no field|whole number|no text|characters'):
+        fill_template(template, {'episode': 42, 'key': 'front'})
+    assert time.perf_counter() - begin_s < MOST_S
+    assert tracemalloc.get_traced_memory()[1] < 2**20
+    tracemalloc.stop()

@@ -171,3 +171,14 @@ def test_the_shell_completes_commands_and_options():
             env={**os.environ, **words}, capture_output=True, text=True, timeout=180,
         )  # fmt: skip
         assert wanted in done.stdout.split(), done
+
+
+@pytest.mark.parametrize('error', [MemoryError(), MemoryError('Unable to allocate 8.7 GiB')])
+def test_memory_that_does_not_suffice_is_told_in_a_line(monkeypatch, capsys, error):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr('mtv_world_ros.cli.view._view', fail)
+    assert main(['view', 'x']) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f'mtv-world: {error}') and 'the memory does not suffice' in said

@@ -33,6 +33,10 @@ if _interrupt is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
 
 _FULL = '; make room and run the command again'
+_MORE_MEMORY = (
+    ': the memory does not suffice; is a file larger than it should be? Else give fewer '
+    'recordings, views or --workers'
+)
 _READ_ONLY = '; choose another folder'
 #: modules of commands as `--help` shows them; those of other packages come last
 _ORDER = (
@@ -167,7 +171,7 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # `mtv-world ... | head` has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
-    except (MtvWorldError, OSError) as error:
+    except (MtvWorldError, OSError, MemoryError) as error:
         return _said(f'{error}{_advice(error)}', 1)
     except ModuleNotFoundError as error:
         package = (error.name or '').partition('.')[0]
@@ -191,6 +195,8 @@ def _extra_of(package: str) -> str:
 
 
 def _advice(error: Exception) -> str:
+    if isinstance(error, MemoryError):
+        return _MORE_MEMORY if str(error) else _MORE_MEMORY.removeprefix(': ')
     return _ADVICE.get(error.errno or 0, '') if isinstance(error, OSError) else ''
 
 

@@ -185,6 +185,14 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
     **{f'mesh {case}': ('mesh', found('mesh', case)) for case in (267, 1157, 1889)},
     'distortion of letters': ('camera parameters', found('camera parameters', 778)),
     'image path of no text': ('LeRobot v2.1', found('LeRobot v2.1', 1496)),
+    'data path of 3 GB': (
+        'LeRobot v2.1',
+        lambda: altered('LeRobot v2.1', rb'\{episode_index:06d\}', b'{episode_index:>3000000000}'),
+    ),
+    'data path that asks an object': (
+        'LeRobot v3.0',
+        lambda: altered('LeRobot v3.0', rb'\{file_index:03d\}', b'{file_index.__class__}'),
+    ),
     'instruction of 15 kB': ('instruction', lambda: b'put the red block ' * 5_000),
     'width .inf': ('calibration', lambda: calibrated(width=float('inf'))),
     'nesting': ('calibration', lambda: b'[' * 100_000),

@@ -21,6 +21,7 @@ from mtv_world_ros.bench.world.scene import (
     SceneObject,
 )
 from mtv_world_ros.bench.world.workcell import PlacementConfig, Workcell
+from mtv_world_ros.bounded_input import fill_template
 from mtv_world_ros.errors import SimulatorError
 from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.vision.segmenters.colour import PALETTE
@@ -171,4 +172,4 @@ def _raised(place: Place, height: float) -> Place:
 
 def instruction_of(task: Task, scene: Scene) -> str:
     """Returns the task's instruction with the scene's object names filled in."""
-    return task.instruction.format(**{item.role: item.name for item in scene.objects})
+    return fill_template(task.instruction, {item.role: item.name for item in scene.objects})

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator, ValidationInfo
 
-from mtv_world_ros.bounded_input import read_json
+from mtv_world_ros.bounded_input import fill_template, read_json
 from mtv_world_ros.config import Pair, Schema, wrong
 from mtv_world_ros.data_types import CameraModel, FloatArray
 from mtv_world_ros.errors import CalibrationError, ConfigError, nearest
@@ -244,8 +244,8 @@ class _Lookup:
 
 def _formatted(name: str, episode_index: int, where: str) -> str:
     try:
-        return name.format(episode_index=episode_index)
-    except (KeyError, IndexError, ValueError, AttributeError) as error:
+        return fill_template(name, {'episode_index': episode_index})
+    except ValueError as error:
         raise ConfigError(
             f"{where}: 'file' is '{name}'; it may hold {{episode_index}} or "
             f'{{episode_index:06d}} and no other braces'

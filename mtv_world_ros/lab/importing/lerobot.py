@@ -16,7 +16,13 @@ import av
 from av.container import InputContainer
 import numpy as np
 
-from mtv_world_ros.bounded_input import check_limit, parse_json, read_json, read_text
+from mtv_world_ros.bounded_input import (
+    check_limit,
+    fill_template,
+    parse_json,
+    read_json,
+    read_text,
+)
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import ConfigError, EpisodeError, nearest, ObservationError
@@ -28,6 +34,8 @@ _PNG_DEPTH = bytes([16, 0])
 _INFO = Path('meta/info.json')
 #: a video frame may be this share of the period away from its row
 _TIME_TOLERANCE = 0.25
+#: characters of a wrong value in an error
+_MOST_SHOWN = 120
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,8 +92,8 @@ class LeRobotDataset:
         try:
             self.fps = float(info['fps'])
             self.features: dict[str, dict[str, Any]] = dict(info['features'])
-            self._data_path = str(info['data_path'])
-            self._video_path = str(info.get('video_path') or '')
+            self._data_path = info['data_path']
+            self._video_path = info.get('video_path') or ''
             self._chunk = int(info.get('chunks_size', 1000))
             read = self._episodes_v3 if self.version == 'v3.0' else self._episodes_v2
             self.episodes = {entry.index: entry for entry in read()}
@@ -250,8 +258,14 @@ class LeRobotDataset:
         except (OSError, ValueError) as error:
             raise EpisodeError(f"cannot read '{file}': {error}") from error
 
-    def _file(self, template: str, place: Mapping[str, Any]) -> Path:
-        relative = Path(template.format(**place))
+    def _file(self, template: object, place: Mapping[str, int | str]) -> Path:
+        try:
+            relative = Path(fill_template(template, place))
+        except ValueError as error:
+            key = 'data_path' if template == self._data_path else 'video_path'
+            raise EpisodeError(
+                f"'{self.root / _INFO}': '{key}' is {repr(template)[:_MOST_SHOWN]}: {error}"
+            ) from error
         if relative.is_absolute() or '..' in relative.parts:
             raise EpisodeError(f"'{self.root / _INFO}' names '{relative}', outside the dataset")
         return self.root / relative
