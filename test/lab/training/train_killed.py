@@ -14,6 +14,7 @@ import random
 import signal
 import sys
 import time
+import traceback
 
 from sources import run_training
 
@@ -29,6 +30,8 @@ def start(out: Path, episodes: Path, preset: Path) -> int:
     try:
         run_training(out, episodes, preset, save_every=3)
         code = 0
+    except BaseException:
+        traceback.print_exc()  # `os._exit` below prints nothing
     finally:
         os._exit(code)
 
