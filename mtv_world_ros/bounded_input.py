@@ -7,6 +7,7 @@ limit that is too low for you is raised with an environment variable, e.g.
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -177,8 +178,13 @@ def _open_regular(path: Path | str) -> Iterator[tuple[BinaryIO, int]]:
 
 
 def read_text(path: Path | str, limit: str) -> str:
-    """Returns the UTF-8 text of a regular file; see `read_bytes`."""
-    return read_bytes(path, limit).decode('utf-8')
+    """Return the text of a regular file, in UTF-8, or UTF-16 with its mark; see `read_bytes`.
+
+    The byte order mark that editors and spreadsheet programs write is no part of the text.
+    """
+    data = read_bytes(path, limit)
+    is_utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode('utf-16' if is_utf16 else 'utf-8-sig')
 
 
 def read_json(path: Path | str) -> Any:

@@ -141,7 +141,7 @@ def camera_track(
                 f"'{source.calibration}' has no view '{source.view}'"
                 f'{nearest(source.view, cameras)}; it has {", ".join(cameras)}'
             )
-        return _sized(cameras[source.view], size)
+        return sized_camera(cameras[source.view], size)
     row = source.camera
     assert row is not None
     look_up = _Lookup(source, dataset, episode_index, values)
@@ -162,13 +162,23 @@ def camera_track(
         mount_link=row.mount_link,
         T_mount_camera=poses[0],
     )
-    return _sized(camera, size, np.stack(poses) if row.moves else None)
+    return sized_camera(camera, size, np.stack(poses) if row.moves else None)
 
 
-def _sized(
+def sized_camera(
     camera: CameraModel, size: tuple[int, int], poses: FloatArray | None = None
 ) -> CameraTrack:
-    """The camera for images of a size; a note says where they were stretched."""
+    """Return the camera for images of a size; a note says where they were stretched.
+
+    Raises:
+        CalibrationError: images lie on their side against those that were calibrated.
+    """
+    if (camera.width - camera.height) * (size[0] - size[1]) < 0:
+        raise CalibrationError(
+            f"view '{camera.view}': images of {size[0]}x{size[1]}, but its K is for "
+            f'{camera.width}x{camera.height}: they are turned against each other; calibrate the '
+            'images as players show them'
+        )
     try:
         sized, note = windowed_camera(camera, *size)
     except CalibrationError:

@@ -181,9 +181,8 @@ def import_dataset(
 
 def _check_features(source: LeRobotDataset, chosen: DatasetMapping) -> None:
     """Checks the names of features before the first episode is read."""
-    streams = [chosen.state, *([chosen.action] if chosen.action else [])]
-    for stream in streams:
-        source.feature(stream.feature)
+    for name in _stream_features(chosen):
+        source.feature(name)
     if chosen.outcome_feature:
         source.feature(chosen.outcome_feature)
     for view in chosen.views.values():
@@ -266,14 +265,21 @@ def convert_episode(
             if k in commands:  # after what it starts from, so that the episode can be played
                 writer.write_trajectory(stamp_ns, commands[k])
         masks.finish()
-    return *odd, *notes, *jumps(commands.values(), mapping.robot)
+    shown = {view: dataset.video_note(entry, row.feature) for view, row in mapping.views.items()}
+    turned = [f"view '{view}': {note}" for view, note in shown.items() if note]
+    return *odd, *notes, *turned, *jumps(commands.values(), mapping.robot)
+
+
+def _stream_features(mapping: DatasetMapping) -> tuple[str, ...]:
+    """Return the features of the measured and the commanded joints."""
+    commanded = mapping.action.features if mapping.action else ()
+    return *mapping.state.features, *commanded
 
 
 def _read_rows(
     dataset: LeRobotDataset, entry: EpisodeEntry, mapping: DatasetMapping
 ) -> dict[str, FloatArray]:
-    names = ['timestamp', 'task_index', mapping.state.feature]
-    names += [mapping.action.feature] if mapping.action else []
+    names = ['timestamp', 'task_index', *_stream_features(mapping)]
     names += [mapping.outcome_feature] if mapping.outcome_feature else []
     for source in mapping.views.values():
         dataset.feature(source.feature, ('video', 'image'))
@@ -286,8 +292,8 @@ def _measured(
 ) -> FloatArray:
     """(T, J)."""
     stream = mapping.state
-    names = dataset.column_names(stream.feature)
-    positions = to_positions(_table(rows, stream), names, stream.columns, stream.feature)
+    values, names = _table(dataset, rows, stream)
+    positions = to_positions(values, names, stream.columns, stream.label)
     _check(positions, stream, mapping, 'state')
     return positions
 
@@ -302,14 +308,20 @@ def _commanded(
     stream = mapping.action
     if stream is None:
         return measured, ()
-    names = dataset.column_names(stream.feature)
-    positions, odd = stream.commanded(_table(rows, stream), names, measured, mapping.robot)
+    values, names = _table(dataset, rows, stream)
+    positions, odd = stream.commanded(values, names, measured, mapping.robot)
     _check(positions, stream, mapping, 'action')
     return positions, odd
 
 
-def _table(rows: dict[str, FloatArray], stream: Stream) -> FloatArray:
-    return rows[stream.feature].reshape(len(rows['timestamp']), -1)
+def _table(
+    dataset: LeRobotDataset, rows: dict[str, FloatArray], stream: Stream
+) -> tuple[FloatArray, list[str]]:
+    """Return the columns (T, C) of a stream's features side by side, and their names."""
+    count = len(rows['timestamp'])
+    tables = {name: rows[name].reshape(count, -1) for name in stream.features}
+    sizes = {name: table.shape[1] for name, table in tables.items()}
+    return np.concatenate(list(tables.values()), axis=1), dataset.joined_names(sizes)
 
 
 def _check(positions: FloatArray, stream: Stream, mapping: DatasetMapping, what: str) -> None:
@@ -317,7 +329,7 @@ def _check(positions: FloatArray, stream: Stream, mapping: DatasetMapping, what:
         check_positions(mapping.robot, positions, tolerance=mapping.limit_tolerance)
     except TrajectoryError as error:
         raise TrajectoryError(
-            f"{what} '{stream.feature}': {error}; are unit, sign, offset and gripper range in "
+            f"{what} '{stream.label}': {error}; are unit, sign, offset and gripper range in "
             'the mapping right? (limit_tolerance there says how far outside is accepted)'
         ) from error
 

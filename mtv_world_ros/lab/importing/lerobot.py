@@ -6,26 +6,26 @@ Layout as in huggingface/lerobot (`src/lerobot/datasets/utils.py`, `io_utils.py`
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
-import av
-from av.container import InputContainer
 import numpy as np
 
 from mtv_world_ros.bounded_input import (
-    check_limit,
     fill_template,
     parse_json,
+    read_bytes,
     read_json,
     read_text,
 )
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.errors import ConfigError, EpisodeError, nearest, ObservationError
+from mtv_world_ros.lab.importing.video_frames import frames_at, video_note
 
 VERSIONS = ('v2.0', 'v2.1', 'v3.0')
 _PICTURES = ('video', 'image')
@@ -82,6 +82,7 @@ class LeRobotDataset:
     def __init__(self, root: Path) -> None:
         pyarrow_modules()
         self.root = root
+        self._video_notes: dict[Path, str] = {}
         info = self._info()
         self.version = str(info.get('codebase_version', ''))
         if self.version not in VERSIONS:
@@ -146,6 +147,46 @@ class LeRobotDataset:
         if isinstance(names, list) and len(names) == 1 and isinstance(names[0], list):
             names = names[0]
         return [str(name) for name in names] if isinstance(names, list) else []
+
+    def joined_names(self, sizes: Mapping[str, int]) -> list[str]:
+        """Return one name a column of several features side by side.
+
+        Args:
+            sizes: numbers of columns by feature, in their order.
+
+        A column keeps its own name where no other feature has it, else it is FEATURE/NAME. One
+        without a name is FEATURE/NUMBER, or FEATURE where it is the only one. Columns of a single
+        feature keep their names; there are none where the feature names none.
+        """
+        own = {feature: self.column_names(feature) for feature in sizes}
+        if len(sizes) == 1:
+            return own[next(iter(sizes))]
+        counts = Counter(name for names in own.values() for name in names)
+        found = []
+        for feature, size in sizes.items():
+            names = own[feature]
+            if len(names) != size:
+                names = []
+            for k in range(size):
+                if names and counts[names[k]] == 1:
+                    found.append(names[k])
+                else:
+                    part = names[k] if names else str(k)
+                    found.append(feature if size == 1 and not names else f'{feature}/{part}')
+        return found
+
+    def video_note(self, entry: EpisodeEntry, feature: str) -> str:
+        """Return what is done to the frames of a video feature and why; empty if nothing is.
+
+        Raises:
+            EpisodeError: the video is missing or damaged.
+        """
+        if self.feature(feature, _PICTURES)['dtype'] == 'image':
+            return ''
+        file = entry.videos[feature].file
+        if file not in self._video_notes:
+            self._video_notes[file] = video_note(file)
+        return self._video_notes[file]
 
     def rows(self, entry: EpisodeEntry, features: Sequence[str]) -> dict[str, FloatArray]:
         """Numbers of an episode by feature, (T, ...) each, in order.
@@ -338,12 +379,56 @@ class LeRobotDataset:
                 ) from error
             yield self._decoded(cell, entry, feature)
 
-    def _decoded(self, cell: Any, entry: EpisodeEntry, feature: str) -> ByteArray:
-        data = cell.get('bytes') if isinstance(cell, Mapping) else None
-        if data is None:
+    def _image_bytes(self, cell: Any, entry: EpisodeEntry, feature: str) -> bytes:
+        """Return the encoded image of a cell: bytes, a path, or both by key.
+
+        Raises:
+            EpisodeError: the cell holds none, or the file that it names cannot be read.
+        """
+        data, path = (
+            (cell.get('bytes'), cell.get('path')) if isinstance(cell, Mapping) else (cell, None)
+        )
+        if isinstance(data, str):
+            data, path = None, data
+        if isinstance(data, list) and all(isinstance(n, int) and 0 <= n < 256 for n in data):
+            data = bytes(data)
+        if isinstance(data, bytes):
+            return data
+        if data is None and isinstance(path, str):
+            return self._image_file(path, entry, feature)
+        kind = type(cell).__name__ if not isinstance(cell, Mapping) else f'keys {sorted(cell)}'
+        raise EpisodeError(
+            f"'{entry.data_file}': a cell of '{feature}' holds {kind}, must be an encoded image, "
+            'or the path of one'
+        )
+
+    def _image_file(self, path: str, entry: EpisodeEntry, feature: str) -> bytes:
+        """Return the content of an image file; paths of another machine are taken by their end."""
+        parts = [part for part in PurePosixPath(path.replace('\\', '/')).parts if part != '/']
+        if not parts or '..' in parts:
             raise EpisodeError(
-                f"'{entry.data_file}': '{feature}' holds no image bytes, but {type(cell).__name__}"
+                f"'{entry.data_file}': an image of '{feature}' is '{path}', outside the dataset"
             )
+        ends = [Path(*parts[k:]) for k in range(len(parts))]
+        bases = (
+            self.root,
+            entry.data_file.parent,
+            self.root / 'images' / feature / f'episode_{entry.index:06d}',
+        )
+        files = (base / end for end in ends for base in bases)
+        found = next((file for file in files if _is_file(file)), None)
+        if found is None:
+            raise EpisodeError(
+                f"'{entry.data_file}': an image of '{feature}' is '{path}', which is not there, "
+                f"neither in '{self.root}' nor beside the table"
+            )
+        try:
+            return read_bytes(found, 'image_bytes')
+        except (OSError, ValueError) as error:
+            raise EpisodeError(f"image '{found}' cannot be read: {error}") from error
+
+    def _decoded(self, cell: Any, entry: EpisodeEntry, feature: str) -> ByteArray:
+        data = self._image_bytes(cell, entry, feature)
         if data[:4] == b'\x89PNG' and data[24:26] == _PNG_DEPTH:
             raise EpisodeError(
                 f"'{entry.data_file}': '{feature}' has 16-bit images of one channel, as of depth; "
@@ -356,6 +441,13 @@ class LeRobotDataset:
             raise EpisodeError(
                 f"'{entry.data_file}': an image of '{feature}' is damaged: {error}"
             ) from error
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that no system has
+        return False
 
 
 def _is_depth_map(feature: Mapping[str, Any]) -> bool:
@@ -387,48 +479,3 @@ def pyarrow_modules() -> tuple[Any, Any]:
             "LeRobot datasets need pyarrow: pip install 'mtv_world_ros[import]'"
         ) from error
     return pyarrow, parquet
-
-
-def frames_at(path: Path, times: FloatArray, tolerance_s: float) -> Iterator[ByteArray]:
-    """Yields the (H, W, 3) RGB frame of a video at each of (T,) increasing times [s], in one pass.
-
-    Raises:
-        EpisodeError: the file is missing or damaged, or has no frame near enough to a time.
-    """
-    if len(times) == 0:
-        return
-    try:
-        with av.open(str(path)) as container:
-            if not container.streams.video:
-                raise EpisodeError(f"'{path}' holds no video")
-            yield from _matched(container, path, times, tolerance_s)
-    except (av.FFmpegError, OSError, ValueError) as error:  # names in it may be no UTF-8
-        raise EpisodeError(f"video '{path}' cannot be read: {error}") from error
-
-
-def _matched(
-    container: InputContainer, path: Path, times: FloatArray, tolerance_s: float
-) -> Iterator[ByteArray]:
-    stream = container.streams.video[0]
-    base = stream.time_base
-    if base is not None and times[0] > tolerance_s:
-        container.seek(int((times[0] - tolerance_s) / base), stream=stream, backward=True)
-    wanted, last = 0, float('nan')
-    for frame in container.decode(stream):
-        check_limit('image_pixels', frame.width * frame.height, 'a frame')
-        seconds = float('nan') if frame.time is None else float(frame.time)
-        while wanted < len(times) and abs(seconds - times[wanted]) <= tolerance_s:
-            yield np.asarray(frame.to_ndarray(format='rgb24'), np.uint8)
-            wanted += 1
-        if wanted == len(times):
-            return
-        if seconds > times[wanted] + tolerance_s:
-            raise EpisodeError(
-                f"video '{path}' has no frame at {times[wanted]:.4f} s: there is one at "
-                f'{last:.4f} s and the next at {seconds:.4f} s'
-            )
-        last = seconds
-    raise EpisodeError(
-        f"video '{path}' ends at {last:.4f} s, but the data have a frame at "
-        f'{times[wanted]:.4f} s ({len(times) - wanted} frames are missing)'
-    )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 import hashlib
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,12 +33,32 @@ from mtv_world_ros.lab.importing.camera_parameters import CameraSource
 from mtv_world_ros.lab.importing.lerobot import LeRobotDataset
 from mtv_world_ros.lab.importing.tool_poses import ToolPoses
 
+#: names of features, or of what several features begin with, in data sets of LeRobot's layout
+_STATES = ('observation.state', 'observation.states', 'state', 'states')
+_ACTIONS = ('action', 'actions')
+
 
 class Stream(JointTable):
-    """Joint values of a feature."""
+    """Joint values of a feature, or of several whose columns follow each other."""
 
-    feature: str = Field(description='name in the dataset')
+    feature: str | Annotated[ListOf[str], Field(min_length=1)] = Field(
+        description='name in the dataset, or a list of names'
+    )
     joints: JointEntries | None = None
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Names in the dataset, in the order of their columns."""
+        return (self.feature,) if isinstance(self.feature, str) else self.feature
+
+    @property
+    def label(self) -> str:
+        """Names in the dataset, for errors."""
+        return ', '.join(self.features)
+
+    def used_columns(self) -> tuple[int | str, ...]:
+        """Return the columns that joints are made of, by name or number."""
+        return tuple(joint.column for joint in self.columns if joint.column is not None)
 
 
 class ActionStream(Stream):
@@ -54,6 +76,11 @@ class ActionStream(Stream):
     tools: dict[str, ToolPoses] = Field(
         default_factory=dict, description='poses of the tools of arms, in place of their joints'
     )
+
+    def used_columns(self) -> tuple[int | str, ...]:
+        """Return the columns that joints and poses are made of, by name or number."""
+        poses = [(*poses.position, *poses.rotation) for poses in self.tools.values()]
+        return tuple(chain(super().used_columns(), *poses))
 
     def _needed(self, robot: RobotModel) -> Sequence[str]:
         led = tool_joints(self.tools, robot)
@@ -85,12 +112,12 @@ class ActionStream(Stream):
         """
         positions = measured.copy()
         at = [robot.joint_names.index(column.joint) for column in self.columns]
-        positions[:, at] = to_positions(values, names, self.columns, self.feature)
+        positions[:, at] = to_positions(values, names, self.columns, self.label)
         added = [robot.joint_names.index(joint) for joint in self.differences]
         positions[:, added] += measured[:, added]
         odd = [
             add_tool_poses(
-                positions, measured, robot, arm, poses, poses.wanted(values, names, self.feature)
+                positions, measured, robot, arm, poses, poses.wanted(values, names, self.label)
             )
             for arm, poses in self.tools.items()
         ]
@@ -101,10 +128,15 @@ def load_mapped_robot(name: Any, info: ValidationInfo[dict[str, Any]]) -> RobotM
     """Loads the robot that a mapping names; its file is put into the context."""
     if not isinstance(name, str):
         raise wrong("the name of a bundled robot, or a robot's YAML")
-    is_path = Path(name).suffix in ('.yaml', '.yml')
-    file = info.context['folder'] / name if is_path else bundled('robots', name, 'robot')
+    file = _robot_path(name, info.context['folder'])
     info.context.update(robot_file=file, robot=load_robot(file))
     return info.context['robot']
+
+
+def _robot_path(name: str, folder: Path) -> Path:
+    """Return a robot's YAML, in `folder` unless it is a bundled one."""
+    is_path = Path(name).suffix in ('.yaml', '.yml')
+    return folder / name if is_path else bundled('robots', name, 'robot')
 
 
 def _not_from_state(value: Any) -> Any:
@@ -193,6 +225,8 @@ def guess_mapping(
             f'{", ".join(found) or "none"}; call them alike, or write a mapping (--mapping)'
         )
     file = str(calibration.resolve())
+    joints = load_robot(_robot_path(robot, Path())).joint_names
+    action = _guess_features(dataset, joints, _ACTIONS)
     is_path = Path(robot).suffix in ('.yaml', '.yml')
     values = {
         'robot': str(Path(robot).resolve()) if is_path else robot,
@@ -201,10 +235,34 @@ def guess_mapping(
             for view, name in found.items()
             if view in known
         },
-        'state': {'feature': 'observation.state'},
-        'action': {'feature': 'action'} if 'action' in dataset.features else 'state',
+        'state': {'feature': _guess_features(dataset, joints, _STATES) or _STATES[0]},
+        'action': {'feature': action} if action else 'state',
     }
     return values, tuple(name for view, name in found.items() if view not in known)
+
+
+def _guess_features(
+    dataset: LeRobotDataset, joints: Sequence[str], stems: Sequence[str]
+) -> str | list[str]:
+    """Return the feature of joint positions, or the features that they are split into.
+
+    A data set has either one feature of a stem's name, or several below it, e.g.
+    `observation.state.arm.position`, with columns that are named like the robot's joints. Where
+    several have a joint, those that are called a position count. Empty if there is none.
+    """
+    for stem in stems:
+        if stem in dataset.features:
+            return stem
+    below = {
+        name: set(dataset.column_names(name)) & set(joints)
+        for name in dataset.features
+        if name.startswith(tuple(f'{stem}.' for stem in stems))
+    }
+    held = [name for name, found in below.items() if found]
+    counts = Counter(joint for name in held for joint in below[name])
+    if any(count > 1 for count in counts.values()):
+        held = [name for name in held if 'position' in name]
+    return held
 
 
 def digest_of(*files: Path | None, start: bytes = b'') -> str:

@@ -2,37 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-import csv
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from glob import escape
-from itertools import islice
-import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-import av
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PrivateAttr
 
-from mtv_world_ros.bounded_input import check_limit, parse_json, read_text
 from mtv_world_ros.config import read_yaml, validated, wrong
 from mtv_world_ros.data.bag_mapping import BagMapping, ViewSource, Written
 from mtv_world_ros.data.episode import Episode, EpisodeInfo, JointStates, Track
 from mtv_world_ros.data.joint_plans import following
-from mtv_world_ros.data_types import ByteArray, FloatArray
-from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.data_types import FloatArray
+from mtv_world_ros.errors import ConfigError, EpisodeError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.camera import scaled, unknown_camera
+from mtv_world_ros.geometry.camera import unknown_camera
 from mtv_world_ros.geometry.robot.file import save_robot
-from mtv_world_ros.geometry.robot.joint_columns import to_positions
+from mtv_world_ros.geometry.robot.joint_columns import column_number, to_positions
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.lab.importing.bags import write_imported
+from mtv_world_ros.lab.importing.camera_parameters import sized_camera
 from mtv_world_ros.lab.importing.convert import import_each, ImportSummary, START_NS
 from mtv_world_ros.lab.importing.mapping import ActionStream, digest_of, load_mapped_robot
+from mtv_world_ros.lab.importing.number_tables import NumberTable, read_table
 from mtv_world_ros.lab.importing.stored_objects import AS_RECORDED, ObjectStage
 from mtv_world_ros.lab.importing.tool_poses import joints_of_poses
+from mtv_world_ros.lab.importing.video_frames import FrameTimes, match_frames, VideoFileFrames
+
+#: units of `time` in a second
+_PER_SECOND = {'s': 1.0, 'ms': 1e3, 'us': 1e6, 'ns': 1e9}
+#: settings that are not among those that older imports were made with
+_LATER = ('time_unit', 'frame_times')
 
 
 def _inside(pattern: str) -> str:
@@ -58,7 +60,13 @@ class VideoMapping(Written):
     fps: float | None = Field(
         default=None, gt=0, le=1000, description='rows a second, without `time`'
     )
-    time: str = Field(default='', description='column or key of the time of each row [s]')
+    time: str = Field(default='', description='column or key of the time of each row')
+    time_unit: Literal['s', 'ms', 'us', 'ns'] = Field(default='s', description='of `time`')
+    frame_times: FrameTimes = Field(
+        default='auto',
+        description='`video` = frames keep the times of the video, from the first row on; `rows` '
+        '= frame k belongs to row k; `auto` = what number, rate and duration tell',
+    )
     instruction: str = Field(default='', description='text, or `key: NAME` of the JSON file')
     _robot_file: Path = PrivateAttr(default=Path())
 
@@ -66,6 +74,12 @@ class VideoMapping(Written):
     def robot_file(self) -> Path:
         """The robot's YAML."""
         return self._robot_file
+
+    @property
+    def unused_settings(self) -> set[str]:
+        """Settings that leave episodes of earlier versions as they are."""
+        fields = type(self).model_fields
+        return {key for key in _LATER if getattr(self, key) == fields[key].default}
 
     def written(self) -> BagMapping:
         """Task, outcome and quality of the episodes that are written."""
@@ -154,7 +168,7 @@ def import_videos(
     """
     recordings = find_recordings(folder, mapping)
     saved = save_robot(mapping.robot_file, out / 'robot')
-    text = mapping.model_dump_json(exclude={'robot'}).encode()
+    text = mapping.model_dump_json(exclude={'robot', *mapping.unused_settings}).encode()
     key = digest_of(mapping.robot_file, calibration, start=stage.key + text)
 
     def convert(one: VideoRecording, path: Path) -> tuple[str, ...]:
@@ -174,38 +188,36 @@ def read_recording(
 ) -> Episode:
     """Reads a recording as an episode whose commands are the positions that follow.
 
-    Frame k belongs to row k. A view without calibration gets a placeholder and is named in
-    `unknown`.
+    Frames are matched to rows by `match_frames`. A view without calibration gets a placeholder
+    and is named in `unknown`.
 
     Raises:
         EpisodeError: a file is missing or cannot be read, or its rows cannot be used.
         ConfigError: a column is not there.
     """
     path = recording.file(mapping.rows)
-    values, names, keys = read_rows(path, mapping.state.feature)
-    stamps = START_NS + np.round(_times(values, keys, mapping, path) * 1e9).astype(np.int64)
-    positions, notes = _positions(values, names, mapping, path)
+    table = read_table(path, mapping.state.features)
+    times = _times(table, mapping)
+    stamps = START_NS + np.round(times * 1e9).astype(np.int64)
+    positions, notes = _positions(table, mapping)
     images, cameras, unknown = {}, {}, {}
     known = {} if calibration is None else load_calibration(calibration)
     for view, pattern in mapping.views.items():
         frames = VideoFileFrames(recording.file(pattern))
-        if abs(len(frames) - len(stamps)) > 0:
-            notes.append(
-                f"view '{view}': {len(frames)} frames and {len(stamps)} rows: frame k is taken to "
-                'belong to row k, and what is longer is left out'
-            )
-        count = min(len(frames), len(stamps))
-        images[view] = Track(stamps[:count], frames.first(count))
+        images[view], said = _track(frames, times, mapping)
+        notes += [f"view '{view}': {text}" for text in said]
         height, width = frames[0].shape[:2]
         if view in known:
-            cameras[view] = scaled(known[view], width, height)
+            found = sized_camera(known[view], (width, height))
+            cameras[view] = found.camera
+            notes += [found.note] if found.note else []
         else:
             unknown[view] = 'pose and intrinsics'
             cameras[view] = unknown_camera(view, width, height, mapping.robot.base_link)
     states = JointStates(
         stamps_ns=stamps, joint_names=mapping.robot.joint_names, positions=positions
     )
-    info = EpisodeInfo(path=path, instruction=_instruction(keys, mapping, path))
+    info = EpisodeInfo(path=path, instruction=_instruction(table.keys, mapping, path))
     return Episode(
         info=info,
         views=tuple(mapping.views),
@@ -220,63 +232,65 @@ def read_recording(
     )
 
 
-def _positions(
-    values: FloatArray, names: Sequence[str], mapping: VideoMapping, path: Path
-) -> tuple[FloatArray, list[str]]:
+def _track(
+    frames: VideoFileFrames, times: FloatArray, mapping: VideoMapping
+) -> tuple[Track, list[str]]:
+    """Return the frames within the rows at `times` (T,) [s], and how they were read."""
+    match = match_frames(
+        frames.times,
+        len(frames),
+        times,
+        rows_are_timed=bool(mapping.time),
+        source=mapping.frame_times,
+    )
+    stamps = START_NS + np.round(match.times * 1e9).astype(np.int64)
+    return Track(stamps, frames.chosen(match.numbers)), list(
+        filter(None, (frames.note, match.note))
+    )
+
+
+def _positions(table: NumberTable, mapping: VideoMapping) -> tuple[FloatArray, list[str]]:
     """(T, J) [rad or m], and what was odd; joints of tool poses by inverse kinematics."""
-    stream, robot = mapping.state, mapping.robot
+    stream, robot, values, names = mapping.state, mapping.robot, table.values, table.names
+    what = ', '.join(filter(None, stream.features)) or table.path.name
+    count = values.shape[1]
+    table.check_numbers(
+        [column_number(column, names, count, what, 'state') for column in stream.used_columns()]
+    )
     positions = np.tile(np.clip(0.0, robot.lower, robot.upper), (len(values), 1))
     at = [robot.joint_names.index(column.joint) for column in stream.columns]
-    positions[:, at] = to_positions(values, names, stream.columns, stream.feature or path.name)
-    notes = []
+    positions[:, at] = to_positions(values, names, stream.columns, what)
+    notes = list(table.notes)
     for arm, poses in stream.tools.items():
-        wanted = poses.wanted(values, names, stream.feature or path.name)
+        wanted = poses.wanted(values, names, what)
         notes.append(joints_of_poses(positions, robot, arm, poses, wanted))
     return positions, notes
 
 
-def read_rows(path: Path, feature: str) -> tuple[FloatArray, tuple[str, ...], Mapping[str, Any]]:
-    """Reads a table: values (T, C), names of the columns where there are any, everything by key.
-
-    Args:
-        path: CSV with a head, or JSON: an object of lists.
-        feature: key of the JSON file whose rows are wanted; of a CSV file all columns are.
-
-    Raises:
-        EpisodeError: the file is missing, or no such table.
-    """
-    try:
-        text = read_text(path, 'json_bytes')
-        if path.suffix.lower() == '.csv':
-            head, *rows = list(csv.reader(text.splitlines()))
-            table = np.array(rows, float)
-            columns = tuple(name.strip() for name in head)
-            return table, columns, dict(zip(columns, table.T, strict=True))
-        keys = parse_json(text, str(path))
-        table = np.asarray(keys[feature], float)
-    except (ConfigError, OSError, ValueError, TypeError, json.JSONDecodeError) as error:
-        raise EpisodeError(f"'{path}' cannot be read as a table of numbers: {error}") from error
-    except KeyError as error:
-        raise EpisodeError(
-            f"'{path}' has no '{feature}'; it has {', '.join(map(str, keys))}"
-        ) from error
-    if table.ndim != 2 or len(table) < 2 or not np.isfinite(table).all():
-        raise EpisodeError(f"'{path}': '{feature}' is {table.shape}, must be (rows, columns)")
-    return table, (), keys
-
-
-def _times(
-    values: FloatArray, keys: Mapping[str, Any], mapping: VideoMapping, path: Path
-) -> FloatArray:
-    """(T,) from 0 on [s]."""
+def _times(table: NumberTable, mapping: VideoMapping) -> FloatArray:
+    """Return (T,) times of rows, from 0 on [s]."""
+    path, keys, name = table.path, table.keys, mapping.time
     if mapping.fps is not None:
-        return np.arange(len(values)) / mapping.fps
-    if mapping.time not in keys:
-        raise EpisodeError(f"'{path}' has no '{mapping.time}'; it has {', '.join(keys)}")
-    times = np.asarray(keys[mapping.time], float).ravel()
-    if len(times) != len(values) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise EpisodeError(f"'{path}': '{mapping.time}' must increase, once a row")
-    return times - times[0]
+        return np.arange(len(table.values)) / mapping.fps
+    if name not in keys:
+        raise EpisodeError(
+            f"'{path}' has no '{name}'{nearest(name, keys)}; it has {', '.join(keys)}"
+        )
+    if name in table.names:
+        table.check_numbers([table.names.index(name)])
+    try:
+        times = np.asarray(keys[name], float).ravel()
+    except (TypeError, ValueError) as error:
+        raise EpisodeError(f"'{path}': '{name}' must hold numbers: {error}") from error
+    if len(times) != len(table.values) or not np.isfinite(times).all():
+        raise EpisodeError(f"'{path}': '{name}' must have a finite number for each row")
+    if (np.diff(times) <= 0).any():
+        row = int(np.argmax(np.diff(times) <= 0)) + 1
+        raise EpisodeError(
+            f"'{path}': '{name}' must increase; it goes from {times[row - 1]:.9g} to "
+            f'{times[row]:.9g} at row {row + 1}'
+        )
+    return (times - times[0]) / _PER_SECOND[mapping.time_unit]
 
 
 def _instruction(keys: Mapping[str, Any], mapping: VideoMapping, path: Path) -> str:
@@ -285,61 +299,3 @@ def _instruction(keys: Mapping[str, Any], mapping: VideoMapping, path: Path) -> 
         return mapping.instruction
     value = keys.get(name.strip(), '')
     return str(value[0]) if isinstance(value, list) and value else str(value)
-
-
-class VideoFileFrames:
-    """The first `count` frames (None = all) of a video file, decoded one after the other.
-
-    Raises:
-        EpisodeError: the file is missing or damaged, or holds no video.
-    """
-
-    def __init__(self, path: Path, count: int | None = None) -> None:
-        self._path = path
-        self._count = sum(1 for _ in self._packets()) if count is None else count
-        self._decoded: Iterator[ByteArray] = iter(())
-        self._next, self._last = self._count, np.zeros((0, 0, 3), np.uint8)
-        if self._count == 0:
-            raise EpisodeError(f"'{path}' holds no frame")
-
-    def first(self, count: int) -> VideoFileFrames:
-        """The first frames alone."""
-        return VideoFileFrames(self._path, count)
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, index: Any) -> ByteArray:
-        if isinstance(index, slice):
-            return np.stack([self._frame(i) for i in range(*index.indices(self._count))])
-        if np.ndim(index):
-            return np.stack([self._frame(int(i)) for i in index])
-        return self._frame(int(index))
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        return self[:]
-
-    def _frame(self, index: int) -> ByteArray:
-        index += self._count if index < 0 else 0
-        if not 0 <= index < self._count:
-            raise IndexError(index)
-        if index == self._next - 1 and self._last.size:
-            return self._last
-        if index < self._next:
-            self._decoded, self._next = self._packets(), 0
-        found = next(islice(self._decoded, index - self._next, None), None)
-        if found is None:
-            raise EpisodeError(f"'{self._path}' ends before frame {index}")
-        self._next, self._last = index + 1, found
-        return found
-
-    def _packets(self) -> Iterator[ByteArray]:
-        try:
-            with av.open(str(self._path)) as container:
-                if not container.streams.video:
-                    raise EpisodeError(f"'{self._path}' holds no video")
-                for frame in container.decode(video=0):
-                    check_limit('image_pixels', frame.width * frame.height, 'a frame')
-                    yield np.asarray(frame.to_ndarray(format='rgb24'), np.uint8)
-        except (av.FFmpegError, OSError, ValueError) as error:
-            raise EpisodeError(f"video '{self._path}' cannot be read: {error}") from error
