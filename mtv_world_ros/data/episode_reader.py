@@ -46,8 +46,9 @@ from mtv_world_ros.data.transform_tree import Mount, pose_track, read_tree, Tran
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.camera import unknown_camera, with_camera_info
-from mtv_world_ros.geometry.image_window import ImageWindow, WHOLE, window_of, windowed_camera
+from mtv_world_ros.geometry.camera import unknown_camera
+from mtv_world_ros.geometry.camera_info import Intrinsics, read_camera_info, RECTIFIED
+from mtv_world_ros.geometry.image_window import ImageWindow, WHOLE, windowed_camera
 from mtv_world_ros.geometry.robot.model import RobotModel
 
 Stamped = list[tuple[int, Any]]
@@ -168,6 +169,7 @@ class _EpisodeReader:
         self.refused: dict[str, list[str]] = {}
         self.tracks: dict[str, FloatArray] = {}
         self.unknown: dict[str, str] = {}
+        self.infos: dict[str, list[tuple[Any, Intrinsics]]] = {}
         self.seen_ns = 0  # all views have an image from here on
 
     def read(
@@ -474,12 +476,13 @@ class _EpisodeReader:
             return self._placeholder(view, unknown_mount, images)
         if not infos:
             raise CalibrationError(
-                f"'{self.path}', view '{view}': '{self._camera_info(view)}' has no CameraInfo, "
-                'which intrinsics come from where there is no calibration file; '
+                f"'{self.path}', view '{view}': '{self._camera_info(view)}' has no CameraInfo "
+                'that is calibrated (K[0] is not 0), which intrinsics come from where there is no '
+                'calibration file; '
                 f'{_estimate(self.path, view)}'
             )
         of_images = self.received[self.topics.views[view].image][0][1][1].header.frame_id
-        of_info = infos[0].header.frame_id
+        of_info = infos[0][0].header.frame_id
         if of_images and of_info and of_images != of_info:
             self._warn_once(
                 f"view '{view}': its images are of frame '{of_images}', its CameraInfo of "
@@ -524,40 +527,46 @@ class _EpisodeReader:
         given = row.camera_info if row else ''
         return self.mapping.topic(given) if given else self.topics.views[view].camera_info
 
-    def _camera_infos(self, view: str) -> list[Any]:
-        return [m for _, m in self._take(self._camera_info(view), messages.CAMERA_INFO)]
+    def _camera_infos(self, view: str) -> list[tuple[Any, Intrinsics]]:
+        """CameraInfos of a view that are calibrated, with their intrinsics.
+
+        Raises:
+            CalibrationError: a number in one is NaN or infinite.
+        """
+        if view not in self.infos:
+            is_rectified = RECTIFIED in self.topics.views[view].image
+            taken = self._take(self._camera_info(view), messages.CAMERA_INFO)
+            read = [(m, read_camera_info(view, m, is_rectified=is_rectified)) for _, m in taken]
+            self.infos[view] = [(m, found) for m, found in read if found is not None]
+            if read and not self.infos[view]:
+                self._warn_once(
+                    f"view '{view}': '{self._camera_info(view)}' is not calibrated "
+                    f'({"P" if is_rectified else "K"}[0] = 0), which is the same as no CameraInfo'
+                )
+        return self.infos[view]
 
     def _at_images(
         self, camera: CameraModel, size: tuple[int, int], *, is_given: bool
     ) -> CameraModel:
         """The camera for images of a size, by CameraInfo where a file has not given others."""
-        view = camera.view
-        infos = self._camera_infos(view)
-        if not infos:
+        view, first, informed = camera.view, None, camera
+        try:
+            infos = self._camera_infos(view)
+            first = infos[0][1].sized(*size) if infos else None
+            informed = first.camera(camera) if first else camera
+        except CalibrationError as error:
+            if not is_given:
+                raise
+            self._warn_once(f"{error}: the calibration file's intrinsics are used")
+            first, infos = None, []
+        self._check_changes(view, infos, size)
+        if first is None:
             return self._windowed(camera, size)
-        if '/image_rect' in self.topics.views[view].image:
-            infos = [_rectified(info) for info in infos]
-        first = _intrinsics(infos[0])
-        for index, info in enumerate(infos):
-            if _intrinsics(info) != first:
-                raise CalibrationError(
-                    f"'{self.path}': '{self._camera_info(view)}' changes at message {index}, from "
-                    f'{first} to {_intrinsics(info)}; cut the episode there'
-                )
-        width, height, k, model, distortion, window = first
-        informed = with_camera_info(
-            camera,
-            width=width,
-            height=height,
-            K=np.reshape(k, (3, 3)),
-            distortion_model=model,
-            distortion=distortion,
-        )
-        seen = self._windowed(informed, size, window)
+        seen = self._windowed(informed, size, first.window)
         if not is_given:
             return seen
-        is_full = (camera.width, camera.height) == (width, height)
-        given = self._windowed(camera, size, window if is_full else WHOLE)
+        is_full = (camera.width, camera.height) == (first.width, first.height)
+        given = self._windowed(camera, size, first.window if is_full else WHOLE)
         apart = np.abs(given.K - seen.K)[:2] / seen.K[0, 0]
         if apart.max() < _SAME_K:
             return seen
@@ -566,6 +575,23 @@ class _EpisodeReader:
             f"CameraInfo {_four(seen.K)} px; the file's are used"
         )
         return given
+
+    def _check_changes(
+        self, view: str, infos: Sequence[tuple[Any, Intrinsics]], size: tuple[int, int]
+    ) -> None:
+        """Refuse intrinsics that change, and say where the size of the images stands in."""
+        for index, (_, found) in enumerate(infos):
+            first = infos[0][1]
+            if found != first:
+                raise CalibrationError(
+                    f"'{self.path}': '{self._camera_info(view)}' changes at message {index}, "
+                    f'{first.difference(found)}; cut the episode there'
+                )
+            if not (first.width and first.height):
+                self._warn_once(
+                    f"view '{view}': its CameraInfo has no size ({first.width}x{first.height}): "
+                    f'taken as that of the images, {size[0]}x{size[1]}'
+                )
 
     def _windowed(
         self, camera: CameraModel, size: tuple[int, int], window: ImageWindow = WHOLE
@@ -611,18 +637,6 @@ def _estimate(path: Path, view: str) -> str:
 
 def _four(K: FloatArray) -> str:
     return ', '.join(f'{v:.1f}' for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-
-
-def _intrinsics(
-    info: Any,
-) -> tuple[int, int, tuple[float, ...], str, tuple[float, ...], ImageWindow]:
-    k, d = tuple(info.k.tolist()), tuple(info.d.tolist())
-    return info.width, info.height, k, info.distortion_model, d, window_of(info)
-
-
-def _rectified(info: Any) -> Any:
-    """The CameraInfo of rectified images: K is P's, without distortion."""
-    return replace(info, k=np.asarray(info.p).reshape(3, 4)[:, :3].ravel(), d=np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from mtv_world_ros.data_types import CameraModel, FloatArray
+from mtv_world_ros.data_types import CameraModel, DISTORTION_MODELS, FloatArray
 from mtv_world_ros.errors import CalibrationError
 from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.transforms import inverse
@@ -142,7 +142,7 @@ def with_camera_info(
         K: (3, 3) [px].
         distortion_model: as in CameraInfo; ignored if all coefficients are zero, unless it is
             `equidistant`.
-        distortion: coefficients.
+        distortion: coefficients; zeros beyond those of the model are ignored.
 
     Raises:
         CalibrationError: the CameraInfo is not calibrated, is of an unknown model, or contradicts
@@ -152,6 +152,9 @@ def with_camera_info(
     distortion_model = _SAME_MODEL.get(distortion_model, distortion_model)
     if not coefficients.any() and distortion_model != 'equidistant':
         distortion_model, coefficients = 'none', np.zeros(0)
+    longest = max(DISTORTION_MODELS.get(distortion_model, (len(coefficients),)))
+    if not coefficients[longest:].any():  # further zeros do not change the lens
+        coefficients = coefficients[:longest]
     informed = replace(
         camera,
         width=width,

@@ -12,7 +12,6 @@ from std_msgs.msg import Header
 
 from mtv_world_ros.data.bag import image_decoding
 from mtv_world_ros.data_types import ByteArray, CameraModel
-from mtv_world_ros.geometry.camera import with_camera_info
 from mtv_world_ros.geometry.image_window import WHOLE, window_of, windowed_pixels
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
 
@@ -75,21 +74,20 @@ def to_compressed(rgb: ByteArray, header: Header, quality: int) -> CompressedIma
     )
 
 
-def camera_from_info(calibrated: CameraModel, info: CameraInfo) -> CameraModel:
-    """Returns the camera with the intrinsics of `info` and the pose of `calibrated`.
-
-    Raises:
-        Rejection: `info` is not calibrated, or contradicts itself or the calibration.
-    """
-    with rejected_as(Reason.CAMERA_INFO_INVALID):
-        return with_camera_info(
-            calibrated,
-            width=info.width,
-            height=info.height,
-            K=np.reshape(info.k, (3, 3)),
-            distortion_model=info.distortion_model,
-            distortion=list(info.d),
-        )
+def info_of_camera(camera: CameraModel, header: Header) -> CameraInfo:
+    """Returns the CameraInfo of a calibrated camera; P = [K 0]."""
+    return CameraInfo(
+        header=header,
+        width=camera.width,
+        height=camera.height,
+        distortion_model='plumb_bob'
+        if camera.distortion_model == 'none'
+        else (camera.distortion_model),
+        d=camera.distortion.tolist() or [0.0] * 5,
+        k=camera.K.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.column_stack([camera.K, np.zeros(3)]).ravel(),
+    )
 
 
 def windowed_camera_info(info: CameraInfo, camera: CameraModel) -> CameraInfo:

@@ -16,6 +16,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from mtv_world_ros.data.transform_tree import Mount
 from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, Observation
 from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.geometry.camera_info import Intrinsics as InfoIntrinsics
+from mtv_world_ros.geometry.camera_info import read_camera_info
 from mtv_world_ros.geometry.image_window import window_of, windowed_camera
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.ros.messages import image_messages
@@ -84,7 +86,7 @@ class ObservationBuffer:
         on_image: Callable[[str, Image | CompressedImage], None] | None = None,
         pose: Callable[[str, str, int], Mount | None] | None = None,
     ) -> None:
-        self._intrinsics = Intrinsics(cameras)
+        self._intrinsics = Intrinsics(cameras, lambda: bool(limits().calibration_file))
         self._pose = pose
         self._size = (width, height)
         self._limits, self._on_image = limits, on_image
@@ -119,13 +121,20 @@ class ObservationBuffer:
         if self._on_image is not None:
             self._on_image(view, message)
 
-    def add_camera_info(self, view: str, message: CameraInfo) -> None:
+    def add_camera_info(
+        self, view: str, message: CameraInfo, *, is_rectified: bool = False
+    ) -> None:
         """Stores the first CameraInfo of a view and watches the later ones.
+
+        Args:
+            view: name of the view.
+            message: its CameraInfo.
+            is_rectified: whether the view's images are; their intrinsics are P.
 
         Raises:
             Rejection: the view is not calibrated, or its calibration just changed.
         """
-        self._intrinsics.add(view, message)
+        self._intrinsics.add(view, message, is_rectified=is_rectified)
 
     def add_joint_state(self, message: JointState) -> None:
         """Stores positions; several publishers may each give some of the joints.
@@ -201,8 +210,7 @@ class ObservationBuffer:
             missing += _freshness(
                 f"images of view '{view}'", images, now_ns, limits.max_image_age_s
             )
-            if not self._intrinsics.has(view):
-                missing.append(f"no camera_info of view '{view}'")
+            missing += self._intrinsics.missing(view)
         old = {
             name: _freshness('', samples, now_ns, limits.max_joint_state_age_s)
             for name, samples in self._joints.items()
@@ -326,23 +334,41 @@ class Intrinsics:
 
     Args:
         cameras: calibrated cameras of the V views; their poses are used.
+        is_given: asked whether their intrinsics are those of the views' cameras (of a calibration
+            file that the user named), so that they stand in for a CameraInfo that is not
+            calibrated.
     """
 
-    def __init__(self, cameras: Sequence[CameraModel]) -> None:
+    def __init__(
+        self, cameras: Sequence[CameraModel], is_given: Callable[[], bool] = lambda: False
+    ) -> None:
         self._calibrated = {camera.view: camera for camera in cameras}
+        self._is_given = is_given
+        self._rectified: set[str] = set()
+        self._uncalibrated: set[str] = set()
         self._infos: dict[str, CameraInfo] = {}
+        self._shown: dict[str, CameraInfo] = {}
         self._cameras: dict[str, CameraModel] = {}
         self._changed: dict[str, tuple[CameraInfo, str]] = {}
+        self._sources: dict[str, str] = {}
         self.notes: dict[str, str] = {}
 
-    def add(self, view: str, message: CameraInfo) -> None:
+    def add(self, view: str, message: CameraInfo, *, is_rectified: bool = False) -> None:
         """Stores the first info of a view and watches the later ones.
+
+        An info that is not calibrated is the same as none.
 
         Raises:
             Rejection: the view is not calibrated, or its calibration just changed.
         """
+        if is_rectified:
+            self._rectified.add(view)
+        found = self._read(view, message)
+        if found is None:
+            self._add_uncalibrated(view, message)
+            return
         if view not in self._infos:
-            self._take(view, message)
+            self._take(view, message, found)
             return
         differences = _differences(self._infos[view], message)
         if not differences:
@@ -366,10 +392,15 @@ class Intrinsics:
         """
         if not _are_equal(self._calibrated.values(), cameras):
             self._calibrated = {camera.view: camera for camera in cameras}
-            for stored in (self._infos, self._cameras, self._changed):
+            for stored in (
+                self._infos, self._shown, self._cameras, self._changed, self._uncalibrated,
+                self._sources,
+            ):  # fmt: skip
                 stored.clear()
         for view, (message, _) in list(self._changed.items()):
-            self._take(view, message)
+            found = self._read(view, message)
+            if found is not None:
+                self._take(view, message, found)
             del self._changed[view]
 
     def camera(self, view: str, *, width: int, height: int) -> CameraModel:
@@ -378,7 +409,9 @@ class Intrinsics:
         Raises:
             Rejection: its info is missing, changed, or for another size.
         """
-        if view not in self._cameras:
+        if view not in self._infos:
+            if view in self._uncalibrated:
+                raise Rejection(Reason.CAMERA_INFO_INVALID, self._not_calibrated(view))
             raise Rejection(
                 Reason.CAMERA_INFO_MISSING,
                 f"no camera_info of view '{view}' was received; publish it beside the images",
@@ -386,27 +419,91 @@ class Intrinsics:
         if view in self._changed:
             raise Rejection(Reason.CAMERA_INFO_CHANGED, self._changed[view][1])
         with rejected_as(Reason.CAMERA_INFO_INVALID):
-            window = window_of(self._infos[view])
+            if view not in self._cameras:
+                self._size(view, width, height)
+            window = window_of(self._shown[view])
             camera, note = windowed_camera(self._cameras[view], width, height, window)
-        self.notes[view] = note
+        self.notes[view] = '; '.join(filter(None, (self._sources.get(view, ''), note)))
         return camera
 
     def has(self, view: str) -> bool:
-        """Tells whether the view's info was received."""
+        """Tells whether an info of the view was received that can be used."""
         return view in self._infos
+
+    def missing(self, view: str) -> list[str]:
+        """Returns what is missing of the view's info, as text."""
+        if self.has(view):
+            return []
+        if view in self._uncalibrated:
+            return [self._not_calibrated(view)]
+        return [f"no camera_info of view '{view}'"]
 
     def info(self, view: str, frame_id: str) -> CameraInfo:
         """The view's info, with the image's frame where the image names one."""
-        info = self._infos[view]
+        info = self._shown[view]
         if frame_id in ('', info.header.frame_id):
             return info
-        named = CameraInfo(**{name: getattr(info, name) for name in _INFO_FIELDS})
-        named.header = type(info.header)(stamp=info.header.stamp, frame_id=frame_id)
-        return named
+        return _copied(info, header=type(info.header)(stamp=info.header.stamp, frame_id=frame_id))
 
-    def _take(self, view: str, message: CameraInfo) -> None:
-        self._cameras[view] = image_messages.camera_from_info(self._calibrated[view], message)
-        self._infos[view] = message
+    def _read(self, view: str, message: CameraInfo) -> InfoIntrinsics | None:
+        with rejected_as(Reason.CAMERA_INFO_INVALID):
+            return read_camera_info(view, message, is_rectified=view in self._rectified)
+
+    def _take(self, view: str, message: CameraInfo, found: InfoIntrinsics) -> None:
+        self._cameras.pop(view, None)
+        if found.width and found.height:  # else that of the images
+            with rejected_as(Reason.CAMERA_INFO_INVALID):
+                self._cameras[view] = found.camera(self._calibrated[view])
+        self._infos[view] = self._shown[view] = message
+        self._sources.pop(view, None)
+        self._uncalibrated.discard(view)
+
+    def _size(self, view: str, width: int, height: int) -> None:
+        """Sets the size of the images where the info has none."""
+        message = self._infos[view]
+        found = self._read(view, message)
+        assert found is not None
+        self._cameras[view] = found.sized(width, height).camera(self._calibrated[view])
+        self._shown[view] = _copied(message, width=width, height=height)
+        self._sources[view] = (
+            f"view '{view}': its camera_info has no size: taken as that of the images, "
+            f'{width}x{height}'
+        )
+
+    def _add_uncalibrated(self, view: str, message: CameraInfo) -> None:
+        """Takes the calibration file's intrinsics in place of an info without any.
+
+        Raises:
+            Rejection: there is no such file; at the first of these infos.
+        """
+        if view in self._infos:
+            return
+        if self._is_given():
+            camera = self._calibrated[view]
+            self._cameras[view] = camera
+            self._infos[view] = message
+            self._shown[view] = image_messages.info_of_camera(camera, message.header)
+            self._sources[view] = (
+                f"view '{view}': its camera_info is not calibrated: the intrinsics of "
+                "'calibration_file' are used"
+            )
+        elif view not in self._uncalibrated:
+            self._uncalibrated.add(view)
+            raise Rejection(Reason.CAMERA_INFO_INVALID, self._not_calibrated(view))
+
+    def _not_calibrated(self, view: str) -> str:
+        field = 'P' if view in self._rectified else 'K'
+        return (
+            f"camera_info of view '{view}' is not calibrated ({field}[0] = 0), which is the same "
+            "as none: calibrate the camera, or give its intrinsics in 'calibration_file'"
+        )
+
+
+def _copied(info: CameraInfo, **changes: object) -> CameraInfo:
+    copied = CameraInfo(**{name: getattr(info, name) for name in _INFO_FIELDS})
+    for name, value in changes.items():
+        setattr(copied, name, value)
+    return copied
 
 
 def _age(samples: Sequence[tuple[int, object]], now_ns: int) -> float:

@@ -16,6 +16,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.geometry.camera_info import RECTIFIED
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 
@@ -101,8 +102,10 @@ def subscribe_observations(
     kind, suffix = (CompressedImage, '/compressed') if compressed else (Image, '')
     newest: list[tuple[Any, str, Handler, int]] = []
     for view, topic in parameters.declare_camera_topics(node, views).items():
+        is_rectified = RECTIFIED in node.resolve_topic_name(f'{topic}/image_raw{suffix}')
+        add_info = partial(buffer.add_camera_info, view, is_rectified=is_rectified)
         newest += [
-            (CameraInfo, f'{topic}/camera_info', partial(buffer.add_camera_info, view), 1),
+            (CameraInfo, f'{topic}/camera_info', add_info, 1),
             (kind, f'{topic}/image_raw{suffix}', partial(buffer.add_image, view), 1),
         ]
     newest.append((JointState, 'joint_states', buffer.add_joint_state, 10))
