@@ -66,11 +66,12 @@ from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.object_motion import FoundObjects, ObjectMotionModel
 from mtv_world_ros.geometry.resample import resample
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.imagined_episode import ImaginedEpisode
+from mtv_world_ros.imagined_episode import Rollout
 from mtv_world_ros.lab.evaluation.metrics.statistics import clustered_wilson
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.rendering.images import encode_png, resize_frames
+from mtv_world_ros.rollout_options import RolloutOptions
 from mtv_world_ros.success.doubts import Grounds, NEAR_M, PhysicsWatch, unforeseen
 from mtv_world_ros.success.estimator import capped, stated_probability, verdict
 from mtv_world_ros.success.foreseen import foreseen_of
@@ -159,7 +160,7 @@ class Ahead:
 
 
 def foreseen_by(
-    pipeline: Pipeline, episode: ImaginedEpisode, observation: Observation, commands: FloatArray
+    pipeline: Pipeline, episode: Rollout, observation: Observation, commands: FloatArray
 ) -> Ahead:
     """Returns what is foreseen of commands (C, J)."""
     model, names = pipeline.object_motion, episode.names
@@ -176,7 +177,7 @@ def foreseen_by(
     (ahead,) = objects.foresee([commands])
     num_rows = len(ahead.motions[0].points)
     motions = foreseen_of(pipeline.robot, ahead, num_rows)
-    ends = pipeline.estimator.foresee(motions, episode.instruction)
+    ends = pipeline.estimator.foresee(motions, episode.options.instruction)
     each = round(pipeline.spec.num_frames / pipeline.spec.fps / motions.step_s)
     rows = np.array([*range(0, num_rows - 1, each), num_rows - 1])
     return Ahead(
@@ -192,7 +193,7 @@ def features_of(estimate: SuccessEstimate) -> dict[str, float] | None:
     return dict(estimate.features) if isfinite(estimate.probability) else None
 
 
-def imagined(pipeline: Pipeline, episode: ImaginedEpisode, commands: FloatArray) -> Said:
+def imagined(pipeline: Pipeline, episode: Rollout, commands: FloatArray) -> Said:
     """Returns what the estimate rests on after commands (C, J) are imagined."""
     times = PERIOD_S * np.arange(1, len(commands), dtype=np.float64)
     plan = JointTrajectory(
@@ -230,7 +231,7 @@ def observed(sim: SimEpisode, seen: Any) -> Observation:
     return Observation(cameras=cameras, frames=frames, positions=seen.positions, stamp_ns=1)
 
 
-def frames_judged(pipeline: Pipeline, episode: ImaginedEpisode, take: Take) -> Said:
+def frames_judged(pipeline: Pipeline, episode: Rollout, take: Take) -> Said:
     """Returns what the estimate rests on at the end of the simulator's own frames."""
     each = round(1 / (pipeline.spec.fps * _RECORD.frame_period_s))
     kept = take.observations[::each]
@@ -308,7 +309,9 @@ class Scenes:
                 for judge, one in found.items()
             }
             if is_real:
-                begun = pipeline.begin(first, instruction=sim.instruction, seed=seed)
+                begun = pipeline.begin(
+                    first, RolloutOptions(instruction=sim.instruction, seed=seed)
+                )
                 said[name][REAL] = frames_judged(pipeline, begun, take)
         rule = self._once(name, RULE, first, sim.instruction, commands, seed)
         return {'final': take.final, 'said': said, 'rule': rule, **ends}
@@ -355,7 +358,7 @@ class Scenes:
             pipeline = replace(pipeline, grounds=Grounds())
             first = check.corrected_observation(first)
             begun = pipeline.begin(
-                first, instruction=instruction, seed=seed, num_inference_steps=1
+                first, RolloutOptions(instruction=instruction, seed=seed, num_inference_steps=1)
             )
             self._known[key] = self._ask(judge, pipeline, begun, first, commands)
         return self._known[key]
@@ -373,13 +376,13 @@ class Scenes:
     def _ask(
         judge: str,
         pipeline: Pipeline,
-        episode: ImaginedEpisode,
+        episode: Rollout,
         first: Observation,
         commands: FloatArray,
     ) -> Said | Ahead:
         if judge == RULE:
             try:
-                return {'value': float(judge_without_pictures(episode, commands))}
+                return {'value': float(judge_without_pictures(pipeline, episode, commands))}
             except CannotTell:
                 return {'value': None}
         if judge in IMAGINED:

@@ -26,6 +26,7 @@ from mtv_world_ros.lab.evaluation.imagined_stretches import predicted_frames, st
 from mtv_world_ros.lab.jobs import fingerprint
 from mtv_world_ros.lab.recordings import commanded
 from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.rollout_options import RolloutOptions
 
 HEAD = ('named', 'objects', 'area left, mean', '95 % interval', 'least', 'at least 90 % left')
 _STILL_PX = 2.0
@@ -55,9 +56,7 @@ def areas_left(pipeline: Pipeline, recording: Recording, seed: int) -> dict[str,
                     positions=recording.positions[0],
                     stamp_ns=recording.stamp_ns,
                 ),
-                objects=given,
-                seed=seed,
-                num_inference_steps=1,
+                RolloutOptions(objects=given, seed=seed, num_inference_steps=1),
             )
             times = np.arange(1, stretch.num_frames + 1) / pipeline.spec.fps
             plan = JointTrajectory(

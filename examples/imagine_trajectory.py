@@ -16,6 +16,7 @@ from mtv_world_ros import load_pipeline
 from mtv_world_ros.data.recording import commands_from, load_recording
 from mtv_world_ros.files import share_path
 from mtv_world_ros.rendering.video import write_video
+from mtv_world_ros.rollout_options import RolloutOptions
 
 parser = argparse.ArgumentParser()
 parser.add_argument(
@@ -28,7 +29,7 @@ pipeline = load_pipeline('bundled')
 recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
 observation = recording.observation(0)
 
-episode = pipeline.begin(observation, instruction=recording.instruction, seed=0)
+episode = pipeline.begin(observation, RolloutOptions(instruction=recording.instruction, seed=0))
 chunks = []
 for prediction in episode.extend(commands_from(recording, 0)):
     video, success = prediction.video, prediction.success

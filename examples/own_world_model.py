@@ -19,6 +19,7 @@ from mtv_world_ros.data.recording import commands_from, load_recording
 from mtv_world_ros.data_types import ByteArray, WorldModelSpec
 from mtv_world_ros.files import share_path
 from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.rollout_options import RolloutOptions
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,9 @@ class HeldFrame:
 
 def imagined(pipeline: Pipeline) -> float:
     """Estimate at the end of the recorded commands."""
-    episode = pipeline.begin(recording.observation(0), instruction=recording.instruction)
+    episode = pipeline.begin(
+        recording.observation(0), RolloutOptions(instruction=recording.instruction)
+    )
     *_, last = episode.extend(commands_from(recording, 0))
     return last.success.probability
 

@@ -16,6 +16,7 @@ from mtv_world_ros import load_pipeline
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data_types import JointTrajectory, Observation
 from mtv_world_ros.files import share_path
+from mtv_world_ros.rollout_options import RolloutOptions
 
 NUM_CHUNKS = 3
 
@@ -56,7 +57,7 @@ observation = recording.observation(0)
 policy = SwingingPolicy(pipeline.robot.joint_names)
 policy.reset(seed=0)
 
-episode = pipeline.begin(observation, instruction=recording.instruction, seed=0)
+episode = pipeline.begin(observation, RolloutOptions(instruction=recording.instruction, seed=0))
 for _ in range(NUM_CHUNKS):
     answer = policy.act(episode.observation, recording.instruction)
     if answer is None:

@@ -16,6 +16,7 @@ from mtv_world_ros import load_pipeline
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.files import share_path
 from mtv_world_ros.policies.policy import RecordedPolicy
+from mtv_world_ros.rollout_options import RolloutOptions
 
 parser = argparse.ArgumentParser()
 parser.add_argument(
@@ -39,7 +40,9 @@ policies = {
 found = {}
 for name, policy in policies.items():
     policy.reset(seed=0)
-    episode = pipeline.begin(recording.observation(0), instruction=recording.instruction, seed=0)
+    episode = pipeline.begin(
+        recording.observation(0), RolloutOptions(instruction=recording.instruction, seed=0)
+    )
     while (answer := policy.act(episode.observation, recording.instruction)) is not None:
         for prediction in episode.extend(answer):
             found[name] = prediction.success.probability

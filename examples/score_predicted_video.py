@@ -16,6 +16,7 @@ import numpy as np
 from mtv_world_ros import load_pipeline
 from mtv_world_ros.data.recording import commands_from, load_recording
 from mtv_world_ros.files import share_path
+from mtv_world_ros.rollout_options import RolloutOptions
 from mtv_world_ros.vision.jaccard import jaccard
 
 parser = argparse.ArgumentParser()
@@ -27,7 +28,7 @@ options = parser.parse_args()
 pipeline = load_pipeline('bundled')
 recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
 observation = recording.observation(0)
-episode = pipeline.begin(observation, instruction=recording.instruction)
+episode = pipeline.begin(observation, RolloutOptions(instruction=recording.instruction))
 prediction = next(episode.extend(commands_from(recording, 0)))
 
 # the recorded frames at the predicted times, segmented as the prediction was

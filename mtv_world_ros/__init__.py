@@ -1,10 +1,13 @@
 """An online embodied world model for ROS 2: trajectory in, imagined camera streams out.
 
-Five names are enough to begin with; they are imported when they are asked for:
+The names below are enough to begin with; they are imported when they are asked for:
 
     load_pipeline    checkpoint and options -> Pipeline
-    Pipeline         `begin(observation)` -> ImaginedEpisode
-    ImaginedEpisode  `extend(trajectory)` imagines chunk after chunk
+    Pipeline         `begin(observation, options)` -> Rollout
+    Rollout          `extend(trajectory)` imagines chunk after chunk
+    RolloutOptions   instruction, seed, denoising steps, limits of a rollout
+    Observation      camera frames and joint positions at one instant
+    JointTrajectory  joint positions over time
     read_episode     a rosbag2 folder -> images, joint states, commands, cameras
     judge            the success estimate on the real frames of a recording
 """
@@ -14,22 +17,40 @@ from __future__ import annotations
 from importlib import import_module
 import os
 from typing import Any, TYPE_CHECKING
+import warnings
 
 if TYPE_CHECKING:
     from mtv_world_ros.assembly import load_pipeline
     from mtv_world_ros.data.episode_reader import read_episode
-    from mtv_world_ros.imagined_episode import ImaginedEpisode
+    from mtv_world_ros.data_types import JointTrajectory, Observation
+    from mtv_world_ros.imagined_episode import Rollout
     from mtv_world_ros.pipeline import Pipeline
     from mtv_world_ros.replay.offline import judge
+    from mtv_world_ros.rollout_options import RolloutOptions
 
-__all__ = ['ImaginedEpisode', 'judge', 'load_pipeline', 'Pipeline', 'read_episode']
+__all__ = [
+    'JointTrajectory',
+    'judge',
+    'load_pipeline',
+    'Observation',
+    'Pipeline',
+    'read_episode',
+    'Rollout',
+    'RolloutOptions',
+]
+#: public name -> module
 _PLACES = {
-    'ImaginedEpisode': 'imagined_episode',
+    'JointTrajectory': 'data_types',
     'judge': 'replay.offline',
     'load_pipeline': 'assembly',
+    'Observation': 'data_types',
     'Pipeline': 'pipeline',
     'read_episode': 'data.episode_reader',
+    'Rollout': 'imagined_episode',
+    'RolloutOptions': 'rollout_options',
 }
+#: names of version 0.1 -> public name that replaced them
+_RENAMED = {'ImaginedEpisode': 'Rollout'}
 
 # Threads of torch that wait for one another sleep. By default they spin: where another process
 # takes a core, those that wait use up the time that the last one needs, and all is many times as
@@ -41,7 +62,15 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 
 def __getattr__(name: str) -> Any:
-    """Imports one of the five names."""
+    """Imports one of the public names."""
+    if name in _RENAMED:
+        new = _RENAMED[name]
+        warnings.warn(
+            f'mtv_world_ros.{name} is now mtv_world_ros.{new}; the old name goes with version 0.3',
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        name = new
     if name not in _PLACES:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     return getattr(import_module(f'{__name__}.{_PLACES[name]}'), name)

@@ -8,7 +8,9 @@ from threading import Lock
 import numpy as np
 
 from mtv_world_ros.data_types import Observation
-from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
+from mtv_world_ros.imagined_episode import Rollout
+from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.rollout_options import DEFAULT_OPTIONS, RolloutOptions
 from mtv_world_ros.rollout_state import fit_observation
 
 #: least time between two frames that are kept, as a share of the model's period
@@ -30,7 +32,7 @@ class ObservedEpisode:
         self._pipeline = pipeline
         self._period_ns = round(_SEEN_SHARE / pipeline.spec.fps * 1e9)
         self._lock = Lock()
-        self._seen: ImaginedEpisode | None = None
+        self._seen: Rollout | None = None
         self._seen_ns = 0
         self._waiting: list[Observation] = []
 
@@ -73,16 +75,15 @@ class ObservedEpisode:
             _look_at(seen, waiting)
 
     def begin(
-        self, observation: Observation, *, instruction: str, objects: tuple[str, ...] = ()
-    ) -> ImaginedEpisode:
+        self, observation: Observation, options: RolloutOptions = DEFAULT_OPTIONS
+    ) -> Rollout:
         """Returns an episode that begins at an observation and remembers what was seen before.
 
         Another instruction, or other objects, begin a new episode.
 
         Args:
             observation: real, of V views; not before those that were seen.
-            instruction: text for the robot.
-            objects: names of the objects; empty = the pipeline's, else those of the instruction.
+            options: options of the episode.
 
         Raises:
             ObservationError: the views are not the model's.
@@ -90,8 +91,8 @@ class ObservedEpisode:
         start = fit_observation(observation, self._pipeline.spec)
         with self._lock:
             seen, waiting = self._seen, self._waiting
-            if seen is None or (seen.instruction, seen.objects) != (instruction, objects):
-                seen = self._pipeline.begin(observation, instruction=instruction, objects=objects)
+            if seen is None or _task(seen.options) != _task(options):
+                seen = self._pipeline.begin(observation, options)
                 self._seen, self._seen_ns, waiting = seen, start.stamp_ns, []
             new = [o for o in waiting if o.stamp_ns < start.stamp_ns]
             self._waiting = [o for o in waiting if o.stamp_ns > start.stamp_ns]
@@ -99,10 +100,17 @@ class ObservedEpisode:
                 new.append(start)
                 self._seen_ns = start.stamp_ns
         _look_at(seen, new)
-        return seen.branch(observation)
+        rollout = seen.branch(observation)
+        rollout.options = options
+        return rollout
 
 
-def _look_at(episode: ImaginedEpisode, observations: Sequence[Observation]) -> None:
+def _task(options: RolloutOptions) -> tuple[str, tuple[str, ...]]:
+    """The options that another episode differs in."""
+    return options.instruction, options.objects
+
+
+def _look_at(episode: Rollout, observations: Sequence[Observation]) -> None:
     """Lets the episode observe these, at the model's size."""
     if observations:
         frames = np.stack([observation.frames for observation in observations], axis=1)

@@ -21,15 +21,16 @@ from mtv_world_ros.foresight.episode_objects import Majority, ObjectForesight
 from mtv_world_ros.geometry.chunk_plan import ChunkPlan
 from mtv_world_ros.geometry.motion import Motion
 from mtv_world_ros.geometry.object_motion import ObjectMotionModel
-from mtv_world_ros.geometry.robot.model import LIMIT_TOLERANCE, RobotModel
+from mtv_world_ros.geometry.robot.model import RobotModel
 from mtv_world_ros.geometry.robot.shape import LinkShape
-from mtv_world_ros.imagined_episode import ImaginedEpisode
+from mtv_world_ros.imagined_episode import ObservedChunk, Rollout
 from mtv_world_ros.prediction import Prediction, StageClock
 from mtv_world_ros.rendering.arm_pictures import arm_pictures
 from mtv_world_ros.rendering.trajectory_video import (
     render_trajectory_video,
     TrajectoryVideoConfig,
 )
+from mtv_world_ros.rollout_options import DEFAULT_OPTIONS, RolloutOptions
 from mtv_world_ros.rollout_state import RolloutState
 from mtv_world_ros.success.calibration import Fits, HorizonCurve
 from mtv_world_ros.success.doubts import doubted, Grounds, widened
@@ -37,7 +38,7 @@ from mtv_world_ros.success.estimator import JudgedChunk, SuccessEstimator
 from mtv_world_ros.success.foreseen import ForeseenMotions
 from mtv_world_ros.success.rollout_memory import footage_of
 from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
-from mtv_world_ros.vision.describers.describer import Describer
+from mtv_world_ros.vision.describers.describer import Describer, name_objects
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 #: of an estimate for which the model was shown no motion
@@ -83,13 +84,9 @@ class WorldModel(Protocol):
         ...
 
 
-def _never() -> bool:
-    return False
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pipeline:
-    """Imagines and judges; stateless: `begin` returns the episode, which holds the state.
+    """Imagines and judges; stateless: `begin` returns the rollout, which holds the state.
 
     Attributes:
         robot: joints, limits and tools.
@@ -161,20 +158,9 @@ class Pipeline:
         )
 
     def begin(
-        self,
-        observation: Observation,
-        *,
-        instruction: str = '',
-        objects: tuple[str, ...] = (),
-        seed: int = 0,
-        num_seeds: int = 1,
-        num_inference_steps: int = 0,
-        limit_tolerance: float = LIMIT_TOLERANCE,
-        should_stop: Callable[[], bool] = _never,
-    ) -> ImaginedEpisode:
+        self, observation: Observation, options: RolloutOptions = DEFAULT_OPTIONS
+    ) -> Rollout:
         """Returns an episode that begins at an observation (V views, any image size).
-
-        The other arguments are the attributes of `ImaginedEpisode`.
 
         Raises:
             ObservationError: the views are not the model's.
@@ -182,38 +168,48 @@ class Pipeline:
         checker = self.camera_checker
         check = CameraCheck() if checker is None else checker.check(observation)
         observation = check.corrected_observation(observation)
-        return ImaginedEpisode(
-            pipeline=self,
-            camera_check=check,
-            instruction=instruction,
-            objects=objects,
-            seed=seed,
-            num_seeds=num_seeds,
-            num_inference_steps=num_inference_steps,
-            limit_tolerance=limit_tolerance,
-            should_stop=should_stop,
-            _rollouts=(RolloutState.at(observation, self.spec, self._objects_in(observation)),),
+        objects = self._objects_in(observation)
+        state = RolloutState.at(observation, self.spec, objects, check)
+        return Rollout(pipeline=self, options=options, _states=(state,))
+
+    def name_objects(
+        self, options: RolloutOptions, first_frame: Callable[[], ByteArray]
+    ) -> tuple[str, ...]:
+        """Returns the names of the objects of a rollout.
+
+        Args:
+            options: may name them; else the pipeline does, its describer, or the instruction.
+            first_frame: returns the first real frame (H, W, 3) uint8 RGB, for the describer.
+
+        Raises:
+            DescriptionError: the describer failed.
+        """
+        return name_objects(
+            options.instruction,
+            given=options.objects or self.objects,
+            describer=self.describer,
+            first_frame=first_frame,
         )
 
     def imagine(
-        self, episode: ImaginedEpisode, state: RolloutState, plan: ChunkPlan, seed: int
+        self, state: RolloutState, plan: ChunkPlan, options: RolloutOptions
     ) -> tuple[Prediction, RolloutState]:
         """Returns one chunk of one rollout, stage by stage, and the rollout's state after it."""
         start, clock = state.observation, StageClock()
-        num_steps = episode.num_inference_steps or self.spec.num_inference_steps
+        num_steps = options.num_inference_steps or self.spec.num_inference_steps
         links = {part.link for part in self.parts}
         motion = Motion.of(self.robot, start.cameras, plan.positions, links)
         in_view = motion.tools_in_view()
-        start_masks = self.find(episode, state)
+        start_masks = self.find(state, options)
         clock.lap('start masks')
         objects = state.objects.foresee(
             plan,
             start,
-            episode.names,
+            options.objects,
             start_masks,
-            self._majority(episode, state),
+            self._majority(state, options),
             state.is_begun,
-            episode.should_stop,
+            options.should_stop,
         )
         pictures = objects.pictures(plan, motion)
         clock.lap('object motion')
@@ -224,17 +220,17 @@ class Pipeline:
             start.frames,
             control.frames,
             positions=plan.positions,
-            seed=seed,
+            seed=options.seed,
             num_inference_steps=num_steps,
-            should_stop=episode.should_stop,
+            should_stop=options.should_stop,
             history=state.history,
         )[:, : plan.num_frames]
         clock.lap('model')
-        masks = self.follow(episode, state, start_masks, frames)
+        masks = self.follow(state, start_masks, frames, options)
         clock.lap('masks')
         motion = motion.first(plan.num_frames + 1)
         foreseen = objects.motions(plan, state.is_begun)
-        success, memory = self.judge(episode, state, motion, start_masks, masks, foreseen)
+        success, memory = self.judge(state, motion, start_masks, masks, options, foreseen)
         unseen = () if in_view.any() else (_UNSEEN,)
         success = doubted(success, (*objects.reasons, *unseen))
         success = doubted(success, refusal=objects.refusal)
@@ -247,7 +243,7 @@ class Pipeline:
         prediction = Prediction(
             start=start,
             video=MultiViewVideo(views=start.views, times=times, frames=frames),
-            seed=seed,
+            seed=options.seed,
             positions=motion.positions[1:],
             trajectory_video=control,
             start_masks=start_masks,
@@ -266,9 +262,34 @@ class Pipeline:
         )
         return prediction, state
 
-    def find(self, episode: ImaginedEpisode, state: RolloutState) -> ObjectMasks:
+    def observe(
+        self,
+        state: RolloutState,
+        frames: ByteArray,
+        positions: FloatArray,
+        options: RolloutOptions,
+    ) -> tuple[ObservedChunk, RolloutState]:
+        """Returns masks and estimate of real frames, and the rollout's state after them.
+
+        Args:
+            state: before them.
+            frames: (V, T, H, W, 3) uint8 RGB after it, at the model's size and frame rate.
+            positions: (1 + T, J) measured [rad or m]; row 0 at the state.
+            options: names of the objects, and the instruction.
+        """
+        start_masks = self.find(state, options)
+        masks = self.follow(state, start_masks, frames, options)
+        motion = Motion.of(self.robot, state.observation.cameras, positions)
+        success, memory = self.judge(state, motion, start_masks, masks, options, is_real=True)
+        stamp_ns = state.observation.stamp_ns + round(frames.shape[1] / self.spec.fps * 1e9)
+        after = state.after(
+            frames, positions[-1], stamp_ns, self.spec.num_history, memory, state.objects
+        )
+        return ObservedChunk(start_masks=start_masks, masks=masks, success=success), after
+
+    def find(self, state: RolloutState, options: RolloutOptions) -> ObjectMasks:
         """Returns masks of the frame that a chunk starts from (T = 1)."""
-        return self.segmenter.segment(state.observation.frames[:, None], episode.names)
+        return self.segmenter.segment(state.observation.frames[:, None], options.objects)
 
     def draw(
         self,
@@ -298,47 +319,46 @@ class Pipeline:
 
     def follow(
         self,
-        episode: ImaginedEpisode,
         state: RolloutState,
         start_masks: ObjectMasks,
         frames: ByteArray,
+        options: RolloutOptions,
     ) -> ObjectMasks:
         """Returns masks of the frames (V, T, H, W, 3) after the start frame."""
         return self.segmenter.segment(
             frames,
-            episode.names,
+            options.objects,
             first_masks=start_masks.masks[:, :, 0],
             first_frames=state.observation.frames,
         )
 
     def judge(
         self,
-        episode: ImaginedEpisode,
         state: RolloutState,
         motion: Motion,
         start_masks: ObjectMasks,
         masks: ObjectMasks,
+        options: RolloutOptions,
         foreseen: ForeseenMotions | None = None,
         *,
         is_real: bool = False,
     ) -> JudgedChunk:
         """Returns the estimate after a chunk of 1 + T states, and what it remembers."""
-        check = episode.camera_check
-        footage = footage_of(motion, start_masks, masks)
+        check, footage = state.camera_check, footage_of(motion, start_masks, masks)
         judged = self.estimator.estimate(
-            footage, episode.instruction, state.memory, foreseen, is_real=is_real
+            footage, options.instruction, state.memory, foreseen, is_real=is_real
         )
         estimate = judged.estimate if is_real else self.grounds.bear(judged.estimate)
         estimate = doubted(estimate, check.notes, check.refusal)
         return judged._replace(
-            estimate=widened(estimate, episode.doubt) if episode.doubt else estimate
+            estimate=widened(estimate, options.doubt) if options.doubt else estimate
         )
 
-    def _majority(self, episode: ImaginedEpisode, state: RolloutState) -> Majority:
+    def _majority(self, state: RolloutState, options: RolloutOptions) -> Majority:
         """The rule that selects futures of majority outcome, for pictures and estimate."""
 
         def majority(motions: ForeseenMotions) -> BoolArray | None:
-            ends = self.estimator.foresee(motions, episode.instruction, state.memory)
+            ends = self.estimator.foresee(motions, options.instruction, state.memory)
             return None if ends is None else ends.is_majority
 
         return majority

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from mtv_world_ros.data_types import (
     ByteArray,
+    CameraModel,
     FloatArray,
     History,
     Observation,
@@ -16,6 +17,7 @@ from mtv_world_ros.foresight.episode_objects import ObjectForesight
 from mtv_world_ros.geometry.camera import scaled
 from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.success.rollout_memory import RolloutMemory
+from mtv_world_ros.vision.camera_check import CameraCheck
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,6 +30,8 @@ class RolloutState:
         objects: foreseen poses of the named objects.
         memory: of the success estimate; None before the first chunk.
         num_imagined: frames since the last real one.
+        camera_check: calibration check on the episode's first frames; its corrections are
+            applied.
     """
 
     observation: Observation
@@ -35,10 +39,15 @@ class RolloutState:
     objects: ObjectForesight
     memory: RolloutMemory | None = None
     num_imagined: int = 0
+    camera_check: CameraCheck = CameraCheck()
 
     @classmethod
     def at(
-        cls, observation: Observation, spec: WorldModelSpec, objects: ObjectForesight
+        cls,
+        observation: Observation,
+        spec: WorldModelSpec,
+        objects: ObjectForesight,
+        camera_check: CameraCheck,
     ) -> RolloutState:
         """Returns the state of an episode that begins at a real observation.
 
@@ -50,6 +59,7 @@ class RolloutState:
             observation=start,
             history=History.begin(start.frames),
             objects=objects,
+            camera_check=camera_check,
         )
 
     @property
@@ -77,7 +87,8 @@ class RolloutState:
             objects: foreseen poses after the chunk.
         """
         start = self.observation
-        return RolloutState(
+        return replace(
+            self,
             observation=replace(
                 start, frames=frames[:, -1], positions=positions, stamp_ns=stamp_ns
             ),
@@ -86,6 +97,19 @@ class RolloutState:
             memory=memory,
             num_imagined=self.num_imagined + frames.shape[1],
         )
+
+    def seen_by(self, cameras: tuple[CameraModel, ...] | None) -> RolloutState:
+        """Returns the state at a real frame, from which objects are looked for anew.
+
+        Args:
+            cameras: as they are at that frame, at the model's size; None = as before.
+        """
+        observation = self.observation
+        if cameras is not None:
+            corrected = self.camera_check.corrected(cameras)
+            observation = replace(observation, cameras=corrected)
+        objects = self.objects.branch(observation)
+        return replace(self, observation=observation, num_imagined=0, objects=objects)
 
 
 def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observation:

@@ -13,6 +13,7 @@ from mtv_world_ros.files import share_path
 from mtv_world_ros.geometry.robot.file import load_robot
 from mtv_world_ros.imagined_episode import SEED_STEP
 from mtv_world_ros.model.card import read_card
+from mtv_world_ros.rollout_options import RolloutOptions
 from mtv_world_ros.success.calibration import HorizonCurve
 
 SPEC = WorldModelSpec(
@@ -54,7 +55,7 @@ def imagine(recording, num_seeds, horizon=None):
         joint_names=whole.joint_names, times=whole.times[kept], positions=whole.positions[kept]
     )
     episode = assemble(CARD, model, robot=YAM, horizon=horizon).begin(
-        observation, instruction=recording.instruction, seed=3, num_seeds=num_seeds
+        observation, RolloutOptions(instruction=recording.instruction, seed=3, num_seeds=num_seeds)
     )
     return model, list(episode.extend(trajectory))
 

@@ -38,6 +38,7 @@ from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.rendering.arm_pictures import arm_pictures
 from mtv_world_ros.rendering.images import resize_frames
+from mtv_world_ros.rollout_options import RolloutOptions
 from mtv_world_ros.success.calibration import Fits, load_fits
 from mtv_world_ros.success.doubts import Grounds
 from mtv_world_ros.vision.describers.describer import DescribedObject
@@ -108,7 +109,9 @@ def with_motion(world_model: CountingWorldModel, object_motion) -> Pipeline:
 
 
 def imagine(pipeline: Pipeline, recording: Recording, seconds: float, **options):
-    episode = pipeline.begin(observe(recording), instruction=recording.instruction, **options)
+    episode = pipeline.begin(
+        observe(recording), RolloutOptions(instruction=recording.instruction, **options)
+    )
     return list(episode.extend(commands(recording, seconds)))
 
 
@@ -184,7 +187,8 @@ def test_chained_extends_are_one_long_extend(recording, num_seeds):
     whole = imagine(pipeline, recording, 4.8, seed=3, num_seeds=num_seeds)
     asked = commands(recording, 4.8)
     episode = pipeline.begin(
-        observe(recording), instruction=recording.instruction, seed=3, num_seeds=num_seeds
+        observe(recording),
+        RolloutOptions(instruction=recording.instruction, seed=3, num_seeds=num_seeds),
     )
     for chunk, other in enumerate(whole):
         (one,) = episode.extend(part_of(asked, 1.6 * chunk, 1.6 * (chunk + 1)))
@@ -203,9 +207,9 @@ def test_chained_extends_are_one_long_extend(recording, num_seeds):
 
 
 def test_what_has_changed_holds_from_the_next_extend_on(pipeline, world_model, recording):
-    episode = pipeline.begin(observe(recording), instruction='pick the red block')
+    episode = pipeline.begin(observe(recording), RolloutOptions(instruction='pick the red block'))
     list(episode.extend(commands(recording, 1.6)))
-    episode.instruction, episode.seed = recording.instruction, 40
+    episode.options = RolloutOptions(instruction=recording.instruction, seed=40)
     (chunk,) = episode.extend(part_of(commands(recording, 3.2), 1.6, 3.2))
     assert chunk.masks.names == recording.objects[:2]
     assert world_model.seeds == [0, 41]
@@ -223,7 +227,9 @@ class StoppingWorldModel(CountingWorldModel):
 @pytest.mark.parametrize('num_seeds', [1, 2])
 def test_a_stop_in_mid_chunk_leaves_the_episode_where_it_was(recording, num_seeds):
     model = StoppingWorldModel(SPEC)
-    episode = assemble(CARD, model, robot=YAM).begin(observe(recording), num_seeds=num_seeds)
+    episode = assemble(CARD, model, robot=YAM).begin(
+        observe(recording), RolloutOptions(num_seeds=num_seeds)
+    )
     done = []
     with pytest.raises(RolloutPreempted):
         for prediction in episode.extend(commands(recording, 4.8)):
@@ -239,7 +245,9 @@ def test_a_stop_in_mid_chunk_leaves_the_episode_where_it_was(recording, num_seed
 
 def test_a_stop_between_chunks_keeps_those_that_are_done(pipeline, recording):
     done: list[int] = []
-    episode = pipeline.begin(observe(recording), should_stop=lambda: len(done) == 2)
+    episode = pipeline.begin(
+        observe(recording), RolloutOptions(should_stop=lambda: len(done) == 2)
+    )
     with pytest.raises(RolloutPreempted):
         for prediction in episode.extend(commands(recording, 4.8)):
             done.append(prediction.chunk)
@@ -267,7 +275,7 @@ def test_the_same_seed_twice_gives_the_same_frames(recording):
 def test_real_frames_are_judged_as_imagined_ones_are(pipeline, recording):
     """Observing what was imagined: masks and estimate are the same, chunk after chunk."""
     imagined = imagine(pipeline, recording, 3.2)
-    episode = pipeline.begin(observe(recording), instruction=recording.instruction)
+    episode = pipeline.begin(observe(recording), RolloutOptions(instruction=recording.instruction))
     for chunk in imagined:
         positions = np.concatenate([chunk.start.positions[None], chunk.positions])
         found = episode.observe(chunk.video.frames, positions)
@@ -281,7 +289,7 @@ def test_real_frames_are_judged_as_imagined_ones_are(pipeline, recording):
 def test_imagining_goes_on_from_what_was_observed(recording):
     model = CountingWorldModel(replace(SPEC, num_history=5))
     episode = assemble(CARD, model, robot=YAM).begin(
-        observe(recording), instruction=recording.instruction
+        observe(recording), RolloutOptions(instruction=recording.instruction)
     )
     real = recording.frames[:, :9]
     episode.observe(real[:, 1:], recording.positions[:9])
@@ -376,7 +384,7 @@ def test_a_plan_is_foreseen_chunk_by_chunk(recording, world_model):
     """So that its first chunk does not wait for the others."""
     log: list[int] = []
     pipeline = with_motion(world_model, DriftingObjects(log))
-    episode = pipeline.begin(observe(recording), instruction=recording.instruction)
+    episode = pipeline.begin(observe(recording), RolloutOptions(instruction=recording.instruction))
     long = JointTrajectory(
         joint_names=YAM.joint_names,
         times=np.array([20.0]),
@@ -425,7 +433,7 @@ def test_objects_move_on_from_chunk_to_chunk_and_are_found_again_in_real_frames(
 ):
     log: list[int] = []
     pipeline = with_motion(world_model, DriftingObjects(log))
-    episode = pipeline.begin(observe(recording), instruction=recording.instruction)
+    episode = pipeline.begin(observe(recording), RolloutOptions(instruction=recording.instruction))
     list(episode.extend(commands(recording, 3.2)))
     assert log == [0, 16, 32]  # found once; two chunks of 1.6 s in steps of 0.1 s
     first, second = world_model.trajectories
@@ -440,7 +448,7 @@ def test_what_is_hidden_by_now_is_shown_and_foreseen_as_it_was_when_it_was_whole
     recording, world_model, found_again
 ):
     pipeline = with_motion(world_model, DriftingObjects([], same=(True, found_again)))
-    begun = pipeline.begin(observe(recording), instruction=recording.instruction)
+    begun = pipeline.begin(observe(recording), RolloutOptions(instruction=recording.instruction))
     begun.observe(recording.frames[:, 1:9], recording.positions[:9])
     now = Observation(
         cameras=recording.cameras,
@@ -451,7 +459,7 @@ def test_what_is_hidden_by_now_is_shown_and_foreseen_as_it_was_when_it_was_whole
     episode = begun.branch(now)
     (chunk,) = episode.extend(part_of(commands(recording, 3.2), 1.6, 3.2))
     first = pipeline.segmenter.segment(recording.frames[:, :1], begun.names).masks[:, :, 0]
-    objects = episode._rollouts[0].objects.found
+    objects = episode._states[0].objects.found
     # nothing of it is seen now; of the other one neither, which does not count as hidden
     np.testing.assert_array_equal(objects.cuts[:, 0, ..., 3] > 0, first[:, 0])
     assert first[:, 1].any() and not objects.cuts[:, 1, ..., 3].any()
@@ -507,7 +515,7 @@ def test_objects_that_one_view_alone_shows_are_named_and_there_is_no_verdict(
     frames = seen.frames.copy()
     frames[1] = 128
     episode = with_motion(world_model, foresight).begin(
-        replace(seen, frames=frames), instruction=recording.instruction
+        replace(seen, frames=frames), RolloutOptions(instruction=recording.instruction)
     )
     (chunk,) = episode.extend(commands(recording, 1.6))
     assert np.isnan(chunk.success.probability)
@@ -641,7 +649,7 @@ def test_objects_are_shown_where_they_go_and_that_goes_on_from_chunk_to_chunk(
 ):
     model = SlidingModel()
     pipeline = with_motion(world_model, model)
-    episode = pipeline.begin(observe(recording), instruction=recording.instruction)
+    episode = pipeline.begin(observe(recording), RolloutOptions(instruction=recording.instruction))
     chunks = list(episode.extend(commands(recording, 3.2)))
     num_objects = len(chunks[0].masks.names)
     assert model.sizes == [(2, num_objects, *recording.frames.shape[2:4])]
@@ -664,7 +672,7 @@ def test_objects_are_shown_where_they_go_and_that_goes_on_from_chunk_to_chunk(
             (u, v), _ = project(camera, camera.T_mount_camera, point)
             colour = recording.frames[1, 0, round(v), round(u)].astype(int)
             assert np.abs(shown - colour).max() < 60
-    episode.instruction = 'pick the red block'
+    episode.options = RolloutOptions(instruction='pick the red block')
     (chunk,) = episode.extend(part_of(commands(recording, 4.8), 3.2, 4.8))
     assert model.sizes[1:] == [(2, len(chunk.masks.names), *recording.frames.shape[2:4])]
 
@@ -698,7 +706,7 @@ def judge(observed: ObservedEpisode, recording: Recording, frame: int, instructi
     """The estimate of a plan that does nothing, at a frame."""
     now = seen_at(recording, frame)
     stay = JointTrajectory(joint_names=YAM.joint_names, times=[1.6], positions=now.positions[None])
-    episode = observed.begin(now, instruction=instruction or recording.instruction)
+    episode = observed.begin(now, RolloutOptions(instruction=instruction or recording.instruction))
     (chunk,) = episode.extend(stay)
     assert np.array_equal(chunk.start.frames, now.frames)
     return chunk.success
@@ -797,16 +805,20 @@ def test_a_describer_is_asked_once_about_the_first_real_frame(pipeline, recordin
     observed = ObservedEpisode(asking)
     for k in range(2):
         moment = replace(observe(recording), stamp_ns=recording.stamp_ns + k)
-        episode = observed.begin(moment, instruction='tidy up')
+        episode = observed.begin(moment, RolloutOptions(instruction='tidy up'))
         chunks = list(episode.extend(commands(recording, 2.0)))
         assert all(chunk.masks.names == ('blue block',) for chunk in chunks)
     frame, instruction = shown[0]
     assert len(shown) == 1 and instruction == 'tidy up'
     np.testing.assert_array_equal(frame, recording.frames[0, 0])
-    episode.instruction = 'stop'  # goes on in the imagined frames, which are not shown
+    episode.options = RolloutOptions(
+        instruction='stop'
+    )  # goes on in the imagined frames, which are not shown
     list(episode.extend(commands(recording, 1.0)))
     np.testing.assert_array_equal(shown[1][0], recording.frames[0, 0])
-    named = asking.begin(observe(recording), instruction='tidy up', objects=('red block',))
+    named = asking.begin(
+        observe(recording), RolloutOptions(instruction='tidy up', objects=('red block',))
+    )
     assert named.names == ('red block',) and len(shown) == 2
 
 

@@ -22,6 +22,7 @@ from mtv_world_ros.observed_episode import ObservedEpisode
 from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.replay.prediction_writer import ERROR, OK, PredictionWriter
+from mtv_world_ros.rollout_options import RolloutOptions
 
 #: beyond these a trajectory is rejected, as by the node: age of the newest frames and joint states
 #: at its start, and time between the views' frames [s]
@@ -133,9 +134,13 @@ def replay_offline(
                 for seen in _seen_between(episode, pipeline, before, stamp):
                     observed.see(seen)
                 text = instruction_at(episode, stamp)
-                imagined = observed.begin(observation, instruction=text, objects=stored)
-                imagined.seed = seed + 1000 * index
-                imagined.num_inference_steps = num_inference_steps
+                options = RolloutOptions(
+                    instruction=text,
+                    objects=stored,
+                    seed=seed + 1000 * index,
+                    num_inference_steps=num_inference_steps,
+                )
+                imagined = observed.begin(observation, options)
                 plan = Plan.of(trajectory, pipeline.robot, imagined.observation, stamp_ns=stamp)
                 _write_rollout(writer, imagined.extend(plan), summary, until, spec.fps)
             except MtvWorldError as error:
@@ -289,5 +294,6 @@ def judge(pipeline: Pipeline, recording: Recording) -> SuccessEstimate:
             f"'{recording.path}' cannot be judged: it lasts {seconds:.2f} s, has a gap or fewer "
             f'than two frames at {spec.fps:g} Hz; record images without a break'
         )
-    episode = pipeline.begin(recording.observation(0), instruction=recording.instruction)
+    options = RolloutOptions(instruction=recording.instruction)
+    episode = pipeline.begin(recording.observation(0), options)
     return episode.observe(recording.frames[:, rows[1:]], recording.positions[rows]).success

@@ -19,6 +19,7 @@ from mtv_world_ros.assembly import load_pipeline
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data_types import JointTrajectory
 from mtv_world_ros.files import share_path
+from mtv_world_ros.rollout_options import RolloutOptions
 
 #: turns, of which the fastest counts: other work only ever makes one slower
 TURNS = 6
@@ -71,7 +72,9 @@ def test_a_chunk_takes_no_longer_than_the_floors_allow(one_thread, record_proper
     units, chunks = [], []
     for _ in range(TURNS):
         units.append(calibrating())
-        episode = pipeline.begin(recording.observation(0), instruction=recording.instruction)
+        episode = pipeline.begin(
+            recording.observation(0), RolloutOptions(instruction=recording.instruction)
+        )
         begun = time.process_time()
         (chunk,) = episode.extend(plan)
         chunks.append(time.process_time() - begun)

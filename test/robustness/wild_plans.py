@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.files import share_path
+from mtv_world_ros.rollout_options import RolloutOptions
 
 #: points of a plan
 NUM_POINTS = 12
@@ -125,7 +126,9 @@ def imagine(plan: Any, _: Any) -> None:
     trajectory = JointTrajectory(
         joint_names=pipeline.robot.joint_names, times=times, positions=rows, velocities=velocities
     )
-    episode = pipeline.begin(observation, instruction=instruction, num_inference_steps=1)
+    episode = pipeline.begin(
+        observation, RolloutOptions(instruction=instruction, num_inference_steps=1)
+    )
     prediction = next(episode.extend(trajectory))
     check_plausible(episode, prediction)
 
@@ -140,7 +143,7 @@ def check_plausible(episode: Any, prediction: Any) -> None:
     if len(prediction.positions) > 1:
         steps = np.linalg.norm(np.diff(poses, axis=1), axis=-1)
         assert steps.max() < REACH_M, f'a tool went {steps.max():.1f} m in a frame'
-    objects = episode._rollouts[0].objects
+    objects = episode._states[0].objects
     found = None if objects is None else objects.found
     if found is None or np.isnan(success):
         return

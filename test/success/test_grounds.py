@@ -15,6 +15,7 @@ from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.files import share_path, write_json
 from mtv_world_ros.foresight.contact_settings import ContactOrigin
 from mtv_world_ros.foresight.loading import load_contact, save_contact
+from mtv_world_ros.rollout_options import RolloutOptions
 from mtv_world_ros.success.calibration import CALIBRATION
 from mtv_world_ros.success.doubts import Grounds
 
@@ -150,7 +151,9 @@ def test_imagined_frames_abstain_and_recorded_ones_do_not(own, foresight, mends)
         share_path('resource', 'demo_episode'), pipeline.spec, pipeline.robot
     )
     assert judge(pipeline, recording).probability > 0.75
-    episode = pipeline.begin(recording.observation(0), instruction=recording.instruction)
+    episode = pipeline.begin(
+        recording.observation(0), RolloutOptions(instruction=recording.instruction)
+    )
     plan = recording.commands
     kept = (plan.times > 1e-6) & (plan.times <= 1.6)
     plan = JointTrajectory(

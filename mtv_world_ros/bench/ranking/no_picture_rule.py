@@ -17,7 +17,8 @@ from mtv_world_ros.errors import CannotTell
 from mtv_world_ros.geometry.camera import camera_poses
 from mtv_world_ros.geometry.mask_geometry import block_size, centroids, locate
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.pipeline import ImaginedEpisode
+from mtv_world_ros.imagined_episode import Rollout
+from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.success.relations import FLOOR_M
 from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import ever_and_final, match_task, TaskSpec
@@ -69,10 +70,11 @@ class Thing:
         return replace(self, centre=np.array([*self.centre[:2], height]))
 
 
-def judge_without_pictures(episode: ImaginedEpisode, commands: FloatArray) -> bool:
+def judge_without_pictures(pipeline: Pipeline, episode: Rollout, commands: FloatArray) -> bool:
     """Returns whether the task is done at the end, by the rule.
 
     Args:
+        pipeline: knows the tasks and finds the objects.
         episode: at its first observation, where the objects are found; its instruction says
             which task's relations judge.
         commands: (C, J) joint positions at the simulator's control rate [rad or m].
@@ -81,12 +83,12 @@ def judge_without_pictures(episode: ImaginedEpisode, commands: FloatArray) -> bo
         CannotTell: the instruction fits no task, an object is not seen in two views, or a
             relation asks for what poses do not tell.
     """
-    pipeline = episode.pipeline
-    found = match_task(pipeline.estimator.tasks, episode.instruction)
+    instruction = episode.options.instruction
+    found = match_task(pipeline.estimator.tasks, instruction)
     if found is None:
-        raise CannotTell(f"'{episode.instruction}' is no known task")
+        raise CannotTell(f"'{instruction}' is no known task")
     task, bound = found
-    things = find_things(episode)
+    things = find_things(pipeline, episode)
     missing = [name for name in bound.values() if name not in things]
     if missing:
         raise CannotTell(f"'{missing[0]}' is not seen in two views of the first frame")
@@ -124,9 +126,9 @@ def is_done(
     return ever_and_final(task.holds(poses, poses.openings))[1]
 
 
-def find_things(episode: ImaginedEpisode) -> dict[str, Thing]:
+def find_things(pipeline: Pipeline, episode: Rollout) -> dict[str, Thing]:
     """Returns the objects of the episode's present frame by name, those that two views see."""
-    pipeline, start, names = episode.pipeline, episode.observation, episode.names
+    start, names = episode.observation, episode.names
     masks = pipeline.segmenter.segment(start.frames[:, None], names).masks[:, :, 0]
     cameras = start.cameras
     poses = [camera_poses(camera, pipeline.robot, start.positions[None])[0] for camera in cameras]

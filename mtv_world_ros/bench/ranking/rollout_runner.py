@@ -28,8 +28,10 @@ from mtv_world_ros.bench.world.simulator import SimEpisode
 from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.data_types import ObjectMasks, SuccessEstimate
 from mtv_world_ros.errors import CannotTell, ConfigError
-from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
+from mtv_world_ros.imagined_episode import Rollout
+from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.policies.policy import Policy
+from mtv_world_ros.rollout_options import RolloutOptions
 
 #: (policy, task, seed, expert) -> policy; has to be picklable for several processes
 MakePolicy = Callable[[str, str, int, Expert], Policy]
@@ -137,7 +139,7 @@ class RolloutRunner:
             foreseen=StoredEstimate.of_motions(imagined.success),
             pictures=StoredEstimate.of(pictures),
             seen=StoredEstimate.of(found[-1].success if found else None),
-            no_picture=_judge_without_pictures(self._begin(real, job, observed.names), world),
+            no_picture=self._judge_without_pictures(job, real, observed.names),
             num_chunks=real.run.num_chunks,
             num_imagined=run.num_chunks,
             is_over=real.run.is_over and run.is_over,
@@ -170,20 +172,34 @@ class RolloutRunner:
         self._run(real.policy, world, real.instruction, job)
         return world.success
 
+    def _judge_without_pictures(
+        self, job: Job, real: SimulatedRollout, objects: tuple[str, ...]
+    ) -> StoredEstimate:
+        """The verdict of the no-picture rule."""
+        world, episode = real.world, self._begin(real, job, objects)
+        commands = np.concatenate([world.start.positions[None], *world.commands])
+        try:
+            success = judge_without_pictures(self.pipeline, episode, commands)
+        except CannotTell as reason:
+            return StoredEstimate.stated(nan, f'abstains: {reason}')
+        return StoredEstimate.stated(float(success), 'the no-picture rule')
+
     def _begin(
         self,
         real: SimulatedRollout,
         job: Job,
         objects: tuple[str, ...] = (),
         pipeline: Pipeline | None = None,
-    ) -> ImaginedEpisode:
+    ) -> Rollout:
         """An episode that begins with the simulator's first observation."""
         return (pipeline or self.pipeline).begin(
             real.world.start,
-            instruction=real.instruction,
-            objects=objects,
-            seed=job.seed,
-            num_inference_steps=self.config.num_inference_steps,
+            RolloutOptions(
+                instruction=real.instruction,
+                objects=objects,
+                seed=job.seed,
+                num_inference_steps=self.config.num_inference_steps,
+            ),
         )
 
     def _run(self, policy: Policy, world: World, instruction: str, job: Job) -> PolicyRun:
@@ -268,15 +284,6 @@ class WantedJob:
 def _objects_shown(masks: ObjectMasks) -> str:
     """Where objects are in the last of the real frames, as `Result.files` has it."""
     return base64.b64encode(objects_png(masks.masks[:, :, -1])).decode()
-
-
-def _judge_without_pictures(episode: ImaginedEpisode, simulated: SimulatedWorld) -> StoredEstimate:
-    commands = np.concatenate([simulated.start.positions[None], *simulated.commands])
-    try:
-        success = judge_without_pictures(episode, commands)
-    except CannotTell as reason:
-        return StoredEstimate.stated(nan, f'abstains: {reason}')
-    return StoredEstimate.stated(float(success), 'the no-picture rule')
 
 
 def make_runner(

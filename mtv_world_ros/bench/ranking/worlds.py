@@ -23,7 +23,7 @@ from mtv_world_ros.data_types import (
 )
 from mtv_world_ros.geometry.chunk_plan import Plan
 from mtv_world_ros.geometry.resample import resample
-from mtv_world_ros.pipeline import ImaginedEpisode
+from mtv_world_ros.imagined_episode import Rollout
 from mtv_world_ros.policies.policy import first_part, Policy
 from mtv_world_ros.prediction import Prediction
 from mtv_world_ros.rendering.images import resize_frames
@@ -137,7 +137,7 @@ class ImaginedWorld:
         start: the real observation that it begins with.
     """
 
-    def __init__(self, episode: ImaginedEpisode, start: Observation) -> None:
+    def __init__(self, episode: Rollout, start: Observation) -> None:
         self._episode, self._start = episode, start
         self.observation = start
         self.chunks: list[Prediction] = []

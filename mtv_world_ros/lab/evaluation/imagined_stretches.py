@@ -16,9 +16,11 @@ from mtv_world_ros.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.errors import ConfigError, EpisodeError
+from mtv_world_ros.imagined_episode import Rollout
 from mtv_world_ros.lab.recordings import commands_until
-from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
+from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
+from mtv_world_ros.rollout_options import RolloutOptions
 
 #: observe: every chunk from the real frames until its start; imagine: chunks chained from the
 #: episode's first frame
@@ -156,14 +158,16 @@ def _begin(
     seed: int = 0,
     num_inference_steps: int = 0,
     num_seeds: int = 1,
-) -> ImaginedEpisode:
+) -> Rollout:
     """An episode that has seen all that was recorded before the stretch, as a node's has."""
     episode = pipeline.begin(
         recording.observation(0),
-        instruction=recording.instruction,
-        seed=seed,
-        num_seeds=num_seeds,
-        num_inference_steps=num_inference_steps,
+        RolloutOptions(
+            instruction=recording.instruction,
+            seed=seed,
+            num_seeds=num_seeds,
+            num_inference_steps=num_inference_steps,
+        ),
     )
     if not stretch.start:
         return episode

@@ -15,8 +15,10 @@ from std_msgs.msg import Float32MultiArray
 
 from mtv_world_ros.data_types import ByteArray, FloatArray
 from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
+from mtv_world_ros.imagined_episode import Rollout
+from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.rendering.images import resize_frames
+from mtv_world_ros.rollout_options import RolloutOptions
 from mtv_world_ros.ros.messages import image_messages
 from mtv_world_ros.ros.messages.conversions import NANO, to_multi_array, to_ns
 from mtv_world_ros.ros.messages.rejection import Rejection
@@ -80,7 +82,7 @@ class _SeenRollout(NamedTuple):
 
     rollout: int
     num_chunks: int
-    episode: ImaginedEpisode
+    episode: Rollout
 
 
 class LiveFidelity:
@@ -255,16 +257,15 @@ class LiveFidelity:
             self.watch.take(unforeseen(prediction.foreseen, episode.seen_points(len(indices))))
         self._done.trigger()
 
-    def _real_episode(self, chunk: Chunk) -> ImaginedEpisode:
+    def _real_episode(self, chunk: Chunk) -> Rollout:
         """The real frames of the chunk's rollout so far; a new episode where some are missing."""
         prediction, rollout = chunk.prediction, chunk.request.rollout
         seen = self._seen
         if seen is None or (seen.rollout, seen.num_chunks) != (rollout, prediction.chunk):
-            episode = self._pipeline.begin(
-                prediction.start,
-                instruction=chunk.request.instruction,
-                objects=prediction.masks.names,
+            options = RolloutOptions(
+                instruction=chunk.request.instruction, objects=prediction.masks.names
             )
+            episode = self._pipeline.begin(prediction.start, options)
             seen = _SeenRollout(rollout, prediction.chunk, episode)
         self._seen = seen._replace(num_chunks=prediction.chunk + 1)
         return seen.episode

@@ -13,9 +13,11 @@ from mtv_world_ros.data_types import Observation
 from mtv_world_ros.errors import ModelMemoryError, MtvWorldError, PlanError, RolloutPreempted
 from mtv_world_ros.geometry.chunk_plan import Plan
 from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.imagined_episode import Rollout
 from mtv_world_ros.observed_episode import ObservedEpisode
-from mtv_world_ros.pipeline import ImaginedEpisode, Pipeline
+from mtv_world_ros.pipeline import Pipeline
 from mtv_world_ros.prediction import Prediction
+from mtv_world_ros.rollout_options import RolloutOptions
 from mtv_world_ros.ros.messages.conversions import NANO
 from mtv_world_ros.ros.messages.rejection import Reason
 from mtv_world_ros.ros.parameters import Settings
@@ -136,7 +138,7 @@ class RolloutWorker:
         self._between: deque[Callable[[], None]] = deque()
         self._abandoned = False
         self._closing = False
-        self._episode: ImaginedEpisode | None = None
+        self._episode: Rollout | None = None
         self._last: SensedScene | None = None
         self._results: deque[Result] = deque()
         #: time of the thread's last step [s]; None = it waits for work
@@ -373,12 +375,7 @@ class RolloutWorker:
 
     def _imagine(self, request: Request) -> None:
         """Imagines the chunks of a request and hands each on."""
-        scene, episode = self._begin(request)
-        settings = request.settings
-        episode.instruction, episode.objects = request.instruction, settings.objects
-        episode.seed, episode.num_seeds = settings.seed, settings.num_seeds
-        episode.num_inference_steps = settings.num_inference_steps
-        episode.limit_tolerance = settings.limit_tolerance
+        scene, episode = self._begin(request, self._options(request))
         # rollouts before this one may have moved the robot in imagination
         plan = request.plan.after(episode.observation)
         for prediction in episode.extend(plan):
@@ -398,23 +395,30 @@ class RolloutWorker:
                 self._known.append(chunk)
                 self._put(chunk)
 
-    def _begin(self, request: Request) -> tuple[SensedScene, ImaginedEpisode]:
+    def _options(self, request: Request) -> RolloutOptions:
+        """The options that the request asks for."""
+        settings = request.settings
+        return RolloutOptions(
+            instruction=request.instruction,
+            objects=settings.objects,
+            seed=settings.seed,
+            num_seeds=settings.num_seeds,
+            num_inference_steps=settings.num_inference_steps,
+            limits=settings.plan_limits,
+            should_stop=self._should_stop,
+            doubt='' if request.imagine else self.doubt(),
+        )
+
+    def _begin(self, request: Request, options: RolloutOptions) -> tuple[SensedScene, Rollout]:
         """The scene to start from and its episode: the one that goes on, or a new one."""
         with self._changed:
             if request.imagine and self._episode is not None and self._last is not None:
+                self._episode.options = options
                 return self._last, self._episode
         scene = request.scene
-        if request.imagine:
-            episode = self._pipeline.begin(scene.observation)
-        else:
-            episode = self._observed.begin(
-                scene.observation,
-                instruction=request.instruction,
-                objects=request.settings.objects,
-            )
-        episode.should_stop = self._should_stop
+        begin = self._pipeline.begin if request.imagine else self._observed.begin
+        episode = begin(scene.observation, options)
         self.camera_check = episode.camera_check
-        episode.doubt = '' if request.imagine else self.doubt()
         return scene, episode
 
     def _put(self, result: Result) -> None:

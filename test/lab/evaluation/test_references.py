@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.imagined_episode import Rollout
 from mtv_world_ros.lab.evaluation.imagined_stretches import imagine_stretch, stretches
 from mtv_world_ros.lab.evaluation.references import check_actions, with_actions
 from mtv_world_ros.lab.recordings import commands_until
-from mtv_world_ros.pipeline import ImaginedEpisode
 
 
 @pytest.fixture
@@ -60,13 +60,13 @@ def test_all_commands_are_imagined_as_they_were_sent(fluent, make_pipeline, monk
     pipeline, recording = make_pipeline(), fluent
     stretch = stretches(recording, pipeline.spec, 'observe')[1]
     given = []
-    whole = ImaginedEpisode.extend
+    whole = Rollout.extend
 
     def extend(self, trajectory, **more):
         given.append(trajectory)
         return whole(self, trajectory, **more)
 
-    monkeypatch.setattr(ImaginedEpisode, 'extend', extend)
+    monkeypatch.setattr(Rollout, 'extend', extend)
     imagine_stretch(pipeline, recording, stretch, actions=recording, seed=0, num_inference_steps=1)
     sent, seconds = recording.commands, stretch.num_frames / pipeline.spec.fps
     begins = recording.times[stretch.start]

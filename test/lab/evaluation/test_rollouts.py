@@ -3,13 +3,13 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from mtv_world_ros.imagined_episode import Rollout
 from mtv_world_ros.lab.evaluation.imagined_stretches import (
     imagine_stretch,
     observe_stretch,
     predicted_frames,
     stretches,
 )
-from mtv_world_ros.pipeline import ImaginedEpisode
 
 
 def test_observed_stretches_are_chunks_from_real_frames(recordings, make_pipeline):
@@ -31,7 +31,7 @@ def test_recorded_frames_are_judged_with_the_joints_that_were_measured(
         judged.append((frames, positions))
         return SimpleNamespace(success='estimate')
 
-    monkeypatch.setattr(ImaginedEpisode, 'observe', observe)
+    monkeypatch.setattr(Rollout, 'observe', observe)
     pipeline = make_pipeline()
     stretch = stretches(recordings[0], pipeline.spec, 'observe')[1]
     assert observe_stretch(pipeline, recordings[0], stretch) == 'estimate'

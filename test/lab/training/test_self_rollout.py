@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from mtv_world_ros.lab.training.training_config import (
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.rollout_options import RolloutOptions
 from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
@@ -128,7 +130,7 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
             stamp_ns=0,
         )
         episode = pipeline.begin(
-            observation, instruction=recording.instruction, num_inference_steps=1
+            observation, RolloutOptions(instruction=recording.instruction, num_inference_steps=1)
         )
         shown = [clip.frames[:, :1]]
         for chunk, seed in enumerate(own_seeds):
@@ -138,7 +140,7 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
                 times=clip.times[1 : spec.num_frames + 1],
                 positions=clip.positions[first + 1 : first + spec.num_frames + 1],
             )
-            episode.seed = seed - chunk
+            episode.options = replace(episode.options, seed=seed - chunk)
             (prediction,) = episode.extend(trajectory)
             shown.append(prediction.video.frames)
         frame = episode.observation.frames

@@ -1,0 +1,34 @@
+"""The names at the top of the package: complete, imported when asked for, old ones warn."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import mtv_world_ros
+
+
+def test_the_public_names_are_listed_and_imported_when_they_are_asked_for():
+    assert {*mtv_world_ros.__all__} <= {*dir(mtv_world_ros)}
+    code = (
+        'import sys, mtv_world_ros\n'
+        "assert not [n for n in sys.modules if n.startswith('mtv_world_ros.')]\n"
+        "assert 'numpy' not in sys.modules\n"
+        'for name in mtv_world_ros.__all__: assert callable(getattr(mtv_world_ros, name)), name\n'
+        'from mtv_world_ros import *\n'
+        'assert judge is mtv_world_ros.judge\n'
+    )
+    subprocess.run([sys.executable, '-W', 'error', '-c', code], check=True)
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="has no attribute 'juge'"):
+        _ = mtv_world_ros.juge
+
+
+def test_old_names_work_and_name_the_new_one():
+    with pytest.warns(DeprecationWarning, match=r'mtv_world_ros\.Rollout'):
+        old = mtv_world_ros.ImaginedEpisode
+    assert old is mtv_world_ros.Rollout
