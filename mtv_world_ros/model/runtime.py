@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import TypeVar
 
 import torch
 from torch import nn
 
 from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.model.transformer.attention import cpu_multiplies_bfloat16
 
 Module = TypeVar('Module', bound=nn.Module)
 
@@ -49,16 +49,11 @@ def choose_dtype(name: str, device: str) -> torch.dtype:
         ConfigError: an unknown name.
     """
     if name == 'auto':
-        native = device != 'cpu' or _cpu_has_bfloat16()
+        native = device != 'cpu' or cpu_multiplies_bfloat16()
         return torch.bfloat16 if native else torch.float32
     if name not in _DTYPES:
         raise ConfigError(f"dtype '{name}' is not one of auto, {', '.join(_DTYPES)}")
     return _DTYPES[name]
-
-
-def _cpu_has_bfloat16() -> bool:
-    info = Path('/proc/cpuinfo')
-    return info.is_file() and 'avx512_bf16' in info.read_text()
 
 
 def place(module: Module, device: torch.device, dtype: torch.dtype) -> Module:

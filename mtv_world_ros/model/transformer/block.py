@@ -13,6 +13,7 @@ import torch
 from torch import nn, Tensor
 
 from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.model.transformer.attention import attend
 
 #: umT5 tokens; Wan's attention splits image from text tokens by this number
 NUM_TEXT_TOKENS = 512
@@ -109,12 +110,12 @@ class SelfAttnProcessor:
         query = attn.norm_q(attn.to_q(hidden_states)).unflatten(2, (attn.heads, -1))
         key = attn.norm_k(attn.to_k(hidden_states)).unflatten(2, (attn.heads, -1))
         value = attn.to_v(hidden_states).unflatten(2, (attn.heads, -1))
-        out = dispatch_attention_fn(
-            _turned(query, *rotary_emb),
-            _turned(key, *rotary_emb),
-            value,
-            backend=self._attention_backend,
-        )
+        query, key = _turned(query, *rotary_emb), _turned(key, *rotary_emb)
+        if query.device.type == 'cpu':
+            heads = (x.transpose(1, 2) for x in (query, key, value))
+            out = attend(*heads).transpose(1, 2)
+        else:
+            out = dispatch_attention_fn(query, key, value, backend=self._attention_backend)
         out = out.flatten(2, 3).type_as(hidden_states)
         return attn.to_out[1](attn.to_out[0](out))
 

@@ -13,6 +13,8 @@ import torch
 from torch import nn, Tensor
 import torch.nn.functional as F
 
+from mtv_world_ros.model.transformer.attention import attend
+
 #: what every output pixel chooses from: hold the reference, two copies of it, or draw anew
 NUM_SOURCES = 4
 #: weight, before the softmax, of a source that a model learns to use later
@@ -126,21 +128,9 @@ class CopyAttention(nn.Module):
         q = q.reshape(num_refs, frames, NUM_COPIES, self.head_dim, h2 * w2)
         q = q.permute(0, 2, 1, 4, 3).flatten(2, 3)
         v = values.flatten(2).transpose(1, 2)[:, None].expand(-1, NUM_COPIES, -1, -1)
-        copied = _attend(q, k.transpose(2, 3), v)
+        copied = attend(q.to(v.dtype), k.transpose(2, 3).to(v.dtype), v)
         copied = copied.unflatten(2, (frames, h2 * w2)).permute(0, 2, 1, 4, 3)
         return copied.reshape(x.shape[0], -1, h2, w2)
-
-
-def _attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """Attention whose values have another width than its keys: (R, heads, M, P).
-
-    Filled up with zeros to one width: torch's fused kernel, which needs that, never holds the
-    weights, and takes a quarter of the time on a CPU.
-    """
-    wide = max(q.shape[-1], v.shape[-1])
-    scale, width = q.shape[-1] ** -0.5, v.shape[-1]
-    q, k, v = (F.pad(x.to(v.dtype), (0, wide - x.shape[-1])) for x in (q, k, v))
-    return F.scaled_dot_product_attention(q, k, v, scale=scale)[..., :width]
 
 
 def _fourier_places(h: int, w: int, like: Tensor) -> Tensor:
@@ -210,6 +200,7 @@ class ReferenceDecoder(nn.Module):
         fine, half, coarse = skips
         grid = self.from_tokens(tokens).unflatten(-1, (self.merge, -1))
         x = grid.permute(0, 1, 2, 5, 6, 3, 4).reshape(coarse.shape)
+        x = x.contiguous(memory_format=torch.channels_last)
         x = self.block3(torch.cat([x, coarse], dim=1), temb)
         x = self.up2(F.interpolate(x, scale_factor=2.0, mode='nearest'))
         x = self.block2(torch.cat([x, half], dim=1), temb)

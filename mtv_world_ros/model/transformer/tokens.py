@@ -244,24 +244,16 @@ def arrange(video: Tensor, reference: Tensor, history: Tensor | None) -> TokenGr
     )
 
 
-def by_token(time_proj: Tensor, grid: TokenGrid) -> Tensor:
-    """Returns the blocks' modulation: one for all tokens, or one per token if levels differ.
+def by_run(time_proj: Tensor, grid: TokenGrid) -> Tensor:
+    """Returns the blocks' modulation (B, R, 6, D) of R runs of tokens.
+
+    There is one run, or V * F frames if noise levels differ. The reference shares the video's
+    level, as in Wan.
 
     Args:
         time_proj: (B, 1, 6, D), or (B, 2, 6, D) of the video's and the history's noise level.
         grid: view, time, row and column of each token.
-
-    Returns:
-        (B, 6, D), or (B, S, 6, D). The reference shares the video's level, as in Wan.
     """
-    if not grid.num_history:
-        return time_proj[:, 0]
-    height, width = grid.tokens.shape[3:5]
-    return by_run(time_proj, grid).repeat_interleave(height * width, dim=1)
-
-
-def by_run(time_proj: Tensor, grid: TokenGrid) -> Tensor:
-    """Returns it (B, R, 6, D) for R runs of tokens: a single one, or the V * F frames."""
     if not grid.num_history:
         return time_proj
     views, frames = grid.tokens.shape[1:3]

@@ -24,7 +24,6 @@ from mtv_world_ros.model.transformer.stem import ConvStem, ReferenceDecoder, Ref
 from mtv_world_ros.model.transformer.tokens import (
     arrange,
     by_run,
-    by_token,
     check_start_image,
     embed_history,
     embed_reference,
@@ -134,7 +133,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             )
         else:
             self.ref_conv = nn.Conv2d(latent_channels, dim, patch_size[1:], stride=patch_size[1:])  # type: ignore[arg-type]
-            hold_levels_by_run(self.blocks)
+        hold_levels_by_run(self.blocks)
         self.with_text = context != 'none'
         if not self.with_text:
             without_cross_attention(self.blocks)
@@ -218,7 +217,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         sequence = self._run_blocks(
             sequence.flatten(1, 4),
             context,
-            (by_token if self.stem == 'conv' else by_run)(time_proj, grid),
+            by_run(time_proj, grid),
             self.rope(grid.tokens, grid.times),
         )
         shift, scale = (self.scale_shift_table + temb[:, :1]).chunk(2, dim=1)

@@ -5,7 +5,8 @@ from small_transformer import build, inputs, PATCH, SMALL
 import torch
 
 from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.model.transformer.stem import _attend
+from mtv_world_ros.model.transformer import attention
+from mtv_world_ros.model.transformer.attention import attend
 
 CONFIGS = {'conv': (SMALL, 0), 'patch': (PATCH, 16)}
 
@@ -76,4 +77,50 @@ def test_the_attention_of_copies_is_that_of_the_formula(width):
     q, k = torch.randn(2, 2, 30, 32), torch.randn(2, 2, 20, 32)
     v = torch.randn(2, 1, 20, width).expand(-1, 2, -1, -1)
     wanted = (q @ k.transpose(2, 3) / 32**0.5).softmax(dim=-1) @ v
-    torch.testing.assert_close(_attend(q, k, v), wanted, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(attend(q, k, v), wanted, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize('has_fast_products', [True, False])
+def test_attention_in_bfloat16_is_that_of_the_formula_by_both_kernels(
+    monkeypatch: pytest.MonkeyPatch, has_fast_products: bool
+):
+    """Values and gradients, whether the CPU multiplies bfloat16 or torch's fused kernel runs."""
+    monkeypatch.setattr(attention, 'cpu_multiplies_bfloat16', lambda: has_fast_products)
+    fused = []
+    kernel = attention.F.scaled_dot_product_attention
+    monkeypatch.setattr(
+        attention.F,
+        'scaled_dot_product_attention',
+        lambda *given, **named: fused.append(given[2].is_contiguous()) or kernel(*given, **named),
+    )
+    torch.manual_seed(0)
+    exact = [torch.randn(2, 2, n, width) for n, width in ((30, 32), (20, 32), (20, 48))]
+    given = [x.bfloat16().transpose(2, 3).contiguous().transpose(2, 3) for x in exact]
+    for x in (*exact, *given):
+        x.requires_grad_(True)
+    q, k, v = exact
+    wanted = (q @ k.transpose(2, 3) / 32**0.5).softmax(dim=-1) @ v
+    found = attend(*given)
+    assert found.dtype == torch.bfloat16
+    torch.testing.assert_close(found.float(), wanted, rtol=0, atol=0.03)
+    wanted.square().sum().backward()
+    found.float().square().sum().backward()
+    for x, y in zip(given, exact, strict=True):
+        torch.testing.assert_close(x.grad.float(), y.grad, rtol=0.05, atol=0.1)
+    # the fused kernel would hold all scores if channels were not contiguous
+    assert fused == ([] if has_fast_products else [True])
+
+
+def test_scores_that_would_fill_the_memory_are_left_to_the_fused_kernel(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(attention, 'cpu_multiplies_bfloat16', lambda: True)
+    monkeypatch.setattr(attention, 'MAX_SCORES', 2 * 30 * 20 - 1)
+    kernel, calls = attention.F.scaled_dot_product_attention, []
+    monkeypatch.setattr(
+        attention.F,
+        'scaled_dot_product_attention',
+        lambda *given, **named: calls.append(1) or kernel(*given, **named),
+    )
+    attend(*(torch.zeros(1, 2, n, 32, dtype=torch.bfloat16) for n in (30, 20, 20)))
+    assert calls
