@@ -68,7 +68,8 @@ Factor = Annotated[float, Field(gt=0, le=1000)]
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 #: a part of a rotation
 Quaternion = Annotated[float, Field(ge=-1000, le=1000)]
-Count = Annotated[int, Field(ge=1)]
+#: a number of frames, pixels, steps, ...; more takes memory and time without end
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Pair = Annotated[
     tuple[Number, Number], Strict(False), expected('a list of 2 numbers of at most 1e6 either way')
 ]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
-from mtv_world_ros.bounded_input import read_json
+from mtv_world_ros.bounded_input import check_limit, read_json
 from mtv_world_ros.config import expected, ListOf, Schema, validated
 from mtv_world_ros.data_types import WorldModelSpec
 from mtv_world_ros.errors import CheckpointError
@@ -93,6 +93,12 @@ class CheckpointCard(Schema):
         default=4, description='denoising steps that the model is made for'
     )
     history: HistorySettings = HistorySettings()
+
+    @model_validator(mode='after')
+    def _chunk_fits_the_memory(self) -> Self:
+        size = self.num_frames * self.width * self.height * 3 * len(self.views)
+        check_limit('video_bytes', size, 'a chunk of these views')
+        return self
 
     @property
     def spec(self) -> WorldModelSpec:

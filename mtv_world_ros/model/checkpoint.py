@@ -19,6 +19,7 @@ from mtv_world_ros.model.parts import Autoencoder, build_autoencoder, build_sche
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.tensor_files import disk_errors, PICKLES, read_tensors
 from mtv_world_ros.model.transformer.transformer import copy_of, MultiViewWanTransformer
+from mtv_world_ros.network_sizes import check_sizes
 
 WEIGHTS = 'diffusion_pytorch_model'
 ADAPTER_FOLDER = 'adapter'
@@ -133,6 +134,7 @@ def _load_transformer(folder: Path, dtype: torch.dtype) -> MultiViewWanTransform
     found, expected = config.get('_class_name'), MultiViewWanTransformer.__name__
     if found != expected:
         raise CheckpointError(f"'{folder}' holds a {found}, expected a {expected}")
+    check_sizes(config, f"'{folder / 'config.json'}'")
     given = {name: value for name, value in config.items() if name not in _OF_0_1}
     with torch.device('meta'):
         transformer: Any = MultiViewWanTransformer.from_config(given)

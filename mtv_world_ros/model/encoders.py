@@ -15,6 +15,7 @@ from mtv_world_ros.bounded_input import check_weights
 from mtv_world_ros.errors import CheckpointError
 from mtv_world_ros.model.tensor_files import import_transformers
 from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
+from mtv_world_ros.network_sizes import check_config_file
 
 FOLDERS = ('text_encoder', 'tokenizer')
 #: mean and standard deviation of the colours that CLIP was trained with
@@ -68,6 +69,7 @@ class TextEncoder:
     def _load(self, device: torch.device) -> tuple[Any, Any]:
         transformers = import_transformers()
         encoder, tokenizer = (str(self._checkpoint / name) for name in FOLDERS)
+        check_config_file(Path(encoder) / 'config.json')
         try:
             model = transformers.UMT5EncoderModel.from_pretrained(
                 encoder, dtype=self._dtype, local_files_only=True, use_safetensors=True
@@ -114,6 +116,7 @@ class ImageEncoder:
             CheckpointError: the encoder is missing or cannot be loaded.
         """
         folder = checkpoint / _FOLDER
+        check_config_file(folder / 'config.json')
         try:
             model = import_transformers().CLIPVisionModel.from_pretrained(
                 str(folder), dtype=dtype, local_files_only=True, use_safetensors=True

@@ -18,6 +18,7 @@ from mtv_world_ros.model.autoencoders import (
     TinyAutoencoder,
     WanAutoencoder,
 )
+from mtv_world_ros.network_sizes import check_sizes
 
 Autoencoder: TypeAlias = SpaceToDepthAutoencoder | WanAutoencoder | TinyAutoencoder
 Scheduler: TypeAlias = FlowMatchEulerDiscreteScheduler | UniPCMultistepScheduler
@@ -101,4 +102,5 @@ def _split(
         raise CheckpointError(
             f"{what} '{name}' is not one of {', '.join(known)}{nearest(name, known)}"
         )
+    check_sizes(arguments, what)
     return name, arguments

@@ -49,8 +49,10 @@ class ImageInput(Schema):
 
     key: Key = Field(description='where it goes')
     view: str
-    width: int = Field(default=0, ge=0, description='that the server wants [px]; 0 = as it is')
-    height: int = Field(default=0, ge=0, description='see `width`')
+    width: int = Field(
+        default=0, ge=0, le=16_384, description='that the server wants [px]; 0 = as it is'
+    )
+    height: int = Field(default=0, ge=0, le=16_384, description='see `width`')
     layout: Literal['hwc', 'chw'] = Field(default='hwc', description='order of the axes')
     fit: Literal['pad', 'stretch'] = Field(
         default='pad', description='`pad` keeps the aspect ratio and fills with black'

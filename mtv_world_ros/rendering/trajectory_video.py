@@ -73,8 +73,11 @@ class TrajectoryVideoConfig(Schema):
         default=True,
         description='the newest point has a core, the whiter the more the gripper is closed',
     )
-    points_per_frame: Annotated[int, expected('a whole number of at least 1')] = Field(
-        default=3, ge=1, description='least number of trail points from one frame to the next'
+    points_per_frame: Annotated[int, expected('a whole number from 1 to 100')] = Field(
+        default=3,
+        ge=1,
+        le=100,
+        description='least number of trail points from one frame to the next',
     )
     max_gap_m: _Length | None = Field(
         default=None,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 import io
 from pathlib import Path
 import re
@@ -193,6 +194,32 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
         'LeRobot v3.0',
         lambda: altered('LeRobot v3.0', rb'\{file_index:03d\}', b'{file_index.__class__}'),
     ),
+    **{
+        f'checkpoint of {field} {value}': (
+            'checkpoint',
+            partial(
+                altered,
+                'checkpoint',
+                rf'"{field}": \[?[\d, \n]+\]?'.encode(),
+                f'"{field}": {value}'.encode(),
+            ),
+        )
+        for field, value in (
+            ('num_layers', 10**9),
+            ('num_layers', 10**40),
+            ('num_attention_heads', 10**9),
+            ('attention_head_dim', 10**9),
+            ('ffn_dim', 10**12),
+            ('rope_max_seq_len', 10**9),
+            ('num_views', 10**12),
+            ('patch_size', [10**6] * 3),
+            ('stem_widths', [10**12] * 3),
+            ('block_size', 10**6),
+            ('num_train_timesteps', 10**9),
+            ('width', 16_000),
+            ('num_frames', 10_000),
+        )
+    },
     'instruction of 15 kB': ('instruction', lambda: b'put the red block ' * 5_000),
     'width .inf': ('calibration', lambda: calibrated(width=float('inf'))),
     'nesting': ('calibration', lambda: b'[' * 100_000),

@@ -229,8 +229,8 @@ class LoraSettings(Schema):
 
     section: ClassVar = 'lora'
 
-    rank: Annotated[int, expected('positive, or 0 for none')] = Field(
-        default=0, ge=0, description='0 = all weights are trained'
+    rank: Annotated[int, expected('positive, at most 4096, or 0 for none')] = Field(
+        default=0, ge=0, le=4096, description='0 = all weights are trained'
     )
     alpha: Factor = 32.0
 

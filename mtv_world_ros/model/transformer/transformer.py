@@ -31,6 +31,7 @@ from mtv_world_ros.model.transformer.tokens import (
     MultiViewRotaryPosEmbed,
     unembed,
 )
+from mtv_world_ros.network_sizes import check_sizes
 
 
 class MultiViewWanTransformer(WanTransformer3DModel):
@@ -95,6 +96,10 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         start_image: str = 'both',
         copies_control: bool = False,
     ) -> None:
+        sizes = {'num_layers': num_layers, 'num_views': num_views, 'patch_size': patch_size}
+        sizes |= {'num_attention_heads': num_attention_heads, 'ffn_dim': ffn_dim}
+        sizes |= {'attention_head_dim': attention_head_dim, 'rope_max_seq_len': rope_max_seq_len}
+        check_sizes(sizes, 'transformer')
         super().__init__(
             patch_size=patch_size,
             num_attention_heads=num_attention_heads,

@@ -8,6 +8,7 @@ from typing import Any
 
 from mtv_world_ros.bounded_input import check_weights, read_json
 from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.network_sizes import check_sizes
 
 #: `model_type` in a folder's config.json -> (class in transformers, a public name of it)
 VISION_MODELS = {
@@ -120,7 +121,9 @@ def _check_folder(folder: Path, kind: str, public_name: str) -> None:
             f"'{folder}' has no config.json; name a folder with {public_name} or another "
             f'{kind} model'
         )
-    found = _model_type(config)
+    values = _read(config)
+    check_sizes(values, f"'{config}'")
+    found = str(values.get('model_type'))
     if found != kind:
         raise CheckpointError(
             f"'{folder}' holds a model of type '{found}', not '{kind}' ({public_name})"
