@@ -16,7 +16,7 @@ CONFIG = PathJoinSubstitution([FindPackageShare('mtv_world_ros'), 'config'])
 #: arguments that override a parameter of the file where they are given
 PARAMETERS = {
     'use_sim_time': (bool, 'follow /clock, e.g. of a bag'),
-    'checkpoint': (str, "checkpoint folder; 'bundled' ships with the package"),
+    'checkpoint': (str, "checkpoint folder; 'bundled' and 'bundled-paper' ship with the package"),
     'calibration_file': (str, "YAML with every view's pose"),
     'compressed_input': (bool, '<camera>/image_raw/compressed instead of image_raw'),
     'num_inference_steps': (int, 'denoising steps a chunk'),

@@ -9,7 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.entry_points import policy_kind
-from mtv_world_ros.errors import CalibrationError, CheckpointError, ConfigError, PolicyError
+from mtv_world_ros.errors import (
+    CalibrationError,
+    CheckpointError,
+    ConfigError,
+    nearest,
+    PolicyError,
+)
 from mtv_world_ros.files import bundled, content_digest, share_path
 from mtv_world_ros.geometry.object_motion import ObjectMotionModel
 from mtv_world_ros.geometry.robot.file import load_robot, ROBOT_YAML
@@ -46,14 +52,30 @@ if TYPE_CHECKING:
     from mtv_world_ros.vision.describers.describer_config import DescriberConfig
 
 BUNDLED = 'bundled'
+#: folders of `resource` with the checkpoints that ship with the package, by name; the second one
+#: was trained the paper's way: trails and first masks, no object motion
+BUNDLED_FOLDERS = {BUNDLED: 'checkpoint', 'bundled-paper': 'checkpoint_paper'}
 _YAML = ('.yaml', '.yml')
 #: makes a policy for an episode's origin; most do not look at it
 PolicyMaker = Callable[[EpisodeOrigin], Policy]
 
 
 def checkpoint_path(name: str | Path) -> Path:
-    """Returns the folder of a checkpoint; `bundled` is the one that ships with the package."""
-    return share_path('resource', 'checkpoint') if str(name) == BUNDLED else Path(name)
+    """Returns the folder of a checkpoint, given by path or by a name of `BUNDLED_FOLDERS`.
+
+    Raises:
+        CheckpointError: no folder, and nearly the name of one that ships with the package.
+    """
+    folder = BUNDLED_FOLDERS.get(str(name))
+    if folder is not None:
+        return share_path('resource', folder)
+    path = Path(name)
+    if not path.exists() and path.name.replace('_', '-').startswith(BUNDLED):
+        raise CheckpointError(
+            f"checkpoint '{name}' is no folder and no checkpoint of the package"
+            f'{nearest(str(name), BUNDLED_FOLDERS)}; those are {", ".join(BUNDLED_FOLDERS)}'
+        )
+    return path
 
 
 def robot_path(name: str | Path) -> Path:

@@ -133,7 +133,9 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
             'stored with the episode, else the colour words of its instruction',
         }
     },
-    'checkpoint': {'--checkpoint': {'default': 'bundled', 'help': "folder, or 'bundled'"}},
+    'checkpoint': {
+        '--checkpoint': {'default': 'bundled', 'help': "folder, 'bundled' or 'bundled-paper'"}
+    },
     'overwrite': {
         '--overwrite': {'action': 'store_true', 'help': 'replace what an earlier run wrote'}
     },

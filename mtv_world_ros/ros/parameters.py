@@ -56,7 +56,9 @@ _SET_SERVICES = ('set_parameters', 'set_parameters_atomically')
 class NodeSettings(Schema):
     """Parameters of every node that observes."""
 
-    checkpoint: str = at_start('bundled', "Checkpoint folder; 'bundled' ships with the package.")
+    checkpoint: str = at_start(
+        'bundled', "Checkpoint folder; 'bundled' and 'bundled-paper' ship with the package."
+    )
     robot_file: str = at_start(
         '', "Robot YAML or a bundled robot's name; empty = the checkpoint's."
     )

@@ -40,7 +40,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="fit a checkpoint's success estimate to recorded outcomes",
         epilog=_EPILOG,
     )
-    parser.add_argument('checkpoint', help="folder, or 'bundled'")
+    parser.add_argument('checkpoint', help="folder, 'bundled' or 'bundled-paper'")
     parser.add_argument('dataset', type=Path, help='folder of episodes with outcomes')
     parser.add_argument('--out', type=Path, required=True, metavar='DIR')
     parser.add_argument(
@@ -137,16 +137,16 @@ def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
 
 def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
     """Refuses to write into the installed package, and to replace an earlier calibration."""
-    from mtv_world_ros.assembly import BUNDLED
+    from mtv_world_ros.assembly import BUNDLED_FOLDERS
     from mtv_world_ros.success.calibration import Calibration, fit_path
 
     check_free(arguments.out / 'calibration.json', arguments.overwrite)
     if not arguments.store:
         return
-    if arguments.checkpoint == BUNDLED:
+    if arguments.checkpoint in BUNDLED_FOLDERS:
         raise ConfigError(
-            "'bundled' is part of the installed package, into which nothing is written; copy it "
-            f"with 'cp -r {folder} DIR' and calibrate DIR, or give --no-store"
+            f"'{arguments.checkpoint}' is part of the installed package, into which nothing is "
+            f"written; copy it with 'cp -r {folder} DIR' and calibrate DIR, or give --no-store"
         )
     file = fit_path(folder, Calibration, of_pictures=_is_of_pictures(arguments, folder))
     check_free(file, arguments.overwrite, 'checkpoint')

@@ -50,7 +50,7 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
         'checkpoints',
         nargs='+',
         metavar='CHECKPOINT',
-        help="folder, or 'bundled'; NAME=FOLDER names its row in the tables",
+        help="folder, 'bundled' or 'bundled-paper'; NAME=FOLDER names its row in the tables",
     )
     parser.add_argument('dataset', type=Path, help='folder of episodes')
     parser.add_argument('--out', type=Path, required=True, metavar='DIR')

@@ -43,7 +43,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--dry-run', action='store_true', help='print memory and arithmetic of a step, then exit'
     )
-    parser.add_argument('--init', help="checkpoint to start from: a folder, or 'bundled'")
+    parser.add_argument(
+        '--init', help="checkpoint to start from: a folder, 'bundled' or 'bundled-paper'"
+    )
     parser.add_argument(
         '--latent-cache',
         type=Path,
