@@ -13,13 +13,11 @@ from setuptools import find_packages, setup
 PACKAGE = 'mtv_world_ros'
 SHARE = f'share/{PACKAGE}'
 MARKER = f'resource/{PACKAGE}'
-#: modules of commands on each floor
-GROUND_COMMANDS = ('imagine', 'view')
-LAB_COMMANDS = (
-    'calibrate', 'datasets', 'demo', 'evaluate', 'fit_contact', 'foresee', 'import_weights',
-    'own_robot', 'train',
+#: modules of commands in the folder cli
+COMMANDS = (
+    'calibrate', 'collect', 'datasets', 'demo', 'evaluate', 'faults', 'fit_contact', 'foresee',
+    'imagine', 'import_weights', 'own_robot', 'rank', 'train', 'view',
 )  # fmt: skip
-BENCH_COMMANDS = ('collect', 'faults', 'rank')
 
 
 def data_files() -> list[tuple[str, Sequence[str]]]:
@@ -113,16 +111,17 @@ setup(
         ],
         # A module of commands adds them to the parser: `add(subparsers)`.
         'mtv_world.commands': [
-            *(f'{name} = {PACKAGE}.cli.{name}' for name in GROUND_COMMANDS),
-            *(f'{name} = {PACKAGE}.lab.cli.{name}' for name in LAB_COMMANDS),
-            *(f'{name} = {PACKAGE}.bench.cli.{name}' for name in BENCH_COMMANDS),
+            f'{name} = {PACKAGE}.cli.{name}'
+            if name != 'demo'
+            else f'demo = {PACKAGE}.cli.demo.command'
+            for name in COMMANDS
         ],
         # Policy kinds that the simulator makes.
-        'mtv_world.policies': [f'scripted = {PACKAGE}.bench.expert.policy_kind'],
+        'mtv_world.policies': [f'scripted = {PACKAGE}.simulation.expert.policy_kind'],
         # Folders whose rollouts `mtv-world view` shows.
         'mtv_world.rollouts': [
-            f'ranking = {PACKAGE}.bench.ranking.shown_rollouts',
-            f'evaluation = {PACKAGE}.lab.evaluation.shown_rollouts',
+            f'ranking = {PACKAGE}.reports.shown_rankings',
+            f'evaluation = {PACKAGE}.reports.shown_rollouts',
         ],
     },
     zip_safe=True,

@@ -25,28 +25,28 @@ from typing import Any
 import numpy as np
 from page import parse_arguments, publish, table
 
-from mtv_world_ros.assembly import robot_path
-from mtv_world_ros.bench.expert.expert import Expert
-from mtv_world_ros.bench.tasks.tasks import task_named
-from mtv_world_ros.bench.world.arm import actuators_of
-from mtv_world_ros.bench.world.opengl import load_mujoco
-from mtv_world_ros.bench.world.randomize import draw_scene
-from mtv_world_ros.bench.world.scene import scene_xml
-from mtv_world_ros.bench.world.simulator import scene_generator
-from mtv_world_ros.bench.world.workcell import workcell_of
+from mtv_world_ros.cameras.camera import camera_poses
+from mtv_world_ros.cli.own_robot import GOOD_MATCH, is_doubtful
+from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray
+from mtv_world_ros.core.errors import MtvWorldError
+from mtv_world_ros.core.transforms import looking_along
 from mtv_world_ros.data.episode import JointStates, Track
-from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
-from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.geometry.camera import camera_poses
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.geometry.robot.shape import load_shape
-from mtv_world_ros.geometry.transforms import looking_along
-from mtv_world_ros.lab.camera_calibration.fixed_camera import FixedCamera
-from mtv_world_ros.lab.camera_calibration.wrist_camera import follow_scene, WristCamera
-from mtv_world_ros.lab.cli.own_robot import GOOD_MATCH, is_doubtful
-from mtv_world_ros.lab.inspection.camera_pose import CameraEstimate, difference, moved
-from mtv_world_ros.lab.inspection.clocks import JointTrack
+from mtv_world_ros.inspection.camera_pose import CameraEstimate, difference, moved
+from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
+from mtv_world_ros.inspection.cameras.wrist_camera import follow_scene, WristCamera
+from mtv_world_ros.inspection.clocks import JointTrack
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.shape import load_shape
+from mtv_world_ros.rollout.assembly import robot_path
+from mtv_world_ros.simulation.arm import actuators_of
+from mtv_world_ros.simulation.expert.expert import Expert
+from mtv_world_ros.simulation.opengl import load_mujoco
+from mtv_world_ros.simulation.randomize import draw_scene
+from mtv_world_ros.simulation.scene import scene_xml
+from mtv_world_ros.simulation.simulator import scene_generator
+from mtv_world_ros.simulation.tasks import task_named
+from mtv_world_ros.simulation.workcell import workcell_of
 
 #: of estimates
 KINDS = ('on the arm, guess', 'on the arm, no guess', 'fixed, guess', 'fixed, no guess')

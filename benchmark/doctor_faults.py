@@ -31,18 +31,18 @@ import numpy as np
 from page import parse_arguments, publish, table
 import yaml
 
+from mtv_world_ros.cameras.camera import scaled
+from mtv_world_ros.cli.calibrate_camera import recorded_robot
+from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.data.episode import Episode, Track
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
-from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray
-from mtv_world_ros.geometry.camera import scaled
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.geometry.robot.shape import load_shape, moving_links, RobotShape
-from mtv_world_ros.lab.cli.shared_camera import recorded_robot
-from mtv_world_ros.lab.inspection.folder import inspect_folder
-from mtv_world_ros.lab.inspection.inspect import Inspector, load_inspector
-from mtv_world_ros.lab.inspection.inspection_report import Inspection
-from mtv_world_ros.lab.inspection.places import background
+from mtv_world_ros.inspection.folder import inspect_folder
+from mtv_world_ros.inspection.inspect import Inspector, load_inspector
+from mtv_world_ros.inspection.inspection_report import Inspection
+from mtv_world_ros.inspection.places import background
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.shape import load_shape, moving_links, RobotShape
 
 #: (episode, view, sign) -> the same with something wrong
 Fault = Callable[[Episode, str, float], Episode]

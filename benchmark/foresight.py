@@ -31,9 +31,9 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
 
+from mtv_world_ros.core.data_types import JointTrajectory
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording, Recording
-from mtv_world_ros.data_types import JointTrajectory
-from mtv_world_ros.files import share_path
 from mtv_world_ros.ros.messages.conversions import (
     make_header,
     to_joint_state,

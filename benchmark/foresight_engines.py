@@ -38,28 +38,25 @@ from typing import Any
 import numpy as np
 from page import old_checkout, parse_arguments, publish, ROOT, table
 
-from mtv_world_ros.assembly import (
-    checkpoint_path,
-    checkpoint_robot,
-    robot_path,
-)
-from mtv_world_ros.bench.ranking.no_picture_rule import is_done, things_in
 from mtv_world_ros.cli.shared_options import names
+from mtv_world_ros.core.data_types import BoolArray, FloatArray
+from mtv_world_ros.core.errors import MtvWorldError
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
-from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.files import share_path
-from mtv_world_ros.foresight.loading import load_foresight
-from mtv_world_ros.foresight.solid_foresight import SolidForesight
-from mtv_world_ros.geometry.object_motion import FoundObjects
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.lab.evaluation.metrics.statistics import wilson
-from mtv_world_ros.lab.evaluation.metrics.success_agreement import area_under_roc
-from mtv_world_ros.lab.jobs import fingerprint
-from mtv_world_ros.lab.splits import refuse_test_kinds
-from mtv_world_ros.lab.training.object_motion.tracks import fine_commands, first_frame
+from mtv_world_ros.data.splits import refuse_test_kinds
+from mtv_world_ros.evaluation.metrics.statistics import wilson
+from mtv_world_ros.evaluation.metrics.success_agreement import area_under_roc
+from mtv_world_ros.evaluation.result_settings import fingerprint
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
-from mtv_world_ros.success.foreseen import foreseen_of
+from mtv_world_ros.physics.checkpoint_files import load_foresight
+from mtv_world_ros.physics.fitting.tracks import fine_commands, first_frame
+from mtv_world_ros.physics.foreseen_motions import foreseen_of
+from mtv_world_ros.physics.object_motion import FoundObjects
+from mtv_world_ros.physics.solid_foresight import SolidForesight
+from mtv_world_ros.ranking.no_picture_rule import is_done, things_in
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.rollout.assembly import checkpoint_path, checkpoint_robot, robot_path
+from mtv_world_ros.success.foreseen import foreseen_ends
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
 
 OLD, RULE = '0.1.0: networks and DART', 'no-picture rule'
@@ -94,14 +91,14 @@ import json, sys, time
 time.perf_counter = time.process_time  # other work does not count
 from dataclasses import replace
 import numpy as np
-from mtv_world_ros.assembly import load_pipeline
+from mtv_world_ros.rollout.assembly import load_pipeline
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.data_types import JointTrajectory, Observation
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.data_types import JointTrajectory, Observation
+from mtv_world_ros.core.files import share_path
 futures = int(sys.argv[1])
 pipeline = load_pipeline('bundled', num_threads=1)
 if futures:
-    from mtv_world_ros.foresight.solid_foresight import SolidForesight
+    from mtv_world_ros.physics.solid_foresight import SolidForesight
     known = pipeline.object_motion
     settings = known.settings.model_copy(update={'num_motions': futures})
     pipeline = replace(
@@ -262,7 +259,7 @@ class New:
                 tracked=tracked,
             ).after(positions)
             foreseen = foreseen_of(self.robot, ahead, len(ahead.motions[0].points))
-            ends = foreseen.ends(task, bound, np.full((len(named), 3), np.nan))
+            ends = foreseen_ends(foreseen, task, bound, np.full((len(named), 3), np.nan))
             if ends is None:
                 return success, {}
             answers[row] = ends.share, time.process_time() - begin

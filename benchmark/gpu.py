@@ -41,8 +41,8 @@ _LEFT_OUT = (':!docs', ':!benchmark/results', ':!.github', ':!findings')
 _TESTS = (
     'test/model/serving/test_serving.py',
     'test/model/serving/test_wan_serving.py',
-    'test/lab/training/test_trainer.py',
-    'test/lab/training/test_wan_training.py',
+    'test/training/test_trainer.py',
+    'test/training/test_wan_training.py',
     'test/vision/segmenters/test_prompted.py',
 )
 _SERVING = 'compile=true'

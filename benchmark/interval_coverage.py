@@ -19,20 +19,20 @@ from page import parse_arguments, publish, table
 from scipy.special import betaincinv, ndtr, ndtri
 from scipy.stats import rankdata
 
-from mtv_world_ros.bench.ranking.scores import area_interval
-from mtv_world_ros.lab.evaluation.metrics.policy_agreement import (
+from mtv_world_ros.evaluation.metrics.policy_agreement import (
     mean_maximum_rank_violation,
     pearson,
     powered_mean,
     rate_agreement,
     ScoreOfRates,
 )
-from mtv_world_ros.lab.evaluation.metrics.statistics import (
+from mtv_world_ros.evaluation.metrics.statistics import (
     clustered_wilson,
     Interval,
     mean_interval,
     wilson,
 )
+from mtv_world_ros.ranking.judges import area_interval
 
 SIZES = (4, 8, 20, 60)
 #: name -> whether it is the population that differs

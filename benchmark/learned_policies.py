@@ -36,16 +36,16 @@ import pyarrow.parquet as parquet
 from scipy.stats import spearmanr
 import yaml
 
-from mtv_world_ros.bench.collect.record import expert_generator
-from mtv_world_ros.bench.expert.expert import Expert
-from mtv_world_ros.bench.ranking.rollout_jobs import Result
-from mtv_world_ros.bench.ranking.run_jobs import read_results
-from mtv_world_ros.bench.world.simulator import SimEpisode
-from mtv_world_ros.errors import SimulatorError
-from mtv_world_ros.files import bundled
-from mtv_world_ros.geometry.resample import resample
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.rendering.images import resize_frames
+from mtv_world_ros.core.errors import SimulatorError
+from mtv_world_ros.core.files import bundled
+from mtv_world_ros.core.images import resize_frames
+from mtv_world_ros.ranking.rollout_jobs import Result
+from mtv_world_ros.ranking.run_jobs import read_results
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.resample import resample
+from mtv_world_ros.simulation.collect.record import expert_generator
+from mtv_world_ros.simulation.expert.expert import Expert
+from mtv_world_ros.simulation.simulator import SimEpisode
 
 #: one arm moves one object: ACT reads no instruction
 TASKS = 'shake_bottle,place_cup_plate,place_bread_plate'

@@ -26,28 +26,32 @@ import time
 
 import numpy as np
 
-from mtv_world_ros.assembly import checkpoint_path
 from mtv_world_ros.cli.shared_options import machine
-from mtv_world_ros.files import content_digest
+from mtv_world_ros.core.files import content_digest
+from mtv_world_ros.rollout.assembly import checkpoint_path
 
 ROOT = Path(__file__).resolve().parents[1]
 #: what speed is compared with
 OLD_TAG = 'v0.1.0'
 #: kind of page -> what it describes: other numbers may come out once that has changed
 DESCRIBES = {
-    'camera_calibration': ('mtv_world_ros/lab/inspection',),
+    'camera_calibration': ('mtv_world_ros/inspection',),
     'camera_check': ('mtv_world_ros/vision',),
-    'doctor': ('mtv_world_ros/lab/inspection',),
+    'doctor': ('mtv_world_ros/inspection',),
     'foresight': ('mtv_world_ros/ros',),
-    'interval_coverage': ('mtv_world_ros/lab/evaluation/metrics',),
-    'learned_policies': ('mtv_world_ros/bench', 'mtv_world_ros/policies'),
+    'interval_coverage': ('mtv_world_ros/evaluation/metrics',),
+    'learned_policies': (
+        'mtv_world_ros/ranking',
+        'mtv_world_ros/simulation',
+        'mtv_world_ros/policies',
+    ),
     'robustness': ('mtv_world_ros',),
     'segmenter': ('mtv_world_ros/vision/segmenters',),
     'serving': ('mtv_world_ros/model',),
-    'training_speed': ('mtv_world_ros/lab/training',),
-    'trajectory_video': ('mtv_world_ros/rendering',),
+    'training_speed': ('mtv_world_ros/training',),
+    'trajectory_video': ('mtv_world_ros/control',),
     'wan': ('mtv_world_ros/model',),
-    'wan_training_speed': ('mtv_world_ros/lab/training', 'mtv_world_ros/model'),
+    'wan_training_speed': ('mtv_world_ros/training', 'mtv_world_ros/model'),
 }
 #: kinds of pages whose numbers are a checkpoint's; by default the bundled one's
 OF_A_CHECKPOINT = (

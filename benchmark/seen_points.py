@@ -27,24 +27,24 @@ import numpy as np
 from page import table
 from scipy.stats import binomtest
 
-from mtv_world_ros.assembly import robot_path
-from mtv_world_ros.config import read_yaml
+from mtv_world_ros.cameras.camera import project
+from mtv_world_ros.cli.calibrate_camera import recorded_robot
+from mtv_world_ros.core.config import read_yaml
+from mtv_world_ros.core.data_types import CameraModel, FloatArray
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
-from mtv_world_ros.data_types import CameraModel, FloatArray
-from mtv_world_ros.geometry.camera import project
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.geometry.robot.shape import load_shape, RobotShape
-from mtv_world_ros.lab.camera_calibration import joint_camera
-from mtv_world_ros.lab.camera_calibration.shared_camera import (
+from mtv_world_ros.inspection.cameras import joint_camera
+from mtv_world_ros.inspection.cameras.shared_camera import (
     estimate_shared,
     expected_within,
     seen_points,
     SharedEstimate,
 )
-from mtv_world_ros.lab.cli.shared_camera import recorded_robot
-from mtv_world_ros.lab.inspection.clocks import JointTrack
+from mtv_world_ros.inspection.clocks import JointTrack
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.shape import load_shape, RobotShape
+from mtv_world_ros.rollout.assembly import robot_path
 
 WAYS = ('recorded', 'search', 'points', 'same-focal')
 HEAD = (

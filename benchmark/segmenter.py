@@ -20,11 +20,11 @@ import cv2
 import numpy as np
 import page
 
+from mtv_world_ros.core.data_types import ByteArray, ObjectMasks, WorldModelSpec
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import load_recording, Recording
-from mtv_world_ros.data_types import ByteArray, ObjectMasks, WorldModelSpec
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.vision.jaccard import jaccard
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter, SEGMENTERS
 from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, Segmenter

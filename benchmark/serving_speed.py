@@ -16,11 +16,11 @@ import numpy as np
 from page import parse_arguments, publish
 import torch
 
-from mtv_world_ros.assembly import load_pipeline
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.files import share_path
-from mtv_world_ros.lab.evaluation.imagined_stretches import imagine_stretch, stretches
-from mtv_world_ros.prediction import Prediction
+from mtv_world_ros.evaluation.imagined_stretches import imagine_stretch, stretches
+from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros.rollout.prediction import Prediction
 
 
 def main() -> None:

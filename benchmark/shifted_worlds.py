@@ -38,43 +38,43 @@ import cv2
 import numpy as np
 from page import parse_arguments, publish, table
 
-from mtv_world_ros.assembly import load_pipeline
-from mtv_world_ros.bench.collect.episode_jobs import episode_seed
-from mtv_world_ros.bench.collect.record import carry_out, RecordConfig, Take
-from mtv_world_ros.bench.expert.expert import Expert
-from mtv_world_ros.bench.expert.faults.catalogue import EXPERT, FAULTS, kinds_of, PolicyVariant
-from mtv_world_ros.bench.expert.faults.drawn import is_drawn
-from mtv_world_ros.bench.expert.scripted_policy import scripted_policy
-from mtv_world_ros.bench.ranking.flips import is_nearer, objects_png
-from mtv_world_ros.bench.ranking.no_picture_rule import judge_without_pictures
-from mtv_world_ros.bench.ranking.scores import area_interval
-from mtv_world_ros.bench.tasks.tasks import task_named
-from mtv_world_ros.bench.world.physics import catalogue, physics_named
-from mtv_world_ros.bench.world.simulator import CONTROL_PERIOD_S, SimEpisode
-from mtv_world_ros.data.episode import NOMINAL
-from mtv_world_ros.data_types import (
+from mtv_world_ros.cameras.camera import camera_poses
+from mtv_world_ros.core.data_types import (
     ByteArray,
     FloatArray,
     JointTrajectory,
     Observation,
     SuccessEstimate,
 )
-from mtv_world_ros.errors import MtvWorldError, PolicyError, SimulatorError
-from mtv_world_ros.foresight.arm_response import PERIOD_S
-from mtv_world_ros.foresight.loading import load_foresight
-from mtv_world_ros.geometry.camera import camera_poses
-from mtv_world_ros.geometry.object_motion import FoundObjects, ObjectMotionModel
-from mtv_world_ros.geometry.resample import resample
-from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.imagined_episode import Rollout
-from mtv_world_ros.lab.evaluation.metrics.statistics import clustered_wilson
+from mtv_world_ros.core.errors import MtvWorldError, PolicyError, SimulatorError
+from mtv_world_ros.core.images import encode_png, resize_frames
+from mtv_world_ros.data.episode import NOMINAL
+from mtv_world_ros.evaluation.metrics.statistics import clustered_wilson
 from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
-from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.rendering.images import encode_png, resize_frames
-from mtv_world_ros.rollout_options import RolloutOptions
+from mtv_world_ros.physics.arm_response import PERIOD_S
+from mtv_world_ros.physics.checkpoint_files import load_foresight
+from mtv_world_ros.physics.foreseen_motions import foreseen_of
+from mtv_world_ros.physics.object_motion import FoundObjects, ObjectMotionModel
+from mtv_world_ros.ranking.flips import is_nearer, objects_png
+from mtv_world_ros.ranking.judges import area_interval
+from mtv_world_ros.ranking.no_picture_rule import judge_without_pictures
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.resample import resample
+from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros.rollout.imagined_episode import Rollout
+from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.simulation.collect.episode_jobs import episode_seed
+from mtv_world_ros.simulation.collect.record import carry_out, RecordConfig, Take
+from mtv_world_ros.simulation.expert.expert import Expert
+from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
+from mtv_world_ros.simulation.faults.catalogue import EXPERT, FAULTS, kinds_of, PolicyVariant
+from mtv_world_ros.simulation.faults.drawn import is_drawn
+from mtv_world_ros.simulation.physics import catalogue, physics_named
+from mtv_world_ros.simulation.simulator import CONTROL_PERIOD_S, SimEpisode
+from mtv_world_ros.simulation.tasks import task_named
 from mtv_world_ros.success.doubts import Grounds, NEAR_M, PhysicsWatch, unforeseen
 from mtv_world_ros.success.estimator import capped, stated_probability, verdict
-from mtv_world_ros.success.foreseen import foreseen_of
 from mtv_world_ros.success.situation import CannotTell
 from mtv_world_ros.vision.camera_check import CameraCheck
 

@@ -18,16 +18,16 @@ import cv2
 import numpy as np
 from page import measure, parse_arguments, publish, table
 
-from mtv_world_ros.data_types import CameraModel
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.rendering.trajectory_video import (
+from mtv_world_ros.control.trajectory_video import (
     arm_colour,
     object_colour,
     render_trajectory_video,
     TrajectoryVideoConfig,
 )
+from mtv_world_ros.core.data_types import CameraModel
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.model import RobotModel
 
 #: name, frames, width, height, frames a second
 CASES = (('small preset', 17, 96, 72, 5.0), ('81 frames', 81, 384, 288, 10.0))

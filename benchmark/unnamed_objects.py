@@ -17,16 +17,16 @@ from pathlib import Path
 import numpy as np
 from page import parse_arguments, publish, table
 
-from mtv_world_ros.assembly import load_pipeline
+from mtv_world_ros.cameras.mask_geometry import centroids
+from mtv_world_ros.core.data_types import BoolArray, JointTrajectory, Observation
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import load_recording, Recording
-from mtv_world_ros.data_types import BoolArray, JointTrajectory, Observation
-from mtv_world_ros.geometry.mask_geometry import centroids
-from mtv_world_ros.lab.evaluation.imagined_stretches import predicted_frames, stretches
-from mtv_world_ros.lab.jobs import fingerprint
-from mtv_world_ros.lab.recordings import commanded
-from mtv_world_ros.pipeline import Pipeline
-from mtv_world_ros.rollout_options import RolloutOptions
+from mtv_world_ros.data.recordings import commanded
+from mtv_world_ros.evaluation.imagined_stretches import predicted_frames, stretches
+from mtv_world_ros.evaluation.result_settings import fingerprint
+from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.rollout.rollout_options import RolloutOptions
 
 HEAD = ('named', 'objects', 'area left, mean', '95 % interval', 'least', 'at least 90 % left')
 _STILL_PX = 2.0

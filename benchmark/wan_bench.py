@@ -13,7 +13,6 @@ from diffusers import WanImageToVideoPipeline, WanTransformer3DModel
 import torch
 from torch import nn, Tensor
 
-from mtv_world_ros.lab.training.training_config import TrainingConfig
 from mtv_world_ros.model.autoencoders import TinyAutoencoder
 from mtv_world_ros.model.conditioning import (
     condition,
@@ -28,6 +27,7 @@ from mtv_world_ros.model.serving import compile_norms, prepare, ServingOptions
 from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.world_model import denoise, sample_latents
+from mtv_world_ros.training.training_config import TrainingConfig
 
 _IMAGE_TOKENS = 257
 #: of a stock Wan image-to-video transformer: noisy 16, mask 4, image 16

@@ -21,8 +21,8 @@ from diffusers.models.transformers.transformer_wan import WanAttnProcessor, WanT
 from page import in_turns, parse_arguments, publish, table
 import torch
 
-from mtv_world_ros.lab.training.training_config import load_training_config
 from mtv_world_ros.model.transformer.block import hold_levels_by_run
+from mtv_world_ros.training.training_config import load_training_config
 
 #: rows and columns of a view's tokens, views; frames are an option
 _HEIGHT, _WIDTH, _VIEWS = 9, 12, 2

@@ -29,10 +29,10 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry
 from wan_bench import Bench
 
-from mtv_world_ros.lab.cli.train import set_overrides
-from mtv_world_ros.lab.training.dry_run import attention_operations, fill
-from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
+from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.model.serving import ServingOptions
+from mtv_world_ros.training.dry_run import attention_operations, fill
+from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
 
 
 @dataclass(frozen=True)

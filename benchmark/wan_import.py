@@ -40,7 +40,7 @@ from wan_files import (
 )
 from wan_reference import video_tensors
 
-from mtv_world_ros.lab.training.training_config import load_training_config
+from mtv_world_ros.training.training_config import load_training_config
 
 _BYTES = {'BF16': 2, 'F16': 2, 'F32': 4}
 _GIB = 2**30

@@ -29,10 +29,10 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 from wan_bench import Bench
 
-from mtv_world_ros.lab.cli.train import set_overrides
-from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
+from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.model.conditioning import Conditioning
 from mtv_world_ros.model.serving import ServingOptions
+from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
 
 _COMPARED = (
     'compile=true',

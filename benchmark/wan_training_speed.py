@@ -25,16 +25,16 @@ from page import in_turns, parse_arguments, publish, table
 import torch
 from wan_bench import Bench
 
-from mtv_world_ros.lab.cli.train import set_overrides
-from mtv_world_ros.lab.training.adapter import add_adapter
-from mtv_world_ros.lab.training.base import Base
-from mtv_world_ros.lab.training.clips.batches import ClipBatch
-from mtv_world_ros.lab.training.dry_run import ideal_seconds, measured_peak
-from mtv_world_ros.lab.training.encoding import encode_batch, EncodedBatch, Encoders
-from mtv_world_ros.lab.training.trainer import Trainer
-from mtv_world_ros.lab.training.training_config import load_training_config, TrainingConfig
+from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.serving import ServingOptions
+from mtv_world_ros.training.adapter import add_adapter
+from mtv_world_ros.training.base_checkpoint import Base
+from mtv_world_ros.training.batches import ClipBatch
+from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
+from mtv_world_ros.training.encoding import encode_batch, EncodedBatch, Encoders
+from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 import re
 
-from mtv_world_ros.config import Schema
+from mtv_world_ros.core.config import Schema
 from mtv_world_ros.ros.parameters import is_read_only, Settings, shown_default, valid_values
 from mtv_world_ros.ros.policy.loop import PolicySettings
 

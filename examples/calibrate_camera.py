@@ -12,14 +12,14 @@ import argparse
 from pathlib import Path
 
 from mtv_world_ros import read_episode
-from mtv_world_ros.assembly import robot_path
-from mtv_world_ros.files import check_free, share_path
-from mtv_world_ros.geometry.calibration_file import save_calibration
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.shape import load_shape
-from mtv_world_ros.lab.camera_calibration.fixed_camera import FixedCamera
-from mtv_world_ros.lab.inspection.camera_pose import difference
-from mtv_world_ros.lab.inspection.clocks import JointTrack
+from mtv_world_ros.cameras.calibration_file import save_calibration
+from mtv_world_ros.core.files import check_free, share_path
+from mtv_world_ros.inspection.camera_pose import difference
+from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
+from mtv_world_ros.inspection.clocks import JointTrack
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.shape import load_shape
+from mtv_world_ros.rollout.assembly import robot_path
 
 parser = argparse.ArgumentParser()
 parser.add_argument(

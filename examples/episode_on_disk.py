@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from mtv_world_ros import read_episode
+from mtv_world_ros.cameras.calibration_file import load_calibration
+from mtv_world_ros.core.data_types import JointTrajectory
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode_writer import EpisodeWriter
-from mtv_world_ros.data_types import JointTrajectory
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.robot.file import load_robot
 
 parser = argparse.ArgumentParser()
 parser.add_argument('--out', type=Path, default=Path('out/examples/episode'))

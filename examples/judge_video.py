@@ -11,8 +11,8 @@ import argparse
 from pathlib import Path
 
 from mtv_world_ros import judge, load_pipeline
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.files import share_path
 
 parser = argparse.ArgumentParser()
 parser.add_argument(

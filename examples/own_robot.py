@@ -15,9 +15,9 @@ import shutil
 import numpy as np
 import yaml
 
-from mtv_world_ros.files import check_free, share_path
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.lab.importing.robot_guess import guess_robot
+from mtv_world_ros.core.files import check_free, share_path
+from mtv_world_ros.importing.robot_guess import guess_robot
+from mtv_world_ros.robot.file import load_robot
 
 parser = argparse.ArgumentParser()
 parser.add_argument(

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 
 from mtv_world_ros import judge, load_pipeline
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
-from mtv_world_ros.files import share_path
 
 #: hues of OpenCV, 0 .. 179, around which a colour is
 HUES = {'red': 0, 'yellow': 28, 'green': 60, 'blue': 110, 'purple': 140, 'pink': 165}

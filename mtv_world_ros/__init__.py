@@ -20,13 +20,13 @@ from typing import Any, TYPE_CHECKING
 import warnings
 
 if TYPE_CHECKING:
-    from mtv_world_ros.assembly import load_pipeline
+    from mtv_world_ros.core.data_types import JointTrajectory, Observation
     from mtv_world_ros.data.episode_reader import read_episode
-    from mtv_world_ros.data_types import JointTrajectory, Observation
-    from mtv_world_ros.imagined_episode import Rollout
-    from mtv_world_ros.pipeline import Pipeline
-    from mtv_world_ros.replay.offline import judge
-    from mtv_world_ros.rollout_options import RolloutOptions
+    from mtv_world_ros.rollout.assembly import load_pipeline
+    from mtv_world_ros.rollout.imagined_episode import Rollout
+    from mtv_world_ros.rollout.offline import judge
+    from mtv_world_ros.rollout.pipeline import Pipeline
+    from mtv_world_ros.rollout.rollout_options import RolloutOptions
 
 __all__ = [
     'JointTrajectory',
@@ -40,14 +40,14 @@ __all__ = [
 ]
 #: public name -> module
 _PLACES = {
-    'JointTrajectory': 'data_types',
-    'judge': 'replay.offline',
-    'load_pipeline': 'assembly',
-    'Observation': 'data_types',
-    'Pipeline': 'pipeline',
+    'JointTrajectory': 'core.data_types',
+    'judge': 'rollout.offline',
+    'load_pipeline': 'rollout.assembly',
+    'Observation': 'core.data_types',
+    'Pipeline': 'rollout.pipeline',
     'read_episode': 'data.episode_reader',
-    'Rollout': 'imagined_episode',
-    'RolloutOptions': 'rollout_options',
+    'Rollout': 'rollout.imagined_episode',
+    'RolloutOptions': 'rollout.rollout_options',
 }
 #: names of version 0.1 -> public name that replaced them
 _RENAMED = {'ImaginedEpisode': 'Rollout'}

@@ -14,11 +14,14 @@ import warnings
 from left_behind import left, restore, state
 import pytest
 
-from mtv_world_ros.assembly import checkpoint_path
-from mtv_world_ros.files import share_path
-from mtv_world_ros.foresight.arm_response import ArmResponse
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.physics.arm_response import ArmResponse
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.rollout.assembly import checkpoint_path
+from mtv_world_ros.simulation.expert.expert import Expert
+from mtv_world_ros.simulation.opengl import missing_opengl
+from mtv_world_ros.simulation.workcell import workcell_of
 
 
 def _no_gpu() -> str:
@@ -76,9 +79,31 @@ def robot() -> RobotModel:
 
 
 @pytest.fixture(scope='session')
+def yam() -> RobotModel:
+    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+
+
+@pytest.fixture(scope='session')
+def workcell(robot):
+    return workcell_of(robot)
+
+
+@pytest.fixture(scope='session')
+def expert(robot):
+    return Expert(robot)
+
+
+@pytest.fixture
+def opengl():
+    reason = missing_opengl()
+    if reason:
+        pytest.skip(reason)
+
+
+@pytest.fixture(scope='session')
 def response(robot: RobotModel) -> ArmResponse:
     """How it follows commands, as the bundled checkpoint found."""
-    from mtv_world_ros.foresight.loading import load_response
+    from mtv_world_ros.physics.checkpoint_files import load_response
 
     found = load_response(checkpoint_path('bundled') / 'object_motion', robot)
     assert found is not None

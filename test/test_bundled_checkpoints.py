@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from mtv_world_ros.assembly import load_pipeline
-from mtv_world_ros.files import share_path
-from mtv_world_ros.lab.evaluation.evaluate_episodes import evaluate
-from mtv_world_ros.lab.evaluation.settings import EvaluationConfig
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.evaluation.evaluate_episodes import evaluate
+from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.model.card import CARD
+from mtv_world_ros.rollout.assembly import load_pipeline
 
 CHECKPOINTS = sorted(path.parent for path in share_path('resource').glob(f'*/{CARD}'))
 WHOLE_EPISODE = EvaluationConfig(mode='imagine', actions=('true',), ceiling=False, seed=3)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from small_episodes import PersistenceWorldModel
 
-from mtv_world_ros.assembly import assemble
+from mtv_world_ros.core.data_types import JointTrajectory, Observation, WorldModelSpec
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.data_types import JointTrajectory, Observation, WorldModelSpec
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.imagined_episode import SEED_STEP
 from mtv_world_ros.model.card import read_card
-from mtv_world_ros.rollout_options import RolloutOptions
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.rollout.assembly import assemble
+from mtv_world_ros.rollout.imagined_episode import SEED_STEP
+from mtv_world_ros.rollout.rollout_options import RolloutOptions
 from mtv_world_ros.success.calibration import HorizonCurve
 
 SPEC = WorldModelSpec(

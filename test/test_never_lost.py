@@ -19,9 +19,9 @@ import pytest
 import torch
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.files import check_free, share_path, write_json
-from mtv_world_ros.lab.jobs import check_same_settings
+from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.files import check_free, share_path, write_json
+from mtv_world_ros.evaluation.result_settings import check_same_settings
 
 ROOT = Path(__file__).parents[1]
 EPISODE = share_path('resource', 'demo_episode')
@@ -226,7 +226,7 @@ def test_wrong_values_get_one_line(more, message, tmp_path, capsys):
 def test_states_are_saved_by_time_too(tmp_path):
     words = train_words(tmp_path, '--set', 'optimizer.steps=3', '--save-minutes', '0')
     seen = []
-    from mtv_world_ros.lab.training.trainer import Trainer
+    from mtv_world_ros.training.trainer import Trainer
 
     save = Trainer.save_state
     with pytest.MonkeyPatch.context() as patch:

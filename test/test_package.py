@@ -189,7 +189,7 @@ def test_installed_like_colcon_the_commands_lie_where_ros2_run_looks(prefix):
 
 def test_installed_like_colcon_the_bundled_files_are_found(prefix):
     pytest.importorskip('ament_index_python')
-    code = "from mtv_world_ros.files import share_path; print(share_path('config', 'robots'))"
+    code = "from mtv_world_ros.core.files import share_path; print(share_path('config', 'robots'))"
     found = Path(_run_installed(prefix, '-c', code).strip())
     assert found == prefix / 'share' / 'mtv_world_ros' / 'config' / 'robots'
 

@@ -14,7 +14,7 @@ from pydantic.fields import FieldInfo
 import pytest
 
 import mtv_world_ros
-from mtv_world_ros.config import ListOf, Schema
+from mtv_world_ros.core.config import ListOf, Schema
 from mtv_world_ros.success.calibration import HorizonCurve
 
 LOWER, UPPER = ('ge', 'gt'), ('le', 'lt')

@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.processes import ended_by_signals, Stopped, stopped_by_sigterm
+from mtv_world_ros.core.processes import ended_by_signals, Stopped, stopped_by_sigterm
 
 ROOT = Path(__file__).parents[1]
 SLOW = "import time\nprint('importing', flush=True)\ntime.sleep(60)\n"

@@ -24,9 +24,14 @@ import sys  # noqa: E402
 from types import ModuleType  # noqa: E402
 from typing import Any  # noqa: E402
 
-from mtv_world_ros.entry_points import broken, COMMANDS, load, registered  # noqa: E402
-from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest, TrainingInterrupted  # noqa: E402
-from mtv_world_ros.processes import ended_by_signals, stopped_by_sigterm  # noqa: E402
+from mtv_world_ros.core.entry_points import broken, COMMANDS, load, registered  # noqa: E402
+from mtv_world_ros.core.errors import (  # noqa: E402
+    ConfigError,
+    MtvWorldError,
+    nearest,
+    TrainingInterrupted,
+)
+from mtv_world_ros.core.processes import ended_by_signals, stopped_by_sigterm  # noqa: E402
 
 if _interrupt is signal.default_int_handler:
     with suppress(ValueError):

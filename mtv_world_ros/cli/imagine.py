@@ -16,8 +16,8 @@ from mtv_world_ros.cli.shared_options import (
     pipeline_of,
     watch_arguments,
 )
-from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.files import check_free
+from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.files import check_free
 
 #: ends of an episode that are no fault, as the node `policy` reports them
 GOOD_ENDS = ('done', 'max_chunks', 'stopped', 'max_seconds')
@@ -49,9 +49,9 @@ def _replay(arguments: argparse.Namespace) -> int:
         return _play(arguments)
     if not arguments.episode.exists():
         raise EpisodeError(f"there is no episode '{arguments.episode}'")
-    from mtv_world_ros.assembly import asked_describer
     from mtv_world_ros.data.bag_mapping import load_source
-    from mtv_world_ros.replay.offline import replay_offline
+    from mtv_world_ros.rollout.assembly import asked_describer
+    from mtv_world_ros.rollout.offline import replay_offline
 
     check_model(arguments.device, arguments.checkpoint)
     out = arguments.out or Path('out') / f'{arguments.episode.name}_predictions'
@@ -114,9 +114,9 @@ def _add_imagine(commands: argparse._SubParsersAction) -> None:
 
 
 def _imagine(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.core.errors import ConfigError
     from mtv_world_ros.data.episode_reader import list_episodes
-    from mtv_world_ros.errors import ConfigError
-    from mtv_world_ros.launching import imagine_episodes, ImagineOptions
+    from mtv_world_ros.ros.launching import imagine_episodes, ImagineOptions
 
     check_model(arguments.device, arguments.checkpoint)
     watch = watch_arguments(arguments)

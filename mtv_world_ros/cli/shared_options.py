@@ -15,7 +15,7 @@ from typing import Any, TYPE_CHECKING
 from mtv_world_ros.viewing.viewer_process import PageAddress
 
 if TYPE_CHECKING:
-    from mtv_world_ros.pipeline import Pipeline
+    from mtv_world_ros.rollout.pipeline import Pipeline
 
 #: options that are arguments of `load_pipeline`
 _CHOICES = (
@@ -178,7 +178,7 @@ def watch_arguments(arguments: argparse.Namespace) -> tuple[str, ...] | None:
     watch: Watch | None = arguments.watch
     if watch is None:
         return None
-    from mtv_world_ros.files import check_free
+    from mtv_world_ros.core.files import check_free
     from mtv_world_ros.viewing.rerun_log import check_installed
     from mtv_world_ros.viewing.viewer_process import check_ports
 
@@ -215,15 +215,15 @@ class Watch:
 
 def threads_of_workers(arguments: argparse.Namespace) -> int:
     """Returns the CPU threads of each of `--workers` processes: as asked, else its share."""
-    from mtv_world_ros.processes import threads_each
+    from mtv_world_ros.core.processes import threads_each
 
     return arguments.threads or threads_each(arguments.workers)
 
 
 def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
     """Returns the pipeline of a command's checkpoint and model options."""
-    from mtv_world_ros.assembly import checkpoint_path, load_pipeline
     from mtv_world_ros.model.card import read_card
+    from mtv_world_ros.rollout.assembly import checkpoint_path, load_pipeline
 
     read_card(checkpoint_path(arguments.checkpoint))  # before torch is imported, which is slow
     return load_pipeline(
@@ -238,8 +238,8 @@ def check_model(device: str, *checkpoints: str) -> None:
         CheckpointError: a folder is no checkpoint.
         ConfigError: this machine has no such device.
     """
-    from mtv_world_ros.assembly import checkpoint_path
     from mtv_world_ros.model.card import read_card
+    from mtv_world_ros.rollout.assembly import checkpoint_path
 
     for name in checkpoints:
         read_card(checkpoint_path(name))

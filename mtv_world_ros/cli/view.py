@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import add_options
-from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.files import check_free
+from mtv_world_ros.core.errors import ConfigError, EpisodeError
+from mtv_world_ros.core.files import check_free
 from mtv_world_ros.viewing.viewer_process import PageAddress
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from mtv_world_ros.config import Length, ListOf, Number, read_yaml, Schema, Seconds, validated
+from mtv_world_ros.core.config import Length, ListOf, Number, read_yaml, Schema, Seconds, validated
 from mtv_world_ros.data.episode import check_outcome
 from mtv_world_ros.data.tool_targets import ToolTargets
 

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mtv_world_ros.bounded_input import parse_json
-from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
-from mtv_world_ros.errors import EpisodeError, MtvWorldError, nearest
-from mtv_world_ros.geometry.resample import interpolated, match_joints
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.core.bounded_input import parse_json
+from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
+from mtv_world_ros.core.errors import EpisodeError, MtvWorldError, nearest
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.resample import interpolated, match_joints
 
 JOINT_STATES = '/joint_states'
 JOINT_TRAJECTORY = '/joint_trajectory'

@@ -11,6 +11,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from mtv_world_ros.cameras.calibration_file import load_calibration
+from mtv_world_ros.cameras.camera import unknown_camera
+from mtv_world_ros.cameras.camera_info import Intrinsics, read_camera_info, RECTIFIED
+from mtv_world_ros.cameras.image_window import ImageWindow, WHOLE, windowed_camera
+from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
+from mtv_world_ros.core.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.image_decoding import check_image, to_ids, to_rgb
 from mtv_world_ros.data.bag.messages import IMAGE_TYPES
@@ -43,13 +49,7 @@ from mtv_world_ros.data.joint_plans import complete_plans, following, join_strea
 from mtv_world_ros.data.measured_joints import merge_joint_states
 from mtv_world_ros.data.tool_targets import joints_of_tools, ToolTrack
 from mtv_world_ros.data.transform_tree import Mount, pose_track, read_tree, TransformTree
-from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
-from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
-from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.camera import unknown_camera
-from mtv_world_ros.geometry.camera_info import Intrinsics, read_camera_info, RECTIFIED
-from mtv_world_ros.geometry.image_window import ImageWindow, WHOLE, windowed_camera
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.robot.model import RobotModel
 
 Stamped = list[tuple[int, Any]]
 #: joints that a warning names at most

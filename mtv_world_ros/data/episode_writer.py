@@ -8,6 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mtv_world_ros.cameras.calibration_file import save_calibration
+from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
+from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.images import encode_jpeg, encode_png
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.metadata import LATCHED
 from mtv_world_ros.data.bag.writer import BagWriter
@@ -27,10 +31,6 @@ from mtv_world_ros.data.episode import (
     optical_frame,
     TF,
 )
-from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
-from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.geometry.calibration_file import save_calibration
-from mtv_world_ros.rendering.images import encode_jpeg, encode_png
 
 
 class EpisodeWriter(BagWriter):

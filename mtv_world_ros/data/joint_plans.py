@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.bounded_input import check_limit, LimitError
+from mtv_world_ros.core.bounded_input import check_limit, LimitError
+from mtv_world_ros.core.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.core.errors import PlanError, PlanFault, TrajectoryError
 from mtv_world_ros.data.episode import JointStates
-from mtv_world_ros.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.errors import PlanError, PlanFault, TrajectoryError
-from mtv_world_ros.geometry.resample import interpolated, resample, SAME_S
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.resample import interpolated, resample, SAME_S
 
 Plan = tuple[int, JointTrajectory]
 

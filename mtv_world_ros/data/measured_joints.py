@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mtv_world_ros.core.data_types import BoolArray, FloatArray
+from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.episode import JointStates
-from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.robot.model import RobotModel
 
 Stamps = NDArray[np.int64]
 NANO = 1_000_000_000

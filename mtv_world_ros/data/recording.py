@@ -11,11 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.data.bag_mapping import BagMapping, EpisodeSource
-from mtv_world_ros.data.episode import Episode, MASKS_BY, Track
-from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.data.joint_plans import complete_plans
-from mtv_world_ros.data_types import (
+from mtv_world_ros.cameras.camera import camera_poses, scaled
+from mtv_world_ros.cameras.mask_geometry import centroids
+from mtv_world_ros.core.data_types import (
     ByteArray,
     CameraModel,
     FloatArray,
@@ -23,14 +21,16 @@ from mtv_world_ros.data_types import (
     Observation,
     WorldModelSpec,
 )
-from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.geometry.camera import camera_poses, scaled
-from mtv_world_ros.geometry.mask_geometry import centroids
-from mtv_world_ros.geometry.object_tracks import track_points
-from mtv_world_ros.geometry.resample import match_joints, nearest_rows
-from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.rendering.images import resize_frames, resize_labels
+from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.images import resize_frames, resize_labels
+from mtv_world_ros.data.bag_mapping import BagMapping, EpisodeSource
+from mtv_world_ros.data.episode import Episode, MASKS_BY, Track
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.joint_plans import complete_plans
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.resample import match_joints, nearest_rows
 from mtv_world_ros.vision.describers.describer import name_objects
+from mtv_world_ros.vision.object_tracks import track_points
 
 DEFAULT = EpisodeSource()
 #: largest distance of a frame from the wanted time, as a share of the model's period

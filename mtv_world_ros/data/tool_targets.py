@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 import pinocchio as pin
 from pydantic import Field
 
-from mtv_world_ros.config import Pair, Schema
+from mtv_world_ros.core.config import Pair, Schema
+from mtv_world_ros.core.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.core.errors import EpisodeError, nearest, TrajectoryError
 from mtv_world_ros.data.episode import JointStates
-from mtv_world_ros.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.errors import EpisodeError, nearest, TrajectoryError
-from mtv_world_ros.geometry.robot.arm_solver import ArmSolver
-from mtv_world_ros.geometry.robot.model import RobotModel, Tool
+from mtv_world_ros.robot.arm_solver import ArmSolver
+from mtv_world_ros.robot.model import RobotModel, Tool
 
 #: share of the poses that may be out of reach before the episode fails
 _MOST_OUT_OF_REACH = 0.5

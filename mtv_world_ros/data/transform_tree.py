@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 import pinocchio as pin
 
-from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.errors import CalibrationError, nearest
-from mtv_world_ros.geometry.transforms import inverse, pose
+from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.core.errors import CalibrationError, nearest
+from mtv_world_ros.core.transforms import inverse, pose
 
 #: a transform on /tf that varies by less than this is static [m, entries of the rotation]
 STILL = 1e-4

@@ -14,7 +14,7 @@ import torch
 from torch import nn, Tensor
 import torch.nn.functional as F
 
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.tensor_files import read_tensors
 
 _CHANNELS = 16

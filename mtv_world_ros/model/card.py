@@ -8,10 +8,10 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from mtv_world_ros.bounded_input import check_limit, read_json
-from mtv_world_ros.config import expected, ListOf, Schema, validated
-from mtv_world_ros.data_types import WorldModelSpec
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.core.bounded_input import check_limit, read_json
+from mtv_world_ros.core.config import expected, ListOf, Schema, validated
+from mtv_world_ros.core.data_types import WorldModelSpec
+from mtv_world_ros.core.errors import CheckpointError
 
 CARD = 'world_model.json'
 #: how actions enter every model: drawn into its views

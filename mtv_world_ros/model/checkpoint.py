@@ -10,16 +10,16 @@ from typing import Any, cast
 
 import torch
 
-from mtv_world_ros.bounded_input import read_json
-from mtv_world_ros.errors import CheckpointError, MtvWorldError
-from mtv_world_ros.files import whole_folder
+from mtv_world_ros.core.bounded_input import read_json
+from mtv_world_ros.core.errors import CheckpointError, MtvWorldError
+from mtv_world_ros.core.files import whole_folder
+from mtv_world_ros.core.network_sizes import check_sizes
 from mtv_world_ros.model.card import CheckpointCard, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.parts import Autoencoder, build_autoencoder, build_scheduler, Scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.tensor_files import disk_errors, PICKLES, read_tensors
 from mtv_world_ros.model.transformer.transformer import copy_of, MultiViewWanTransformer
-from mtv_world_ros.network_sizes import check_sizes
 
 WEIGHTS = 'diffusion_pytorch_model'
 ADAPTER_FOLDER = 'adapter'

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.card import HistorySettings
 from mtv_world_ros.model.parts import Autoencoder
 

@@ -11,11 +11,11 @@ import torch
 from torch import nn, Tensor
 import torch.nn.functional as F
 
-from mtv_world_ros.bounded_input import check_weights
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.core.bounded_input import check_weights
+from mtv_world_ros.core.errors import CheckpointError
+from mtv_world_ros.core.network_sizes import check_config_file
 from mtv_world_ros.model.tensor_files import import_transformers
 from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
-from mtv_world_ros.network_sizes import check_config_file
 
 FOLDERS = ('text_encoder', 'tokenizer')
 #: mean and standard deviation of the colours that CLIP was trained with

@@ -13,8 +13,8 @@ from safetensors.torch import load_file
 import torch
 from torch import Tensor
 
-from mtv_world_ros.bounded_input import check_finite, read_json
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.core.bounded_input import check_finite, read_json
+from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.lora_file import Factors, PEFT_CONFIG, read_lora
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 

@@ -13,9 +13,9 @@ from pydantic import Field
 from safetensors import safe_open, SafetensorError
 from torch import nn, Tensor
 
-from mtv_world_ros.bounded_input import check_finite, parse_json, read_json
-from mtv_world_ros.config import Count, Number, Schema, validated
-from mtv_world_ros.errors import CheckpointError, ConfigError, nearest
+from mtv_world_ros.core.bounded_input import check_finite, parse_json, read_json
+from mtv_world_ros.core.config import Count, Number, Schema, validated
+from mtv_world_ros.core.errors import CheckpointError, ConfigError, nearest
 from mtv_world_ros.model.tensor_files import pickle_error, PICKLES
 
 #: diffusers' key for peft's configuration in a file; peft's own file for it, and its prefix

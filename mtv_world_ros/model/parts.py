@@ -11,14 +11,14 @@ from diffusers import (
     UniPCMultistepScheduler,
 )
 
-from mtv_world_ros.data_types import WorldModelSpec
-from mtv_world_ros.errors import CheckpointError, nearest
+from mtv_world_ros.core.data_types import WorldModelSpec
+from mtv_world_ros.core.errors import CheckpointError, nearest
+from mtv_world_ros.core.network_sizes import check_sizes
 from mtv_world_ros.model.autoencoders import (
     SpaceToDepthAutoencoder,
     TinyAutoencoder,
     WanAutoencoder,
 )
-from mtv_world_ros.network_sizes import check_sizes
 
 Autoencoder: TypeAlias = SpaceToDepthAutoencoder | WanAutoencoder | TinyAutoencoder
 Scheduler: TypeAlias = FlowMatchEulerDiscreteScheduler | UniPCMultistepScheduler

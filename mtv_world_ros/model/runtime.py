@@ -8,7 +8,7 @@ from typing import TypeVar
 import torch
 from torch import nn
 
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.model.transformer.attention import cpu_multiplies_bfloat16
 
 Module = TypeVar('Module', bound=nn.Module)

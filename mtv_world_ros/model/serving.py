@@ -20,8 +20,8 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from mtv_world_ros.config import Schema, validated
-from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError, nearest
+from mtv_world_ros.core.config import Schema, validated
+from mtv_world_ros.core.errors import CheckpointError, ConfigError, ModelMemoryError, nearest
 from mtv_world_ros.model.autoencoders import TinyAutoencoder, WanAutoencoder
 from mtv_world_ros.model.parts import Autoencoder, build_autoencoder
 from mtv_world_ros.model.runtime import place

@@ -14,8 +14,8 @@ from typing import Any
 from safetensors import safe_open, SafetensorError
 from torch import Tensor
 
-from mtv_world_ros.bounded_input import check_finite, read_json
-from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.core.bounded_input import check_finite, read_json
+from mtv_world_ros.core.errors import CheckpointError, ConfigError
 
 PICKLES = ('.bin', '.pt', '.pth', '.ckpt', '.pkl')
 INDEX = '.safetensors.index.json'

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mtv_world_ros.data_types import ByteArray, FloatArray, History
-from mtv_world_ros.errors import CheckpointError, ModelMemoryError, RolloutPreempted
+from mtv_world_ros.core.data_types import ByteArray, FloatArray, History
+from mtv_world_ros.core.errors import CheckpointError, ModelMemoryError, RolloutPreempted
 from mtv_world_ros.model.card import check_same_model
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import (

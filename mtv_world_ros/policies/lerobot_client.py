@@ -14,10 +14,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from mtv_world_ros.bounded_input import limits
-from mtv_world_ros.config import Count, Schema, Seconds
-from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
-from mtv_world_ros.errors import ConfigError, PolicyError, PolicyServerError
+from mtv_world_ros.core.bounded_input import limits
+from mtv_world_ros.core.config import Count, Schema, Seconds
+from mtv_world_ros.core.data_types import FloatArray, JointTrajectory, Observation
+from mtv_world_ros.core.errors import ConfigError, PolicyError, PolicyServerError
 from mtv_world_ros.policies.server_mapping import ServerMapping
 from mtv_world_ros.policies.timed_actions import read_timed_actions
 

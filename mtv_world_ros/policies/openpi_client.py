@@ -17,10 +17,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from mtv_world_ros.bounded_input import limits
-from mtv_world_ros.config import Seconds
-from mtv_world_ros.data_types import JointTrajectory, Observation
-from mtv_world_ros.errors import ConfigError, masked, PolicyError, PolicyServerError
+from mtv_world_ros.core.bounded_input import limits
+from mtv_world_ros.core.config import Seconds
+from mtv_world_ros.core.data_types import JointTrajectory, Observation
+from mtv_world_ros.core.errors import ConfigError, masked, PolicyError, PolicyServerError
 from mtv_world_ros.policies.server_mapping import find, Key, ServerMapping
 
 

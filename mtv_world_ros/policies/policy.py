@@ -11,13 +11,13 @@ from typing import Annotated, Any, Literal, Protocol
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from mtv_world_ros.config import read_yaml, Schema, validated, Wait
-from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation
-from mtv_world_ros.errors import ConfigError, nearest
-from mtv_world_ros.geometry.resample import cut_off, SAME_S
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.core.config import read_yaml, Schema, validated, Wait
+from mtv_world_ros.core.data_types import FloatArray, JointTrajectory, Observation
+from mtv_world_ros.core.errors import ConfigError, nearest
 from mtv_world_ros.policies.lerobot_client import LeRobotConfig
 from mtv_world_ros.policies.openpi_client import OpenPiConfig
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.resample import cut_off, SAME_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

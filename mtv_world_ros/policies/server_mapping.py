@@ -9,23 +9,18 @@ import cv2
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator, PrivateAttr
 
-from mtv_world_ros.bounded_input import check_limit, LimitError
-from mtv_world_ros.config import expected, ListOf, Schema
-from mtv_world_ros.data_types import (
+from mtv_world_ros.core.bounded_input import check_limit, LimitError
+from mtv_world_ros.core.config import expected, ListOf, Schema
+from mtv_world_ros.core.data_types import (
     BoolArray,
     ByteArray,
     FloatArray,
     JointTrajectory,
     Observation,
 )
-from mtv_world_ros.errors import ConfigError, nearest, PolicyError
-from mtv_world_ros.geometry.robot.joint_columns import (
-    JointColumn,
-    JointTable,
-    to_columns,
-    to_positions,
-)
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.core.errors import ConfigError, nearest, PolicyError
+from mtv_world_ros.robot.joint_columns import JointColumn, JointTable, to_columns, to_positions
+from mtv_world_ros.robot.model import RobotModel
 
 #: offset of a velocity below which 0 means rest; rounding of a range such as [-1, 1] [rad/s, m/s]
 _ZERO = 1e-9

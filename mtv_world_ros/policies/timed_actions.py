@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.bounded_input import check_limit, limits
-from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.errors import PolicyError
+from mtv_world_ros.core.bounded_input import check_limit, limits
+from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.core.errors import PolicyError
 
 #: instructions of one pickle; a chunk of 50 actions has about 3,000
 _MOST_STEPS = 200_000

@@ -2,7 +2,7 @@
 
 import sys
 
-from mtv_world_ros.processes import end_on_signals
+from mtv_world_ros.core.processes import end_on_signals
 
 if sys.argv[:1] == ['-m']:  # `python -m` is about to run a node, whose imports take seconds
     end_on_signals('mtv_world_ros')

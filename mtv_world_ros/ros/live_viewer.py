@@ -11,8 +11,8 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
+from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.data.bag.reader import BagMessage
-from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.ros.messages.conversions import has_header, message_class, read_stamp
 from mtv_world_ros.ros.qos_profiles import best_offer
 from mtv_world_ros.ros.run_node import run

@@ -20,9 +20,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 import yaml
 
-from mtv_world_ros.config import ListOf, Model, Schema
-from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest
-from mtv_world_ros.geometry.chunk_plan import PlanLimits
+from mtv_world_ros.core.config import ListOf, Model, Schema
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
+from mtv_world_ros.robot.chunk_plan import PlanLimits
 
 Span = tuple[float, float]
 Mode = Literal['observe', 'imagine']

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.ros.messages.conversions import values_of
 
 #: a service that does not answer within this long is gone [s]

@@ -17,9 +17,9 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.files import share_path
-from mtv_world_ros.processes import end_on_signals, PARENT_VARIABLE
+from mtv_world_ros.core.errors import MtvWorldError
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.core.processes import end_on_signals, PARENT_VARIABLE
 
 _PR_SET_PDEATHSIG = 1
 AnyNode = TypeVar('AnyNode', bound=Node)

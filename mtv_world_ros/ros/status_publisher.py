@@ -14,7 +14,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.ros.messages.conversions import make_header, to_status
 
 #: a fault shows as a warning for this long [s]

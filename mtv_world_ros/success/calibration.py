@@ -10,11 +10,11 @@ from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import Field, model_validator, WrapValidator
 
-from mtv_world_ros.bounded_input import read_json
-from mtv_world_ros.config import ListOf, Model, Number, Schema, Seconds
-from mtv_world_ros.data_types import CameraModel
-from mtv_world_ros.errors import CheckpointError, ConfigError
-from mtv_world_ros.files import write_whole
+from mtv_world_ros.core.bounded_input import read_json
+from mtv_world_ros.core.config import ListOf, Model, Number, Schema, Seconds
+from mtv_world_ros.core.data_types import CameraModel
+from mtv_world_ros.core.errors import CheckpointError, ConfigError
+from mtv_world_ros.core.files import write_whole
 from mtv_world_ros.success.fitted_to import FittedTo, Setting
 
 CALIBRATION = 'success_calibration.json'

@@ -10,7 +10,7 @@ from math import isfinite, nan
 import numpy as np
 from scipy.special import bdtrc
 
-from mtv_world_ros.data_types import FloatArray, SuccessEstimate
+from mtv_world_ros.core.data_types import FloatArray, SuccessEstimate
 from mtv_world_ros.success.estimator import capped, stated_probability
 from mtv_world_ros.success.evidence import MAX_MARGIN
 

@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mtv_world_ros.data_types import FloatArray, SuccessEstimate
-from mtv_world_ros.errors import CannotTell, ConfigError, nearest
+from mtv_world_ros.core.data_types import FloatArray, SuccessEstimate
+from mtv_world_ros.core.errors import CannotTell, ConfigError, nearest
+from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
 from mtv_world_ros.success.calibration import Calibration, weighed
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
 from mtv_world_ros.success.fitted_to import Setting
-from mtv_world_ros.success.foreseen import foreseen_feature, ForeseenEnds, ForeseenMotions
+from mtv_world_ros.success.foreseen import foreseen_ends, foreseen_feature, ForeseenEnds
 from mtv_world_ros.success.relations import Margin
 from mtv_world_ros.success.rollout_memory import Footage, remember, RolloutMemory
 from mtv_world_ros.success.situation import grippers_open
@@ -151,7 +152,7 @@ class SuccessEstimator:
             views.names.index(bound[role]) for role in task.movers if bound[role] in views.names
         ]
         starts = memory.points[:, 0]
-        ends = None if foreseen is None else foreseen.ends(task, bound, starts)
+        ends = None if foreseen is None else foreseen_ends(foreseen, task, bound, starts)
         try:
             evidence = gather(views, task, bound)
         except CannotTell as reason:
@@ -175,7 +176,7 @@ class SuccessEstimator:
         except CannotTell:
             return None
         starts = foreseen.points[0, 0] if memory is None else memory.points[:, 0]
-        return foreseen.ends(task, bound, starts)
+        return foreseen_ends(foreseen, task, bound, starts)
 
     def _task(self, instruction: str, names: tuple[str, ...]) -> tuple[TaskSpec, dict[str, str]]:
         """The task and its objects; a given task takes the objects in their order."""

@@ -8,14 +8,9 @@ from math import isfinite, nan
 
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.errors import CannotTell
-from mtv_world_ros.geometry.mask_geometry import (
-    block_size,
-    count_reversals,
-    Location,
-    widest_swing,
-)
+from mtv_world_ros.cameras.mask_geometry import block_size, count_reversals, Location, widest_swing
+from mtv_world_ros.core.data_types import BoolArray, FloatArray
+from mtv_world_ros.core.errors import CannotTell
 from mtv_world_ros.success.relations import (
     Inside,
     Margin,

@@ -8,9 +8,9 @@ from typing import Self
 import numpy as np
 from pydantic import model_validator
 
-from mtv_world_ros.config import ListOf, Metres, Number, Schema
-from mtv_world_ros.data_types import CameraModel, FloatArray
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.core.config import ListOf, Metres, Number, Schema
+from mtv_world_ros.core.data_types import CameraModel, FloatArray
+from mtv_world_ros.robot.model import RobotModel
 
 #: largest distance between the tools of a calibrated and of the nominal arm [m]
 ROBOT_SLACK_M = 0.03

@@ -12,8 +12,8 @@ from typing import Annotated, ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field, Strict
 
-from mtv_world_ros.config import expected, Schema
-from mtv_world_ros.data_types import BoolArray, FloatArray
+from mtv_world_ros.core.config import expected, Schema
+from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.success.situation import Situation
 
 #: thickness of the floor of plates and containers [m]

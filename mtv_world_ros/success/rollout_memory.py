@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, CameraModel, FloatArray, ObjectMasks
-from mtv_world_ros.geometry.camera import project
-from mtv_world_ros.geometry.mask_geometry import centroids, lean, locate_all
-from mtv_world_ros.geometry.motion import Motion
+from mtv_world_ros.cameras.camera import project
+from mtv_world_ros.cameras.mask_geometry import centroids, lean, locate_all
+from mtv_world_ros.cameras.motion import Motion
+from mtv_world_ros.core.data_types import BoolArray, CameraModel, FloatArray, ObjectMasks
 
 #: frames whose places are kept; the start is kept whatever follows
 MAX_FRAMES = 2000

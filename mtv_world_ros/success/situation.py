@@ -8,9 +8,9 @@ from typing import Protocol
 
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.errors import CannotTell
-from mtv_world_ros.geometry.mask_geometry import count_reversals, widest_swing
+from mtv_world_ros.cameras.mask_geometry import count_reversals, widest_swing
+from mtv_world_ros.core.data_types import BoolArray, FloatArray
+from mtv_world_ros.core.errors import CannotTell
 
 #: a gripper counts as open above this share of its range
 OPEN_SHARE = 0.8

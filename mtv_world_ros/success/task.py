@@ -10,9 +10,9 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import BeforeValidator, model_validator, PlainValidator
 
-from mtv_world_ros.config import expected, ListOf, read_yaml, Schema, validated, wrong
-from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.core.config import expected, ListOf, read_yaml, Schema, validated, wrong
+from mtv_world_ros.core.data_types import BoolArray, FloatArray
+from mtv_world_ros.core.errors import ConfigError, nearest
 from mtv_world_ros.success.relations import EXPECTED, KINDS, Length, Lengths3, Relation
 from mtv_world_ros.success.situation import grippers_open, Situation
 from mtv_world_ros.vision.describers.describer import ends_phrase

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.errors import CannotTell
-from mtv_world_ros.geometry.mask_geometry import centroids, locate, Location, moved_mask
+from mtv_world_ros.cameras.mask_geometry import centroids, locate, Location, moved_mask
+from mtv_world_ros.core.data_types import BoolArray, FloatArray
+from mtv_world_ros.core.errors import CannotTell
 from mtv_world_ros.success.rollout_memory import Footage, RolloutMemory
 from mtv_world_ros.vision.jaccard import jaccard
 

@@ -11,11 +11,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.rendering.video import KINDS
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.viewing.scored_rollout import ScoredRollout, StoredRollout
 from mtv_world_ros.viewing.streams import Streams
+from mtv_world_ros.viewing.video import KINDS
 from mtv_world_ros.viewing.viewer_process import open_window, PageAddress, serve
 
 APPLICATION = 'mtv_world'

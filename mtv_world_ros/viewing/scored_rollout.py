@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray
-from mtv_world_ros.entry_points import load, registered, ROLLOUTS
-from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.rendering.video import KINDS
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, FloatArray
+from mtv_world_ros.core.entry_points import load, registered, ROLLOUTS
+from mtv_world_ros.core.errors import ConfigError, EpisodeError
+from mtv_world_ros.viewing.video import KINDS
 
 MASKS = ('true_masks', 'masks')
 

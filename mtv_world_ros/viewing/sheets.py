@@ -9,17 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.rendering.images import resize_frames, write_png
-from mtv_world_ros.rendering.video import (
-    Comparison,
-    contact_sheet,
-    KINDS,
-    side_by_side,
-    write_video,
-)
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.images import resize_frames, write_png
 from mtv_world_ros.viewing.streams import read_streams, Streams
+from mtv_world_ros.viewing.video import Comparison, contact_sheet, KINDS, side_by_side, write_video
 
 #: bounds of a video: frames, and bytes down to a limit of quality
 MAX_VIDEO_FRAMES, MAX_VIDEO_BYTES = 600, 4_000_000

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.data.bag.image_decoding import to_ids, to_rgb
 from mtv_world_ros.data.bag.messages import (
     COMPRESSED_IMAGE,
@@ -19,9 +21,7 @@ from mtv_world_ros.data.bag.messages import (
     JOINT_STATE,
 )
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
-from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.errors import EpisodeError, MtvWorldError
-from mtv_world_ros.rendering.video import KINDS
+from mtv_world_ros.viewing.video import KINDS
 
 #: no recording is this long [s]
 _APART_S = 86_400.0

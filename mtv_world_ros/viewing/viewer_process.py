@@ -23,8 +23,8 @@ from typing import Any
 from urllib.parse import quote
 import weakref
 
-from mtv_world_ros.errors import ConfigError, MtvWorldError
-from mtv_world_ros.processes import ending_with_this_process, last_line
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+from mtv_world_ros.core.processes import ending_with_this_process, last_line
 
 #: address of the machine itself
 LOOPBACK = '127.0.0.1'

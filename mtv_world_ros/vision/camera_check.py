@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, Observation
-from mtv_world_ros.geometry.camera import camera_poses, project, scaled, unproject
-from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.geometry.robot.shape import fill, LinkShape, RobotShape
-from mtv_world_ros.geometry.transforms import inverse
+from mtv_world_ros.cameras.camera import camera_poses, project, scaled, unproject
+from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, Observation
+from mtv_world_ros.core.transforms import inverse
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.shape import fill, LinkShape, RobotShape
 
 Status = Literal['fits', 'corrected', 'refused', 'unchecked']
 

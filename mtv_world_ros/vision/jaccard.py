@@ -10,8 +10,8 @@ import warnings
 
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, FloatArray, ObjectMasks
-from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.core.data_types import BoolArray, FloatArray, ObjectMasks
+from mtv_world_ros.core.errors import MtvWorldError
 
 #: a prediction of this status cannot be scored; any other (`absent`, ...) is the model's doing
 UNSCORABLE = frozenset({'ambiguous', 'out_of_palette'})

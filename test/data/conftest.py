@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mtv_world_ros.core.data_types import CameraModel, JointTrajectory
 from mtv_world_ros.data.episode_writer import EpisodeWriter
-from mtv_world_ros.data_types import CameraModel, JointTrajectory
 
 HEIGHT, WIDTH, FRAMES = 48, 64, 8
 START_NS, PERIOD_NS = 1_700_000_000_000_000_000, 100_000_000

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
+from mtv_world_ros.core.errors import CalibrationError, EpisodeError, MtvWorldError
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
-from mtv_world_ros.errors import CalibrationError, EpisodeError, MtvWorldError
 
 START_NS, PERIOD_NS, FRAMES = 1_700_000_000_000_000_000, 100_000_000, 8
 

@@ -12,11 +12,11 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_typestore, Stores
 import yaml
 
+from mtv_world_ros.core.data_types import JointTrajectory
+from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode_writer import EpisodeWriter
-from mtv_world_ros.data_types import JointTrajectory
-from mtv_world_ros.errors import EpisodeError
 
 START_NS, PERIOD_NS, FRAMES = 1_700_000_000_000_000_000, 100_000_000, 8
 JOINTS = ['left_joint1', 'left_joint2', 'left_gripper']

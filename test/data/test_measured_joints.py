@@ -7,6 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.measured_joints import (
     find_unreachable,
@@ -14,10 +16,8 @@ from mtv_world_ros.data.measured_joints import (
     merge_joint_states,
     read_sample,
 )
-from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.model import RobotModel
 
 RATE = 50
 HOME = np.array([0, -0.4, 0, -2.2, 0, 1.9, 0.785, 0.03])

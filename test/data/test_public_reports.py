@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
+from mtv_world_ros.core.data_types import JointTrajectory
+from mtv_world_ros.core.errors import PlanError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb, raw_to_rgb
 from mtv_world_ros.data.episode import JointStates
 from mtv_world_ros.data.joint_plans import complete_plans, join_streams, read_plan
-from mtv_world_ros.data_types import JointTrajectory
-from mtv_world_ros.errors import PlanError
-from mtv_world_ros.geometry.resample import resample
+from mtv_world_ros.robot.resample import resample
 
 SECOND = 1_000_000_000
 

@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.episode import LazyFrames
 from mtv_world_ros.data.episode_reader import in_order, merge_joint_states
-from mtv_world_ros.errors import EpisodeError
 
 
 def joint_state(stamp_ns: int, **positions: float):

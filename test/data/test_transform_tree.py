@@ -5,8 +5,8 @@ from types import SimpleNamespace as Message
 import numpy as np
 import pytest
 
+from mtv_world_ros.core.errors import CalibrationError
 from mtv_world_ros.data.transform_tree import pose_track, read_tree, TransformTree
-from mtv_world_ros.errors import CalibrationError
 
 LINKS = ('base', 'hand')
 TURNED = (0.0, 0.0, np.sin(0.25), np.cos(0.25))  # by 0.5 rad about z

@@ -14,7 +14,7 @@ import socket
 import pytest
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.files import share_path
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / 'docs' / 'mistakes.md'

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import yaml
 
-from mtv_world_ros.bench.ranking.policy_list import load_policy_list
+from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.data.bag_mapping import load_source
-from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.lab.importing.object_boxes import load_object_boxes
+from mtv_world_ros.importing.object_boxes import load_object_boxes
 from mtv_world_ros.policies.policy import load_policy_config
+from mtv_world_ros.ranking.policy_list import load_policy_list
+from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.success.relations import KINDS
 from mtv_world_ros.success.task import load_task
 

@@ -9,8 +9,8 @@ import warnings
 
 import pytest
 
-from mtv_world_ros.assembly import checkpoint_path
-from mtv_world_ros.files import content_digest
+from mtv_world_ros.core.files import content_digest
+from mtv_world_ros.rollout.assembly import checkpoint_path
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / 'benchmark' / 'results').glob('*.md'))

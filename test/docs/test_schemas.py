@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from mtv_world_ros.bench.collect.dataset_readme import KEYS
-from mtv_world_ros.geometry.calibration_file import _View
-from mtv_world_ros.geometry.robot.file import DhArmEntry, DhEntry, MimicEntry, RobotFile, ToolEntry
+from mtv_world_ros.cameras.calibration_file import _View
+from mtv_world_ros.robot.file import DhArmEntry, DhEntry, MimicEntry, RobotFile, ToolEntry
+from mtv_world_ros.simulation.collect.dataset_readme import KEYS
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
 

@@ -31,9 +31,9 @@ from typing import Any
 import pytest
 import yaml
 
-from mtv_world_ros.bench.world.opengl import missing_opengl
 from mtv_world_ros.cli import main, make_parser
-from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.core.errors import MtvWorldError
+from mtv_world_ros.simulation.opengl import missing_opengl
 
 ROOT = Path(__file__).resolve().parents[2]
 #: what a block may need; those with a function are run where it returns nothing
@@ -223,13 +223,13 @@ def check_mtv_world(words: Sequence[str]) -> bool:
 
 def check_values(given: dict[str, Any]) -> None:
     """Raises a user error where a preset, policy, task ... does not exist."""
-    from mtv_world_ros.assembly import robot_path
-    from mtv_world_ros.bench.expert.faults.catalogue import parse_variant
-    from mtv_world_ros.bench.tasks.tasks import tasks_named
-    from mtv_world_ros.bench.world.zero_shot import kinds_named
-    from mtv_world_ros.lab.cli.train import set_overrides
-    from mtv_world_ros.lab.training.training_config import load_training_config
+    from mtv_world_ros.cli.train import set_overrides
     from mtv_world_ros.model.serving import ServingOptions
+    from mtv_world_ros.rollout.assembly import robot_path
+    from mtv_world_ros.simulation.faults.catalogue import parse_variant
+    from mtv_world_ros.simulation.tasks import tasks_named
+    from mtv_world_ros.simulation.zero_shot import kinds_named
+    from mtv_world_ros.training.training_config import load_training_config
     from mtv_world_ros.vision.segmenters.choose import SEGMENTERS
     from mtv_world_ros.vision.segmenters.examples import SUFFIX
 

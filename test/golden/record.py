@@ -173,7 +173,7 @@ def _plan(make: Callable[..., Any], name: str, task: str, seed: int, expert: Any
     try:
         policy = make(name, task, seed, expert)
         policy.reset(seed=seed)
-    except import_module(f'{PACKAGE}.errors').MtvWorldError as error:
+    except import_module(f'{PACKAGE}.core.errors').MtvWorldError as error:
         return f'refused: {error}'.encode()
     return np.rint(policy.plan.positions * 1e6).astype('<i8').tobytes()
 
@@ -200,7 +200,7 @@ def schemas() -> dict[str, Any]:
     for name in modules().values():
         with contextlib.suppress(Exception):  # an optional package is not installed
             import_module(name)
-    found, todo = {}, [import_module(f'{PACKAGE}.config').Schema]
+    found, todo = {}, [import_module(f'{PACKAGE}.core.config').Schema]
     while todo:
         kind = todo.pop()
         todo += kind.__subclasses__()

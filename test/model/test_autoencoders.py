@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 import torch.nn.functional as F
 
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder, TinyAutoencoder
 from mtv_world_ros.model.conditioning import condition, decode_frames, encode_frames
 

@@ -11,7 +11,7 @@ import pytest
 from small_transformer import build, CARD, inputs, SMALL
 import torch
 
-from mtv_world_ros.errors import CheckpointError, ModelMemoryError, RolloutPreempted
+from mtv_world_ros.core.errors import CheckpointError, ModelMemoryError, RolloutPreempted
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint

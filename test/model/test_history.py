@@ -12,8 +12,8 @@ from small_transformer import build, CARD, inputs, PATCH, SMALL
 import torch
 from torch import Tensor
 
-from mtv_world_ros.data_types import History
-from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.core.data_types import History
+from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import Checkpoint

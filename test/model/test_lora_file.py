@@ -17,10 +17,10 @@ from torch import Tensor
 from wan_files import DIM, FFN, LAYERS
 from wan_lora import build, RANK, run
 
-from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.lab.training.adapter import TARGETS
+from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.lora import Adapters
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+from mtv_world_ros.training.adapter import TARGETS
 
 Pairs = dict[str, tuple[Tensor, Tensor]]
 LORA = 'pytorch_lora_weights.safetensors'

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mtv_world_ros.errors import CheckpointError, RolloutPreempted
+from mtv_world_ros.core.errors import CheckpointError, RolloutPreempted
 from mtv_world_ros.model.conditioning import Conditioning
 from mtv_world_ros.model.parts import build_scheduler, Scheduler
 from mtv_world_ros.model.world_model import sample_latents, set_timesteps

@@ -10,9 +10,9 @@ from types import ModuleType, SimpleNamespace
 import pytest
 import torch
 
-from mtv_world_ros.lab.training.dry_run import step_cost
-from mtv_world_ros.lab.training.training_config import load_training_config
 from mtv_world_ros.model.tensor_files import open_tensors
+from mtv_world_ros.training.dry_run import step_cost
+from mtv_world_ros.training.training_config import load_training_config
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from wan_files import AUTOENCODER, CARD, SCHEDULER, TRANSFORMER, write_videox
 
-from mtv_world_ros.lab.importing.wan_weights import import_weights
+from mtv_world_ros.model.wan_weights import import_weights
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 
 VIEWS, T = 2, 4

@@ -7,12 +7,12 @@ import sys
 
 import pytest
 
+from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
 from mtv_world_ros.cli import main
 from mtv_world_ros.cli.imagine import episode_table
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.calibration_file import load_calibration, save_calibration
-from mtv_world_ros.launching import check_same_cameras
+from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.ros.launching import check_same_cameras
 
 DEMO = share_path('resource', 'demo_episode')
 

@@ -9,8 +9,8 @@ import pytest
 pytest.importorskip('grpc', reason='grpcio is not installed (pip install .[policies])')
 pytest.importorskip('google.protobuf', reason='protobuf is not installed')
 
-from mtv_world_ros.errors import ConfigError, PolicyError
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.errors import ConfigError, PolicyError
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.policies.policy import load_policy_config
 
 MARK = Path('/tmp/mtv_world_ros_was_here')

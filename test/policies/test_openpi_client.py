@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip('msgpack', reason='msgpack is not installed (pip install .[policies])')
 pytest.importorskip('websockets', reason='websockets is not installed (pip install .[policies])')
 
-from mtv_world_ros.errors import ConfigError, PolicyError
+from mtv_world_ros.core.errors import ConfigError, PolicyError
 from mtv_world_ros.policies.openpi_client import limit_sending
 from mtv_world_ros.policies.server_mapping import fitted
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from mtv_world_ros.errors import PolicyError
+from mtv_world_ros.core.errors import PolicyError
 from mtv_world_ros.policies.lerobot_client import read_actions
 from mtv_world_ros.policies.openpi_client import pack, unpack
 from mtv_world_ros.policies.timed_actions import read_timed_actions

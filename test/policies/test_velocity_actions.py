@@ -9,13 +9,13 @@ import yaml
 pytest.importorskip('msgpack', reason='msgpack is not installed (pip install .[policies])')
 pytest.importorskip('websockets', reason='websockets is not installed (pip install .[policies])')
 
-from mtv_world_ros.assembly import assemble_policy, robot_path
-from mtv_world_ros.data_types import CameraModel, Observation
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.geometry.chunk_plan import Plan
-from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.core.data_types import CameraModel, Observation
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.policies.server_mapping import ActionOutput
+from mtv_world_ros.robot.chunk_plan import Plan
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.rollout.assembly import assemble_policy, robot_path
 
 FRANKA = load_robot(robot_path('franka'))
 HOME = np.array([0.0, -0.4, 0.1, -2.2, 0.2, 1.9, 0.785, 0.03])

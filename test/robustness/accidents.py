@@ -22,7 +22,7 @@ from node_messages import ros, whole
 import numpy as np
 import zstandard
 
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.files import share_path
 
 
 def calibration(text: str, instead: str) -> bytes:

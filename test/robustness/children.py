@@ -30,8 +30,8 @@ from policy_servers import _observation, fine, TIMEOUT_S
 from usage import descendants
 import yaml
 
-from mtv_world_ros.data_types import JointTrajectory
-from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.core.data_types import JointTrajectory
+from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.policies.openpi_client import pack
 
 #: an end that comes later than this after the signal is late; a case that takes longer froze [s]
@@ -101,7 +101,7 @@ def _job(number: int) -> int:
 
 def worker(folder: Path, one: Signal) -> None:
     """Two workers do eight jobs."""
-    from mtv_world_ros.lab.jobs import run_all
+    from mtv_world_ros.core.worker_pool import run_all
 
     assert len(list(run_all(list(range(8)), _make_job, 2))) == 8
 
@@ -111,7 +111,7 @@ def worker(folder: Path, one: Signal) -> None:
 
 def clip_worker(folder: Path, one: Signal) -> None:
     """Two processes make clips of eight steps."""
-    from mtv_world_ros.lab.training.clips.batches import ClipWorkers
+    from mtv_world_ros.training.batches import ClipWorkers
 
     workers = ClipWorkers(lambda step, item: _job(item), 2)
     try:
@@ -140,9 +140,9 @@ def serve(port: int) -> None:
 
 def policy_server(folder: Path, one: Signal) -> None:
     """A policy of a ranking is asked until its server is hit; then it is to answer again."""
-    from mtv_world_ros.assembly import robot_path
-    from mtv_world_ros.bench.ranking.policy_list import GuardedPolicy, load_policy_list
-    from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.ranking.policy_list import GuardedPolicy, load_policy_list
+    from mtv_world_ros.robot.file import load_robot
+    from mtv_world_ros.rollout.assembly import robot_path
 
     command = [sys.executable, str(Path(__file__).resolve()), '--serve', '{port}']
     entry = {'name': 'fine', 'policy': 'openpi', 'command': command}
@@ -206,8 +206,8 @@ def episode_recorder(folder: Path, one: Signal) -> None:
 
 def make_episode(folder: Path, *, compressed: bool = True) -> Path:
     """Five seconds of an arm that turns."""
+    from mtv_world_ros.cameras.calibration_file import load_calibration
     from mtv_world_ros.data.episode_writer import EpisodeWriter
-    from mtv_world_ros.geometry.calibration_file import load_calibration
 
     cameras = load_calibration(ros().make_calibration(folder / 'calibration.yaml'))
     begin_ns, path = 1_700_000_000_000_000_000, folder / 'episode'
@@ -231,7 +231,7 @@ def make_episode(folder: Path, *, compressed: bool = True) -> Path:
 
 def through_node(folder: Path, one: Signal) -> None:
     """An episode is played into a node and recorded while one of the three is hit."""
-    from mtv_world_ros.lab.demo.node_processes import DemoOptions, record_through_node
+    from mtv_world_ros.cli.demo.node_processes import DemoOptions, record_through_node
 
     path = make_episode(folder)
     options = DemoOptions(

@@ -28,16 +28,16 @@ import wild_plans
 import wild_scenes
 import yaml
 
+from mtv_world_ros.cameras.calibration_file import load_calibration
+from mtv_world_ros.core.errors import MtvWorldError
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data.bag.messages import deserialize, typestore
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.joint_plans import read_plan
-from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.lab.importing.recover import recover
+from mtv_world_ros.importing.recover import recover
+from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 
@@ -288,7 +288,7 @@ def _read_urdf(data: bytes, folder: Path) -> Any:
 
 
 def _read_dataset_mapping(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.lab.importing.mapping import load_mapping
+    from mtv_world_ros.importing.mapping import load_mapping
 
     (folder / 'cameras').mkdir(exist_ok=True)
     shutil.copy(share_path('config', 'cameras', 'yam_bimanual.yaml'), folder / 'cameras')
@@ -297,7 +297,7 @@ def _read_dataset_mapping(data: bytes, folder: Path) -> Any:
 
 
 def _read_video_mapping(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.lab.importing.videos import find_recordings, load_video_mapping
+    from mtv_world_ros.importing.videos import find_recordings, load_video_mapping
 
     (folder / 'joints').mkdir(exist_ok=True)
     _file(folder / 'joints' / 'a.csv', b'q1,q2\n0,0\n')
@@ -324,7 +324,7 @@ def _trees() -> list[bytes]:
 
 
 def _read_state_card(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.lab.training.resume import read_card, STATE
+    from mtv_world_ros.training.resume import read_card, STATE
 
     (folder / STATE).mkdir(exist_ok=True)
     _file(folder / STATE / 'state.json', data)
@@ -339,13 +339,13 @@ def _features() -> list[bytes]:
 
 
 def _videos() -> list[bytes]:
-    from mtv_world_ros.rendering.video import encode_video
+    from mtv_world_ros.viewing.video import encode_video
 
     return [encode_video(np.zeros((4, 32, 48, 3), np.uint8), 5.0)]
 
 
 def _read_video(data: bytes, _: Path) -> Any:
-    from mtv_world_ros.rendering.video import decode_video
+    from mtv_world_ros.viewing.video import decode_video
 
     return decode_video(data)
 
@@ -372,7 +372,7 @@ def _responses() -> list[bytes]:
 
 
 def _read_response(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.foresight.loading import load_response
+    from mtv_world_ros.physics.checkpoint_files import load_response
 
     return load_response(_file(folder / 'arm_response.json', data).parent, _yam())
 
@@ -383,7 +383,7 @@ def _contacts() -> list[bytes]:
 
 
 def _read_contact(data: bytes, folder: Path) -> Any:
-    from mtv_world_ros.foresight.loading import load_contact
+    from mtv_world_ros.physics.checkpoint_files import load_contact
 
     return load_contact(_file(folder / 'contact.json', data).parent)
 
@@ -409,8 +409,8 @@ def _load_checkpoint(folder: Path) -> Any:
 
 DESCRIBERS = 'vision.describers.describer_config'
 READS_POLICY = _reads('policy.yaml', 'policies.policy.load_policy_config', _yam)
-READS_PRESET = _reads('preset.yaml', 'lab.training.training_config.load_training_config')
-READS_SCENE = _reads('scene.yaml', 'lab.inspection.foreseen_scene.load_scene', _yam)
+READS_PRESET = _reads('preset.yaml', 'training.training_config.load_training_config')
+READS_SCENE = _reads('scene.yaml', 'inspection.foreseen_scene.load_scene', _yam)
 CHECKPOINT_PARTS = partial(parts, make_checkpoint, '.json')
 LOADS_CHECKPOINT = partial(_read_folder, make_checkpoint, _load_checkpoint)
 KINDS = {
@@ -425,7 +425,7 @@ KINDS = {
     'policy': Kind(_config('policies'), READS_POLICY),
     'policy list': Kind(
         _config('rankings'),
-        _reads('policies.yaml', 'bench.ranking.policy_list.load_policy_list', _yam)),
+        _reads('policies.yaml', 'ranking.policy_list.load_policy_list', _yam)),
     'preset': Kind(_config('models'), READS_PRESET),
     'bag mapping': Kind(lambda: [share_path('config', 'datasets', 'bag.yaml').read_bytes()],
                         _reads('mapping.yaml', 'data.bag_mapping.load_bag_mapping')),
@@ -445,7 +445,7 @@ KINDS = {
     'training state': Kind(_trees, _read_state_card),
     'features': Kind(
         _features,
-        _reads('features.npz', 'lab.evaluation.metrics.frechet.feature_store.load_features')),
+        _reads('features.npz', 'evaluation.metrics.feature_store.load_features')),
     'weights': Kind(_weights, _read_weights),
     'arm response': Kind(_responses, _read_response),
     'contact': Kind(_contacts, _read_contact),

@@ -20,11 +20,11 @@ from typing import Any
 from mcap.writer import CompressionType, Writer
 import numpy as np
 
+from mtv_world_ros.cameras.calibration_file import load_calibration
+from mtv_world_ros.core.errors import MtvWorldError
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.bag.reader import BagReader
-from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.robot.file import load_robot
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -155,7 +155,7 @@ def make_card(folder: Path) -> None:
 
 
 def _read_card(folder: Path) -> Any:
-    from mtv_world_ros.lab.splits import select
+    from mtv_world_ros.data.splits import select
 
     return select(folder, 'train')
 
@@ -174,9 +174,9 @@ def _read_calibration(folder: Path) -> Any:
 
 def make_ranking(folder: Path) -> None:
     """One result of a ranking."""
-    from mtv_world_ros.bench.ranking.rollout_jobs import Result, StoredEstimate
-    from mtv_world_ros.bench.ranking.run_jobs import FOLDER
-    from mtv_world_ros.files import write_json
+    from mtv_world_ros.core.files import write_json
+    from mtv_world_ros.ranking.rollout_jobs import Result, StoredEstimate
+    from mtv_world_ros.ranking.run_jobs import FOLDER
 
     judged = StoredEstimate(
         probability=0.5, interval=(0.25, 0.75), jaccard=((0.5,),), reasons=('a',)
@@ -191,15 +191,15 @@ def make_ranking(folder: Path) -> None:
 
 
 def _read_ranking(folder: Path) -> Any:
-    from mtv_world_ros.bench.ranking.run_jobs import read_results
+    from mtv_world_ros.ranking.run_jobs import read_results
 
     return read_results(folder)
 
 
 def make_evaluation(folder: Path) -> None:
     """An evaluation of one episode."""
-    from mtv_world_ros.lab.evaluation.metrics.scores import ScoreRow
-    from mtv_world_ros.lab.evaluation.results import EpisodeResult
+    from mtv_world_ros.evaluation.metrics.jaccard_scores import ScoreRow
+    from mtv_world_ros.evaluation.results import EpisodeResult
 
     numbers = dict.fromkeys(
         ('j', 'j_visible', 'j_copy', 'j_shuffled', 'j_zero', 'j_ceiling', 'j_self'),
@@ -225,15 +225,15 @@ def make_evaluation(folder: Path) -> None:
 
 
 def _read_evaluation(folder: Path) -> Any:
-    from mtv_world_ros.lab.evaluation.report.read_back import read_evaluations
+    from mtv_world_ros.reports.read_back import read_evaluations
 
     return read_evaluations(folder)
 
 
 def make_rollout(folder: Path) -> None:
     """The frames of a scored episode."""
-    from mtv_world_ros.lab.stored_rollout import save_rollout
     from mtv_world_ros.viewing.scored_rollout import StoredRollout
+    from mtv_world_ros.viewing.stored_rollout import save_rollout
 
     frames, masks = np.zeros((2, 3, 32, 48, 3), np.uint8), np.zeros((2, 1, 3, 32, 48), bool)
     rollout = StoredRollout(
@@ -245,7 +245,7 @@ def make_rollout(folder: Path) -> None:
 
 
 def _read_rollout(folder: Path) -> Any:
-    from mtv_world_ros.lab.stored_rollout import load_rollout
+    from mtv_world_ros.viewing.stored_rollout import load_rollout
 
     return load_rollout(folder / 'rollout.npz')
 
@@ -284,7 +284,7 @@ def make_latents(folder: Path) -> None:
     """A cache of two clips, and one of other settings."""
     import torch
 
-    from mtv_world_ros.lab.training.latent_cache import LatentCache
+    from mtv_world_ros.training.latent_cache import LatentCache
 
     for settings in (CACHE_SETTINGS, {'autoencoder': 'b'}):
         with_clips = LatentCache(folder, settings)
@@ -294,7 +294,7 @@ def make_latents(folder: Path) -> None:
 
 
 def _read_latents(folder: Path) -> Any:
-    from mtv_world_ros.lab.training.latent_cache import LatentCache
+    from mtv_world_ros.training.latent_cache import LatentCache
 
     LatentCache(folder, {'autoencoder': 'c'})
     held = LatentCache(folder, CACHE_SETTINGS)
@@ -367,16 +367,14 @@ def make_mesh(folder: Path) -> None:
 
 
 def _read_mesh(folder: Path) -> Any:
-    from mtv_world_ros.geometry.robot.shape import load_shape
+    from mtv_world_ros.robot.shape import load_shape
 
     return load_shape(load_robot(folder / 'robot.yaml'))
 
 
 @cache
 def _dataset_writer() -> Any:
-    spec = importlib.util.spec_from_file_location(
-        'datasets', ROOT / 'test/lab/importing/conftest.py'
-    )
+    spec = importlib.util.spec_from_file_location('datasets', ROOT / 'test/importing/conftest.py')
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules['datasets_of_tests'] = module
@@ -395,7 +393,7 @@ make_dataset_v3 = partial(make_dataset, 'v3.0')
 
 
 def _read_dataset(folder: Path) -> Any:
-    from mtv_world_ros.lab.importing.lerobot import LeRobotDataset
+    from mtv_world_ros.importing.lerobot import LeRobotDataset
 
     dataset = LeRobotDataset(folder / 'data')
     for entry in dataset.episodes.values():
@@ -414,7 +412,7 @@ def make_camera_file(folder: Path) -> None:
 
 
 def _read_camera_file(folder: Path) -> Any:
-    from mtv_world_ros.lab.importing.camera_parameters import camera_track, CameraSource
+    from mtv_world_ros.importing.camera_parameters import camera_track, CameraSource
 
     source = CameraSource.model_validate(
         {

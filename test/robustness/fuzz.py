@@ -29,7 +29,7 @@ from file_kinds import Kind, KINDS, MOST_S
 from node_messages import commit
 import numpy as np
 
-from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.core.errors import MtvWorldError
 
 #: a process that takes more memory ends
 MOST_BYTES = 2 * 2**30

@@ -31,8 +31,8 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from usage import starved_s
 
-from mtv_world_ros.errors import EpisodeError
-from mtv_world_ros.lab.importing.recover import find_damaged, recover
+from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.importing.recover import find_damaged, recover
 from mtv_world_ros.ros.messages.conversions import read_stamp
 
 sys.path.insert(0, str(ROOT / 'test' / 'ros'))

@@ -198,9 +198,9 @@ def _fixed() -> Any:
     """Robot, cameras and settings, which no case changes."""
     import tempfile
 
-    from mtv_world_ros.files import share_path
-    from mtv_world_ros.geometry.calibration_file import load_calibration
-    from mtv_world_ros.geometry.robot.file import load_robot
+    from mtv_world_ros.cameras.calibration_file import load_calibration
+    from mtv_world_ros.core.files import share_path
+    from mtv_world_ros.robot.file import load_robot
     from mtv_world_ros.ros.parameters import Settings
 
     with tempfile.TemporaryDirectory() as folder:
@@ -216,7 +216,7 @@ def send(key: str, message: Any) -> None:
         Rejection: as the node says.
         AssertionError: the rollout would begin, from implausible input.
     """
-    from mtv_world_ros.bounded_input import check_limit
+    from mtv_world_ros.core.bounded_input import check_limit
     from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
     from mtv_world_ros.ros.sensing.observations import ObservationBuffer
     from mtv_world_ros.ros.world_model.rollouts import RequestMaker

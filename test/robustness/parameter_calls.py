@@ -139,7 +139,7 @@ def call(case: Any, _: Any) -> None:
     """
     from rcl_interfaces import srv
 
-    from mtv_world_ros.errors import ConfigError
+    from mtv_world_ros.core.errors import ConfigError
     from mtv_world_ros.ros import parameters
     from mtv_world_ros.ros.parameters import Settings
     from mtv_world_ros.ros.policy.loop import PolicySettings

@@ -15,7 +15,7 @@ import time
 import pytest
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.files import share_path
 
 DEMO = share_path('resource', 'demo_episode')
 BAG = next(DEMO.glob('*.mcap'))

@@ -13,7 +13,7 @@ import runpy
 import pytest
 from test_commands import PLACES
 
-from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.core.errors import MtvWorldError
 
 EXAMPLES = Path(__file__).parents[2] / 'examples'
 #: scripts whose first argument is a path that is read

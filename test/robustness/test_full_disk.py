@@ -14,11 +14,11 @@ from wan_files import AUTOENCODER, SCHEDULER, TRANSFORMER, write_videox
 import yaml
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.files import share_path
-from mtv_world_ros.lab.camera_calibration.fixed_camera import FixedCamera
-from mtv_world_ros.lab.inspection import inspect
-from mtv_world_ros.lab.inspection.camera_pose import CameraEstimate
-from mtv_world_ros.lab.inspection.motion_residual import ResidualSearch
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.inspection import inspect
+from mtv_world_ros.inspection.camera_pose import CameraEstimate
+from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
+from mtv_world_ros.inspection.motion_residual import ResidualSearch
 
 EPISODE = share_path('resource', 'demo_episode')
 URDF = share_path('config', 'robots', 'yam_bimanual.urdf')

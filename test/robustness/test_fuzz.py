@@ -17,7 +17,7 @@ import numpy as np
 import parameter_calls
 import pytest
 
-from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.core.errors import MtvWorldError
 
 SEED = 20261122
 COUNT = 40

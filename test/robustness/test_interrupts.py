@@ -9,7 +9,7 @@ import signal
 from interrupts import Attack, halves, WAYS
 import pytest
 
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.files import share_path
 
 
 @pytest.fixture(scope='module')

@@ -13,14 +13,14 @@ import torch
 from wan_files import AUTOENCODER, SCHEDULER, TRANSFORMER, write_videox
 import yaml
 
-from mtv_world_ros.bounded_input import check_finite
+from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.cli import main
-from mtv_world_ros.errors import CalibrationError, CheckpointError, ConfigError, RobotError
-from mtv_world_ros.files import share_path
-from mtv_world_ros.foresight.loading import load_contact
-from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.core.bounded_input import check_finite
+from mtv_world_ros.core.errors import CalibrationError, CheckpointError, ConfigError, RobotError
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.model.checkpoint import load_checkpoint
+from mtv_world_ros.physics.checkpoint_files import load_contact
+from mtv_world_ros.robot.file import load_robot
 
 
 @pytest.mark.parametrize('value', [float('nan'), float('inf'), -float('inf')])

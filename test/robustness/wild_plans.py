@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.files import share_path
-from mtv_world_ros.rollout_options import RolloutOptions
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.rollout.rollout_options import RolloutOptions
 
 #: points of a plan
 NUM_POINTS = 12
@@ -26,7 +26,7 @@ REACH_M = 3.0
 @cache
 def bundled() -> Any:
     """The bundled model, on one thread."""
-    from mtv_world_ros.assembly import load_pipeline
+    from mtv_world_ros.rollout.assembly import load_pipeline
 
     return load_pipeline('bundled', num_threads=1)
 
@@ -35,7 +35,7 @@ def bundled() -> Any:
 def first_scene() -> tuple[Any, str]:
     """What is seen where the bundled episode's first trajectory starts, and what is asked for."""
     from mtv_world_ros.data.episode_reader import read_episode
-    from mtv_world_ros.replay.offline import instruction_at, observe
+    from mtv_world_ros.rollout.offline import instruction_at, observe
 
     pipeline = bundled()
     episode = read_episode(
@@ -119,7 +119,7 @@ def imagine(plan: Any, _: Any) -> None:
         MtvWorldError: it is refused.
         AssertionError: it ends implausibly.
     """
-    from mtv_world_ros.data_types import JointTrajectory
+    from mtv_world_ros.core.data_types import JointTrajectory
 
     pipeline, (observation, instruction) = bundled(), first_scene()
     times, rows, velocities = plan

@@ -23,7 +23,7 @@ def samples() -> list[Any]:
 
 
 def _solid(centre: Any, size: Any, yaw: float, is_round: bool, is_open: bool) -> Any:
-    from mtv_world_ros.foresight.solids import Solid
+    from mtv_world_ros.physics.solids import Solid
 
     return Solid(centre=centre, size=size, yaw=yaw, is_round=is_round, is_open=is_open)
 
@@ -53,7 +53,7 @@ def foresee(solids: Any, _: Any) -> None:
     Raises:
         AssertionError: something that counts is where nothing can be.
     """
-    from mtv_world_ros.foresight.solid_foresight import TrackedSolids
+    from mtv_world_ros.physics.solid_foresight import TrackedSolids
 
     observation, _instruction = wild_plans.first_scene()
     foresight = wild_plans.bundled().object_motion

@@ -24,9 +24,9 @@ from std_msgs.msg import Header, String  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
-from mtv_world_ros.data_types import CameraModel  # noqa: E402
-from mtv_world_ros.files import share_path  # noqa: E402
-from mtv_world_ros.geometry.calibration_file import save_calibration  # noqa: E402
+from mtv_world_ros.cameras.calibration_file import save_calibration  # noqa: E402
+from mtv_world_ros.core.data_types import CameraModel  # noqa: E402
+from mtv_world_ros.core.files import share_path  # noqa: E402
 from mtv_world_ros.ros.messages.conversions import (  # noqa: E402
     NANO,
     to_stamp,

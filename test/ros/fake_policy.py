@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from mtv_world_ros.data_types import JointTrajectory
+from mtv_world_ros.core.data_types import JointTrajectory
 from mtv_world_ros.ros.policy.node import main
 
 LATE_S = 2.5

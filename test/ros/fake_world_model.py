@@ -9,12 +9,12 @@ import time
 
 import numpy as np
 
-from mtv_world_ros.assembly import asked_describer, robot_path
-from mtv_world_ros.errors import ModelMemoryError, RolloutPreempted
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.pipeline import Pipeline, WorldModelSpec
-from mtv_world_ros.rendering.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.core.errors import ModelMemoryError, RolloutPreempted
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.rollout.assembly import asked_describer, robot_path
+from mtv_world_ros.rollout.pipeline import Pipeline, WorldModelSpec
 from mtv_world_ros.ros.world_model.node import main
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.ros.parameters import descriptor, Settings
 from mtv_world_ros.ros.policy.loop import PolicySettings
 

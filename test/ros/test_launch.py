@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.files import share_path
 
 
 @pytest.mark.native_ros

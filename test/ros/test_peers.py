@@ -10,7 +10,7 @@ rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed (pip install
 from rclpy.task import Future  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from mtv_world_ros.errors import ConfigError  # noqa: E402
+from mtv_world_ros.core.errors import ConfigError  # noqa: E402
 from mtv_world_ros.ros import peers as peers_module  # noqa: E402
 from mtv_world_ros.ros.bags.recorder import parse  # noqa: E402
 from mtv_world_ros.ros.episodes.episode_recorder import EpisodeRecorder  # noqa: E402

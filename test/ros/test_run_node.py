@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.files import share_path
 
 VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 NODE = f"""

@@ -6,7 +6,7 @@ import re
 import pytest
 import yaml
 
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.files import share_path
 
 FOLDER = share_path('config', 'viewers')
 FILES = ('foxglove_live.json', 'foxglove_recording.json', 'world_model.rviz')

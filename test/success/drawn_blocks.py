@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from mtv_world_ros.data_types import CameraModel, ObjectMasks
+from mtv_world_ros.core.data_types import CameraModel, ObjectMasks
 from mtv_world_ros.success.rollout_memory import Footage
 
 HEIGHT, WIDTH, SCALE = 72, 96, 4

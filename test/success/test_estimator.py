@@ -2,9 +2,9 @@ from drawn_blocks import BLUE, CAMERAS, footage, LEFT, masks, NAMES, path, POSES
 import numpy as np
 import pytest
 
-from mtv_world_ros.data_types import ObjectMasks
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.data_types import ObjectMasks
+from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.success.calibration import Calibration, Weights
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.success.fitted_to import FittedTo, Setting

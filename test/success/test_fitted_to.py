@@ -4,15 +4,11 @@ from shutil import copytree
 import numpy as np
 import pytest
 
-from mtv_world_ros.assembly import (
-    checkpoint_cameras,
-    checkpoint_robot,
-    fitting_setting,
-)
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.calibration_file import load_calibration as load_cameras
-from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.cameras.calibration_file import load_calibration as load_cameras
+from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.rollout.assembly import checkpoint_cameras, checkpoint_robot, fitting_setting
 from mtv_world_ros.success.calibration import Calibration, Fits, load_fit, load_fits, save_fit
 from mtv_world_ros.success.fitted_to import CameraRange, FittedTo, Setting
 

@@ -5,11 +5,12 @@ from drawn_blocks import BLUE, footage, LEFT, masks, NAMES, path, RED
 import numpy as np
 import pytest
 
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.object_motion import FoundObjects, ObjectMotion
-from mtv_world_ros.geometry.robot.file import load_robot
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.physics.foreseen_motions import foreseen_of, ForeseenMotions
+from mtv_world_ros.physics.object_motion import FoundObjects, ObjectMotion
+from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
-from mtv_world_ros.success.foreseen import foreseen_feature, foreseen_of, ForeseenMotions
+from mtv_world_ros.success.foreseen import foreseen_ends, foreseen_feature
 from mtv_world_ros.success.task import match_task
 
 TASKS = load_tasks(share_path('config', 'tasks'))
@@ -57,16 +58,16 @@ def held(*ends):
 def test_the_share_of_motions_that_end_at_the_goal_is_told():
     task, bound = matched()
     unknown = np.full((2, 3), np.nan)
-    ends = held(GOAL, RED, GOAL, BLUE).ends(task, bound, unknown)
+    ends = foreseen_ends(held(GOAL, RED, GOAL, BLUE), task, bound, unknown)
     np.testing.assert_array_equal(ends.done, [True, False, True, False])
     assert foreseen_feature(ends) == 0.0
-    assert foreseen_feature(held(GOAL).ends(task, bound, unknown)) == 1.0
+    assert foreseen_feature(foreseen_ends(held(GOAL), task, bound, unknown)) == 1.0
 
 
 def test_motions_count_by_weight():
     task, bound = matched()
     motions = replace(held(GOAL, RED, BLUE), weights=np.array([3.0, 1.0, 1.0]))
-    ends = motions.ends(task, bound, np.full((2, 3), np.nan))
+    ends = foreseen_ends(motions, task, bound, np.full((2, 3), np.nan))
     assert ends.share == pytest.approx(0.6)
     np.testing.assert_array_equal(ends.is_majority, [True, False, False])
     assert foreseen_feature(ends) == pytest.approx(0.2)
@@ -126,7 +127,7 @@ def test_fingers_that_are_stopped_are_not_open():
     moved = held(GOAL, GOAL)
     openings = moved.openings.copy()
     openings[1, 0, -3:] = 0.7
-    ends = replace(moved, openings=openings).ends(task, bound, np.full((2, 3), np.nan))
+    ends = foreseen_ends(replace(moved, openings=openings), task, bound, np.full((2, 3), np.nan))
     np.testing.assert_array_equal(ends.done, [True, False])
 
 
@@ -135,11 +136,11 @@ def test_what_was_shaken_before_is_not_told_by_motions_that_begin_later():
     assert matches is not None
     task, bound = matches
     moved = replace(held(GOAL), names=('green bottle', 'blue block'))
-    assert moved.ends(task, bound, np.full((2, 3), np.nan)) is not None
+    assert foreseen_ends(moved, task, bound, np.full((2, 3), np.nan)) is not None
     later = replace(moved, is_begun=False)
-    assert later.ends(task, bound, np.full((2, 3), np.nan)) is None
+    assert foreseen_ends(later, task, bound, np.full((2, 3), np.nan)) is None
     stays = replace(held(GOAL), is_begun=False)
-    assert stays.ends(*matched(), np.full((2, 3), np.nan)).done.all()
+    assert foreseen_ends(stays, *matched(), np.full((2, 3), np.nan)).done.all()
 
 
 def test_objects_that_were_not_found_leave_it_open():
@@ -147,7 +148,7 @@ def test_objects_that_were_not_found_leave_it_open():
     seen = held(GOAL)
     lost = replace(seen, points=np.where(np.array([True, False])[:, None], np.nan, seen.points))
     for motions in (lost, replace(seen, names=('green cup', 'bowl'))):
-        assert np.isnan(foreseen_feature(motions.ends(task, bound, np.zeros((2, 3)))))
+        assert np.isnan(foreseen_feature(foreseen_ends(motions, task, bound, np.zeros((2, 3)))))
 
 
 def test_motions_that_fail_lower_an_estimate_whose_pictures_succeed():

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from mtv_world_ros import judge
-from mtv_world_ros.assembly import load_pipeline
+from mtv_world_ros.core.data_types import JointTrajectory, SuccessEstimate
+from mtv_world_ros.core.errors import CheckpointError
+from mtv_world_ros.core.files import share_path, write_json
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.data_types import JointTrajectory, SuccessEstimate
-from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.files import share_path, write_json
-from mtv_world_ros.foresight.contact_settings import ContactOrigin
-from mtv_world_ros.foresight.loading import load_contact, save_contact
-from mtv_world_ros.rollout_options import RolloutOptions
+from mtv_world_ros.physics.checkpoint_files import load_contact, save_contact
+from mtv_world_ros.physics.contact_settings import ContactOrigin
+from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros.rollout.rollout_options import RolloutOptions
 from mtv_world_ros.success.calibration import CALIBRATION
 from mtv_world_ros.success.doubts import Grounds
 

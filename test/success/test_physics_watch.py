@@ -5,7 +5,7 @@ from math import isnan, nan
 import numpy as np
 import pytest
 
-from mtv_world_ros.data_types import SuccessEstimate
+from mtv_world_ros.core.data_types import SuccessEstimate
 from mtv_world_ros.success.doubts import PhysicsWatch, SAYS, unforeseen, widened
 
 

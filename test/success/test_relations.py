@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mtv_world_ros.errors import CannotTell
+from mtv_world_ros.core.errors import CannotTell
 from mtv_world_ros.success.relations import (
     Apart,
     AtGoal,

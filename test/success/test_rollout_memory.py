@@ -6,8 +6,8 @@ from drawn_blocks import BLUE, CAMERAS, footage, LEFT, masks, path, POSES, RED, 
 import numpy as np
 import pytest
 
-from mtv_world_ros.files import share_path
-from mtv_world_ros.geometry.mask_geometry import count_reversals
+from mtv_world_ros.cameras.mask_geometry import count_reversals
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.success.rollout_memory import MAX_FRAMES, remember
 

@@ -9,7 +9,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.files import share_path
 
 rerun = pytest.importorskip('rerun', reason='rerun-sdk is not installed')
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.cli import main
+from mtv_world_ros.core.errors import ConfigError, EpisodeError
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.core.images import encode_jpeg
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagMessage
 from mtv_world_ros.data.bag.writer import BagWriter
-from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.files import share_path
-from mtv_world_ros.rendering.images import encode_jpeg
 from mtv_world_ros.viewing import sheets
 from mtv_world_ros.viewing.streams import read_streams, Streams, take
 
@@ -146,8 +146,8 @@ def test_without_the_extra_one_line_says_so(tmp_path, capsys, monkeypatch):
 
 
 def test_pictures_show_what_there_is_and_grey_where_there_is_nothing(tmp_path):
-    from mtv_world_ros.rendering.video import decode_video
     from mtv_world_ros.viewing.sheets import compared, write_pictures
+    from mtv_world_ros.viewing.video import decode_video
 
     predictions = write_predictions(tmp_path / 'predictions')
     alone = compared(read_streams([predictions]))

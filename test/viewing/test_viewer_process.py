@@ -11,7 +11,7 @@ import time
 import listeners
 import pytest
 
-from mtv_world_ros.errors import ConfigError, MtvWorldError
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.viewing import viewer_process
 from mtv_world_ros.viewing.viewer_process import check_ports, PageAddress
 

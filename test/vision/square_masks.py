@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mtv_world_ros.data_types import ObjectMasks
+from mtv_world_ros.core.data_types import ObjectMasks
 
 
 def square(x, y, size=27, shape=(60, 90)):

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from mtv_world_ros.bench.expert.expert import home_positions
-from mtv_world_ros.bench.world.simulator import SimEpisode
-from mtv_world_ros.data_types import Observation, SuccessEstimate
-from mtv_world_ros.files import bundled
-from mtv_world_ros.geometry.camera import project
-from mtv_world_ros.geometry.robot.file import load_robot
-from mtv_world_ros.geometry.robot.shape import load_shape, rods
+from mtv_world_ros.cameras.camera import project
+from mtv_world_ros.core.data_types import Observation, SuccessEstimate
+from mtv_world_ros.core.files import bundled
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.shape import load_shape, rods
+from mtv_world_ros.simulation.expert.expert import home_positions
+from mtv_world_ros.simulation.simulator import SimEpisode
 from mtv_world_ros.success.doubts import doubted
 from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from square_masks import objects, square
 
-from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.vision.jaccard import (
     held_masks,
     jaccard,

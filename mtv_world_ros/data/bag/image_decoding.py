@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 import simplejpeg
 
-from mtv_world_ros.bounded_input import check_limit, LimitError
-from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.errors import ObservationError
+from mtv_world_ros.core.bounded_input import check_limit, LimitError
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.errors import ObservationError
 
 #: encodings of sensor_msgs/Image: bytes a pixel in a row, conversion to RGB (None = is RGB).
 #: OpenCV names a Bayer pattern by its second row, and `yuv422` is ROS' older name of `uyvy`

@@ -13,10 +13,10 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
+from mtv_world_ros.core.data_types import CameraModel, JointTrajectory
+from mtv_world_ros.core.errors import EpisodeError, nearest
+from mtv_world_ros.core.transforms import quaternion, rotation
 from mtv_world_ros.data.bag.video_packets import FFMPEG_PACKET, FFMPEG_PACKET_DEFINITION
-from mtv_world_ros.data_types import CameraModel, JointTrajectory
-from mtv_world_ros.errors import EpisodeError, nearest
-from mtv_world_ros.geometry.transforms import quaternion, rotation
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from mtv_world_ros.bounded_input import parse_yaml
+from mtv_world_ros.core.bounded_input import parse_yaml
 
 VERSION = 9
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}

@@ -20,8 +20,8 @@ from mcap.records import Channel, Metadata, Schema
 import yaml
 import zstandard
 
-from mtv_world_ros.bounded_input import limits, parse_yaml, PREFIX, read_bytes
-from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.core.bounded_input import limits, parse_yaml, PREFIX, read_bytes
+from mtv_world_ros.core.errors import EpisodeError
 
 MAGIC = b'\x89MCAP0\r\n'
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'

@@ -9,10 +9,10 @@ import av
 from av.video.codeccontext import VideoCodecContext
 import numpy as np
 
-from mtv_world_ros.bounded_input import check_limit, LimitError
+from mtv_world_ros.core.bounded_input import check_limit, LimitError
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.errors import EpisodeError, ObservationError
 from mtv_world_ros.data.episode import LazyFrames
-from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.errors import EpisodeError, ObservationError
 
 FFMPEG_PACKET = 'ffmpeg_image_transport_msgs/msg/FFMPEGPacket'
 #: as in ros-misc-utilities/ffmpeg_image_transport_msgs

@@ -14,6 +14,7 @@ from typing import cast, IO, Self
 
 from mcap.writer import CompressionType, Writer
 
+from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.metadata import (
     bag_information,
@@ -22,7 +23,6 @@ from mtv_world_ros.data.bag.metadata import (
     Qos,
     TopicRecord,
 )
-from mtv_world_ros.errors import EpisodeError
 
 #: small chunks: a cut file loses little more than its last chunk
 CHUNK_BYTES = 256 * 1024

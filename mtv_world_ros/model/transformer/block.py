@@ -12,7 +12,7 @@ from diffusers.models.transformers.transformer_wan import WanTransformerBlock
 import torch
 from torch import nn, Tensor
 
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.transformer.attention import attend
 
 #: umT5 tokens; Wan's attention splits image from text tokens by this number

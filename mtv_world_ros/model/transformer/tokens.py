@@ -14,7 +14,7 @@ from diffusers.models.transformers.transformer_wan import WanRotaryPosEmbed
 import torch
 from torch import Tensor
 
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.core.errors import CheckpointError
 
 #: where the start image may enter: as reference tokens and in its channel slot, or in one of them
 START_IMAGES = ('both', 'either')

@@ -14,7 +14,8 @@ import torch
 from torch import nn, Tensor
 from torch.utils.checkpoint import checkpoint
 
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.core.errors import CheckpointError
+from mtv_world_ros.core.network_sizes import check_sizes
 from mtv_world_ros.model.transformer.block import (
     check_tokens,
     hold_levels_by_run,
@@ -31,7 +32,6 @@ from mtv_world_ros.model.transformer.tokens import (
     MultiViewRotaryPosEmbed,
     unembed,
 )
-from mtv_world_ros.network_sizes import check_sizes
 
 
 class MultiViewWanTransformer(WanTransformer3DModel):

@@ -20,8 +20,8 @@ from rclpy.qos import QoSProfile
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
+from mtv_world_ros.core.errors import ConfigError, EpisodeError
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
-from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.ros.messages.conversions import (
     has_header,
     message_class,

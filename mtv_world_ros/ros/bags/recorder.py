@@ -17,9 +17,9 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
 
+from mtv_world_ros.core.errors import ConfigError, EpisodeError
 from mtv_world_ros.data.bag.metadata import Qos
 from mtv_world_ros.data.bag.writer import BagWriter
-from mtv_world_ros.errors import ConfigError, EpisodeError
 from mtv_world_ros.ros.messages.conversions import (
     has_header,
     message_class,

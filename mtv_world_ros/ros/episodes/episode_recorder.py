@@ -10,8 +10,8 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 
+from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.data.bag.writer import BagWriter
-from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.ros.bags.recorder import parse, Recorder, SILENCE_S
 from mtv_world_ros.ros.run_node import run
 

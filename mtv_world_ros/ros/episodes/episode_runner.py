@@ -21,9 +21,9 @@ from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_srvs.srv import SetBool, Trigger
 
-from mtv_world_ros.errors import ConfigError, EpisodeError
-from mtv_world_ros.files import write_whole
-from mtv_world_ros.processes import (
+from mtv_world_ros.core.errors import ConfigError, EpisodeError
+from mtv_world_ros.core.files import write_whole
+from mtv_world_ros.core.processes import (
     last_line,
     module_command,
     start_process,

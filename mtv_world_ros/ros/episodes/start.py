@@ -12,10 +12,10 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
+from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode import CALIBRATION_FILE, camera_info_topic, optical_frame
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.ros.messages.conversions import (
     make_header,
     NANO,

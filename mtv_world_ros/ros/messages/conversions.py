@@ -17,11 +17,11 @@ from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension, MultiAr
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 from trajectory_msgs.msg import JointTrajectoryPoint
 
-from mtv_world_ros.bounded_input import check_limit
+from mtv_world_ros.core.bounded_input import check_limit
+from mtv_world_ros.core.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.joint_plans import read_plan
 from mtv_world_ros.data.measured_joints import JointSample, read_sample
-from mtv_world_ros.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.errors import EpisodeError
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 
 #: the encapsulation header comes first; the stamp is a header's first field

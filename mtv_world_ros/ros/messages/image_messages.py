@@ -10,9 +10,9 @@ import numpy as np
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 
+from mtv_world_ros.cameras.image_window import WHOLE, window_of, windowed_pixels
+from mtv_world_ros.core.data_types import ByteArray, CameraModel
 from mtv_world_ros.data.bag import image_decoding
-from mtv_world_ros.data_types import ByteArray, CameraModel
-from mtv_world_ros.geometry.image_window import WHOLE, window_of, windowed_pixels
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
 
 #: words in the `format` of compressed images that can be read

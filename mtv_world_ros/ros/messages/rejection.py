@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 
-from mtv_world_ros.bounded_input import LimitError
-from mtv_world_ros.errors import MtvWorldError, PlanError
+from mtv_world_ros.core.bounded_input import LimitError
+from mtv_world_ros.core.errors import MtvWorldError, PlanError
 
 
 class Reason(StrEnum):

@@ -10,8 +10,8 @@ from typing import Protocol
 import numpy as np
 from sensor_msgs.msg import Image, JointState
 
-from mtv_world_ros.data_types import FloatArray, JointTrajectory, Observation, WorldModelSpec
-from mtv_world_ros.geometry.camera import scaled
+from mtv_world_ros.cameras.camera import scaled
+from mtv_world_ros.core.data_types import FloatArray, JointTrajectory, Observation, WorldModelSpec
 from mtv_world_ros.policies.policy import first_part, Policy
 from mtv_world_ros.ros.bags.player import ENDS
 from mtv_world_ros.ros.messages.conversions import NANO, to_ns, to_positions

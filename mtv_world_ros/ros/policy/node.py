@@ -16,15 +16,11 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
-from mtv_world_ros.assembly import (
-    assemble_policy,
-    checkpoint_robot,
-    PolicyMaker,
-)
-from mtv_world_ros.data_types import JointTrajectory, Observation
-from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.core.data_types import JointTrajectory, Observation
+from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.policies.policy import EpisodeOrigin
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.rollout.assembly import assemble_policy, checkpoint_robot, PolicyMaker
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.messages.conversions import make_header, to_trajectory_message, values_of
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection

@@ -9,8 +9,8 @@ from threading import Thread
 import time
 import traceback
 
-from mtv_world_ros.data_types import JointTrajectory
-from mtv_world_ros.errors import MtvWorldError
+from mtv_world_ros.core.data_types import JointTrajectory
+from mtv_world_ros.core.errors import MtvWorldError
 
 #: a policy that hangs is left behind after this long [s]
 _CLOSE_S = 1.0

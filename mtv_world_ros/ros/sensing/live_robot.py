@@ -15,13 +15,13 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
-from mtv_world_ros.bounded_input import check_limit
+from mtv_world_ros.core.bounded_input import check_limit
+from mtv_world_ros.core.data_types import CameraModel, FloatArray
+from mtv_world_ros.core.errors import CalibrationError, ConfigError, RobotError
+from mtv_world_ros.core.transforms import inverse, quaternion
 from mtv_world_ros.data.transform_tree import Mount, STILL, TransformTree
-from mtv_world_ros.data_types import CameraModel, FloatArray
-from mtv_world_ros.errors import CalibrationError, ConfigError, RobotError
-from mtv_world_ros.geometry.robot.file import described_robot
-from mtv_world_ros.geometry.robot.model import RobotModel
-from mtv_world_ros.geometry.transforms import inverse, quaternion
+from mtv_world_ros.robot.file import described_robot
+from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 from mtv_world_ros.ros.parameters import Settings

@@ -13,13 +13,13 @@ from math import prod, sqrt
 import numpy as np
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 
+from mtv_world_ros.cameras.camera import scaled
+from mtv_world_ros.cameras.camera_info import Intrinsics as InfoIntrinsics
+from mtv_world_ros.cameras.camera_info import read_camera_info
+from mtv_world_ros.cameras.image_window import window_of, windowed_camera
+from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, Observation
+from mtv_world_ros.core.images import resize_frames
 from mtv_world_ros.data.transform_tree import Mount
-from mtv_world_ros.data_types import ByteArray, CameraModel, FloatArray, Observation
-from mtv_world_ros.geometry.camera import scaled
-from mtv_world_ros.geometry.camera_info import Intrinsics as InfoIntrinsics
-from mtv_world_ros.geometry.camera_info import read_camera_info
-from mtv_world_ros.geometry.image_window import window_of, windowed_camera
-from mtv_world_ros.rendering.images import resize_frames
 from mtv_world_ros.ros.messages import image_messages
 from mtv_world_ros.ros.messages.conversions import check_sample, NANO, to_ns, to_sample
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection

@@ -15,8 +15,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.geometry.camera_info import RECTIFIED
+from mtv_world_ros.cameras.camera_info import RECTIFIED
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 

@@ -18,8 +18,8 @@ from rclpy.node import Node
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 from trajectory_msgs.msg import JointTrajectoryPoint
 
-from mtv_world_ros.data_types import FloatArray
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.parameters import Settings

@@ -12,16 +12,12 @@ from typing import Protocol, runtime_checkable, TYPE_CHECKING
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from mtv_world_ros.assembly import (
-    checkpoint_cameras,
-    checkpoint_path,
-    load_pipeline,
-)
-from mtv_world_ros.data_types import CameraModel
-from mtv_world_ros.errors import CalibrationError, CheckpointError, MtvWorldError
-from mtv_world_ros.geometry.calibration_file import load_calibration
+from mtv_world_ros.cameras.calibration_file import load_calibration
+from mtv_world_ros.core.data_types import CameraModel
+from mtv_world_ros.core.errors import CalibrationError, CheckpointError, MtvWorldError
 from mtv_world_ros.model.card import read_card
-from mtv_world_ros.pipeline import Pipeline, WorldModel, WorldModelSpec
+from mtv_world_ros.rollout.assembly import checkpoint_cameras, checkpoint_path, load_pipeline
+from mtv_world_ros.rollout.pipeline import Pipeline, WorldModel, WorldModelSpec
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
 from mtv_world_ros.ros.parameters import NodeSettings, refusing, Settings
 

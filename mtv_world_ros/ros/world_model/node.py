@@ -11,8 +11,8 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-from mtv_world_ros.errors import MtvWorldError
-from mtv_world_ros.pipeline import Pipeline
+from mtv_world_ros.core.errors import MtvWorldError
+from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.run_node import run

@@ -15,8 +15,8 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from std_msgs.msg import Float32MultiArray, Float64, Header
 
-from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.pipeline import WorldModelSpec
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.rollout.pipeline import WorldModelSpec
 from mtv_world_ros.ros.messages.conversions import (
     make_header,
     NANO,

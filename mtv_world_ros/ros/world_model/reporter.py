@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.node import Node
 
-from mtv_world_ros.data_types import SuccessEstimate
+from mtv_world_ros.core.data_types import SuccessEstimate
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.status_publisher import StatusPublisher

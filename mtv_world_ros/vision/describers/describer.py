@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 import re
 from typing import Any, Protocol
 
-from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.errors import DescriptionError, nearest
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.errors import DescriptionError, nearest
 from mtv_world_ros.vision.segmenters.colour import PALETTE
 
 ROLES = ('manipuland', 'support', 'container')

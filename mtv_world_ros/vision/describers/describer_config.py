@@ -8,9 +8,9 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from mtv_world_ros.config import read_yaml, Schema, validated
-from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.errors import ConfigError, DescriptionError, nearest
+from mtv_world_ros.core.config import read_yaml, Schema, validated
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.errors import ConfigError, DescriptionError, nearest
 from mtv_world_ros.vision.describers.describer import check_objects, DescribedObject
 from mtv_world_ros.vision.describers.openai_chat import OpenAIConfig
 

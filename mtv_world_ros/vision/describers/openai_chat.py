@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from mtv_world_ros.bounded_input import parse_json
-from mtv_world_ros.config import expected, Schema, Seconds
-from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.errors import ConfigError, DescriptionError, masked
+from mtv_world_ros.core.bounded_input import parse_json
+from mtv_world_ros.core.config import expected, Schema, Seconds
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.errors import ConfigError, DescriptionError, masked
 from mtv_world_ros.vision.describers.vlm import ANSWER_SCHEMA, ChatAnswer, excerpt
 
 #: from the strictest to none; a server that refuses one is asked with the next

@@ -9,10 +9,10 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from mtv_world_ros.bounded_input import read_json
-from mtv_world_ros.data_types import ByteArray
-from mtv_world_ros.errors import ConfigError, DescriptionError, nearest
-from mtv_world_ros.files import write_whole
+from mtv_world_ros.core.bounded_input import read_json
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.errors import ConfigError, DescriptionError, nearest
+from mtv_world_ros.core.files import write_whole
 from mtv_world_ros.vision.describers.describer import (
     BOX_SCALE,
     check_objects,

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import get_args, Literal
 
-from mtv_world_ros.errors import ConfigError, nearest
+from mtv_world_ros.core.errors import ConfigError, nearest
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 from mtv_world_ros.vision.segmenters.examples import ExampleSegmenter, ObjectExamples, SUFFIX
 from mtv_world_ros.vision.segmenters.sam import sam2_segmenter, sam3_segmenter

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks
 from mtv_world_ros.vision.segmenters.segmenter import check_request
 from mtv_world_ros.vision.segmenters.tracking import (
     ObjectTrack,

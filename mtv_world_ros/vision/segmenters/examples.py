@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
-from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.files import write_whole
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks
+from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.files import write_whole
 from mtv_world_ros.vision.jaccard import jaccard
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 from mtv_world_ros.vision.segmenters.segmenter import check_request, resize_masks

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray
-from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, FloatArray
+from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.vision.segmenters.weights import (
     load_tokenizer,
     load_vision_model,

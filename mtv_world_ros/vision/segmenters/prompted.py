@@ -9,8 +9,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
-from mtv_world_ros.errors import ModelMemoryError
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks
+from mtv_world_ros.core.errors import ModelMemoryError
 from mtv_world_ros.vision.segmenters.segmenter import check_request
 from mtv_world_ros.vision.segmenters.tracking import judge, TrackingConfig
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, ByteArray, FloatArray
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, FloatArray
 from mtv_world_ros.vision.segmenters.grounding import (
     choose_boxes,
     GroundingConfig,

@@ -8,8 +8,8 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from mtv_world_ros.data_types import BoolArray, ByteArray, ObjectMasks
-from mtv_world_ros.errors import ObservationError
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks
+from mtv_world_ros.core.errors import ObservationError
 
 
 class Segmenter(Protocol):

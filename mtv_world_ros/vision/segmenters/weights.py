@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mtv_world_ros.bounded_input import check_weights, read_json
-from mtv_world_ros.errors import CheckpointError, ConfigError
-from mtv_world_ros.network_sizes import check_sizes
+from mtv_world_ros.core.bounded_input import check_weights, read_json
+from mtv_world_ros.core.errors import CheckpointError, ConfigError
+from mtv_world_ros.core.network_sizes import check_sizes
 
 #: `model_type` in a folder's config.json -> (class in transformers, a public name of it)
 VISION_MODELS = {

@@ -11,11 +11,11 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 import yaml
 
+from mtv_world_ros.cameras.calibration_file import load_calibration
+from mtv_world_ros.core.errors import CalibrationError, EpisodeError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.episode_reader import read_episode, read_info
-from mtv_world_ros.errors import CalibrationError, EpisodeError
-from mtv_world_ros.geometry.calibration_file import load_calibration
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
@@ -58,7 +58,7 @@ def camera_info(stamp_ns: int, focal: float = 50.0) -> Any:
 
 
 def _camera() -> Any:
-    from mtv_world_ros.data_types import CameraModel
+    from mtv_world_ros.core.data_types import CameraModel
 
     return CameraModel(
         view='low', width=3, height=2, K=np.eye(3), mount_link='base', T_mount_camera=np.eye(4)

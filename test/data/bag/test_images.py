@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from mtv_world_ros.core.errors import ObservationError
 from mtv_world_ros.data.bag import image_decoding
 from mtv_world_ros.data.bag.image_decoding import compressed_to_ids, compressed_to_rgb
-from mtv_world_ros.errors import ObservationError
 
 RED, GREEN = (200, 10, 20), (30, 150, 40)
 #: a row of a red and a green pixel in each encoding

@@ -9,10 +9,10 @@ from mcap.writer import CompressionType, Writer
 import numpy as np
 import pytest
 
+from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
-from mtv_world_ros.errors import EpisodeError
 
 TYPE = 'std_msgs/msg/UInt8MultiArray'
 CHANNEL = {'topic': '/noise', 'message_encoding': 'cdr'}

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import Writer
 
+from mtv_world_ros.core.errors import EpisodeError, ObservationError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.video_packets import (
     check_packet,
@@ -19,8 +20,7 @@ from mtv_world_ros.data.bag.video_packets import (
 )
 from mtv_world_ros.data.bag_mapping import BagMapping
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.errors import EpisodeError, ObservationError
-from mtv_world_ros.lab.importing.bags import with_guessed_views
+from mtv_world_ros.importing.bags import with_guessed_views
 
 NUM, HEIGHT, WIDTH = 12, 48, 64
 

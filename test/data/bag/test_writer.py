@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import Reader
 
+from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.bag.metadata import LATCHED, Qos
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.episode_writer import EpisodeWriter
-from mtv_world_ros.errors import EpisodeError
 
 
 def profiles_of(reader: Reader) -> dict[str, Any]:

@@ -18,8 +18,7 @@ from torch import Tensor
 from wan_files import TRANSFORMER
 from wan_predictions import imported, predict
 
-from mtv_world_ros.errors import CheckpointError, ConfigError, ModelMemoryError
-from mtv_world_ros.lab.training.training_config import HistoryConfig, load_training_config
+from mtv_world_ros.core.errors import CheckpointError, ConfigError, ModelMemoryError
 from mtv_world_ros.model import serving
 from mtv_world_ros.model.autoencoders import TinyAutoencoder
 from mtv_world_ros.model.checkpoint import load_checkpoint
@@ -28,6 +27,7 @@ from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.serving import ServingOptions
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.world_model import DiffusionWorldModel
+from mtv_world_ros.training.training_config import HistoryConfig, load_training_config
 
 
 @pytest.fixture(scope='module')
@@ -254,8 +254,8 @@ def test_a_lack_of_memory_outside_torchs_own_is_named(
 _STARVED = """
 import resource
 import numpy as np
-from mtv_world_ros.assembly import load_pipeline
-from mtv_world_ros.errors import ModelMemoryError
+from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros.core.errors import ModelMemoryError
 model = load_pipeline(num_threads=1, dtype='float32').world_model
 spec = model.spec
 shape = (len(spec.views), 1 + spec.num_frames, spec.height, spec.width, 3)

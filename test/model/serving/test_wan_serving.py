@@ -17,15 +17,15 @@ from wan_encoder_reference import clip_tokens, umt5_encode
 from wan_files import CARD, clip_weights, umt5_weights, vae_model
 from wan_predictions import frames, imported, predict, T, VIEWS
 
-from mtv_world_ros.data_types import History
-from mtv_world_ros.errors import CheckpointError
-from mtv_world_ros.lab.training.adapter import add_adapter, save_adapter
+from mtv_world_ros.core.data_types import History
+from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.autoencoders import WanAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
 from mtv_world_ros.model.conditioning import condition, decode_frames, encode_chunk
 from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.serving import compile_norms
 from mtv_world_ros.model.world_model import DiffusionWorldModel
+from mtv_world_ros.training.adapter import add_adapter, save_adapter
 
 
 @pytest.fixture(scope='module')

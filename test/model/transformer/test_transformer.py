@@ -4,7 +4,7 @@ import pytest
 from small_transformer import build, inputs, PATCH, SMALL
 import torch
 
-from mtv_world_ros.errors import CheckpointError
+from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.transformer import attention
 from mtv_world_ros.model.transformer.attention import attend
 

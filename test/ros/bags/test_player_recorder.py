@@ -16,11 +16,11 @@ from sensor_msgs.msg import CompressedImage, JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
+from mtv_world_ros.cameras.calibration_file import load_calibration
+from mtv_world_ros.core.data_types import JointTrajectory as Trajectory
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode_writer import EpisodeWriter
-from mtv_world_ros.data_types import JointTrajectory as Trajectory
-from mtv_world_ros.geometry.calibration_file import load_calibration
-from mtv_world_ros.lab.importing.recover import find_damaged, recover
+from mtv_world_ros.importing.recover import find_damaged, recover
 from mtv_world_ros.ros.messages.conversions import NANO, to_ns
 
 START_NS = 1_700_000_000 * NANO
@@ -247,7 +247,7 @@ def test_a_recorder_whose_parent_is_killed_closes_its_bag_and_ends(tmp_path, ros
     parent = (
         'import sys, time\n'
         'from pathlib import Path\n'
-        'from mtv_world_ros.processes import module_command, start_process\n'
+        'from mtv_world_ros.core.processes import module_command, start_process\n'
         "command = module_command('bags.recorder', sys.argv[1], '/said')\n"
         "child = start_process('recorder', command, Path(sys.argv[1]).parent)\n"
         'print(child.pid, flush=True)\n'

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import pytest
 
+from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.data.bag.messages import deserialize, header_stamp
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode_writer import EpisodeWriter
-from mtv_world_ros.geometry.calibration_file import load_calibration
 from mtv_world_ros.ros.messages.conversions import NANO, values_of
 
 FRAME_NS, NUM_FRAMES = 200_000_000, 4

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 
-from mtv_world_ros.geometry.calibration_file import load_calibration
+from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.parameters import NodeSettings

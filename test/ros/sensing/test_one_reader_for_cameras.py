@@ -8,11 +8,11 @@ import pytest
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 
+from mtv_world_ros.core.data_types import CameraModel
+from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
-from mtv_world_ros.data_types import CameraModel
-from mtv_world_ros.errors import MtvWorldError
 from mtv_world_ros.ros.messages.image_messages import windowed_camera_info
 from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.sensing.observations import Intrinsics

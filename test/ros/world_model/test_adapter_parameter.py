@@ -8,13 +8,13 @@ import pytest
 from sensor_msgs.msg import Image
 import torch
 
-from mtv_world_ros.lab.training.adapter import add_adapter, save_adapter
-from mtv_world_ros.lab.training.training_config import load_training_config
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint, save_checkpoint
 from mtv_world_ros.model.parts import build_scheduler
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.ros.messages.image_messages import to_rgb
+from mtv_world_ros.training.adapter import add_adapter, save_adapter
+from mtv_world_ros.training.training_config import load_training_config
 
 FRAMES, CHUNKS = 4, 3
 TOPICS = {f'/world_model/{view}/predicted/image_raw': Image for view in ('low', 'high')}

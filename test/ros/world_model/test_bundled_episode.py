@@ -14,9 +14,9 @@ import pytest
 from rclpy.action import ActionClient
 from sensor_msgs.msg import CameraInfo, Image
 
+from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.files import share_path
 from mtv_world_ros.ros.messages.conversions import NANO, to_ns
 from mtv_world_ros.ros.messages.image_messages import to_rgb
 

@@ -8,10 +8,10 @@ import pytest
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import String
 
-from mtv_world_ros.assembly import checkpoint_robot
+from mtv_world_ros.core.data_types import JointTrajectory, WorldModelSpec
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.data_types import JointTrajectory, WorldModelSpec
-from mtv_world_ros.files import share_path
+from mtv_world_ros.rollout.assembly import checkpoint_robot
 from mtv_world_ros.ros.messages.conversions import (
     make_header,
     NANO,

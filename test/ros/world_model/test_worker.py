@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from mtv_world_ros.errors import RolloutPreempted
+from mtv_world_ros.core.errors import RolloutPreempted
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.world_model.worker import Ended, Request, RolloutWorker
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 
-from mtv_world_ros.assembly import assemble_describer
-from mtv_world_ros.errors import ConfigError, DescriptionError
-from mtv_world_ros.files import share_path
+from mtv_world_ros.core.errors import ConfigError, DescriptionError
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.rollout.assembly import assemble_describer
 from mtv_world_ros.vision.describers.describer import InstructionDescriber, names_of
 from mtv_world_ros.vision.describers.describer_config import (
     DescriberConfig,

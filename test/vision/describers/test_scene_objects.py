@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from mtv_world_ros.errors import DescriptionError
+from mtv_world_ros.core.errors import DescriptionError
 from mtv_world_ros.vision.describers.describer import check_objects, DescribedObject, names_of
 
 CUP = {

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mtv_world_ros.errors import ConfigError, DescriptionError
+from mtv_world_ros.core.errors import ConfigError, DescriptionError
 from mtv_world_ros.vision.describers.describer import DescribedObject
 from mtv_world_ros.vision.describers.openai_chat import OpenAIChat, OpenAIConfig, retry_after
 from mtv_world_ros.vision.describers.vlm import DescriptionCache, VlmDescriber

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mtv_world_ros.errors import ObservationError
+from mtv_world_ros.core.errors import ObservationError
 from mtv_world_ros.vision.jaccard import jaccard
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter, PALETTE
 from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, resize_masks

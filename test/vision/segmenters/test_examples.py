@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.vision.jaccard import jaccard
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 from mtv_world_ros.vision.segmenters.examples import ExampleSegmenter, ObjectExamples

@@ -10,7 +10,7 @@ from transformers.models.grounding_dino.image_processing_pil_grounding_dino impo
 )
 from transformers.models.grounding_dino.processing_grounding_dino import GroundingDinoProcessor
 
-from mtv_world_ros.errors import ConfigError
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.vision.segmenters.grounding import (
     _prompt,
     _tokens_of,

@@ -5,7 +5,7 @@ import pytest
 from tiny_vision import save_sam2
 import torch
 
-from mtv_world_ros.errors import ModelMemoryError, ObservationError
+from mtv_world_ros.core.errors import ModelMemoryError, ObservationError
 from mtv_world_ros.vision.jaccard import jaccard
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter, WEIGHTS_VARIABLE
 from mtv_world_ros.vision.segmenters.grounding import GroundingConfig, MMGroundingDino

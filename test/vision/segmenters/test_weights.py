@@ -5,7 +5,7 @@ import sys
 import pytest
 from safetensors.torch import load_file, save_file
 
-from mtv_world_ros.errors import CheckpointError, ConfigError
+from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter, WEIGHTS_VARIABLE
 from mtv_world_ros.vision.segmenters.weights import (
     find_weights,

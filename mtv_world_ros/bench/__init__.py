@@ -1,1 +1,0 @@
-"""The bench: simulates, collects and ranks policies."""

@@ -1,1 +1,0 @@
-"""A second engine, DART, as another truth than MuJoCo."""

@@ -1,1 +1,0 @@
-"""The scripted expert and its faults."""

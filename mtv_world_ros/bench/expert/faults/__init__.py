@@ -1,1 +1,0 @@
-"""What can be wrong with a scripted policy: the catalogue, and what carries it out."""

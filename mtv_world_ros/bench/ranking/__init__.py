@@ -1,1 +1,0 @@
-"""Policies ranked in imagination, and how well that agrees with the simulator."""

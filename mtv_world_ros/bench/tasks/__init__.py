@@ -1,1 +1,0 @@
-"""The simulated tasks and when they are done."""

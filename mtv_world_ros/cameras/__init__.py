@@ -1,0 +1,1 @@
+"""Camera models: projection, calibration files, image windows, masks of projected shapes."""

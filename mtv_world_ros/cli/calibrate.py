@@ -1,0 +1,212 @@
+"""`mtv-world calibrate`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from contextlib import suppress
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mtv_world_ros.cli.evaluate import load_pipelines, say_failed
+from mtv_world_ros.cli.shared_options import add_options, check_model, provenance
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+from mtv_world_ros.core.files import check_free
+
+if TYPE_CHECKING:
+    from mtv_world_ros.data.splits import Selection
+    from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary
+    from mtv_world_ros.evaluation.results import EpisodeResult
+    from mtv_world_ros.success.calibration import HorizonCurve
+    from mtv_world_ros.success.fitted_to import FittedTo
+
+_EPILOG = """\
+Every episode is imagined as a whole from its first frame with its own commands; the success
+estimate on the imagined frames is then fitted to the recorded outcomes. The checkpoint gets
+success_calibration.json and horizon.json. With --no-foresight, a checkpoint that can foresee
+object motion gets success_calibration_pictures.json and horizon_pictures.json; they are used
+where no motion is foreseen. DIR gets calibration.md, reliability.html and calibration.json. Half
+of the episodes should be failures: mtv-world collect --failures-of-ten 5.
+Running the same command again continues an interrupted run. Exit status: 1 if an episode could
+not be scored; it is not in the fit.
+"""
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        'calibrate',
+        help="fit a checkpoint's success estimate to recorded outcomes",
+        epilog=_EPILOG,
+    )
+    parser.add_argument('checkpoint', help="folder, 'bundled' or 'bundled-paper'")
+    parser.add_argument('dataset', type=Path, help='folder of episodes with outcomes')
+    parser.add_argument('--out', type=Path, required=True, metavar='DIR')
+    parser.add_argument(
+        '--split', help="split of dataset.json, or 'all'; default: test where there is one"
+    )
+    parser.add_argument('--episodes', type=int, help='use only so many')
+    parser.add_argument('--workers', type=int, default=1, help='processes that imagine episodes')
+    add_options(parser, 'seeds')
+    parser.add_argument(
+        '--l2', type=float, default=1.0, help='strength of the prior on the weights'
+    )
+    parser.add_argument(
+        '--no-store',
+        dest='store',
+        action='store_false',
+        help='write the report only; do not change the checkpoint',
+    )
+    add_options(parser, 'overwrite dtype model serving segmenter task')
+    parser.set_defaults(handler=_calibrate)
+
+
+def _calibrate(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.data.splits import select
+    from mtv_world_ros.rollout.assembly import checkpoint_path
+    from mtv_world_ros.success.calibration import save_fit
+
+    check_model(arguments.device, arguments.checkpoint)
+    folder = checkpoint_path(arguments.checkpoint)
+    _check_places(arguments, folder)
+    selection = select(arguments.dataset, arguments.split, arguments.episodes)
+    from mtv_world_ros.data.splits import refuse_test_kinds
+    from mtv_world_ros.evaluation.fit import calibrate, samples_of
+    from mtv_world_ros.reports.calibration_report import write_calibration_report
+
+    print(f'{arguments.dataset}: {selection}')
+    refuse_test_kinds(selection.paths, 'calibration')
+    made = {**provenance(arguments), 'dataset': f'{arguments.dataset}: {selection}'}
+    runs = _imagine(arguments, selection)
+    failed = say_failed([run.failed for run in runs])  # before what is too few is refused
+    segmenter = str(runs[0].settings['segmenter'])
+    samples = samples_of([run.results for run in runs], result_kinds(selection.paths))
+    found = calibrate(samples, segmenter=segmenter, l2=arguments.l2, made=made)
+    horizon = _horizon([run.results for run in runs], runs[0], made)
+    text = write_calibration_report(arguments.out, found, horizon)
+    if arguments.store:
+        fitted_to = _fitted_to(arguments, selection)
+        stored = found.calibration.replace(fitted_to=fitted_to)
+        of_pictures = _is_of_pictures(arguments, folder)
+        if horizon is not None:  # first: with the calibration the checkpoint counts as calibrated
+            print(f'stored: {save_fit(folder, horizon, of_pictures=of_pictures)}')
+        print(f'stored: {save_fit(folder, stored, of_pictures=of_pictures)}')
+    print(text)
+    return int(failed)
+
+
+def _fitted_to(arguments: argparse.Namespace, selection: Selection) -> FittedTo:
+    """Robot, foresight and cameras of the episodes; of those only that can be read."""
+    from mtv_world_ros.data.episode_reader import read_episode
+    from mtv_world_ros.model.card import read_card
+    from mtv_world_ros.rollout.assembly import checkpoint_path, checkpoint_robot, fitting_setting
+    from mtv_world_ros.success.fitted_to import FittedTo
+
+    views = read_card(checkpoint_path(arguments.checkpoint)).views
+    cameras = []
+    for path in selection.paths:
+        with suppress(MtvWorldError):  # was named when it was imagined
+            cameras.append(tuple(read_episode(path, views=views).cameras.values()))
+    robot = checkpoint_robot(arguments.checkpoint, arguments.robot)
+    setting = fitting_setting(arguments.checkpoint, robot)
+    if not arguments.foresight:
+        setting = setting.replace(foresight='')
+    return FittedTo.episodes(setting, cameras)
+
+
+def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
+    """Returns the fault kinds of episodes of scripted policies, by what their results are called.
+
+    Raises:
+        EpisodeError: the metadata of an episode cannot be used.
+        PolicyError: a policy has an unknown fault.
+    """
+    from mtv_world_ros.data.splits import recorded_kinds
+    from mtv_world_ros.evaluation.evaluate_episodes import result_names
+
+    names = result_names(paths)
+    return {names[path]: kinds for path, kinds in recorded_kinds(paths).items()}
+
+
+def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
+    """Refuses to write into the installed package, and to replace an earlier calibration."""
+    from mtv_world_ros.rollout.assembly import BUNDLED_FOLDERS
+    from mtv_world_ros.success.calibration import Calibration, fit_path
+
+    check_free(arguments.out / 'calibration.json', arguments.overwrite)
+    if not arguments.store:
+        return
+    if arguments.checkpoint in BUNDLED_FOLDERS:
+        raise ConfigError(
+            f"'{arguments.checkpoint}' is part of the installed package, into which nothing is "
+            f"written; copy it with 'cp -r {folder} DIR' and calibrate DIR, or give --no-store"
+        )
+    file = fit_path(folder, Calibration, of_pictures=_is_of_pictures(arguments, folder))
+    check_free(file, arguments.overwrite, 'checkpoint')
+
+
+def _is_of_pictures(arguments: argparse.Namespace, folder: Path) -> bool:
+    """Whether the fit is to rollouts without the object motion that the checkpoint foresees."""
+    from mtv_world_ros.rollout.assembly import can_foresee
+
+    return not arguments.foresight and can_foresee(folder)
+
+
+def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[EvaluationSummary]:
+    """Imagines and scores the episodes once a seed."""
+    from mtv_world_ros.evaluation.evaluate_episodes import evaluate
+    from mtv_world_ros.evaluation.result_settings import fingerprint
+    from mtv_world_ros.evaluation.settings import EvaluationConfig
+    from mtv_world_ros.rollout.imagined_episode import SEED_STEP
+
+    pipeline, parallel = load_pipelines(arguments, arguments.checkpoint, calibrated=False)
+    return [
+        evaluate(
+            pipeline,
+            selection.paths,
+            arguments.out / f'seed_{index}',
+            EvaluationConfig(
+                mode='imagine',
+                seed=arguments.seed + SEED_STEP * index,
+                num_inference_steps=arguments.steps,
+                actions=('true',),
+                ceiling=False,
+                observed=True,
+            ),
+            name=fingerprint(
+                arguments.checkpoint,
+                calibrated=False,
+                adapter=arguments.adapter,
+                task=arguments.task,
+            ),
+            zero_shot=selection.zero_shot,
+            provenance=provenance(arguments),
+            parallel=parallel,
+            overwrite=arguments.overwrite,
+        )
+        for index in range(arguments.seeds)
+    ]
+
+
+def _horizon(
+    runs: Sequence[Sequence[EpisodeResult]], summary: EvaluationSummary, made: dict[str, str]
+) -> HorizonCurve | None:
+    """J of the objects that move against the horizon; None = nothing moves."""
+    from mtv_world_ros.evaluation.metrics.horizon import curve
+    from mtv_world_ros.success.calibration import HorizonCurve
+
+    rows: dict[str, list] = {}
+    for result in (result for run in runs for result in run):
+        rows.setdefault(result.episode, []).extend(result.rows)
+    found = curve(list(rows.values()), None, 'j_frames')
+    if not found.values:
+        return None
+    return HorizonCurve(
+        period_s=1 / summary.spec.fps,
+        values=found.values,
+        lower=tuple(low if isfinite(low) else 0.0 for low, _ in found.band),
+        segmenter=str(summary.settings['segmenter']),
+        num_episodes=len(rows),
+        made=made,
+    )

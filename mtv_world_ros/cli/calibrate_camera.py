@@ -1,0 +1,301 @@
+"""`mtv-world calibrate-camera` of several recordings: moved cameras, focal length, points."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mtv_world_ros.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from mtv_world_ros.core.data_types import CameraModel, FloatArray
+    from mtv_world_ros.data.bag_mapping import EpisodeSource
+    from mtv_world_ros.data.episode import Episode
+    from mtv_world_ros.inspection.cameras.shared_camera import SharedEstimate
+    from mtv_world_ros.robot.model import RobotModel
+    from mtv_world_ros.robot.shape import LinkShape
+
+
+def is_shared(arguments: argparse.Namespace) -> bool:
+    """Whether several recordings are asked about, or what one recording's search has not."""
+    asked = arguments.points or arguments.focal == 'estimate' or arguments.apply
+    asked = asked or arguments.click or len(arguments.views) > 1
+    return bool(asked) or len(recordings(arguments.episodes)) > 1
+
+
+def recordings(paths: Sequence[Path]) -> list[Path]:
+    """Returns recordings, and those in folders.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    from mtv_world_ros.data.episode_reader import list_episodes
+
+    found: list[Path] = []
+    for path in paths:
+        inside = (
+            [] if (path / 'metadata.yaml').is_file() or path.is_file() else list_episodes(path)
+        )
+        found += inside or [path]
+    if not found:
+        raise ConfigError('name at least one recording')
+    return found
+
+
+def calibrate_shared(arguments: argparse.Namespace) -> int:
+    """Runs the command on all recordings."""
+    from mtv_world_ros.inspection.cameras.shared_camera import load_points
+    from mtv_world_ros.robot.file import load_robot
+    from mtv_world_ros.robot.shape import load_shape
+
+    if arguments.mount_link or arguments.between:
+        raise ConfigError('--mount-link and --between are for one recording')
+    views = arguments.views
+    points = arguments.points and {view: load_points(arguments.points, view) for view in views}
+    episodes, file = _read_all(arguments)
+    robot = load_robot(file)
+    if arguments.click:
+        return _write_page(arguments, episodes, robot)
+    shape = load_shape(robot)
+    if not shape.is_known:
+        raise ConfigError(
+            f'a fixed camera is found by how the robot looks, but it has {shape.source}; give it '
+            'the meshes of its URDF'
+        )
+    groups = [views] if arguments.same_focal else [[view] for view in views]
+    for group in groups:
+        _estimate(arguments, group, points, episodes, robot, shape.parts)
+    return 0
+
+
+def _write_page(
+    arguments: argparse.Namespace, episodes: Sequence[Episode], robot: RobotModel
+) -> int:
+    from mtv_world_ros.core.files import write_whole
+    from mtv_world_ros.inspection.cameras.finger_tips import num_tips
+    from mtv_world_ros.inspection.cameras.points_page import points_page
+    from mtv_world_ros.robot.shape import load_shape
+
+    tips = num_tips(robot, load_shape(robot).parts)
+    write_whole(arguments.click, points_page(episodes, arguments.views, robot, tips))
+    print(
+        f'page: {arguments.click}\nopen it in a browser, click, save, and give what it saves as '
+        '--points'
+    )
+    return 0
+
+
+def _estimate(
+    arguments: argparse.Namespace,
+    views: Sequence[str],
+    points: dict[str, dict[str, list[FloatArray]]] | None,
+    episodes: Sequence[Episode],
+    robot: RobotModel,
+    parts: Sequence[LinkShape],
+) -> None:
+    """Estimates views that share their focal length, prints and writes them."""
+    from mtv_world_ros.inspection.cameras.shared_camera import estimate_shared
+
+    unknown = [episode.unknown.get(view, '') for episode in episodes for view in views]
+    if arguments.guess and any(unknown) and points is None:
+        print('a pose is not known: searched from all sides; --points gives a start')
+    known = arguments.focal == 'known' or (
+        arguments.focal is None and not any('intrinsics' in what for what in unknown)
+    )
+    found = estimate_shared(
+        episodes,
+        views,
+        robot,
+        parts,
+        guess=arguments.guess and not any(unknown) and points is None,
+        points=points,
+        focal_known=known,
+        seed=arguments.seed,
+    )
+    for estimate in found:
+        print(describe(estimate, episodes, focal_known=known))
+        _write(arguments, estimate, episodes, robot, parts)
+
+
+def recorded_robot(episode: Path, name: str) -> Path:
+    """Returns the YAML of the robot that an episode shows.
+
+    Args:
+        episode: its folder; an imported data set has its robot in `robot/` beside the episodes.
+        name: of the robot, by the episode's metadata.
+
+    Raises:
+        ConfigError: there is no file of that name.
+    """
+    from mtv_world_ros.model.card import ROBOT_FOLDER
+    from mtv_world_ros.robot.file import load_robot, ROBOT_YAML
+    from mtv_world_ros.rollout.assembly import robot_path
+
+    for folder in (episode, *list(episode.resolve().parents)[:2]):
+        file = folder / ROBOT_FOLDER / ROBOT_YAML
+        if file.is_file() and load_robot(file).name == name:
+            return file
+    if not name:
+        raise ConfigError(f"'{episode}' does not say which robot it shows; name it with --robot")
+    return robot_path(name)
+
+
+def robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, EpisodeSource]:
+    """Returns the robot's YAML (`--robot`, the mapping's, the episode's), and the source."""
+    from mtv_world_ros.data.bag_mapping import load_source
+    from mtv_world_ros.data.episode_reader import read_info
+    from mtv_world_ros.rollout.assembly import robot_path
+
+    source = load_source(arguments.topics, arguments.calibration)
+    name = arguments.robot or (source.mapping.robot if source.mapping else '')
+    return robot_path(name) if name else recorded_robot(path, read_info(path).robot), source
+
+
+def read_for_checks(
+    path: Path,
+    views: Sequence[str] | None,
+    source: EpisodeSource,
+    robot: RobotModel,
+    unknown_mount: str = '',
+    *,
+    with_masks: bool = False,
+) -> Episode:
+    """Returns a recording; with `unknown_mount` its cameras may be unknown."""
+    from mtv_world_ros.data.episode_reader import read_episode
+
+    return read_episode(
+        path,
+        views=views,
+        calibration=source.calibration,
+        with_masks=with_masks,
+        mapping=source.mapping,
+        robot=robot,
+        unknown_mount=unknown_mount,
+    )
+
+
+def _read_all(arguments: argparse.Namespace) -> tuple[list[Episode], Path]:
+    from tqdm import tqdm
+
+    from mtv_world_ros.robot.file import load_robot
+
+    paths = recordings(arguments.episodes)
+    file, source = robot_file(arguments, paths[0])
+    robot = load_robot(file)
+    episodes = [
+        read_for_checks(path, arguments.views, source, robot, robot.base_link)
+        for path in tqdm(paths, desc='reading', unit='ep', disable=None)
+    ]
+    return episodes, file
+
+
+def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_known: bool) -> str:
+    """Returns the table: a line a recording, with its place, the doctor's measures and doubts."""
+    import numpy as np
+
+    view, width = estimate.cameras[0].view, estimate.cameras[0].width
+    how = 'as given' if focal_known or estimate.kept_guess else 'estimated'
+    count = len(set(estimate.places.place.tolist()))
+    focal = f'focal length {estimate.focal_px:.1f} px of {width} ({how}'
+    focal += ')' if focal_known or estimate.kept_guess else f', {_lens(estimate)})'
+    lines = [f"view '{view}': {focal}; {count} places in {len(episodes)} recordings"]
+    if len(estimate.apart_px):
+        lines.append(
+            f'{len(estimate.apart_px)} seen points that were left out: '
+            f'{np.median(estimate.apart_px):.1f} px beside where they are drawn in the median; '
+            f'95 % of tool points are expected within {estimate.within_px:.1f} px'
+        )
+    else:
+        lines.append(
+            'no error is stated: of three or more --points of a recording each third is left out '
+            'of a first fit, and tells it'
+        )
+    if estimate.strays:
+        names = [episode.info.path.name for episode in episodes]
+        lines.append(
+            'look again at seen points that contradict the others, correct them or leave them out '
+            'where a finger is hidden: '
+            + ', '.join(
+                f'{names[point.recording]} at {point.seconds:g} s ({apart:.1f} px)'
+                for point, apart in estimate.strays
+            )
+        )
+    if estimate.kept_guess:
+        lines.append("the guess fits better by the doctor's measure and is kept")
+    for number, episode in enumerate(episodes):
+        x, y, z = estimate.cameras[number].T_mount_camera[:3, 3]
+        measure = estimate.measures[number]
+        parts = [f'place {estimate.places.place[number]}', f'at ({x:.3f}, {y:.3f}, {z:.3f}) m']
+        parts.append(f'fit {estimate.fits[number]:.2f}, match {measure.match_here:.2f}')
+        if estimate.guess_measures:
+            parts.append(f'guess {estimate.guess_measures[number].match_here:.2f}')
+        doubt = estimate.doubts(number)
+        parts += [f'doubted: {doubt}'] if doubt else []
+        lines.append(f'{episode.info.path.name}: {"; ".join(parts)}')
+    return '\n'.join(lines)
+
+
+def _lens(estimate: SharedEstimate) -> str:
+    """What else was found of the lens, or why not."""
+    camera = estimate.cameras[0]
+    stretch = f'fy is {camera.K[1, 1] / camera.K[0, 0]:.3f} fx'
+    if not estimate.bent:
+        return (
+            f'{stretch}; distortion is not: that takes 8 --points, some of them a quarter of the '
+            'width from the middle of the image'
+        )
+    k1 = camera.distortion[0] if len(camera.distortion) else 0.0
+    return f'{stretch}, k1 is {k1:.3f}'
+
+
+def _write(
+    arguments: argparse.Namespace,
+    estimate: SharedEstimate,
+    episodes: Sequence[Episode],
+    robot: RobotModel,
+    parts: Sequence[LinkShape],
+) -> None:
+    """Writes a calibration file and a picture a place, and with `--apply` into the episodes."""
+    from dataclasses import replace
+
+    from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
+    from mtv_world_ros.core.images import write_png
+    from mtv_world_ros.inspection.clocks import JointTrack
+    from mtv_world_ros.inspection.inspect import overlay_picture
+
+    view = estimate.cameras[0].view
+    out = arguments.out or Path('out/camera') / f'{view}.yaml'
+    numbers = estimate.places.place.tolist()
+    several = len(set(numbers)) > 1
+    stem = f'{out.stem}_{view}' if len(arguments.views) > 1 and arguments.out else out.stem
+    for place in dict.fromkeys(numbers):
+        file = out.with_stem(f'{stem}_{place}' if several else stem)
+        known = load_calibration(file) if file.is_file() else {}
+        if view in known and arguments.out is not None:
+            raise ConfigError(f"'{file}' has view '{view}' already; name another --out")
+        first = numbers.index(place)
+        save_calibration(file, {**known, view: estimate.cameras[first]})
+        states = episodes[first].joint_states
+        assert states is not None
+        shown = replace(episodes[first], cameras={view: estimate.cameras[first]})
+        picture = overlay_picture(shown, view, robot, parts, JointTrack(states, robot))
+        write_png(file.with_suffix('.png'), picture)
+        print(f'calibration: {file}\nlook at it: {file.with_suffix(".png")}')
+    if arguments.apply:
+        for episode, camera in zip(episodes, estimate.cameras, strict=True):
+            _apply(episode, camera)
+
+
+def _apply(episode: Episode, camera: CameraModel) -> None:
+    """Adds a view to the calibration of an episode that has none of it."""
+    from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
+    from mtv_world_ros.data.episode import CALIBRATION_FILE
+
+    file = episode.info.path / CALIBRATION_FILE
+    known = load_calibration(file) if file.is_file() else {}
+    if camera.view in known:
+        print(f"'{file}' has view '{camera.view}' already and is left as it is")
+        return
+    save_calibration(file, {**known, camera.view: camera})

@@ -1,0 +1,1 @@
+"""The demo: an episode through the node, scored and shown."""

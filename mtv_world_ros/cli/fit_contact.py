@@ -1,0 +1,104 @@
+"""`mtv-world fit-contact`."""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+
+from mtv_world_ros.cli.shared_options import add_options, names, number_or_0
+from mtv_world_ros.core.files import check_free
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        'fit-contact',
+        help='find how arms follow, friction, weight and grip: what foresight is told',
+        description='Finds how arms follow their commands and how late they do, how high the '
+        'table is, how fingers grip, what rubs and how heavy objects are: the numbers under which '
+        'solids, shaped as the first masks show them, keep nearest to where later masks show '
+        'them. Masks, commands and joint states are all it reads. Says each number with its '
+        'interval and how much it rests on. Numbers that OUT has are where it begins. Writes '
+        'OUT/object_motion/arm_response.json and contact.json, with which a checkpoint foresees '
+        "where objects go. OUT may be the checkpoint's folder.",
+    )
+    parser.add_argument('dataset', type=Path, help='folder with episodes, searched recursively')
+    parser.add_argument(
+        '--checkpoint',
+        '--out',
+        dest='checkpoint',
+        type=Path,
+        required=True,
+        metavar='OUT',
+        help='folder of a checkpoint, or any',
+    )
+    parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
+    parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
+    parser.add_argument('--episodes', type=int, default=50, help='at most; 20 to 50 will do')
+    parser.add_argument('--motions', type=int, default=16, help='that are foreseen later')
+    parser.add_argument(
+        '--threads', type=number_or_0, default=0, help='that foresee; 0 = all but one'
+    )
+    add_options(parser, 'overwrite')
+    parser.set_defaults(handler=_fit)
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from mtv_world_ros.core.processes import threads_each
+    from mtv_world_ros.data.splits import refuse_test_kinds
+    from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
+    from mtv_world_ros.physics.arms import Arms
+    from mtv_world_ros.physics.checkpoint_files import (
+        CONTACT_FILE,
+        load_contact,
+        load_response,
+        save_contact,
+        save_response,
+    )
+    from mtv_world_ros.physics.fitting.contact_fit import (
+        first_settings,
+        fit_contact,
+        read_recordings,
+    )
+    from mtv_world_ros.physics.fitting.response_fit import found_response
+    from mtv_world_ros.robot.file import load_robot
+    from mtv_world_ros.rollout.assembly import robot_path
+    from mtv_world_ros.training.training_run import find_episodes, spread
+
+    folder = arguments.checkpoint / OBJECT_MOTION_FOLDER
+    check_free(folder / CONTACT_FILE, arguments.overwrite)
+    first = load_contact(folder)
+    robot = load_robot(robot_path(arguments.robot))
+    unfitted = Arms(robot, None)
+    likely = first or first_settings(unfitted)
+    likely.replace(num_motions=arguments.motions)  # refused before the work begins
+    paths = spread(find_episodes(arguments.dataset), arguments.episodes)
+    refuse_test_kinds(paths, 'training')
+    response = load_response(folder, robot)
+    if response is None:
+        response, report = found_response(paths, unfitted.robot)
+        print(report)
+    arms = Arms(robot, response)
+    for note in arms.notes:
+        print(note)
+    recordings, skipped = read_recordings(paths, robot, arguments.views)
+    for path, reason in list(skipped.items())[:3]:
+        print(f'left out: {path}: {reason}')
+    settings, _ = fit_contact(
+        recordings,
+        arms,
+        first,
+        threads=arguments.threads or threads_each(1),
+        report=tqdm.write,
+        progress=partial(tqdm, desc='foreseeing', unit='ep', disable=None),
+    )
+    settings = settings.replace(num_motions=arguments.motions)
+    folder.mkdir(parents=True, exist_ok=True)
+    if response is not None:
+        save_response(response, folder)
+    save_contact(settings, folder)
+    print(f'{len(recordings)} episodes, {len(skipped)} left out: {folder / CONTACT_FILE}')
+    return 0

@@ -1,0 +1,101 @@
+"""`mtv-world import-weights`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import shlex
+from typing import Any, TYPE_CHECKING
+
+from mtv_world_ros.core.errors import CheckpointError
+
+if TYPE_CHECKING:
+    from mtv_world_ros.model.wan_weights import PartReport
+
+#: of the paper, Implementation Details
+PROMPT = 'The robotic arm picks up objects from the table and places them'
+#: parts that may lie outside PATH
+_ELSEWHERE = ('autoencoder', 'text_encoder', 'image_encoder', 'tokenizer')
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        'import-weights',
+        help='convert public Wan 2.1 weights into a checkpoint',
+        description='Makes a checkpoint of Wan2.1-Fun-V1.1-Control: every tensor is loaded, new '
+        'and zero, or an error.',
+    )
+    parser.add_argument(
+        'path', type=Path, help="folder in VideoX-Fun's or diffusers' layout, or transformer file"
+    )
+    parser.add_argument('--out', type=Path, required=True, help='the new checkpoint folder')
+    parser.add_argument('--preset', default='wan-1.3b', help='name or YAML file')
+    parser.add_argument(
+        '--prompt', default=PROMPT, help="the instruction; default: the paper's for all tasks"
+    )
+    parser.add_argument(
+        '--guidance-scale', type=float, help="1 = none; default: the preset's sampling"
+    )
+    parser.add_argument('--negative-prompt', help="of guidance; default: the preset's sampling")
+    for part in _ELSEWHERE:
+        option = '--' + part.replace('_', '-')
+        parser.add_argument(option, type=Path, help='file or folder; default: in PATH')
+    parser.set_defaults(handler=_import_weights)
+
+
+def _import_weights(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.robot.file import load_robot
+    from mtv_world_ros.rollout.assembly import robot_path
+    from mtv_world_ros.training.training_config import load_training_config
+
+    if not arguments.path.exists():
+        raise CheckpointError(
+            f"'{arguments.path}' does not exist; name a checkpoint's folder or file"
+        )
+    config = load_training_config(arguments.preset)
+    sampling = config.sampling
+    from mtv_world_ros.model.wan_weights import import_weights
+
+    robot = load_robot(robot_path(config.video.robot))
+    config = config.replace(video=config.video.replace(robot=robot.name))
+
+    text = {
+        'prompt': arguments.prompt,
+        'negative_prompt': _given(arguments.negative_prompt, sampling.negative_prompt),
+        'guidance_scale': _given(arguments.guidance_scale, sampling.guidance_scale),
+    }
+    reports = import_weights(
+        arguments.path,
+        arguments.out,
+        transformer=config.transformer,
+        autoencoder=config.autoencoder,
+        scheduler=config.scheduler,
+        card=config.card({'imported_from': str(arguments.path)}, **text),
+        robot=robot.file,
+        elsewhere={part: getattr(arguments, part) for part in _ELSEWHERE},
+    )
+    for report in reports:
+        print(_line(report))
+    preset, out = shlex.quote(arguments.preset), shlex.quote(str(arguments.out))
+    print(
+        f'checkpoint: {out}\ntrain it with: mtv-world train DATASET --preset {preset} '
+        f'--init {out} --out DIR'
+    )
+    return 0
+
+
+def _given(value: Any, default: Any) -> Any:
+    return default if value is None else value
+
+
+def _line(report: PartReport) -> str:
+    """Summary of the tensors of a part, as text lines."""
+    size = f'{report.loaded} tensors, {report.parameters / 1e6:.1f} M parameters'
+    lines = [f'{report.part}: {size} ({", ".join(report.dtypes)}) from {report.source}']
+    lines += [f'  new, zero: {name}' for name in report.new]
+    reasons: dict[str, int] = {}
+    for reason in report.unused.values():
+        reasons[reason] = reasons.get(reason, 0) + 1
+    lines += [f'  left out: {count} ({reason})' for reason, count in reasons.items()]
+    return '\n'.join(lines)

@@ -1,0 +1,405 @@
+"""`mtv-world train`, and how it scores held-out episodes."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+import math
+from pathlib import Path
+import re
+import shlex
+import shutil
+from typing import Any, TYPE_CHECKING
+
+from mtv_world_ros.cli.shared_options import add_options, number_or_0
+from mtv_world_ros.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    import torch
+
+    from mtv_world_ros.data.bag_mapping import EpisodeSource
+    from mtv_world_ros.training.training_config import TrainingConfig
+    from mtv_world_ros.training.training_run import HeldOut, Judge
+    from mtv_world_ros.viewing.scored_rollout import StoredRollout
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        'train',
+        help='train a world model on a folder of episodes',
+        description='Several processes, GPUs or machines train together when a launcher starts '
+        'it, e.g. torchrun --nproc-per-node 2 -m mtv_world_ros.cli train DATASET --out DIR, or '
+        'accelerate launch --multi_gpu with the same -m. optimizer.batch_size is that of all of '
+        'all processes together: they see the same clips as one process would.',
+    )
+    parser.add_argument('dataset', type=Path, nargs='?', help='left out with --dry-run')
+    parser.add_argument('--out', type=Path, help='resumes what is there')
+    parser.add_argument('--preset', default='small', help='name or YAML file')
+    parser.add_argument('--views', help='e.g. low,high or low; default: those of the preset')
+    parser.add_argument(
+        '--object-mask', choices=('on', 'off'), help='object masks in the trajectory video'
+    )
+    parser.add_argument(
+        '--dry-run', action='store_true', help='print memory and arithmetic of a step, then exit'
+    )
+    parser.add_argument(
+        '--init', help="checkpoint to start from: a folder, 'bundled' or 'bundled-paper'"
+    )
+    parser.add_argument(
+        '--latent-cache',
+        type=Path,
+        metavar='DIR',
+        help="what Wan's autoencoder and CLIP make of clips, computed once and kept; runs may "
+        'share it',
+    )
+    add_options(parser, 'source')
+    parser.add_argument(
+        '--set',
+        action='append',
+        default=[],
+        metavar='SECTION.KEY=VALUE',
+        dest='overrides',
+        help='of the preset, e.g. optimizer.steps=2000',
+    )
+    parser.add_argument(
+        '--episodes', type=int, metavar='N', help='use N episodes, spread evenly over the data set'
+    )
+    parser.add_argument(
+        '--split', help="split of dataset.json, or 'all'; default: train where there is one"
+    )
+    parser.add_argument(
+        '--cache',
+        type=Path,
+        metavar='DIR',
+        help='keeps the decoded recordings; several runs may share it',
+    )
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--device', default='cpu')
+    parser.add_argument(
+        '--doctor',
+        type=Path,
+        metavar='DIR',
+        help='what mtv-world doctor wrote about these episodes; those are left out of which the '
+        'recording or a view that is trained on is broken',
+    )
+    add_options(parser, 'describer segmenter dtype')
+    parser.add_argument(
+        '--threads',
+        type=number_or_0,
+        default=0,
+        help='CPU threads per process; 0 = its share of all cores',
+    )
+    parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
+    parser.add_argument(
+        '--save-minutes',
+        type=float,
+        default=10.0,
+        help='longest time between saved states [min]; Ctrl-C and SIGTERM save, too',
+    )
+    parser.add_argument(
+        '--data-workers',
+        type=int,
+        default=0,
+        metavar='N',
+        help='processes that prepare clips, with segmenters on the CPU; 0 = a thread. The log '
+        'says how long training waited for clips',
+    )
+    parser.add_argument(
+        '--peak-tflops',
+        type=float,
+        default=0.0,
+        metavar='N',
+        help='of a device, for the model-FLOP utilisation in the log; 0 = that of a product of '
+        'large matrices, measured at the start',
+    )
+    parser.add_argument(
+        '--sample-every',
+        type=int,
+        default=0,
+        metavar='STEPS',
+        help='imagine and score held-out episodes, and keep the best as checkpoint-best; 0 = off',
+    )
+    parser.add_argument(
+        '--held-out',
+        type=Path,
+        metavar='DIR',
+        help="data set they are of; default: DATASET. Its split 'val', else 'test'",
+    )
+    parser.add_argument('--held-out-episodes', type=int, default=4, metavar='N')
+    parser.set_defaults(handler=_train)
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.data.splits import select
+    from mtv_world_ros.training.training_config import load_training_config, TrainingRun
+
+    config = load_training_config(arguments.preset, _overrides(arguments))
+    if arguments.dry_run:
+        return _dry_run(config, arguments)
+    if arguments.dataset is None or arguments.out is None:
+        raise ConfigError(
+            'training needs a folder of episodes and a folder for its results: '
+            'mtv-world train DATASET --out DIR; without them only --dry-run works'
+        )
+    from mtv_world_ros.model.card import read_card
+    from mtv_world_ros.rollout.assembly import asked_describer, checkpoint_path, robot_path
+    from mtv_world_ros.vision.segmenters.choose import choose_segmenter
+
+    # importing torch takes seconds: what is often mistyped is checked before
+    if not arguments.dataset.is_dir():
+        select(arguments.dataset)  # says that it holds no episodes
+    if arguments.init:
+        read_card(checkpoint_path(arguments.init))
+    from mtv_world_ros.model.runtime import check_device, choose_dtype
+
+    check_device(arguments.device)
+    from mtv_world_ros.data.bag_mapping import load_source
+    from mtv_world_ros.data.splits import refuse_test_kinds
+    from mtv_world_ros.robot.file import load_robot
+    from mtv_world_ros.training.training_run import train
+
+    source = load_source(arguments.topics, arguments.calibration)
+    dtype = choose_dtype(arguments.dtype, arguments.device)
+    paths = select(arguments.dataset, arguments.split, default='train').paths
+    _use_threads(arguments)
+    refuse_test_kinds(paths, 'training')
+    same = ('out', 'seed', 'device', 'dtype', 'save_every', 'save_minutes', 'cache')
+    same += ('latent_cache', 'data_workers', 'peak_tflops')
+    broken = found_broken(arguments.doctor, paths, config.video.views) if arguments.doctor else {}
+    run = TrainingRun(
+        config=config,
+        dataset=tuple(paths),
+        broken=broken,
+        num_episodes=arguments.episodes,
+        source=source,
+        initial=checkpoint_path(arguments.init) if arguments.init else None,
+        **{name: getattr(arguments, name) for name in same},
+    )
+    folder = train(
+        run,
+        robot=load_robot(robot_path(config.video.robot)),
+        segmenter=choose_segmenter(arguments.segmenter, device=arguments.device),
+        describer=asked_describer(arguments.describer),
+        held_out=_held_out(arguments, paths, dtype, source),
+    )
+    print(f'{f"adapter for {arguments.init}" if config.lora.rank else "checkpoint"}: {folder}')
+    model = [str(arguments.init), '--adapter', str(folder)] if config.lora.rank else [str(folder)]
+    dataset = str(arguments.held_out or arguments.dataset)
+    out = arguments.out / f'evaluation_{read_card(folder).trained_on["steps"]}'
+    words = [model[0], dataset, *model[1:], '--out', str(out)]
+    print(f'evaluate it with: {shlex.join(["mtv-world", "evaluate", *words])}')
+    return 0
+
+
+def found_broken(report: Path, paths: Sequence[Path], views: Sequence[str]) -> dict[str, str]:
+    """Returns why episodes are broken, by path.
+
+    Args:
+        report: folder that `mtv-world doctor` wrote.
+        paths: of the episodes.
+        views: names of those that are trained on; others may be broken.
+
+    Raises:
+        ConfigError: it is no report of these episodes.
+    """
+    from pydantic import TypeAdapter
+
+    from mtv_world_ros.core.bounded_input import read_json
+    from mtv_world_ros.inspection.inspection_report import BROKEN
+
+    try:
+        found = TypeAdapter(dict[str, dict[str, str]]).validate_python(read_json(report / BROKEN))
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"--doctor '{report}': {BROKEN} cannot be read ({error}); mtv-world doctor FOLDER "
+            '--out DIR writes it'
+        ) from error
+    unchecked = [path.name for path in paths if path.name not in found]
+    if unchecked:
+        raise ConfigError(
+            f"--doctor '{report}': {len(unchecked)} of the episodes were not checked, e.g. "
+            f"'{unchecked[0]}'; run mtv-world doctor on the folder again"
+        )
+    parts = {path: {n: t for n, t in found[path.name].items() if n in (*views, 'recording')}
+             for path in paths}  # fmt: skip
+    return {
+        str(path): '; '.join(f'{name}: {text}' for name, text in texts.items())
+        for path, texts in parts.items()
+        if texts
+    }
+
+
+def _use_threads(arguments: argparse.Namespace) -> None:
+    """Lets torch use the threads of `--threads`: 0 = the process's share of the cores."""
+    import os
+
+    import torch
+
+    from mtv_world_ros.core.processes import threads_each
+
+    processes = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
+    torch.set_num_threads(arguments.threads or threads_each(processes))
+
+
+def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Overrides of the preset by options; --set has precedence."""
+    overrides: dict[str, Any] = {}
+    if arguments.views is not None:
+        views = [view.strip() for view in arguments.views.split(',') if view.strip()]
+        if not views:
+            raise ConfigError(f"--views '{arguments.views}' names no view; e.g. --views low,high")
+        overrides |= {'video.views': views, 'transformer.num_views': len(views)}
+    if arguments.object_mask is not None:
+        overrides['video.object_mask'] = arguments.object_mask == 'on'
+    return overrides | set_overrides(arguments.overrides)
+
+
+def set_overrides(items: list[str]) -> dict[str, Any]:
+    """Returns the overrides of `--set SECTION.KEY=VALUE` options.
+
+    Raises:
+        ConfigError: one has no value, or one that is not YAML.
+    """
+    import yaml
+
+    from mtv_world_ros.core.bounded_input import parse_yaml
+
+    overrides: dict[str, Any] = {}
+    for item in items:
+        key, equals, value = item.partition('=')
+        if not equals:
+            raise ConfigError(f"--set '{item}' must look like optimizer.steps=5000")
+        try:
+            is_number = re.fullmatch(r'[+-]?\d+(\.\d*)?[eE][+-]?\d+', value)
+            overrides[key] = float(value) if is_number else parse_yaml(value)  # 4e-4 is a text
+        except yaml.YAMLError:
+            raise ConfigError(f"--set '{item}': {value!r} is not a YAML value") from None
+    return overrides
+
+
+def _dry_run(config: TrainingConfig, arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.model.runtime import choose_dtype
+    from mtv_world_ros.training.dry_run import step_cost
+
+    dtype = choose_dtype(arguments.dtype, arguments.device)
+    video = config.video
+    cost = step_cost(config, dtype=dtype)
+    print(
+        f'{len(video.views)} views of {1 + video.num_frames} frames of '
+        f'{video.width}x{video.height}, batch {config.optimizer.batch_size}, {dtype}'
+    )
+    print('per step, the transformer alone:', *cost.lines(), sep='\n')
+    return 0
+
+
+_SPLITS = ('val', 'test')
+
+
+def _held_out(
+    arguments: argparse.Namespace,
+    trained_on: Sequence[Path],
+    dtype: torch.dtype,
+    source: EpisodeSource,
+) -> HeldOut | None:
+    """Returns the scorer of held-out episodes; None if it is off.
+
+    Raises:
+        ConfigError: there are no held-out episodes, or they are trained on.
+    """
+    if not arguments.sample_every:
+        return None
+    from mtv_world_ros.training.training_run import HeldOut, spread
+
+    paths = spread(_paths(arguments), arguments.held_out_episodes)
+    both = {path.resolve() for path in paths} & {path.resolve() for path in trained_on}
+    if both:
+        raise ConfigError(
+            f"'{min(both)}' and {len(both) - 1} more would be trained on and held out; give "
+            '--held-out another folder, or --split train'
+        )
+    return HeldOut(_judge(arguments, paths, dtype, source), arguments.sample_every)
+
+
+def _paths(arguments: argparse.Namespace) -> Sequence[Path]:
+    from mtv_world_ros.data.splits import select
+
+    dataset = arguments.held_out or arguments.dataset
+    for split in _SPLITS:
+        selection = select(dataset, default=split)
+        if selection.split == split:
+            return selection.paths
+    if arguments.held_out is None:
+        raise ConfigError(
+            f"--sample-every needs held-out episodes, '{dataset}' has no split val or test; give "
+            '--held-out DIR'
+        )
+    return selection.paths
+
+
+def _judge(
+    arguments: argparse.Namespace, paths: Sequence[Path], dtype: torch.dtype, source: EpisodeSource
+) -> Judge:
+    """Returns a function that scores checkpoints by J of moving objects, as `mtv-world evaluate`.
+
+    `OUT/held_out` gets a folder per step, with `metrics.json` and an MP4 per episode.
+    """
+    import torch
+
+    from mtv_world_ros.evaluation.evaluate_episodes import evaluate
+    from mtv_world_ros.evaluation.results import rollout_path
+    from mtv_world_ros.evaluation.settings import EvaluationConfig
+    from mtv_world_ros.model.lora import ADAPTER
+    from mtv_world_ros.rollout.assembly import asked_describer, load_pipeline
+    from mtv_world_ros.training.training_run import HeldOutScores
+    from mtv_world_ros.viewing.stored_rollout import load_rollout
+
+    describer = asked_describer(arguments.describer)
+
+    def judge(checkpoint: Path, step: int) -> HeldOutScores:
+        folder = arguments.out / 'held_out' / f'{step:07d}'
+        is_adapter = (checkpoint / ADAPTER).is_file()
+        pipeline = load_pipeline(
+            arguments.init if is_adapter and arguments.init else checkpoint,
+            adapter=checkpoint if is_adapter else None,
+            device=arguments.device,
+            dtype=str(dtype).removeprefix('torch.'),
+            num_threads=torch.get_num_threads(),  # keep the training's threads
+            segmenter=arguments.segmenter,
+        )
+        summary = evaluate(
+            pipeline,
+            paths,
+            folder,
+            EvaluationConfig(actions=('true',), ceiling=False, source=source),
+            describer=describer,
+            show_progress=False,
+        )
+        for result in summary.results:
+            _show(load_rollout(rollout_path(folder, result.episode)), folder / result.episode)
+        shutil.rmtree(folder / 'episodes')
+        by_view = {None: '', **{view: f'_{view}' for view in pipeline.spec.views}}
+        numbers = {
+            name + suffix: round(estimates[name].value, 4)
+            for view, suffix in by_view.items()
+            for estimates in [summary.estimates(view)]
+            for name in ('j_moving', 'j_copy_moving')
+            if math.isfinite(estimates[name].value)
+        }
+        return HeldOutScores(score=numbers.get('j_moving', math.nan), numbers=numbers)
+
+    return judge
+
+
+def _show(rollout: StoredRollout, path: Path) -> None:
+    """Writes an MP4: recorded, trajectory video and imagined side by side, views below."""
+    import numpy as np
+
+    from mtv_world_ros.core.files import write_whole
+    from mtv_world_ros.viewing.video import encode_video
+
+    columns = [rollout.real, rollout.trajectory, rollout.imagined]
+    rows = np.concatenate(columns, axis=3)  # (V, T, H, 3 * W, 3)
+    frames = np.concatenate(list(rows), axis=1)
+    even = frames[:, : frames.shape[1] // 2 * 2, : frames.shape[2] // 2 * 2]
+    write_whole(path.with_name(f'{path.name}.mp4'), encode_video(even, rollout.fps))

@@ -1,0 +1,1 @@
+"""How a plan enters the model: the trajectory video and what it draws."""

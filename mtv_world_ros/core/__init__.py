@@ -1,0 +1,1 @@
+"""Types, errors, configuration, bounded files and processes that all rooms share."""

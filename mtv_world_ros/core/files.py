@@ -1,0 +1,279 @@
+"""Files that are not code: where bundled ones lie, digests, writing them whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
+import errno
+import fcntl
+import hashlib
+import json
+import math
+import os
+from pathlib import Path
+import re
+import shutil
+import sys
+from typing import Any
+
+from mtv_world_ros.core.errors import ConfigError, nearest
+
+PACKAGE = 'mtv_world_ros'
+
+
+def _candidates() -> list[Path]:
+    source = Path(__file__).resolve().parents[2]
+    roots = [source] if (source / 'package.xml').is_file() else []
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        roots.append(Path(get_package_share_directory(PACKAGE)))
+    except (ImportError, LookupError, OSError):
+        pass
+    return [*roots, Path(sys.prefix) / 'share' / PACKAGE]
+
+
+def share_path(*parts: str) -> Path:
+    """Returns the path of a bundled file or folder.
+
+    Looks in the source tree, then in the ament share folder, then in the pip prefix.
+
+    Raises:
+        ConfigError: none of them holds it.
+    """
+    roots = _candidates()
+    for root in roots:
+        path = root.joinpath(*parts)
+        if path.exists():
+            return path
+    searched = ', '.join(str(root) for root in roots)
+    wanted = '/'.join(parts)
+    raise ConfigError(f"'{wanted}' is not among the installed files; looked in {searched}")
+
+
+def bundled(kind: str, name: str | Path, setting: str) -> Path:
+    """Returns the YAML file of `config/<kind>` with this name, or `name` if it is a YAML path.
+
+    Raises:
+        ConfigError: there is no such file; names the nearest known one and `setting`.
+    """
+    path = Path(name)
+    if path.suffix in ('.yaml', '.yml'):
+        return path
+    folder = share_path('config', kind)
+    known = sorted(file.stem for file in folder.glob('*.yaml'))
+    if str(name) not in known:
+        raise ConfigError(
+            f"'{name}' is not in config/{kind}{nearest(str(name), known)}; set '{setting}' to a "
+            f'YAML file or to one of {", ".join(known)}'
+        )
+    return folder / f'{name}.yaml'
+
+
+def content_digest(folder: Path, without: Collection[str] = ()) -> str:
+    """Returns the SHA-256 of a folder's files, or of one: other names or contents, another digest.
+
+    Args:
+        folder: searched recursively; or a file.
+        without: names of files to leave out.
+    """
+    digest = hashlib.sha256()
+    paths = [folder] if folder.is_file() else folder.rglob('*')
+    files = (path for path in paths if path.is_file() and path.name not in without)
+    for file in sorted(files):
+        digest.update(file.relative_to(folder).as_posix().encode())
+        with file.open('rb') as opened:
+            while block := opened.read(2**24):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def check_free(path: Path, overwrite: bool, instead: str = '--out') -> None:
+    """Refuses to replace an existing file or folder unless the user asked for it.
+
+    Args:
+        path: file or folder that would be written; an empty folder counts as free.
+        overwrite: the user asked for it.
+        instead: option that names another place.
+
+    Raises:
+        ConfigError: the path exists.
+    """
+    is_free = not any(path.iterdir()) if path.is_dir() else not path.exists()
+    if not (overwrite or is_free):
+        raise ConfigError(f"'{path}' exists; give another {instead}, or --overwrite to replace it")
+
+
+def check_room(folder: Path, num_bytes: int) -> None:
+    """Checks the free space of a folder's disk before processes write to it; makes the folder.
+
+    Raises:
+        OSError: the disk has less.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    free = shutil.disk_usage(folder).free
+    if free < num_bytes:
+        text = f'{os.strerror(errno.ENOSPC)}: {free} bytes are free, {num_bytes} are needed'
+        raise OSError(errno.ENOSPC, text, str(folder))
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Writes a JSON file; NaN becomes null."""
+    write_whole(path, json.dumps(plain(values), indent=1, allow_nan=False) + '\n')
+
+
+def plain(value: Any) -> Any:
+    """Returns what JSON can hold: NaN as None, tuples as lists, floats to 6 digits."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return round(value, 6) if math.isfinite(value) else None
+    return value
+
+
+def write_whole(path: Path, content: bytes | str) -> None:
+    """Writes a file beside its name and renames it, in a folder that is made where it is missing.
+
+    Args:
+        path: the file; what was there before stays until the new content is complete.
+        content: text is written as UTF-8.
+
+    Raises:
+        OSError: the file cannot be written; the old one is untouched.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, f"'{path}' is a folder; name a file")
+    data = content.encode() if isinstance(content, str) else content
+    beside = _own_name(path, _NEW)  # others may write the same file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        beside.write_bytes(data)
+        beside.replace(path)
+    except BaseException:  # a signal, too
+        beside.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """Yields an empty folder that gets the name `folder` when the block ends without an error.
+
+    A folder of that name stays until then. What is written has a hidden name of its own beside it,
+    `.<folder>.mtv-new-<process>`, and what is replaced, `.<folder>.mtv-old-<process>`; nothing
+    else is touched. What a killed process left under those names is tidied up by the next call;
+    see `recover_folder`.
+
+    Raises:
+        OSError: the folder cannot be written; the old one is untouched.
+    """
+    folder = Path(os.path.realpath(folder))  # a link stays a link
+    recover_folder(folder)
+    new, old, waste = (_own_name(folder, word) for word in _WORDS)
+    new.mkdir(parents=True)
+    with _locked(new):
+        try:
+            yield new
+            for file in new.rglob('*'):
+                if file.is_file():
+                    with file.open('rb') as stream:
+                        os.fsync(stream.fileno())  # the disk has its content before its name
+            if folder.exists():
+                with _locked(folder):
+                    folder.rename(old)
+                    new.rename(folder)
+                    old.rename(waste)
+            else:
+                new.rename(folder)
+        except BaseException:
+            shutil.rmtree(new, ignore_errors=True)  # room for what is written next
+            if old.exists() and not folder.exists():
+                old.rename(folder)
+            raise
+    shutil.rmtree(waste, ignore_errors=True)
+
+
+def recover_folder(folder: Path) -> None:
+    """Tidies up what a process left that was killed while it wrote a folder by `whole_folder`.
+
+    A folder that was replaced, while the new one did not get its name, is renamed back. What
+    living processes write is left alone. Earlier versions left `<folder>.old` and, complete,
+    `<folder>.partial`: where both hold files of the same names and `folder` is missing, the first
+    is renamed back. Otherwise either may be somebody else's.
+    """
+    folder = Path(os.path.realpath(folder))
+    abandoned = [path for path in _own_folders(folder) if _is_abandoned(path)]
+    old = [path for path in abandoned if f'.{_OLD}-' in path.name]
+    if old and not folder.exists():
+        newest = max(old, key=lambda path: path.stat().st_mtime_ns)
+        newest.rename(folder)
+        abandoned.remove(newest)
+    for path in abandoned:
+        shutil.rmtree(path, ignore_errors=True)
+    earlier, partial = (folder.with_name(f'{folder.name}.{word}') for word in ('old', 'partial'))
+    if not folder.exists() and _names_in(earlier) == _names_in(partial) != set():
+        earlier.rename(folder)
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+#: words in the hidden names beside a folder: being written, replaced, to be removed
+_WORDS = _NEW, _OLD, _WASTE = 'mtv-new', 'mtv-old', 'mtv-waste'
+
+
+def _own_name(path: Path, word: str) -> Path:
+    """A hidden name beside a file or folder, of this package and process."""
+    return path.with_name(f'.{path.name}.{word}-{os.getpid()}')
+
+
+def _own_folders(folder: Path) -> list[Path]:
+    """The folders beside one that `whole_folder` made for it."""
+    name = re.compile(rf'\.{re.escape(folder.name)}\.({"|".join(_WORDS)})-\d+')
+    try:
+        beside = sorted(folder.parent.iterdir())
+    except FileNotFoundError:
+        return []
+    return [path for path in beside if name.fullmatch(path.name) and path.is_dir()]
+
+
+def _names_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Holds a folder's lock, which ends with the process; a file system may have no locks."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _is_abandoned(folder: Path) -> bool:
+    """True if no process of this machine writes the folder any more."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # no locks there: the number says who made it
+        return not _is_running(int(folder.name.rpartition('-')[2]))
+    finally:
+        os.close(descriptor)
+    return True
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # somebody else's process
+        return True
+    return pid != os.getpid()

@@ -1,0 +1,60 @@
+"""Images: resized the same everywhere, encoded as JPEG and PNG, written as files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.files import write_whole
+
+
+def resize_frames(frames: ByteArray, width: int, height: int) -> ByteArray:
+    """Returns (N, height, width, 3) frames; shrinking averages over areas."""
+    if frames.shape[1:3] == (height, width):
+        return frames
+    shrinks = height <= frames.shape[1] and width <= frames.shape[2]
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.stack([cv2.resize(f, (width, height), interpolation=method) for f in frames])
+
+
+def resize_labels(labels: ByteArray, width: int, height: int) -> ByteArray:
+    """Returns (N, height, width) label images, nearest pixel."""
+    if labels.shape[1:] == (height, width):
+        return labels
+    return np.stack(
+        [cv2.resize(x, (width, height), interpolation=cv2.INTER_NEAREST_EXACT) for x in labels]
+    )
+
+
+def encode_jpeg(rgb: ByteArray, quality: int) -> bytes:
+    """Returns the JPEG file of an (H, W, 3) RGB image.
+
+    Raises:
+        EpisodeError: the image is too large.
+    """
+    return _encode('.jpg', rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def encode_png(image: ByteArray) -> bytes:
+    """Returns the PNG file of an (H, W, 3) RGB or (H, W) image.
+
+    Raises:
+        EpisodeError: the image has no pixels.
+    """
+    return _encode('.png', image[..., ::-1] if image.ndim == 3 else image, [])
+
+
+def write_png(path: Path, image: ByteArray) -> None:
+    """Writes an (H, W, 3) RGB picture beside its name and renames it."""
+    write_whole(path, encode_png(image))
+
+
+def _encode(extension: str, image: ByteArray, options: list[int]) -> bytes:
+    encoded, data = cv2.imencode(extension, np.ascontiguousarray(image), options)
+    if not encoded:
+        raise EpisodeError(f'an image of shape {image.shape} cannot be encoded as {extension}')
+    return data.tobytes()

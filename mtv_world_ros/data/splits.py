@@ -1,0 +1,239 @@
+"""Which episodes of a data set are used: its splits, and the fault kinds of what acted in them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ValidationError
+
+from mtv_world_ros.core.bounded_input import read_json
+from mtv_world_ros.core.entry_points import policy_kind
+from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest, PolicyError
+from mtv_world_ros.data.episode import EpisodeInfo, NOMINAL, PHYSICS
+from mtv_world_ros.data.episode_reader import list_episodes, read_info
+
+#: keys of an episode's metadata: what acted, and the splits of its fault kinds
+POLICY, FAULT_SPLIT = 'policy', 'fault_split'
+#: kind of policies, and what their names begin with
+_SCRIPTED, _EXPERT = 'scripted', 'expert'
+#: fault kinds of this split are for rankings alone
+_TEST = 'test'
+
+
+def recorded_policy(path: Path) -> str:
+    """Returns the scripted policy of an episode; empty = another one, or not recorded.
+
+    Raises:
+        EpisodeError: the episode's metadata cannot be used.
+    """
+    name = read_info(path).metadata.get(POLICY, '')
+    return name if name.split('-')[0] == _EXPERT else ''
+
+
+def recorded_kinds(paths: Iterable[Path]) -> dict[Path, tuple[str, ...]]:
+    """Returns the fault kinds of episodes of scripted policies.
+
+    Raises:
+        ConfigError: the simulator, which knows scripted policies, is not installed.
+        EpisodeError: the metadata of an episode cannot be used.
+        PolicyError: a policy has an unknown fault.
+    """
+    named = {Path(path): recorded_policy(path) for path in paths}
+    scripted = {path: policy for path, policy in named.items() if policy}
+    if not scripted:
+        return {}
+    kind = policy_kind(_SCRIPTED)
+    return {path: kind.fault_kinds(policy) for path, policy in scripted.items()}
+
+
+def refuse_test_kinds(paths: Iterable[Path], what: str) -> None:
+    """Refuses episodes of policies with faults of the split `test`.
+
+    Args:
+        paths: folders of episodes.
+        what: purpose that such episodes are refused for, e.g. `training`.
+
+    Raises:
+        ConfigError: an earlier episode names a policy alone, and the simulator, which knows its
+            faults, is not installed.
+        EpisodeError: the metadata of an episode cannot be used.
+        PolicyError: names the policies and their kinds.
+    """
+    read = [read_info(path).metadata for path in paths]
+    of_test = {m.get(POLICY, '') for m in read if _TEST in m.get(FAULT_SPLIT, '').split(',')}
+    if of_test:
+        raise PolicyError(
+            f'fault kinds of the split {_TEST} are not for {what}: policies of these episodes '
+            f'have some: {", ".join(sorted(of_test))}; leave the episodes out'
+        )
+    # earlier episodes do not say it: the name does
+    names = {m.get(POLICY, '') for m in read if FAULT_SPLIT not in m}
+    scripted = sorted(name for name in names if name.split('-')[0] == _EXPERT)
+    if scripted:
+        policy_kind(_SCRIPTED).refuse_test_kinds(scripted, what)
+
+
+#: describes a data set; `mtv-world collect` writes it
+CARD_FILE = 'dataset.json'
+EVERY = 'all'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Selection:
+    """Episodes to score.
+
+    Attributes:
+        paths: their folders.
+        split: of the chosen episodes; `all` where the data set has no splits.
+        zero_shot: by folder what the model was not trained for, where the data set says so.
+        num_in_dataset: number of episodes in the data set.
+    """
+
+    paths: Sequence[Path]
+    split: str
+    zero_shot: Mapping[Path, str]
+    num_in_dataset: int
+
+    def __str__(self) -> str:
+        return f'{len(self.paths)} of {self.num_in_dataset} episodes, split {self.split}'
+
+
+def select(
+    dataset: Path, split: str | None = None, limit: int | None = None, *, default: str = 'test'
+) -> Selection:
+    """Returns the episodes of a split.
+
+    Args:
+        dataset: folder with episode folders in it; its `dataset.json`, if there is one, names the
+            splits and, per episode, `zero_shot`: `view`, `task` or `object`.
+        split: name of a split, or `all`; None = `default` where the data set has it, else `all`.
+        limit: only the first so many of them.
+        default: see `split`.
+
+    Raises:
+        EpisodeError: the folder holds no episodes, or none of the split.
+        ConfigError: no such split, the card cannot be read, or siblings are not of one scene or
+            not in one split.
+    """
+    found = list_episodes(dataset)
+    if not found:
+        raise EpisodeError(
+            f"'{dataset}' holds no episodes (folders with metadata.yaml and an .mcap); record "
+            "some with 'ros2 bag record -s mcap' or 'mtv-world collect'"
+        )
+    card = _card(dataset)
+    _check_siblings(dataset, card)
+    if split is None:
+        split = default if card.splits.get(default) else EVERY
+    names = _names(dataset, card.splits, split)
+    paths = [path for path in found if names is None or path.name in names][:limit]
+    if not paths:
+        raise EpisodeError(f"split '{split}' of '{dataset}' has no episodes in the folder")
+    marks = {entry.name: entry.zero_shot or '' for entry in card.episodes}
+    return Selection(
+        paths=paths,
+        split=split,
+        zero_shot={path: marks[path.name] for path in paths if marks.get(path.name)},
+        num_in_dataset=len(found),
+    )
+
+
+def of_physics(selection: Selection, physics: str | None = None) -> tuple[Selection, str]:
+    """Returns the episodes of one physics, and what is true in them, in words.
+
+    Args:
+        selection: episodes to choose from.
+        physics: as `collect --physics` named it; None = all of them.
+
+    Raises:
+        ConfigError: no episode is of this physics.
+    """
+    found = {path: _physics(read_info(path)) for path in selection.paths}
+    if physics is None:
+        counts = Counter(found.values())
+        return selection, ', '.join(f'{name} ({num})' for name, num in counts.most_common())
+    paths = [path for path, name in found.items() if name == physics]
+    if not paths:
+        known = sorted(set(found.values()))
+        raise ConfigError(
+            f"no episode is of the physics '{physics}'{nearest(physics, known)} (--physics); "
+            f'there are {", ".join(known)}'
+        )
+    return replace(selection, paths=paths), f'{physics} ({len(paths)})'
+
+
+def _physics(info: EpisodeInfo) -> str:
+    """What is true in an episode; the simulator's older ones do not say it."""
+    usual = NOMINAL if info.seed is not None else 'not stated'
+    return info.metadata.get(PHYSICS, usual)
+
+
+class _Entry(BaseModel):
+    """An episode in `dataset.json`: its name, what is zero-shot in it, scene and seed if any."""
+
+    name: str
+    scene: Annotated[str, BeforeValidator(lambda given: given or '')] = ''
+    zero_shot: Any = None
+    seed: Any = None
+
+
+class _Card(BaseModel):
+    """What is read of `dataset.json`; it has more."""
+
+    splits: dict[str, list[str]] = {}
+    episodes: list[_Entry] = []
+
+
+def _card(dataset: Path) -> _Card:
+    file = dataset / CARD_FILE
+    if not file.is_file():
+        return _Card()
+    try:
+        card = read_json(file)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"'{file}' is not a data set card: {error}") from error
+    try:
+        return _Card.model_validate(card)
+    except ValidationError as error:
+        raise ConfigError(
+            f"'{file}' is not a data set card: 'splits' or 'episodes' are not as 'mtv-world "
+            "collect' writes them"
+        ) from error
+
+
+def _check_siblings(dataset: Path, card: _Card) -> None:
+    """Refuses siblings of different scenes, and of different splits."""
+    places = {name: split for split, names in card.splits.items() for name in names}
+    firsts: dict[str, _Entry] = {}
+    for entry in card.episodes:
+        if not entry.scene:
+            continue
+        first = firsts.setdefault(entry.scene, entry)
+        names = f"'{first.name}' and '{entry.name}' of '{dataset}'"
+        if first.seed != entry.seed:
+            raise ConfigError(
+                f'{names} are called siblings of scene {entry.scene}, but their scenes are drawn '
+                f'from the seeds {first.seed} and {entry.seed}; siblings share a seed'
+            )
+        if places.get(first.name) != places.get(entry.name):
+            raise ConfigError(
+                f'{names} are siblings, but in the splits {places.get(first.name)} and '
+                f'{places.get(entry.name)}; keep the siblings of a scene in one split'
+            )
+
+
+def _names(dataset: Path, splits: Mapping[str, Any], split: str) -> set[str] | None:
+    """Names of a split's episodes; None = all."""
+    if split == EVERY:
+        return None
+    if split not in splits:
+        known = [*splits, EVERY]
+        raise ConfigError(
+            f"split '{split}'{nearest(split, known)} is not one of '{dataset}', which has "
+            f'{", ".join(known)}'
+        )
+    return set(splits[split])

@@ -1,0 +1,1 @@
+"""Scores of predictions against recordings, and fits of the success estimate."""

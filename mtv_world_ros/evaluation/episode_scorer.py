@@ -1,0 +1,366 @@
+"""Scores one episode: imagines its stretches, segments, compares, keeps what reports need."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+import time
+
+import numpy as np
+
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.errors import MtvWorldError
+from mtv_world_ros.data.recording import load_recording, Recording
+from mtv_world_ros.evaluation.imagined_stretches import (
+    imagine_stretch,
+    last_chunk,
+    observe_stretch,
+    predicted_frames,
+    Stretch,
+    stretches,
+)
+from mtv_world_ros.evaluation.metrics.arm_masks import arm_scenes, ArmScene
+from mtv_world_ros.evaluation.metrics.feature_store import feature_path, FeatureTaker
+from mtv_world_ros.evaluation.metrics.image_quality import ImageQuality
+from mtv_world_ros.evaluation.metrics.jaccard_scores import (
+    find_masks,
+    score_frames,
+    score_rows,
+    ScoreRow,
+    true_masks,
+    Truth,
+)
+from mtv_world_ros.evaluation.metrics.object_scores import object_scores, ObjectScores
+from mtv_world_ros.evaluation.metrics.picture_scores import (
+    HELD,
+    picture_scores,
+    RECORDED,
+    SHUFFLED,
+)
+from mtv_world_ros.evaluation.references import Reconstruct, with_actions
+from mtv_world_ros.evaluation.results import EpisodeResult, rollout_path, stored_stretch
+from mtv_world_ros.evaluation.settings import EvaluationConfig
+from mtv_world_ros.robot.shape import load_shape, RobotShape
+from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.rollout.prediction import Prediction
+from mtv_world_ros.viewing.scored_rollout import StoredRollout
+from mtv_world_ros.viewing.stored_rollout import join, save_rollout
+
+#: what the time of an episode goes into
+STAGES = ('reading', 'imagining', 'segmenting', 'scoring', 'features', 'storing')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluationJob:
+    """One episode to score.
+
+    Attributes:
+        path: its folder.
+        name: of its results, unique in the evaluation.
+        donor: the episode that lends its actions, if there is one.
+        zero_shot: what the model was not trained for in it: `view`, `task`, `object`; or empty.
+        objects: names of its objects; empty = the pipeline's, or recorded, or named by the task.
+    """
+
+    path: Path
+    name: str
+    donor: Path | None = None
+    zero_shot: str = ''
+    objects: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Instruments:
+    """What episodes are measured with; None = not measured.
+
+    Attributes:
+        pipeline: imagines and segments.
+        reconstruct: the autoencoder's round trip, for the ceiling.
+        quality: PSNR, SSIM, LPIPS.
+        features: for FID and FVD.
+    """
+
+    pipeline: Pipeline
+    reconstruct: Reconstruct | None = None
+    quality: ImageQuality | None = None
+    features: FeatureTaker | None = None
+
+
+@dataclass(slots=True)
+class _Found:
+    """What is gathered over the stretches of an episode."""
+
+    rows: list[ScoreRow] = field(default_factory=list)
+    shown: list[StoredRollout] = field(default_factory=list)
+    quality: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
+    pictures: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
+    scenes: list[ArmScene | None] = field(default_factory=list)
+    notes: dict[str, None] = field(default_factory=dict)
+    chunk_seconds: list[float] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] += time.perf_counter() - begun
+
+
+class EpisodeScorer:
+    """Scores episodes with the same instruments, and keeps the last two recordings that it read.
+
+    Rollouts and features go into `out/episodes`.
+    """
+
+    def __init__(self, instruments: Instruments, config: EvaluationConfig, out: Path) -> None:
+        self.instruments, self.config, self.out = instruments, config, out
+        self.pipeline = instruments.pipeline
+        self._load = lru_cache(maxsize=2)(self._read)
+
+    def score(self, job: EvaluationJob) -> EpisodeResult:
+        """Imagines and scores an episode.
+
+        Raises:
+            MtvWorldError: the episode cannot be read or imagined.
+        """
+        found = _Found()
+        with found.timed('reading'):
+            recording, donor = self._load(job.path), self._donor(job)
+            if self._shape.is_known:
+                found.scenes += arm_scenes(recording, self.pipeline.robot, self._shape.parts)
+        found.notes.update(dict.fromkeys(recording.warnings))
+        features = self.instruments.features and self.instruments.features.start()
+        success, observed, resumed = None, {}, {}
+        names = job.objects or self.pipeline.objects or recording.names
+        for stretch in stretches(recording, self.pipeline.spec, self.config.mode):
+            chunks = self._stretch(recording, stretch, donor, names, found)
+            success = chunks[-1].success
+            if self.config.observed:
+                with found.timed('segmenting'):
+                    pipeline = replace(self.pipeline, objects=names)
+                    observed = observe_stretch(pipeline, recording, stretch).features
+                last = last_chunk(recording, stretch, pipeline.spec)
+                if last is not None:
+                    chunk = self._imagine(recording, last, recording, names, found)[-1]
+                    resumed = chunk.success.features
+            if features:
+                with found.timed('features'):
+                    features.add(predicted_frames(chunks), stretch.frames[:, 1:])
+        with found.timed('storing'):
+            save_rollout(rollout_path(self.out, job.name), join(found.shown))
+            if features:
+                features.save(feature_path(self.out, job.name))
+        return EpisodeResult(
+            episode=job.name,
+            task=recording.task,
+            zero_shot=job.zero_shot,
+            outcome=recording.outcome,
+            rows=tuple(found.rows),
+            quality=_mean_quality(found.quality),
+            pictures=_mean_quality(found.pictures),
+            probability=success.probability if success else np.nan,
+            reasons=success.reasons if success else (),
+            features=dict(success.features) if success else {},
+            observed=dict(observed),
+            resumed=dict(resumed),
+            notes=tuple(found.notes),
+            seconds_per_chunk=float(np.mean(found.chunk_seconds)),
+            seconds=found.seconds,
+            has_ids=recording.object_ids is not None and not recording.masks_by,
+        )
+
+    def _read(self, path: Path) -> Recording:
+        pipeline = self.pipeline
+        return load_recording(path, pipeline.spec, pipeline.robot, source=self.config.source)
+
+    def _donor(self, job: EvaluationJob) -> Recording | None:
+        """The episode that lends its actions; None if there is none that can be read."""
+        if job.donor is None or 'shuffled' not in self.config.actions:
+            return None
+        try:
+            return self._load(job.donor)
+        except MtvWorldError:  # listed with its reason when its own turn comes
+            return None
+
+    def _stretch(
+        self,
+        recording: Recording,
+        stretch: Stretch,
+        donor: Recording | None,
+        names: tuple[str, ...],
+        found: _Found,
+    ) -> list[Prediction]:
+        """Imagines and scores one stretch; returns its chunks."""
+        chunks = self._imagine(
+            recording, stretch, recording, names, found, num_seeds=self.config.num_seeds
+        )
+        found.chunk_seconds += [sum(chunk.seconds.values()) for chunk in chunks]
+        frames, real = predicted_frames(chunks), stretch.frames[:, 1:]
+        with found.timed('segmenting'):
+            truth = true_masks(
+                stretch,
+                self.pipeline.segmenter,
+                names,
+                recording.objects,
+                use_ids=self.config.use_ids,
+            )
+            masks = find_masks(frames, truth, self.pipeline.segmenter)
+        with found.timed('scoring'):
+            predicted = object_scores(masks, truth.masks)
+        others, shuffled = self._controls(recording, stretch, donor, truth, found)
+        others |= self._ceilings(stretch, truth, found)
+        views = self.pipeline.spec.views
+        with found.timed('scoring'):
+            found.rows += score_rows(stretch, views, truth, predicted, others, masks)
+        with found.timed('features'):
+            found.quality.append((stretch.num_frames, self._quality(frames, real)))
+            pictures = self._pictures(stretch, frames, shuffled, found.scenes)
+            found.pictures.append((stretch.num_frames, pictures))
+        stored = stored_stretch(
+            chunks,
+            stretch,
+            start_seconds=float(recording.times[stretch.start]),
+            fps=self.pipeline.spec.fps,
+            true_masks=truth.masks,
+            masks=masks,
+            j=predicted.frames,
+        )
+        found.shown.append(stored)
+        return chunks
+
+    def _imagine(
+        self,
+        recording: Recording,
+        stretch: Stretch,
+        actions: Recording,
+        names: tuple[str, ...],
+        found: _Found,
+        num_seeds: int = 1,
+    ) -> list[Prediction]:
+        with found.timed('imagining'):
+            chunks = imagine_stretch(
+                replace(self.pipeline, objects=names),
+                recording,
+                stretch,
+                actions=actions,
+                seed=self.config.seed + 1000 * stretch.index,
+                num_inference_steps=self.config.num_inference_steps,
+                num_seeds=num_seeds,
+            )
+        stages = ('start masks', 'masks')
+        masks = sum(chunk.seconds.get(stage, 0.0) for chunk in chunks for stage in stages)
+        found.seconds['imagining'] -= masks
+        found.seconds['segmenting'] += masks
+        return chunks
+
+    def _controls(
+        self,
+        recording: Recording,
+        stretch: Stretch,
+        donor: Recording | None,
+        truth: Truth,
+        found: _Found,
+    ) -> tuple[dict[str, ObjectScores], ByteArray | None]:
+        """Scores under other actions, where anything moves; what the robot cannot do is noted.
+
+        Shuffled actions are imagined in any case: their frames are returned beside.
+        """
+        scores: dict[str, ObjectScores] = {}
+        shuffled = None
+        moves = truth.moving.any()
+        for name in self.config.actions if moves else {SHUFFLED} & {*self.config.actions}:
+            try:
+                actions = with_actions(name, recording, stretch, donor)
+                if name == 'true' or actions is None:
+                    continue
+                chunks = self._imagine(recording, stretch, actions, truth.names, found)
+            except MtvWorldError as error:
+                found.notes[f'{name} actions were not imagined: {error}'] = None
+                continue
+            frames = predicted_frames(chunks)
+            shuffled = frames if name == SHUFFLED else shuffled
+            if moves:
+                scores[name] = self._scored(frames, truth, found)
+        return scores, shuffled
+
+    def _pictures(
+        self,
+        stretch: Stretch,
+        frames: ByteArray,
+        shuffled: ByteArray | None,
+        scenes: Sequence[ArmScene | None],
+    ) -> dict[str, dict[str, float]]:
+        """Picture scores by view: imagined, first frame held, shuffled commands, recorded."""
+        held = np.repeat(stretch.frames[:, :1], frames.shape[1], axis=1)
+        compared = {'': frames, f'_{HELD}': held}
+        compared |= {} if shuffled is None else {f'_{SHUFFLED}': shuffled}
+        scores = {
+            view: {
+                f'{name}{suffix}': value
+                for suffix, shown in compared.items()
+                for name, value in picture_scores(
+                    shown[v], stretch.frames[v, 1:], stretch.frames[v, 0]
+                ).items()
+            }
+            for v, view in enumerate(self.pipeline.spec.views)
+        }
+        compared[f'_{RECORDED}'] = stretch.frames[:, 1:]
+        for v, (numbers, scene) in enumerate(zip(scores.values(), scenes, strict=False)):
+            if scene is not None:
+                masks = scene.masks(stretch.positions[1:])
+                for suffix, shown in compared.items():
+                    numbers[f'j_arm{suffix}'] = masks.jaccard(shown[v])
+        return scores
+
+    @cached_property
+    def _shape(self) -> RobotShape:
+        return load_shape(self.pipeline.robot)
+
+    def _ceilings(self, stretch: Stretch, truth: Truth, found: _Found) -> dict[str, ObjectScores]:
+        """Scores of the recorded frames: as they are, and through the autoencoder."""
+        if not self.config.ceiling:
+            return {}
+        scores = {'self': self._scored(stretch.frames[:, 1:], truth, found)}
+        if self.instruments.reconstruct is not None:
+            with found.timed('imagining'):
+                back = self.instruments.reconstruct(stretch.frames)
+            scores['ceiling'] = self._scored(back, truth, found)
+        return scores
+
+    def _scored(self, frames: ByteArray, truth: Truth, found: _Found) -> ObjectScores:
+        with found.timed('segmenting'):
+            return score_frames(frames, truth, self.pipeline.segmenter)
+
+    def _quality(self, frames: ByteArray, real: ByteArray) -> dict[str, dict[str, float]]:
+        measure = self.instruments.quality
+        if measure is None:
+            return {}
+        each = enumerate(self.pipeline.spec.views)
+        return {view: measure(frames[v], real[v]) for v, view in each}
+
+
+def _mean_quality(
+    stretches: Sequence[tuple[int, dict[str, dict[str, float]]]],
+) -> dict[str, dict[str, float]]:
+    """Means over the stretches of an episode by view; frames weigh equally, NaN counts nothing."""
+    found: dict[str, dict[str, float]] = {}
+    for view in stretches[0][1]:
+        names = dict.fromkeys(name for _, numbers in stretches for name in numbers[view])
+        found[view] = {
+            name: _weighted(
+                [(count, numbers[view].get(name, np.nan)) for count, numbers in stretches]
+            )
+            for name in names
+        }
+    return found
+
+
+def _weighted(values: Sequence[tuple[int, float]]) -> float:
+    known = [(count, value) for count, value in values if np.isfinite(value)]
+    total = sum(count for count, _ in known)
+    return sum(count * value for count, value in known) / total if total else float('nan')

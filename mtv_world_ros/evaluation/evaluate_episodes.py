@@ -1,0 +1,303 @@
+"""Scores a pipeline on recorded episodes: J per view and object, baselines, intervals."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from mtv_world_ros.core.bounded_input import read_json
+from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
+from mtv_world_ros.core.files import plain, write_json
+from mtv_world_ros.core.processes import threads_each
+from mtv_world_ros.core.worker_pool import score_all
+from mtv_world_ros.data.recordings import described_objects
+from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, EvaluationJob, Instruments
+from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, Group
+from mtv_world_ros.evaluation.metrics.feature_store import (
+    distances,
+    feature_path,
+    FeatureTaker,
+    load_features,
+)
+from mtv_world_ros.evaluation.metrics.frechet_features import clip_features, frame_features
+from mtv_world_ros.evaluation.metrics.image_quality import image_quality
+from mtv_world_ros.evaluation.metrics.statistics import Estimate
+from mtv_world_ros.evaluation.references import round_trip
+from mtv_world_ros.evaluation.result_settings import check_same_settings
+from mtv_world_ros.evaluation.results import EpisodeResult
+from mtv_world_ros.evaluation.settings import EvaluationConfig
+from mtv_world_ros.evaluation.tables import write_summary
+from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.vision.describers.describer import Describer
+from mtv_world_ros.vision.jaccard import mean_of_known
+
+DEFAULTS = EvaluationConfig()
+#: makes the pipeline anew, in another process
+MakePipeline = Callable[[], Pipeline]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parallel:
+    """How many processes score episodes.
+
+    Attributes:
+        workers: processes.
+        make_pipeline: makes the same pipeline in each of them; has to be picklable.
+        threads: of each process; 0 = the cores shared evenly.
+    """
+
+    workers: int
+    make_pipeline: MakePipeline
+    threads: int = 0
+
+
+def evaluate(
+    pipeline: Pipeline,
+    episode_paths: Sequence[Path],
+    out: Path,
+    config: EvaluationConfig = DEFAULTS,
+    *,
+    name: str = '',
+    label: str = '',
+    zero_shot: Mapping[Path, str] = MappingProxyType({}),
+    provenance: Mapping[str, str] = MappingProxyType({}),
+    parallel: Parallel | None = None,
+    describer: Describer | None = None,
+    overwrite: bool = False,
+    show_progress: bool = True,
+) -> EvaluationSummary:
+    """Scores a pipeline and writes `metrics.json`, `rows.csv` and `tables.md`.
+
+    Episodes that were scored before with the same settings are taken from `out/episodes`.
+    Episodes that cannot be used are listed with their reason.
+
+    Args:
+        pipeline: imagines and segments.
+        episode_paths: folders of recorded episodes.
+        out: folder of the results.
+        config: stretches to imagine and scores to compute.
+        name: fingerprint of the checkpoint; only results of the same name are taken over, and none
+            without a name.
+        label: name of its rows in tables that compare checkpoints.
+        zero_shot: by path what the model was not trained for: `view`, `task` or `object`.
+        provenance: command, date and versions, by heading; goes into metrics.json.
+        parallel: processes to score with; None = this one.
+        describer: names the objects from each episode's first frame; None = see `EvaluationJob`.
+        overwrite: replace results of other settings; only asked where there is a name.
+        show_progress: draw a progress bar, on a terminal.
+
+    Raises:
+        ConfigError: weights are missing, or `out` holds results of other settings.
+        EpisodeError: no episode can be used.
+    """
+    if not config.num_inference_steps:  # results say the number
+        config = config.replace(num_inference_steps=pipeline.spec.num_inference_steps)
+    run = _Run(pipeline, out, name, config, parallel, describer)
+    check_same_settings(out / 'episodes', run.settings, overwrite or not name)
+    jobs = make_jobs(episode_paths, zero_shot, config.seed)
+    results, failed = [], {}
+    bar = tqdm(
+        run.results(jobs), total=len(jobs), unit='ep', disable=None if show_progress else True
+    )
+    for job, result in bar:
+        if isinstance(result, EpisodeResult):
+            results.append(result)
+            bar.set_postfix_str(_progress(results))
+        else:
+            failed[str(job.path)] = result
+    if not results:
+        reason = next(iter(failed.items()), ('', 'none was given'))
+        raise EpisodeError(f'no episode could be scored; {reason[0]}: {reason[1]}')
+    results.sort(key=lambda result: result.episode)
+    summary = EvaluationSummary(
+        folder=out,
+        name=name,
+        label=label,
+        spec=pipeline.spec,
+        settings={**config.as_json(), 'segmenter': pipeline.segmenter.name},
+        provenance=provenance,
+        results=results,
+        failed=dict(sorted(failed.items())),
+    )
+    summary = replace(summary, distances=_distances(summary, config))
+    write_summary(summary)
+    return summary
+
+
+def result_names(paths: Sequence[Path]) -> dict[Path, str]:
+    """Returns what results are called: as the folder, or by the whole path if two are alike."""
+    count = Counter(Path(path).name for path in paths)
+    return {
+        path: path.name if count[path.name] == 1 else '__'.join(path.parts).strip('/')
+        for path in map(Path, paths)
+    }
+
+
+def make_jobs(
+    paths: Sequence[Path], zero_shot: Mapping[Path, str], seed: int
+) -> list[EvaluationJob]:
+    """Returns the episodes in an order in which each lends its actions to the next."""
+    order = np.random.default_rng(seed).permutation(len(paths))
+    shuffled = [Path(paths[index]) for index in order]
+    names = result_names(paths)
+    return [
+        EvaluationJob(
+            path=path,
+            name=names[path],
+            donor=shuffled[index - 1] if len(shuffled) > 1 else None,
+            zero_shot=zero_shot.get(path, ''),
+        )
+        for index, path in enumerate(shuffled)
+    ]
+
+
+def make_scorer(make_pipeline: MakePipeline, config: EvaluationConfig, out: Path) -> EpisodeScorer:
+    """Returns what scores episodes, with everything that the configuration asks to measure.
+
+    Raises:
+        ConfigError, CheckpointError: weights or packages for that are missing.
+    """
+    pipeline = make_pipeline()
+    device = str(getattr(pipeline.world_model, 'device', 'cpu'))
+    features = None
+    if config.fid_weights is not None or config.fvd_weights is not None:
+        features = FeatureTaker(
+            views=pipeline.spec.views,
+            num_frames=pipeline.spec.num_frames,
+            frames=config.fid_weights and frame_features(config.fid_weights, device),
+            clips=config.fvd_weights and clip_features(config.fvd_weights, device),
+        )
+    instruments = Instruments(
+        pipeline=pipeline,
+        reconstruct=round_trip(pipeline.world_model) if config.ceiling else None,
+        quality=image_quality(config.quality, device),
+        features=features,
+    )
+    return EpisodeScorer(instruments, config, out)
+
+
+def _progress(results: Sequence[EpisodeResult]) -> str:
+    means = [result.means(None) for result in results]
+    moving, copy = (
+        float(mean_of_known(np.array([found[key] for found in means])))
+        for key in ('j_moving', 'j_copy_moving')
+    )
+    return f'J moving {moving:.3f}, persistence {copy:.3f}'
+
+
+def _distances(
+    summary: EvaluationSummary, config: EvaluationConfig
+) -> dict[tuple[str | None, str], dict[str, Estimate]]:
+    """FID and FVD by (zero-shot set, view), the set None for all episodes."""
+    if config.fid_weights is None and config.fvd_weights is None:
+        return {}
+    return {
+        (group, view): distances(
+            [
+                load_features(feature_path(summary.folder, result.episode))
+                for result in summary.chosen(Group(zero_shot=group))
+            ],
+            view,
+        )
+        for group in (None, *summary.zero_shot_sets)
+        for view in summary.spec.views
+    }
+
+
+class _Run:
+    """Takes results from earlier runs where they are of the same settings, else scores."""
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        out: Path,
+        name: str,
+        config: EvaluationConfig,
+        parallel: Parallel | None,
+        describer: Describer | None,
+    ) -> None:
+        self.pipeline, self.out, self.name, self.config = pipeline, out, name, config
+        self.parallel, self.describer = parallel, describer
+        spec = pipeline.spec
+        self.settings = {
+            **config.as_json(),
+            'name': name,
+            'spec': [list(spec.views), spec.fps, spec.num_frames, spec.width, spec.height],
+            'segmenter': pipeline.segmenter.name,
+        }
+
+    def results(
+        self, jobs: Sequence[EvaluationJob]
+    ) -> Iterator[tuple[EvaluationJob, EpisodeResult | str]]:
+        """Yields jobs with their result, or why there is none."""
+        left = []
+        for job in map(self._described, jobs):
+            if isinstance(job, tuple):
+                yield job
+                continue
+            stored = self._stored(job)
+            if stored is None:
+                left.append(job)
+            else:
+                yield job, stored
+        for job, outcome in self._scored(left):
+            if isinstance(outcome, str):
+                yield job, outcome
+                continue
+            values = {'settings': self._settings_of(job), 'result': outcome}
+            write_json(self._file(job), values)
+            yield job, EpisodeResult.from_json(outcome)
+
+    def _described(self, job: EvaluationJob) -> EvaluationJob | tuple[EvaluationJob, str]:
+        """The episode with its objects named, or why they could not be."""
+        if self.describer is None:
+            return job
+        try:
+            view, source = self.pipeline.spec.views[0], self.config.source
+            found = described_objects(job.path, self.describer, view, source)
+        except MtvWorldError as error:
+            return job, str(error)
+        return replace(job, objects=found)
+
+    def _scored(
+        self, jobs: Sequence[EvaluationJob]
+    ) -> Iterator[tuple[EvaluationJob, dict[str, Any] | str]]:
+        if self.parallel is None or self.parallel.workers == 1:
+            here = partial(make_scorer, lambda: self.pipeline, self.config, self.out)
+            return score_all(jobs, here, 1, 1)
+        there = partial(make_scorer, self.parallel.make_pipeline, self.config, self.out)
+        workers = self.parallel.workers
+        return score_all(jobs, there, workers, self.parallel.threads or threads_each(workers))
+
+    def _file(self, job: EvaluationJob) -> Path:
+        return self.out / 'episodes' / f'{job.name}.json'
+
+    def _settings_of(self, job: EvaluationJob) -> dict[str, Any]:
+        return {
+            **self.settings,
+            'path': str(job.path),
+            'donor': str(job.donor),
+            'zero_shot': job.zero_shot,
+            'objects': list(job.objects),
+        }
+
+    def _stored(self, job: EvaluationJob) -> EpisodeResult | None:
+        """The result of an earlier run; None if it is of other settings or another version."""
+        features = self.config.fid_weights or self.config.fvd_weights
+        if not self.name or (features and not feature_path(self.out, job.name).is_file()):
+            return None
+        try:
+            stored = read_json(self._file(job))
+            if stored['settings'] == plain(self._settings_of(job)):
+                return EpisodeResult.from_json(stored['result'])
+        except (OSError, ValueError, KeyError, TypeError):
+            pass  # not there, half written, or of another version: score it again
+        return None

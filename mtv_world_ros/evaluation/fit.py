@@ -1,0 +1,351 @@
+"""Fits the success estimate to episodes of known outcome, and scores it on left-out tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import isfinite, nan
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from mtv_world_ros.core.data_types import BoolArray, FloatArray
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+from mtv_world_ros.evaluation.metrics.success_agreement import agreement, Judgement
+from mtv_world_ros.evaluation.results import EpisodeResult
+from mtv_world_ros.success.calibration import Calibration, weighed, Weights
+from mtv_world_ros.success.estimator import capped, STATED_WEIGHTS
+from mtv_world_ros.success.evidence import FEATURES
+
+#: fewer episodes of known outcome than this say nothing
+MIN_EPISODES = 8
+#: of a fitted logistic; all labels equal would have no finite one
+MAX_BIAS = 30.0
+#: what the scores are called, in the order of the tables
+BEFORE, AFTER, AFTER_KINDS, FITTED = 'before', 'after', 'after_kinds', 'fitted'
+OBSERVED, UNFORESEEN, RESUMED = 'observed', 'unforeseen', 'resumed'
+ALWAYS = 'always success'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sample:
+    """An imagined episode of known outcome.
+
+    Attributes:
+        episode: its name.
+        task: its name.
+        success: the true outcome.
+        features: of the estimate by seed; empty where it abstained.
+        before: probabilities by seed with the stated weights; NaN = abstained.
+        reasons: of the first seed's estimate.
+        kinds: faults of the policy that acted; empty = none, or not a scripted policy.
+        observed: features of the estimate on the recorded frames; empty where it abstained, or
+            they were not judged.
+        resumed: features where all but the last chunk was seen.
+    """
+
+    episode: str
+    task: str
+    success: bool
+    features: tuple[Mapping[str, float], ...]
+    before: tuple[float, ...]
+    reasons: tuple[str, ...]
+    kinds: tuple[str, ...] = ()
+    observed: Mapping[str, float] = field(default_factory=dict)
+    resumed: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def as_observed(self) -> Sample:
+        """The same with the recorded frames in place of the imagined ones."""
+        return replace(self, features=(self.observed,))
+
+    @property
+    def as_resumed(self) -> Sample:
+        """The same with all but the last chunk seen."""
+        return replace(self, features=(self.resumed,))
+
+    @property
+    def as_unforeseen(self) -> Sample:
+        """The same with nothing foreseen; empty where pictures do not tell."""
+        is_judged = isfinite(self.resumed.get('margin', nan))
+        return replace(self, features=({**self.resumed, 'foreseen': nan} if is_judged else {},))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibrated:
+    """A calibration and what it was judged by.
+
+    Attributes:
+        calibration: fitted to all samples.
+        samples: episodes of known outcome.
+        judgements: a judgement of each sample, by the names above. `AFTER` leaves each task out
+            of the fit that judges it, `AFTER_KINDS` each fault kind (of episodes without a fault
+            their task). `OBSERVED` is that of the recorded frames and `UNFORESEEN` that with all
+            but the last chunk seen and nothing foreseen, each by a fit of its own. `RESUMED`: with
+            all but the last chunk seen. `FITTED`: on what it was fitted to, thus too good.
+    """
+
+    calibration: Calibration
+    samples: tuple[Sample, ...]
+    judgements: Mapping[str, tuple[Judgement, ...]]
+
+
+def samples_of(
+    runs: Sequence[Sequence[EpisodeResult]], kinds: Mapping[str, tuple[str, ...]] | None = None
+) -> list[Sample]:
+    """Returns the episodes of known outcome.
+
+    Args:
+        runs: of the same episodes, one run a seed.
+        kinds: faults of the policies that acted, by episode; episodes may be missing.
+    """
+    known_kinds = kinds or {}
+    by_name = [{result.episode: result for result in run} for run in runs]
+    samples = []
+    for name, first in sorted(by_name[0].items()):
+        found = [run[name] for run in by_name if name in run]
+        if first.outcome in ('success', 'failure'):
+            samples.append(
+                Sample(
+                    episode=name,
+                    task=first.task,
+                    success=first.outcome == 'success',
+                    features=tuple(result.features for result in found),
+                    before=tuple(result.probability for result in found),
+                    reasons=first.reasons,
+                    kinds=known_kinds.get(name, ()),
+                    observed=first.observed,
+                    resumed=first.resumed,
+                )
+            )
+    return samples
+
+
+def calibrate(
+    samples: Sequence[Sample],
+    *,
+    segmenter: str,
+    l2: float = 1.0,
+    made: Mapping[str, str] | None = None,
+) -> Calibrated:
+    """Fits the calibration to imagined episodes of known outcome, and judges it.
+
+    Args:
+        samples: imagined episodes of known outcome.
+        segmenter: name of what found the masks.
+        l2: strength of the penalty.
+        made: command, date and machine, by heading.
+
+    Raises:
+        ConfigError: too few episodes, or all of one outcome.
+    """
+    _check(samples)
+    fitted = _fit(samples, segmenter, l2)
+    groups = [{s.task} for s in samples]
+    fits = _fits_without(samples, groups, segmenter, l2)
+    judgements = {
+        BEFORE: tuple(_judged(s, _mean_of(s.before)) for s in samples),
+        AFTER: _judged_by(fits, samples),
+        FITTED: tuple(_judged(s, _probability(fitted, s)) for s in samples),
+        ALWAYS: tuple(_judged(s, 1.0) for s in samples),
+    }
+    if any(sample.kinds for sample in samples):
+        groups = [set(s.kinds) or {f'no fault, {s.task}'} for s in samples]
+        fits = _fits_without(samples, groups, segmenter, l2)
+        judgements[AFTER_KINDS] = _judged_by(fits, samples)
+    special: dict[str, Any] = {}
+    for name, others in (
+        (OBSERVED, [sample.as_observed for sample in samples]),
+        (UNFORESEEN, [sample.as_unforeseen for sample in samples]),
+    ):
+        if _tells(others):
+            special[name] = Weights(**_weights(others, l2))
+            of_others = _fits_without(others, groups, segmenter, l2)
+            judgements[name] = _judged_by(of_others, others)
+    if UNFORESEEN in judgements:
+        resumed = _judged_by(fits, [sample.as_resumed for sample in samples])
+        judgements[RESUMED] = tuple(
+            one if isfinite(sample.resumed.get('foreseen', nan)) else other
+            for sample, one, other in zip(samples, resumed, judgements[UNFORESEEN], strict=True)
+        )
+    scores = {name: agreement(found) for name, found in judgements.items()}
+    calibration = Calibration(**fitted, **special, scores=scores, made=dict(made or {}))
+    return Calibrated(calibration=calibration, samples=tuple(samples), judgements=judgements)
+
+
+def _check(samples: Sequence[Sample]) -> None:
+    usable = [sample for sample in samples if any(sample.features)]
+    if not _tells(samples):
+        raise ConfigError(
+            f'{len(samples)} episodes have a known outcome, of which {len(usable)} could be '
+            f'judged, {sum(s.success for s in usable)} of them successes; a calibration needs at '
+            f'least {MIN_EPISODES} and both outcomes: collect some with --failures-of-ten 5'
+        )
+
+
+def _tells(samples: Sequence[Sample]) -> bool:
+    """Whether there are enough episodes, of both outcomes."""
+    outcomes = [sample.success for sample in samples if any(sample.features)]
+    return len(outcomes) >= MIN_EPISODES and len(set(outcomes)) == 2
+
+
+def _fits_without(
+    samples: Sequence[Sample], groups: Sequence[set[str]], segmenter: str, l2: float
+) -> list[dict[str, Any] | None]:
+    """For each sample the fit to those that share no group with it; None = of one outcome."""
+    fits: dict[frozenset[str], dict[str, Any] | None] = {}
+    for left_out in set(map(frozenset, groups)):
+        others = [
+            sample
+            for sample, group in zip(samples, groups, strict=True)
+            if not group & left_out and any(sample.features)
+        ]
+        enough = len({sample.success for sample in others}) == 2
+        fits[left_out] = _fit(others, segmenter, l2) if enough else None
+    return [fits[frozenset(group)] for group in groups]
+
+
+def _judged_by(
+    fits: Sequence[dict[str, Any] | None], samples: Sequence[Sample]
+) -> tuple[Judgement, ...]:
+    """Each sample judged by a fit of its own."""
+    return tuple(
+        _judged(sample, nan if fit is None else _probability(fit, sample))
+        for fit, sample in zip(fits, samples, strict=True)
+    )
+
+
+def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]:
+    """Fields of `Calibration`."""
+    return {
+        **_weights(samples, l2),
+        'segmenter': segmenter,
+        'tasks': tuple(sorted({sample.task for sample in samples})),
+        'num_episodes': len(samples),
+        'num_seeds': max(len(sample.before) for sample in samples),
+        'l2': l2,
+    }
+
+
+def _weights(samples: Sequence[Sample], l2: float) -> dict[str, Any]:
+    """Fields of `Weights`."""
+    rows, labels = _design(samples)
+    with np.errstate(invalid='ignore'):
+        known = np.isfinite(rows)
+        counts = np.maximum(known.sum(0), 1)
+        means = np.where(known, rows, 0.0).sum(0) / counts
+        spread = np.sqrt((np.where(known, rows - means, 0.0) ** 2).sum(0) / counts)
+    scales = np.where(spread > 1e-6, spread, 1.0)
+    standard = np.where(known, (rows - means) / scales, 0.0)
+    # imagination rarely shows what failed, as an object left behind: there, what was stated holds
+    prior = scales * [STATED_WEIGHTS.get(name, 0.0) for name in FEATURES]
+    logistic = fit_logistic(standard, labels, l2=l2, prior=prior, non_negative=True)
+    return {
+        'features': FEATURES,
+        'means': tuple(means.tolist()),
+        'scales': tuple(scales.tolist()),
+        'weights': tuple(logistic.weights.tolist()),
+        'bias': logistic.bias,
+    }
+
+
+def _design(samples: Sequence[Sample]) -> tuple[FloatArray, BoolArray]:
+    """(N, F) features, NaN where one says nothing, and (N,) outcomes; abstentions are left out."""
+    pairs = [(f, sample.success) for sample in samples for f in sample.features if f]
+    rows = [[weighed(features, name) for name in FEATURES] for features, _ in pairs]
+    return np.array(rows, np.float64), np.array([success for _, success in pairs], np.bool_)
+
+
+def _probability(fit: dict[str, Any], sample: Sample) -> float:
+    calibration = Calibration(**fit)
+    return _mean_of(
+        [
+            capped(calibration.probability(features), features) if features else nan
+            for features in sample.features
+        ]
+    )
+
+
+def _mean_of(probabilities: Sequence[float]) -> float:
+    """The mean over the seeds that know; NaN where most of them abstain."""
+    known = [value for value in probabilities if isfinite(value)]
+    return float(np.mean(known)) if 2 * len(known) > len(probabilities) else nan
+
+
+def _judged(sample: Sample, probability: float) -> Judgement:
+    outcome = 'success' if sample.success else 'failure'
+    return Judgement(probability=probability, outcome=outcome)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Logistic:
+    """P(true) = 1 / (1 + exp(-(weights x + bias))): weights (F,), bias within +-`MAX_BIAS`."""
+
+    weights: FloatArray
+    bias: float
+
+    def probability(self, features: FloatArray) -> FloatArray:
+        """Returns (N,) for features (N, F)."""
+        return expit(features @ self.weights + self.bias)
+
+
+def fit_logistic(
+    features: FloatArray,
+    labels: BoolArray,
+    *,
+    l2: float = 1.0,
+    prior: FloatArray | None = None,
+    non_negative: bool = False,
+) -> Logistic:
+    """Minimises -log likelihood + l2 / 2 * |weights - prior|^2 (scikit-learn's with C = 1 / l2).
+
+    The bias is not penalised.
+
+    Args:
+        features: (N, F).
+        labels: (N,) outcomes.
+        l2: strength of the penalty; positive, so that there is one minimum.
+        prior: (F,) weights that hold where the rows say nothing; None = zero.
+        non_negative: no weight below 0, for features that grow with the probability.
+
+    Raises:
+        ConfigError: there are no rows, or `l2` is not positive.
+        MtvWorldError: the minimum was not reached.
+    """
+    if not len(features) or l2 <= 0:
+        raise ConfigError(
+            f'a logistic is fitted to {len(features)} episodes with l2 = {l2}; it needs at least '
+            'one episode and a positive l2'
+        )
+    num = features.shape[1]
+    centre = np.zeros(num) if prior is None else np.asarray(prior, np.float64)
+
+    def loss(theta: FloatArray) -> tuple[float, FloatArray]:
+        logits, away = features @ theta[:-1] + theta[-1], theta[:-1] - centre
+        value = np.logaddexp(0, logits).sum() - logits[labels].sum() + l2 / 2 * away @ away
+        slope = expit(logits) - labels
+        return float(value), np.append(slope @ features + l2 * away, slope.sum())
+
+    start = np.append(np.maximum(centre, 0.0) if non_negative else centre, 0.0)
+    bounds = [(0.0 if non_negative else None, None)] * num + [(-MAX_BIAS, MAX_BIAS)]
+    # stops at the gradient alone: the value is flat near the minimum
+    options = {'ftol': 0.0, 'gtol': 1e-9, 'maxiter': 10_000, 'maxfun': 100_000, 'maxcor': 30}
+    theta = minimize(loss, start, jac=True, method='L-BFGS-B', bounds=bounds, options=options).x
+    left = _slope_within(theta, loss(theta)[1], bounds)
+    if left > 1e-4 * max(1.0, l2, float(np.abs(features).sum(0).max(initial=0))):
+        raise MtvWorldError(
+            f'the logistic fit to {len(features)} episodes did not reach its minimum (gradient '
+            f'{left:.2g}); set another --l2, now {l2:g}'
+        )
+    return Logistic(weights=theta[:-1], bias=float(theta[-1]))
+
+
+def _slope_within(
+    theta: FloatArray, gradient: FloatArray, bounds: Sequence[tuple[float | None, float | None]]
+) -> float:
+    """The largest slope along which `theta` could still go down without leaving its bounds."""
+    low, high = np.array(bounds, np.float64).T  # None becomes NaN: no bound
+    blocked = ((theta <= low) & (gradient > 0)) | ((theta >= high) & (gradient < 0))
+    return float(np.abs(np.where(blocked, 0.0, gradient)).max())

@@ -1,0 +1,1 @@
+"""Metrics of predictions: Jaccard, image quality, Frechet distances, agreement, intervals."""

@@ -1,0 +1,209 @@
+"""PSNR, SSIM and changed pixels of imagined frames, beside what knows nothing of the commands.
+
+The held first frame and frames imagined with another episode's commands are scored alike, over
+whole frames and where the recorded picture differs from the first one. No object is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import nan
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.evaluation.metrics.statistics import Estimate, mean_interval, MIN_EPISODES
+
+#: what is scored: imagined, first frame held, another episode's commands, and recorded frames
+#: themselves, whose J of the arm is the most that a calibration allows
+HELD, SHUFFLED, RECORDED = 'held', 'shuffled', 'recorded'
+#: what is shown in tables, by the end of a number's name
+KINDS = {
+    '': 'imagined',
+    f'_{HELD}': 'first frame held',
+    f'_{SHUFFLED}': 'other commands',
+    f'_{RECORDED}': 'recorded',
+}
+#: numbers by name, and how tables call them
+MEASURES = {
+    'psnr': 'PSNR [dB]',
+    'ssim': 'SSIM',
+    'psnr_changed': 'PSNR where it changes [dB]',
+    'ssim_changed': 'SSIM where it changes',
+    'j_changed': 'J of changed pixels',
+    'j_arm': 'J of the arm',
+}
+#: a pixel has changed if a channel of it, blurred, differs by more [grey levels]
+_CHANGED = 20.0
+#: frames in which fewer pixels change are not scored by them [share]
+_LEAST_CHANGED = 0.002
+#: largest margin over shuffled commands of a model that does not follow commands [dB]
+_NO_MARGIN_DB = 0.25
+#: SSIM: window and constants of Wang et al. 2004
+_SIGMA, _C1, _C2 = 1.5, (0.01 * 255) ** 2, (0.03 * 255) ** 2
+
+
+def picture_scores(frames: ByteArray, real: ByteArray, first: ByteArray) -> dict[str, float]:
+    """Returns `MEASURES` of a view but `j_arm`, means over frames; NaN where nothing changes.
+
+    Args:
+        frames: (T, H, W, 3) uint8 RGB imagined.
+        real: (T, H, W, 3) recorded at the same times.
+        first: (H, W, 3) recorded frame that both start from.
+    """
+    rows = [_frame_scores(a, b, first) for a, b in zip(frames, real, strict=True)]
+    return {
+        name: float(np.nanmean(values)) if np.isfinite(values).any() else nan
+        for name in rows[0]
+        for values in [np.array([row[name] for row in rows])]
+    }
+
+
+def _frame_scores(frame: ByteArray, real: ByteArray, first: ByteArray) -> dict[str, float]:
+    error = (frame.astype(np.float64) - real) ** 2
+    similar = ssim_map(frame, real)
+    changes, imagined = changed(real, first), changed(frame, first)
+    scores = dict.fromkeys((name for name in MEASURES if name != 'j_arm'), nan)
+    scores |= {'psnr': _psnr(error), 'ssim': float(similar.mean())}
+    if changes.mean() < _LEAST_CHANGED:
+        return scores
+    both = float((changes & imagined).sum()) / float((changes | imagined).sum())
+    return scores | {
+        'psnr_changed': _psnr(error[changes]),
+        'ssim_changed': float(similar[changes].mean()),
+        'j_changed': both,
+    }
+
+
+def _psnr(error: NDArray[np.float64]) -> float:
+    """As if one value of equal frames differed by half a grey level, so that means are finite."""
+    return float(10 * np.log10(255.0**2 / max(float(error.mean()), 0.25 / error.size)))
+
+
+def changed(frame: ByteArray, first: ByteArray) -> NDArray[np.bool_]:
+    """Returns (H, W) whether a pixel differs between two frames (H, W, 3)."""
+    apart = np.abs(frame.astype(np.float32) - first.astype(np.float32)).max(axis=-1)
+    return np.asarray(cv2.GaussianBlur(apart, (0, 0), 0.8) > _CHANGED)
+
+
+def ssim_map(a: ByteArray, b: ByteArray) -> NDArray[np.float64]:
+    """(H, W) structural similarity of two frames (H, W, 3), the mean of the channels."""
+
+    def blurred(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        found = cv2.GaussianBlur(x, (11, 11), _SIGMA, borderType=cv2.BORDER_REFLECT_101)
+        return np.asarray(found, np.float64)
+
+    x, y = a.astype(np.float64), b.astype(np.float64)
+    mx, my = blurred(x), blurred(y)
+    vx, vy, both = blurred(x * x) - mx**2, blurred(y * y) - my**2, blurred(x * y) - mx * my
+    top = (2 * mx * my + _C1) * (2 * both + _C2)
+    found = top / ((mx**2 + my**2 + _C1) * (vx + vy + _C2))
+    return np.asarray(found.mean(axis=-1), np.float64)
+
+
+#: numbers of an episode by view and name; a name is `psnr`, `psnr_held`, `psnr_shuffled`, ...
+PictureScores = Mapping[str, Mapping[str, float]]
+
+
+def episode_pictures(episode: PictureScores, view: str | None) -> dict[str, float]:
+    """Returns an episode's numbers of a view (None = mean of all), and margins."""
+    views = [numbers for name, numbers in episode.items() if view in (None, name)]
+    names = dict.fromkeys(name for numbers in views for name in numbers)
+    found = {name: _mean([numbers.get(name, nan) for numbers in views]) for name in names}
+    for other in (HELD, SHUFFLED):
+        key = f'psnr_changed_{other}'
+        if key in found:
+            found[f'margin_over_{other}'] = found['psnr_changed'] - found[key]
+    return found
+
+
+def _mean(values: Sequence[float]) -> float:
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else nan
+
+
+def picture_estimates(
+    episodes: Sequence[PictureScores], view: str | None = None
+) -> dict[str, Estimate]:
+    """Returns means over episodes with 95 % intervals, by name; margins are paired."""
+    rows = [episode_pictures(episode, view) for episode in episodes if episode]
+    found = {}
+    for name in dict.fromkeys(name for row in rows for name in row):
+        values = np.array([row.get(name, nan) for row in rows])
+        known = np.isfinite(values)
+        sums = np.where(known, values, 0.0)[:, None]
+        mean, ends = mean_interval(sums, known[:, None].astype(float), low=-np.inf, high=np.inf)
+        found[name] = Estimate(
+            value=float(mean[0]),
+            interval=(float(ends[0, 0]), float(ends[1, 0])),
+            num_episodes=int(known.sum()),
+        )
+    return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Following:
+    """Whether a model follows the commands: `yes`, `no` or `cannot tell`, and why."""
+
+    word: str
+    why: str
+
+    @property
+    def line(self) -> str:
+        """The first line of a report."""
+        return f'follows the commands: {self.word} ({self.why})'
+
+
+def following(estimates: Mapping[str, Estimate], objects: Estimate | None = None) -> Following:
+    """Decides by PSNR where the picture changes, against held frame and shuffled commands.
+
+    Args:
+        estimates: of `picture_estimates`.
+        objects: J of the moving objects minus that of the held first frame, paired within the
+            episodes; None = no episode names a moving object. A model below the held frame does
+            not follow the commands, whatever its pictures of the arm are like.
+    """
+    found = _following_by_pictures(estimates)
+    if objects is None or objects.num_episodes < MIN_EPISODES or found.word == 'no':
+        return found
+    why = f'{found.why}; J of moving objects {_against_held(objects)}'
+    if objects.interval[1] < 0:
+        return Following(word='no', why=why)
+    is_above = objects.value > 0 and not objects.interval[0] <= 0
+    return Following(word=found.word if is_above else 'cannot tell', why=why)
+
+
+def _against_held(margin: Estimate) -> str:
+    low, high = margin.interval
+    ends = f' [{low:+.2f}, {high:+.2f}]' if np.isfinite(low) else ''
+    return f'{margin.value:+.2f}{ends} against the held frame'
+
+
+def _following_by_pictures(estimates: Mapping[str, Estimate]) -> Following:
+    shuffled = estimates.get(f'margin_over_{SHUFFLED}')
+    held = estimates.get(f'margin_over_{HELD}')
+    if shuffled is None or held is None or not np.isfinite([shuffled.value, held.value]).all():
+        compared = estimates.get('psnr_changed')
+        why = "no frames were imagined with another episode's commands"
+        if compared is not None and compared.num_episodes < MIN_EPISODES:
+            why = f'episodes: {compared.num_episodes}, give at least {MIN_EPISODES}'
+        return Following(word='cannot tell', why=why)
+    why = (
+        f'where the picture changes, {_signed(shuffled)} against other commands, '
+        f'{_signed(held)} against the held frame; {shuffled.num_episodes} episodes'
+    )
+    if min(shuffled.num_episodes, held.num_episodes) < MIN_EPISODES:
+        return Following(word='cannot tell', why=f'{why}, give at least {MIN_EPISODES}')
+    if shuffled.interval[0] > 0 and held.interval[0] > 0:
+        return Following(word='yes', why=why)
+    is_no = shuffled.interval[1] < _NO_MARGIN_DB or held.interval[1] < 0
+    return Following(word='no' if is_no else 'cannot tell', why=why)
+
+
+def _signed(margin: Estimate) -> str:
+    low, high = margin.interval
+    ends = f' [{low:+.2f}, {high:+.2f}]' if np.isfinite(low) else ''
+    return f'{margin.value:+.2f} dB{ends}'

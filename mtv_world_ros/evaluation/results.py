@@ -1,0 +1,146 @@
+"""Scores of one episode, and what is kept of its frames for later reports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.core.data_types import ByteArray, FloatArray, ObjectMasks
+from mtv_world_ros.evaluation.imagined_stretches import Stretch
+from mtv_world_ros.evaluation.metrics.jaccard_scores import episode_means, QUALITY, ScoreRow
+from mtv_world_ros.rollout.prediction import Prediction
+from mtv_world_ros.viewing.scored_rollout import StoredRollout
+from mtv_world_ros.viewing.video import Comparison
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeResult:
+    """Scores of one episode.
+
+    Attributes:
+        episode: name of its folder.
+        task: its name.
+        zero_shot: what the model was not trained for in it: `view`, `task`, `object`; or empty.
+        outcome: `success`, `failure` or `unknown`.
+        rows: scores.
+        quality: PSNR and the like by view, as far as measured.
+        probability: the success estimate at the end of its last stretch; NaN = abstained.
+        reasons: of that estimate.
+        notes: what was wrong with the recording, and what could not be imagined.
+        seconds_per_chunk: mean time to imagine a chunk [s].
+        seconds: by stage of the episode's evaluation [s].
+        pictures: `picture_scores` by view and name, of held frame and shuffled commands too.
+        features: of that estimate, by name; empty where it abstained.
+        observed: of the estimate at the end of the recorded frames, likewise; empty where they
+            were not judged.
+        resumed: features of the estimate where all but the last chunk was seen.
+        has_ids: whether recorded identities say which objects move.
+    """
+
+    episode: str
+    task: str
+    zero_shot: str
+    outcome: str
+    rows: tuple[ScoreRow, ...]
+    quality: Mapping[str, Mapping[str, float]]
+    probability: float
+    reasons: tuple[str, ...]
+    notes: tuple[str, ...]
+    seconds_per_chunk: float
+    seconds: Mapping[str, float]
+    has_ids: bool
+    pictures: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    features: Mapping[str, float] = field(default_factory=dict)
+    observed: Mapping[str, float] = field(default_factory=dict)
+    resumed: Mapping[str, float] = field(default_factory=dict)
+
+    def means(self, view: str | None) -> dict[str, float]:
+        """Returns the numbers of a view (None = all views) that are averaged over episodes."""
+        views = [numbers for name, numbers in self.quality.items() if view in (None, name)]
+        known = [name for name in QUALITY if views and all(name in numbers for numbers in views)]
+        quality = {n: float(np.mean([numbers[n] for numbers in views])) for n in known}
+        return {**episode_means(self.rows, view), **quality}
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns plain values."""
+        return {**asdict(self), 'rows': [row.as_json() for row in self.rows]}
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> EpisodeResult:
+        """The inverse of `as_json`, read back from a file."""
+        read: dict[str, Any] = dict(values)
+        read['rows'] = tuple(ScoreRow.from_json(row) for row in values['rows'])
+        read['reasons'], read['notes'] = tuple(values['reasons']), tuple(values['notes'])
+        read['probability'] = np.nan if values['probability'] is None else values['probability']
+        for name in ('features', 'observed', 'resumed'):
+            read[name] = _nan_for_none(values.get(name, {}))
+        read['pictures'] = {k: _nan_for_none(v) for k, v in values.get('pictures', {}).items()}
+        return EpisodeResult(**read)
+
+
+def _nan_for_none(values: Mapping[str, float | None]) -> dict[str, float]:
+    return {k: np.nan if v is None else v for k, v in values.items()}
+
+
+def compare(chunks: Sequence[Prediction], real: ByteArray) -> Comparison:
+    """Returns a rollout's chunks beside (V, T, H, W, 3) recorded frames at the same times."""
+    videos = [chunk.video for chunk in chunks]
+    return Comparison(
+        views=videos[0].views,
+        times=np.concatenate([video.times for video in videos]),
+        real=real,
+        trajectory=np.concatenate(
+            [
+                chunk.trajectory_video.frames[:, 1 : 1 + video.frames.shape[1]]
+                for chunk, video in zip(chunks, videos, strict=True)
+            ],
+            axis=1,
+        ),
+        imagined=np.concatenate([video.frames for video in videos], axis=1),
+    )
+
+
+def stored_stretch(
+    chunks: Sequence[Prediction],
+    stretch: Stretch,
+    *,
+    start_seconds: float,
+    fps: float,
+    true_masks: ObjectMasks,
+    masks: ObjectMasks,
+    j: FloatArray,
+) -> StoredRollout:
+    """Returns what is kept of a stretch for later reports.
+
+    Args:
+        chunks: imagined from the stretch's first frame.
+        stretch: the recorded frames.
+        start_seconds: from the episode's first frame to the stretch's [s].
+        fps: frames a second.
+        true_masks: of the recorded frames 1..T.
+        masks: of the predicted frames.
+        j: (V, O, T) J per frame.
+    """
+    shown = compare(chunks, stretch.frames[:, 1:])
+    return StoredRollout(
+        views=shown.views,
+        objects=masks.names,
+        fps=fps,
+        stretches=np.full(len(shown.times), stretch.index),
+        times=shown.times + start_seconds,
+        real=shown.real,
+        trajectory=shown.trajectory,
+        imagined=shown.imagined,
+        true_masks=true_masks.masks,
+        masks=masks.masks,
+        j=j,
+    )
+
+
+def rollout_path(out: Path, episode: str) -> Path:
+    """Returns where the rollout of an episode lies in an evaluation's folder."""
+    return Path(out) / 'episodes' / f'{episode}.rollout.npz'

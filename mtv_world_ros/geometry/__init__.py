@@ -1,1 +1,0 @@
-"""Robots and cameras: forward kinematics, projection, resampling."""

@@ -1,1 +1,0 @@
-"""Robots: their files and descriptions, kinematics and shapes."""

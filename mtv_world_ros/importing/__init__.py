@@ -1,0 +1,1 @@
+"""Other people's recordings become episodes: bags, LeRobot data sets, videos."""

@@ -1,0 +1,431 @@
+"""Imports rosbag2 recordings of a robot's own topics: each bag becomes an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+import tempfile
+from typing import Any
+
+import numpy as np
+import yaml
+
+from mtv_world_ros.cameras.camera import camera_poses
+from mtv_world_ros.core.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.core.errors import ConfigError, EpisodeError, RobotError, TrajectoryError
+from mtv_world_ros.data.bag import messages
+from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.bag_mapping import BagMapping
+from mtv_world_ros.data.episode import Episode, MASKS_BY, UNKNOWN_CAMERAS
+from mtv_world_ros.data.episode_reader import list_episodes, read_episode
+from mtv_world_ros.data.episode_writer import EpisodeWriter
+from mtv_world_ros.importing.convert import import_each, ImportSummary, jumps, MAPPING_KEY
+from mtv_world_ros.importing.mapping import digest_of
+from mtv_world_ros.importing.robot_guess import guess_robot
+from mtv_world_ros.importing.stored_objects import AS_RECORDED, MaskWriter, ObjectStage
+from mtv_world_ros.robot.file import load_robot, ROBOT_YAML, save_robot
+from mtv_world_ros.robot.model import check_positions, RobotModel
+from mtv_world_ros.robot.resample import match_joints
+
+#: parts of an image topic's name that say nothing of the view
+_NOT_A_VIEW = {'image', 'image_raw', 'image_rect', 'image_color', 'image_rect_color', 'color',
+               'rgb', 'compressed', 'ffmpeg', 'camera', 'image_rect_raw'}  # fmt: skip
+#: no pictures of the scene
+_NO_COLOURS = ('depth', 'infra', 'mask', 'confidence', 'disparity')
+
+
+def find_bags(paths: Sequence[Path]) -> list[Path]:
+    """Returns bags: files as they are, folders that are bags, and the bags in other folders.
+
+    Raises:
+        EpisodeError: a path is not there, or there is no bag.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.exists():
+            raise EpisodeError(f"there is no bag '{path}'")
+        holds_files = path.is_dir() and any(path.glob('*.mcap*')) or any(path.glob('*.db3*'))
+        found += [path] if path.is_file() or holds_files else list_episodes(path)
+    if not found:
+        raise EpisodeError(f'there is no bag in {", ".join(map(str, paths))}')
+    return found
+
+
+def with_guessed_views(mapping: BagMapping, bag: Path) -> BagMapping:
+    """Returns the mapping with the bag's image topics as views, where it names none.
+
+    Raises:
+        EpisodeError: the bag has no images.
+    """
+    if mapping.views:
+        return mapping
+    found = BagReader(bag).topics()
+    topics = [name for name, kind in found.items() if kind in messages.IMAGE_TYPES]
+    inside = [t for t in topics if t.startswith(mapping.topic(''))] or topics
+    views = guess_views(inside)
+    if not views:
+        raise EpisodeError(
+            f"'{bag}' has no images (topics of Image, CompressedImage or FFMPEGPacket)"
+        )
+    return mapping.replace(views={view: {'image': topic} for view, topic in views.items()})
+
+
+def guess_views(topics: Collection[str]) -> dict[str, str]:
+    """Returns image topics by a view's name: the last part of the topic that says which it is.
+
+    Depth, infrared and masks are left out; of raw and compressed images of a view the raw ones
+    are taken.
+    """
+    found: dict[str, str] = {}
+    for topic in sorted(topics):
+        plain = topic.removesuffix('/compressed').removesuffix('/ffmpeg')
+        if any(word in plain for word in _NO_COLOURS):
+            continue
+        parts = [part for part in plain.split('/') if part and part not in _NOT_A_VIEW]
+        found.setdefault(parts[-1] if parts else 'camera', plain)
+    return found
+
+
+def described_robot(bag: Path, mapping: BagMapping, folder: Path) -> tuple[Path, tuple[str, ...]]:
+    """Writes the robot of a bag's `/robot_description` into a folder; fingers and tools guessed.
+
+    Returns:
+        The robot's YAML, and what was guessed.
+
+    Raises:
+        RobotError: the bag has no description, or no robot can be made of it.
+    """
+    text, topic, chosen = robot_description(bag, mapping)
+    with tempfile.TemporaryDirectory(prefix='mtv_world_robot_') as place:
+        urdf = Path(place) / 'robot.urdf'
+        urdf.write_text(text, encoding='utf-8')
+        file = Path(place) / ROBOT_YAML
+        try:
+            guessed = guess_robot(urdf)
+            file.write_text(yaml.safe_dump(guessed.values, sort_keys=False), encoding='utf-8')
+            saved = save_robot(file, folder)
+            return saved.file, (*chosen, *guessed.notes, *saved.notes)
+        except (RobotError, ConfigError) as error:
+            source, reason = f"'{topic}' of '{bag}'", str(error)
+            for temporary in (urdf, file):
+                reason = reason.replace(f"'{temporary}'", source)
+            raise RobotError(
+                f"{reason}; --robot, or 'robot' in the mapping, names another file"
+            ) from error
+
+
+def robot_description(bag: Path, mapping: BagMapping) -> tuple[str, str, tuple[str, ...]]:
+    """Returns the URDF that a bag holds; of several, the one whose joints are recorded most.
+
+    Returns:
+        The text, its topic, and how it was chosen, where there was a choice.
+
+    Raises:
+        RobotError: the bag holds no robot description.
+    """
+    topics = {mapping.topic(mapping.robot_description), '/robot_description'}
+    texts = {
+        str(messages.deserialize(messages.STRING, message.data).data): message.topic
+        for message in BagReader(bag).messages(topics)
+        if message.msgtype == messages.STRING
+    }
+    if not texts:
+        raise RobotError(
+            f"'{bag}' has no '{mapping.topic(mapping.robot_description)}'; name the robot's file "
+            "with --robot or as 'robot' in the mapping"
+        )
+    if len(texts) == 1:
+        return *next(iter(texts.items())), ()
+    topic = mapping.topic(mapping.joint_states)
+    named = [
+        {f'name="{mapping.joints.get(name, name)}"' for name in state.name}
+        for message in BagReader(bag).messages({topic})
+        if message.msgtype == messages.JOINT_STATE
+        for state in [messages.deserialize(messages.JOINT_STATE, message.data)]
+    ]
+    counts = {text: sum(any(name in text for name in names) for names in named) for text in texts}
+    best = max(counts, key=lambda text: counts[text])
+    note = (
+        f"the bag describes {len(texts)} robots: taken is the one whose joints '{topic}' names "
+        f'most ({counts[best]} of {len(named)} messages); --robot takes another'
+    )
+    return best, texts[best], (note,)
+
+
+def import_bags(
+    bags: Sequence[Path],
+    out: Path,
+    mapping: BagMapping,
+    robot_file: Path,
+    *,
+    calibration: Path | None = None,
+    stage: ObjectStage = AS_RECORDED,
+    progress: Callable[[Iterable[Path]], Iterable[Path]] = iter,
+) -> ImportSummary[Path]:
+    """Converts bags into episodes `out/<name of the bag>`, with `out/robot/` beside them.
+
+    Args:
+        bags: rosbag2 folders or files.
+        out: folder of the episodes.
+        mapping: names and kinds of the topics, with views.
+        robot_file: the robot's YAML.
+        calibration: file of the cameras; None = the bags' own.
+        stage: names the objects and finds their masks.
+        progress: wraps the bags, e.g. in a progress bar.
+
+    Raises:
+        ConfigError, RobotError: the robot cannot be used at all.
+    """
+    robot = load_robot(robot_file)
+    inside, notes = out / 'robot', ()
+    if robot_file.parent.resolve() != inside.resolve():
+        notes = save_robot(robot_file, inside).notes
+    key = digest_of(robot_file, calibration, start=stage.key + mapping.model_dump_json().encode())
+
+    def convert(bag: Path, path: Path) -> tuple[str, ...]:
+        return convert_bag(bag, path, mapping, robot, calibration, key, stage)
+
+    summary = import_each(progress(bags), key, lambda bag: out / episode_name(bag), convert)
+    summary.robot_notes = notes
+    return summary
+
+
+def episode_name(bag: Path) -> str:
+    """Name of the folder that a bag's episode gets."""
+    return bag.name.split('.')[0] if bag.is_file() else bag.name
+
+
+def summary_line(path: Path, objects: bool = False) -> str:
+    """What an imported episode holds, in one line; `objects` = also where none are named."""
+    episode = read_episode(path, with_cameras=False)
+    states = episode.joint_states
+    assert states is not None
+    seconds = (states.stamps_ns[-1] - states.stamps_ns[0]) * 1e-9
+    counts = ', '.join(f'{view} {len(episode.images[view].stamps_ns)}' for view in episode.views)
+    parts = [f'{seconds:.1f} s', f'frames: {counts}', f"'{episode.info.instruction}'"]
+    if episode.info.objects or objects:
+        parts.append(f'objects: {", ".join(episode.info.objects) or "none named"}')
+    areas = episode.mask_areas()
+    if areas:
+        seen = [
+            ', '.join(f'{view} {(area[n] > 0).mean():.0%}' for view, area in areas.items())
+            for n in range(len(episode.info.objects))
+        ]
+        found = zip(episode.info.objects, seen, strict=True)
+        parts.append('seen: ' + '; '.join(f'{name} in {share}' for name, share in found))
+    unknown = episode.info.metadata.get(UNKNOWN_CAMERAS, '')
+    if unknown:
+        parts.append(f'cameras not known: {unknown}')
+    return f'{path.name}: {"; ".join(parts)}'
+
+
+def convert_bag(
+    bag: Path,
+    out: Path,
+    mapping: BagMapping,
+    robot: RobotModel,
+    calibration: Path | None,
+    key: str = '',
+    stage: ObjectStage = AS_RECORDED,
+) -> tuple[str, ...]:
+    """Writes a bag as an episode; see `write_imported`."""
+    episode = read_episode(
+        bag,
+        views=list(mapping.views),
+        calibration=calibration,
+        mapping=mapping,
+        robot=robot,
+        unknown_mount=robot.base_link,
+    )
+    return write_imported(episode, bag.name, out, mapping, robot, key, stage)
+
+
+def write_imported(
+    episode: Episode,
+    source: str,
+    out: Path,
+    mapping: BagMapping,
+    robot: RobotModel,
+    key: str = '',
+    stage: ObjectStage = AS_RECORDED,
+) -> tuple[str, ...]:
+    """Writes a recording as an episode, whose folder appears when it is complete.
+
+    Args:
+        episode: what was read, with cameras.
+        source: name of the recording.
+        out: folder of the episode.
+        mapping: task, outcome and quality of what is written, and how commands are checked.
+        robot: gives the order of joints and their limits.
+        key: digest of mapping, robot and calibration.
+        stage: names the objects and finds their masks.
+
+    Returns:
+        What was odd and how it was handled.
+
+    Raises:
+        MtvWorldError: it cannot be converted; nothing is left behind.
+    """
+    for camera in episode.cameras.values():  # names a mount_link that is not there
+        camera_poses(camera, robot, np.zeros((1, len(robot.joint_names))))
+    stamps, positions = _measured(episode, robot, mapping)
+    commands = _commands(episode, robot, mapping)
+    warnings = [*episode.warnings, *jumps([t for _, t in commands], robot)]
+    warnings += [
+        f"view '{view}': {what} not known: mtv-world calibrate-camera {out.parent} --view {view} "
+        '--click points.html'
+        for view, what in episode.unknown.items()
+    ]
+    instruction = mapping.instruction or episode.info.instruction
+    names = stage.names(
+        out.name,
+        instruction,
+        lambda: np.asarray(episode.images[episode.views[0]].frames[0]),
+        given=mapping.objects,
+        stored=episode.info.objects,
+    )
+    if episode.masks and (stage.segmenter is not None or names != episode.info.objects):
+        episode = replace(episode, masks=None)
+        warnings.append('recorded masks are of other objects, or are made anew, and are left out')
+    with EpisodeWriter(
+        out,
+        task=mapping.task or episode.info.task,
+        instruction=instruction,
+        robot=robot.name,
+        cameras=[episode.cameras[v] for v in episode.views if v not in episode.unknown],
+        objects=names,
+        metadata=_metadata(episode, source, key),
+        jpeg_quality=mapping.jpeg_quality,
+    ) as writer:
+        writer.outcome = mapping.outcome if mapping.outcome != 'unknown' else episode.info.outcome
+        masks = stage.masks(out.name, writer)
+        for write in _in_order(
+            episode, writer, masks, robot, stamps, positions, commands, mapping
+        ):
+            write()
+        masks.finish()
+    return tuple(warnings)
+
+
+def _measured(
+    episode: Episode, robot: RobotModel, mapping: BagMapping
+) -> tuple[np.ndarray, FloatArray]:
+    """Stamps (N,) and positions (N, J) in the robot's order."""
+    states = episode.joint_states
+    if states is None:
+        hints = [text for text in episode.warnings if 'joint states' in text]
+        raise EpisodeError(f"'{episode.info.path}' has no joint states{': '.join(['', *hints])}")
+    seconds = (states.stamps_ns - states.stamps_ns[0]) * 1e-9
+    table = JointTrajectory(
+        joint_names=states.joint_names,
+        times=np.asarray(seconds, np.float64),
+        positions=states.positions,
+    )
+    missing = [name for name in robot.joint_names if name not in states.joint_names]
+    if missing:
+        raise TrajectoryError(
+            f"joints {missing} of robot '{robot.name}' are not in the joint states, which have "
+            f"{list(states.joint_names)}; rename recorded ones by 'joints' in the mapping, or "
+            f"give what is not measured: 'constants: {{{missing[0]}: 0.0}}'"
+        )
+    positions = match_joints(table, robot).positions
+    _check(robot, positions, mapping, 'joint states')
+    return states.stamps_ns, positions
+
+
+def _commands(
+    episode: Episode, robot: RobotModel, mapping: BagMapping
+) -> list[tuple[int, JointTrajectory]]:
+    if not episode.trajectories:
+        topic = mapping.topic(mapping.action)
+        reasons = [f' ({warning})' for warning in episode.warnings if f"'{topic}'" in warning]
+        raise EpisodeError(
+            f"'{episode.info.path}' has no commands at '{topic}'{''.join(reasons)}; name "
+            "their topic with --action or in the mapping's 'action', or set 'action: state' "
+            '(--action state) to take the measured positions'
+        )
+    matched = [(stamp, match_joints(t, robot)) for stamp, t in episode.trajectories]
+    for _, trajectory in matched:
+        _check(robot, trajectory.positions, mapping, 'commands')
+    return matched
+
+
+def _check(robot: RobotModel, positions: FloatArray, mapping: BagMapping, what: str) -> None:
+    try:
+        check_positions(robot, positions, tolerance=mapping.limit_tolerance)
+    except TrajectoryError as error:
+        raise TrajectoryError(
+            f"{what}: {error}; are the joints' names, units and the gripper's range those of the "
+            'robot? (limit_tolerance in the mapping says how far outside is accepted)'
+        ) from error
+
+
+def _in_order(
+    episode: Episode,
+    writer: EpisodeWriter,
+    object_masks: MaskWriter,
+    robot: RobotModel,
+    stamps: np.ndarray,
+    positions: FloatArray,
+    commands: Sequence[tuple[int, JointTrajectory]],
+    mapping: BagMapping,
+) -> list[Callable[[], Any]]:
+    """Returns the write calls, sorted by stamp."""
+    entries: list[tuple[int, int, Callable[[], Any]]] = []
+
+    def add(stamp: int, rank: int, write: Callable[..., Any], *values: Any) -> None:
+        entries.append((stamp, rank, lambda: write(*values)))
+
+    for stamp, words in _instructions(episode, mapping, int(stamps[0])):
+        add(stamp, 0, writer.write_instruction, stamp, words)
+    for stamp, row in zip(stamps.tolist(), positions, strict=True):
+        add(stamp, 1, writer.write_joint_states, stamp, robot.joint_names, row)
+    for stamp, trajectory in commands:  # after what it starts from, so that it can be played
+        add(stamp, 6, writer.write_trajectory, stamp, trajectory)
+    frames = [(v, s, i) for v in episode.views for i, s in enumerate(episode.images[v].stamps_ns)]
+    for view, stamp_ns, index in frames:
+        stamp = int(stamp_ns)
+        add(stamp, 3, _write_camera_info, writer, episode, view, stamp)
+        if view in episode.camera_tracks:
+            camera = episode.camera(view, index)
+            mount, T = camera.mount_link, camera.T_mount_camera
+            add(stamp, 3, writer.write_camera_pose, view, stamp, mount, T)
+        add(stamp, 4, _write_frame, writer, object_masks, episode, view, index)
+    masks = episode.masks or {}
+    for view, stamp, index in ((v, s, i) for v in masks for i, s in enumerate(masks[v].stamps_ns)):
+        add(int(stamp), 5, _write_mask, writer, view, int(stamp), masks[view].frames, index)
+    return [write for _, _, write in sorted(entries, key=lambda entry: entry[:2])]
+
+
+def _instructions(episode: Episode, mapping: BagMapping, start_ns: int) -> list[tuple[int, str]]:
+    """Instructions by stamp, at least one."""
+    if mapping.instruction or not episode.instructions:
+        return [(start_ns, mapping.instruction or episode.info.instruction)]
+    return list(episode.instructions)
+
+
+def _metadata(episode: Episode, source: str, key: str) -> dict[str, str]:
+    """Where the episode is from, and who made its masks."""
+    values = {'source': source, MAPPING_KEY: key}
+    values |= {UNKNOWN_CAMERAS: ', '.join(episode.unknown)} if episode.unknown else {}
+    by = episode.info.metadata.get(MASKS_BY, '')
+    return {**values, MASKS_BY: by} if episode.masks and by else values
+
+
+def _write_camera_info(writer: EpisodeWriter, episode: Episode, view: str, stamp_ns: int) -> None:
+    if episode.unknown.get(view, 'pose') == 'pose':  # the intrinsics are known
+        writer.write_camera_info(view, stamp_ns, episode.cameras[view])
+
+
+def _write_frame(
+    writer: EpisodeWriter, masks: MaskWriter, episode: Episode, view: str, index: int
+) -> None:
+    track = episode.images[view]
+    stamp, frame = int(track.stamps_ns[index]), track.frames[index]
+    writer.write_image(view, stamp, frame)
+    masks.add(view, stamp, frame)
+
+
+def _write_mask(writer: EpisodeWriter, view: str, stamp: int, frames: Any, index: int) -> None:
+    writer.write_mask(view, stamp, frames[index])

@@ -1,0 +1,422 @@
+"""Imports a dataset, episode by episode: existing ones are kept, failures are reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtv_world_ros.cameras.camera import camera_poses
+from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
+from mtv_world_ros.core.errors import ConfigError, EpisodeError, MtvWorldError, TrajectoryError
+from mtv_world_ros.data.episode import Episode, EpisodeInfo, Track
+from mtv_world_ros.data.episode_reader import read_info
+from mtv_world_ros.data.episode_writer import EpisodeWriter
+from mtv_world_ros.importing.camera_parameters import camera_track
+from mtv_world_ros.importing.lerobot import EpisodeEntry, LeRobotDataset
+from mtv_world_ros.importing.mapping import DatasetMapping, digest_of, load_mapping, Stream
+from mtv_world_ros.importing.stored_objects import AS_RECORDED, ObjectStage
+from mtv_world_ros.robot.file import save_robot
+from mtv_world_ros.robot.joint_columns import to_positions
+from mtv_world_ros.robot.model import check_positions, RobotModel
+from mtv_world_ros.robot.plan_limits import joint_speeds
+
+Item = TypeVar('Item')
+
+
+@dataclass(slots=True)
+class ImportSummary(Generic[Item]):
+    """Outcome of an import, by the number of the episode or by bag.
+
+    Attributes:
+        made: converted now.
+        kept: were there already.
+        failed: why.
+        warnings: problems and how they were handled.
+        robot_notes: problems of the robot's description.
+    """
+
+    made: list[Item] = field(default_factory=list)
+    kept: list[Item] = field(default_factory=list)
+    failed: dict[Item, str] = field(default_factory=dict)
+    warnings: dict[Item, tuple[str, ...]] = field(default_factory=dict)
+    robot_notes: tuple[str, ...] = ()
+
+
+def import_each(
+    items: Iterable[Item],
+    key: str,
+    place: Callable[[Item], Path],
+    convert: Callable[[Item, Path], tuple[str, ...]],
+) -> ImportSummary[Item]:
+    """Converts what is not there yet.
+
+    Args:
+        items: e.g. numbers of a data set's episodes.
+        key: digest of mapping, robot and calibration; an episode made with others is an error.
+        place: gives the folder of an item's episode.
+        convert: writes the folder; returns what was odd and how it was handled.
+    """
+    summary = ImportSummary[Item]()
+    for item in items:
+        path = place(item)
+        try:
+            if not path.exists():
+                summary.warnings[item] = convert(item, path)
+                summary.made.append(item)
+            elif read_info(path).metadata.get(MAPPING_KEY, '') == key:
+                summary.kept.append(item)
+            else:
+                raise EpisodeError(
+                    f"'{path}' was imported with another mapping, calibration, robot, describer "
+                    'or segmenter; remove it or choose another --out'
+                )
+        except MtvWorldError as error:
+            summary.failed[item] = str(error)
+    return summary
+
+
+def episode_name(number: int) -> str:
+    """Returns the name of an imported episode."""
+    return f'episode_{number:06d}'
+
+
+def read_frames(dataset: LeRobotDataset, entry: EpisodeEntry, mapping: DatasetMapping) -> Episode:
+    """Reads an episode's frames alone, each when it is asked for.
+
+    Raises:
+        EpisodeError: its rows cannot be read.
+    """
+    times = dataset.rows(entry, ['timestamp'])['timestamp'].ravel()
+    stamps = START_NS + np.round((times - times[0]) * 1e9).astype(np.int64)
+    return Episode(
+        info=EpisodeInfo(path=dataset.root / episode_name(entry.index)),
+        views=tuple(mapping.views),
+        images={
+            view: Track(stamps, _Frames(dataset, entry, source.feature, times))
+            for view, source in mapping.views.items()
+        },
+        cameras={},
+        joint_states=None,
+        trajectories=[],
+        masks=None,
+        instructions=[],
+    )
+
+
+class _Frames:
+    """Frames of an episode; each is decoded when it is asked for, from the first one on."""
+
+    def __init__(
+        self, dataset: LeRobotDataset, entry: EpisodeEntry, feature: str, times: FloatArray
+    ) -> None:
+        self._dataset, self._entry, self._feature = dataset, entry, feature
+        self._times = times
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def __getitem__(self, index: Any) -> ByteArray:
+        frames = self._dataset.frames(self._entry, self._feature, self._times[: index + 1])
+        frame = next(islice(frames, index, None), None)
+        if frame is None:
+            raise EpisodeError(f"'{self._feature}' has no frame {index}")
+        return frame
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.stack(list(self._dataset.frames(self._entry, self._feature, self._times)))
+
+
+def import_dataset(
+    dataset: Path,
+    mapping: Path,
+    out: Path,
+    *,
+    episodes: Sequence[int] | None = None,
+    stage: ObjectStage = AS_RECORDED,
+    progress: Callable[[Iterable[int]], Iterable[int]] = iter,
+) -> ImportSummary[int]:
+    """Converts a LeRobot dataset into episodes `out/episode_<number>`, with `out/robot/` beside.
+
+    Args:
+        dataset: folder of the dataset.
+        mapping: mapping file, see `load_mapping`.
+        out: folder of the episodes.
+        episodes: numbers of those wanted; None = all.
+        stage: names the objects and finds their masks.
+        progress: wraps the numbers, e.g. in a progress bar.
+
+    Raises:
+        ConfigError, EpisodeError: dataset or mapping cannot be used at all.
+    """
+    source, chosen = LeRobotDataset(dataset), load_mapping(mapping)
+    _check_features(source, chosen)
+    wanted = sorted(source.episodes) if episodes is None else list(episodes)
+    unknown = [number for number in wanted if number not in source.episodes]
+    if unknown:
+        known = sorted(source.episodes)
+        raise ConfigError(
+            f"'{dataset}' has no episode {unknown[0]}; it has {len(known)}, from "
+            f'{known[0] if known else "-"} to {known[-1] if known else "-"}'
+        )
+
+    key = digest_of(start=stage.key + chosen.key.encode()) if stage.key else chosen.key
+
+    def convert(number: int, path: Path) -> tuple[str, ...]:
+        return convert_episode(source, source.episodes[number], chosen, path, stage, key)
+
+    summary = import_each(
+        progress(wanted), key, lambda number: out / episode_name(number), convert
+    )
+    if summary.made or summary.kept:
+        summary.robot_notes = save_robot(chosen.robot_file, out / 'robot').notes
+    return summary
+
+
+def _check_features(source: LeRobotDataset, chosen: DatasetMapping) -> None:
+    """Checks the names of features before the first episode is read."""
+    for name in _stream_features(chosen):
+        source.feature(name)
+    if chosen.outcome_feature:
+        source.feature(chosen.outcome_feature)
+    for view in chosen.views.values():
+        source.colour_feature(view.feature)
+        for name in view.features():
+            source.feature(name)
+
+
+#: datasets have no date: episodes start at this stamp (0 would mean "not stamped") [ns]
+START_NS = 1_000_000_000
+MAPPING_KEY = 'import_mapping'
+
+
+def convert_episode(
+    dataset: LeRobotDataset,
+    entry: EpisodeEntry,
+    mapping: DatasetMapping,
+    out: Path,
+    stage: ObjectStage = AS_RECORDED,
+    key: str = '',
+) -> tuple[str, ...]:
+    """Writes the episode's folder `out`, which appears when it is complete.
+
+    Row k has the state and the images of its time; its action is the target that is reached
+    `delay_frames` later. Times are the dataset's own.
+
+    Returns:
+        What was odd and how it was handled.
+
+    Raises:
+        MtvWorldError: the episode cannot be converted; nothing is left behind.
+    """
+    rows = _read_rows(dataset, entry, mapping)
+    times = rows['timestamp'].ravel()
+    if len(times) < 2 or (np.diff(times) <= 0).any() or not np.isfinite(times).all():
+        raise EpisodeError(f'its {len(times)} timestamps do not increase')
+    measured = _measured(dataset, rows, mapping)
+    commanded, odd = _commanded(dataset, rows, mapping, measured)
+    videos = {
+        view: dataset.frames(entry, source.feature, times)
+        for view, source in mapping.views.items()
+    }
+    first = {view: _next_frame(frames, view, 0) for view, frames in videos.items()}
+    cameras, tracks, notes = _cameras(dataset, entry, mapping, rows, first)
+    texts = _instructions(dataset, rows, mapping)
+    with ExitStack() as stack:
+        writer = EpisodeWriter(
+            out,
+            task=mapping.task,
+            instruction=texts[0],
+            robot=mapping.robot.name,
+            cameras=cameras,
+            objects=stage.names(
+                out.name, texts[0], lambda: next(iter(first.values())), given=mapping.objects
+            ),
+            metadata={
+                'source': dataset.root.resolve().name,
+                'source_episode': str(entry.index),
+                MAPPING_KEY: key or mapping.key,
+            },
+            jpeg_quality=mapping.jpeg_quality,
+        )
+        stack.enter_context(writer)
+        masks = stage.masks(out.name, writer)
+        writer.outcome = _outcome(rows, mapping)
+        stamps = [START_NS + round(float(t - times[0]) * 1e9) for t in times]
+        commands = dict(_commands(times, commanded, mapping, dataset.fps))
+        for k, stamp_ns in enumerate(stamps):
+            if k == 0 or texts[k] != texts[k - 1]:
+                writer.write_instruction(stamp_ns, texts[k])
+            writer.write_joint_states(stamp_ns, mapping.robot.joint_names, measured[k])
+            for camera in cameras:
+                view = camera.view
+                frame = first[view] if k == 0 else _next_frame(videos[view], view, k)
+                writer.write_camera_info(view, stamp_ns, camera)
+                if view in tracks:
+                    writer.write_camera_pose(view, stamp_ns, camera.mount_link, tracks[view][k])
+                writer.write_image(view, stamp_ns, frame)
+                masks.add(view, stamp_ns, frame)
+            if k in commands:  # after what it starts from, so that the episode can be played
+                writer.write_trajectory(stamp_ns, commands[k])
+        masks.finish()
+    shown = {view: dataset.video_note(entry, row.feature) for view, row in mapping.views.items()}
+    turned = [f"view '{view}': {note}" for view, note in shown.items() if note]
+    return *odd, *notes, *turned, *jumps(commands.values(), mapping.robot)
+
+
+def _stream_features(mapping: DatasetMapping) -> tuple[str, ...]:
+    """Return the features of the measured and the commanded joints."""
+    commanded = mapping.action.features if mapping.action else ()
+    return *mapping.state.features, *commanded
+
+
+def _read_rows(
+    dataset: LeRobotDataset, entry: EpisodeEntry, mapping: DatasetMapping
+) -> dict[str, FloatArray]:
+    names = ['timestamp', 'task_index', *_stream_features(mapping)]
+    names += [mapping.outcome_feature] if mapping.outcome_feature else []
+    for source in mapping.views.values():
+        dataset.feature(source.feature, ('video', 'image'))
+        names += source.features()
+    return dataset.rows(entry, list(dict.fromkeys(names)))
+
+
+def _measured(
+    dataset: LeRobotDataset, rows: dict[str, FloatArray], mapping: DatasetMapping
+) -> FloatArray:
+    """(T, J)."""
+    stream = mapping.state
+    values, names = _table(dataset, rows, stream)
+    positions = to_positions(values, names, stream.columns, stream.label)
+    _check(positions, stream, mapping, 'state')
+    return positions
+
+
+def _commanded(
+    dataset: LeRobotDataset,
+    rows: dict[str, FloatArray],
+    mapping: DatasetMapping,
+    measured: FloatArray,
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """(T, J) targets beside the rows, and what was odd."""
+    stream = mapping.action
+    if stream is None:
+        return measured, ()
+    values, names = _table(dataset, rows, stream)
+    positions, odd = stream.commanded(values, names, measured, mapping.robot)
+    _check(positions, stream, mapping, 'action')
+    return positions, odd
+
+
+def _table(
+    dataset: LeRobotDataset, rows: dict[str, FloatArray], stream: Stream
+) -> tuple[FloatArray, list[str]]:
+    """Return the columns (T, C) of a stream's features side by side, and their names."""
+    count = len(rows['timestamp'])
+    tables = {name: rows[name].reshape(count, -1) for name in stream.features}
+    sizes = {name: table.shape[1] for name, table in tables.items()}
+    return np.concatenate(list(tables.values()), axis=1), dataset.joined_names(sizes)
+
+
+def _check(positions: FloatArray, stream: Stream, mapping: DatasetMapping, what: str) -> None:
+    try:
+        check_positions(mapping.robot, positions, tolerance=mapping.limit_tolerance)
+    except TrajectoryError as error:
+        raise TrajectoryError(
+            f"{what} '{stream.label}': {error}; are unit, sign, offset and gripper range in "
+            'the mapping right? (limit_tolerance there says how far outside is accepted)'
+        ) from error
+
+
+def _cameras(
+    dataset: LeRobotDataset,
+    entry: EpisodeEntry,
+    mapping: DatasetMapping,
+    rows: dict[str, FloatArray],
+    first: dict[str, ByteArray],
+) -> tuple[list[CameraModel], dict[str, FloatArray], list[str]]:
+    """The cameras at the first row, the poses at all rows of those that move, what is odd."""
+    cameras, tracks, notes = [], {}, []
+    for view, source in mapping.views.items():
+        height, width = first[view].shape[:2]
+        found = camera_track(source, dataset.root, entry.index, rows, (width, height))
+        camera = found.camera
+        if found.poses is not None:
+            tracks[view] = found.poses
+        notes += [found.note] if found.note else []
+        resting = np.zeros((1, len(mapping.robot.joint_names)))
+        camera_poses(camera, mapping.robot, resting)  # names a mount_link that is not there
+        cameras.append(camera)
+    return cameras, tracks, notes
+
+
+def _instructions(
+    dataset: LeRobotDataset, rows: dict[str, FloatArray], mapping: DatasetMapping
+) -> list[str]:
+    """The instruction at each row."""
+    numbers = rows['task_index'].ravel().astype(int)
+    if mapping.instruction:
+        return [mapping.instruction] * len(numbers)
+    unknown = sorted(set(numbers.tolist()) - set(dataset.tasks))
+    if unknown:
+        raise EpisodeError(f'it names task {unknown[0]}, which meta/tasks does not have')
+    return [dataset.tasks[int(number)] for number in numbers]
+
+
+def _outcome(rows: dict[str, FloatArray], mapping: DatasetMapping) -> str:
+    if not mapping.outcome_feature:
+        return mapping.outcome
+    return 'success' if (rows[mapping.outcome_feature] > 0).any() else 'failure'
+
+
+def _commands(
+    times: FloatArray, positions: FloatArray, mapping: DatasetMapping, fps: float
+) -> list[tuple[int, JointTrajectory]]:
+    """Trajectories of `chunk_s`, each with its first row."""
+    if mapping.action is None:  # the measured positions of the rows that follow
+        reached, targets = times[1:], positions[1:]
+    else:
+        reached, targets = times + mapping.action.delay_frames / fps, positions
+    size = max(1, round(mapping.chunk_s * fps))
+    names, found = mapping.robot.joint_names, []
+    for first in range(0, len(targets), size):
+        chunk = slice(first, first + size)
+        trajectory = JointTrajectory(
+            joint_names=names, times=reached[chunk] - times[first], positions=targets[chunk]
+        )
+        found.append((first, trajectory))
+    return found
+
+
+#: a command this many times faster than the joint's limit is a jump
+_JUMP = 2.0
+
+
+def jumps(commands: Iterable[JointTrajectory], robot: RobotModel) -> list[str]:
+    """Returns joints whose commands are faster than they can move, and how often."""
+    counts, limits = np.zeros(len(robot.joint_names), int), joint_speeds(robot)
+    for trajectory in commands:
+        if len(trajectory.times) > 1:
+            speeds = np.diff(trajectory.positions, axis=0) / np.diff(trajectory.times)[:, None]
+            counts += (np.abs(speeds) > _JUMP * limits).sum(axis=0)
+    given = np.isfinite(robot.velocity_limits)
+    rows = zip(robot.joint_names, counts, given, limits, strict=True)
+    return [
+        f"commands of joint '{name}' jump {count} times (over {_JUMP:g} times "
+        f'{"its speed limit" if is_given else f"{limit:g} a second, as no speed limit is given"})'
+        for name, count, is_given, limit in rows
+        if count
+    ]
+
+
+def _next_frame(frames: Iterator[ByteArray], view: str, row: int) -> ByteArray:
+    frame = next(frames, None)
+    if frame is None:
+        raise EpisodeError(f"view '{view}' has no frame for row {row}")
+    return frame

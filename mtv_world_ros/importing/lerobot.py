@@ -1,0 +1,481 @@
+"""Reads LeRobot datasets, formats v2.0, v2.1 and v3.0.
+
+Layout as in huggingface/lerobot (`src/lerobot/datasets/utils.py`, `io_utils.py` and
+`scripts/convert_dataset_v21_to_v30.py`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.core.bounded_input import (
+    fill_template,
+    parse_json,
+    read_bytes,
+    read_json,
+    read_text,
+)
+from mtv_world_ros.core.data_types import ByteArray, FloatArray
+from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest, ObservationError
+from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
+from mtv_world_ros.importing.video_frames import frames_at, video_note
+
+VERSIONS = ('v2.0', 'v2.1', 'v3.0')
+_PICTURES = ('video', 'image')
+#: bytes 24 and 25 of a PNG: 16 bits, grey
+_PNG_DEPTH = bytes([16, 0])
+_INFO = Path('meta/info.json')
+#: a video frame may be this share of the period away from its row
+_TIME_TOLERANCE = 0.25
+#: characters of a wrong value in an error
+_MOST_SHOWN = 120
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoPart:
+    """A video file with an episode's frames, and the time at which the episode starts in it."""
+
+    file: Path
+    start_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeEntry:
+    """One episode of a dataset.
+
+    Attributes:
+        index: its number.
+        length: number of rows.
+        data_file: parquet file with its rows, maybe among others'.
+        videos: by feature.
+    """
+
+    index: int
+    length: int
+    data_file: Path
+    videos: Mapping[str, VideoPart]
+
+
+class LeRobotDataset:
+    """A dataset: a folder with `meta/`, `data/` and `videos/`.
+
+    Attributes:
+        root: the folder.
+        version: of the format.
+        fps: rows a second [Hz].
+        features: types and shapes of the columns, by name.
+        episodes: entries by number.
+        tasks: texts by number.
+
+    Raises:
+        EpisodeError: the folder is no LeRobot dataset, or of another version.
+        ConfigError: pyarrow is not installed.
+    """
+
+    def __init__(self, root: Path) -> None:
+        pyarrow_modules()
+        self.root = root
+        self._video_notes: dict[Path, str] = {}
+        info = self._info()
+        self.version = str(info.get('codebase_version', ''))
+        if self.version not in VERSIONS:
+            raise EpisodeError(
+                f"'{root / _INFO}' is of format '{self.version}'; readable are "
+                f'{", ".join(VERSIONS)} (LeRobot itself converts older ones)'
+            )
+        try:
+            self.fps = float(info['fps'])
+            self.features: dict[str, dict[str, Any]] = dict(info['features'])
+            self._data_path = info['data_path']
+            self._video_path = info.get('video_path') or ''
+            self._chunk = int(info.get('chunks_size', 1000))
+            read = self._episodes_v3 if self.version == 'v3.0' else self._episodes_v2
+            self.episodes = {entry.index: entry for entry in read()}
+            self.tasks = self._tasks_v3() if self.version == 'v3.0' else self._tasks_v2()
+        except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
+            raise EpisodeError(
+                f"'{root / 'meta'}' is not what format {self.version} has there: "
+                f'{type(error).__name__}: {error}'
+            ) from error
+
+    def feature(self, name: str, kinds: Sequence[str] = ()) -> dict[str, Any]:
+        """Returns what the dataset says about a feature.
+
+        Raises:
+            ConfigError: there is none of that name and (if any are given) kinds.
+        """
+        known = [n for n, f in self.features.items() if not kinds or f.get('dtype') in kinds]
+        if name not in known:
+            what = 'image or video feature' if kinds else 'feature'
+            raise ConfigError(
+                f"'{self.root}' has no {what} '{name}'{nearest(name, known)}; it has "
+                f'{", ".join(known) or "none"}'
+            )
+        return self.features[name]
+
+    def colour_feature(self, name: str) -> dict[str, Any]:
+        """Returns what the dataset says about a camera's video or images.
+
+        Raises:
+            ConfigError: there is no such feature, or it is a depth map.
+        """
+        found = self.feature(name, _PICTURES)
+        if _is_depth_map(found):
+            cameras = {n: f for n, f in self.features.items() if f.get('dtype') in _PICTURES}
+            colours = [n for n, f in cameras.items() if not _is_depth_map(f)]
+            raise ConfigError(
+                f"'{self.root}': feature '{name}' is a depth map (is_depth_map), no picture of "
+                f'the scene; those are {", ".join(colours) or "none"}'
+            )
+        return found
+
+    def column_names(self, feature: str) -> list[str]:
+        """Names of a feature's columns, empty where it has none.
+
+        They are a list, a list in a list, or a list under one key (`motors`).
+        """
+        names = self.feature(feature).get('names')
+        if isinstance(names, Mapping):
+            names = next(iter(names.values()), None)
+        if isinstance(names, list) and len(names) == 1 and isinstance(names[0], list):
+            names = names[0]
+        return [str(name) for name in names] if isinstance(names, list) else []
+
+    def joined_names(self, sizes: Mapping[str, int]) -> list[str]:
+        """Return one name a column of several features side by side.
+
+        Args:
+            sizes: numbers of columns by feature, in their order.
+
+        A column keeps its own name where no other feature has it, else it is FEATURE/NAME. One
+        without a name is FEATURE/NUMBER, or FEATURE where it is the only one. Columns of a single
+        feature keep their names; there are none where the feature names none.
+        """
+        own = {feature: self.column_names(feature) for feature in sizes}
+        if len(sizes) == 1:
+            return own[next(iter(sizes))]
+        counts = Counter(name for names in own.values() for name in names)
+        found = []
+        for feature, size in sizes.items():
+            names = own[feature]
+            if len(names) != size:
+                names = []
+            for k in range(size):
+                if names and counts[names[k]] == 1:
+                    found.append(names[k])
+                else:
+                    part = names[k] if names else str(k)
+                    found.append(feature if size == 1 and not names else f'{feature}/{part}')
+        return found
+
+    def video_note(self, entry: EpisodeEntry, feature: str) -> str:
+        """Return what is done to the frames of a video feature and why; empty if nothing is.
+
+        Raises:
+            EpisodeError: the video is missing or damaged.
+        """
+        if self.feature(feature, _PICTURES)['dtype'] == 'image':
+            return ''
+        file = entry.videos[feature].file
+        if file not in self._video_notes:
+            self._video_notes[file] = video_note(file)
+        return self._video_notes[file]
+
+    def rows(self, entry: EpisodeEntry, features: Sequence[str]) -> dict[str, FloatArray]:
+        """Numbers of an episode by feature, (T, ...) each, in order.
+
+        Raises:
+            EpisodeError: the file cannot be read, or does not hold what the metadata say.
+            ConfigError: a feature is not there.
+        """
+        for name in features:
+            self.feature(name)
+        wanted = list(dict.fromkeys([*features, 'frame_index', 'episode_index']))
+        table = self._table(entry, wanted)
+        try:
+            arrays = {
+                name: np.array(table.column(name).to_pylist(), dtype=float) for name in wanted
+            }
+        except (TypeError, ValueError) as error:
+            raise EpisodeError(
+                f"'{entry.data_file}': a feature among {list(features)} does not hold numbers "
+                f'of one shape ({error})'
+            ) from error
+        order = np.argsort(arrays['frame_index'].ravel(), kind='stable')
+        return {name: arrays[name][order] for name in features}
+
+    def frames(
+        self, entry: EpisodeEntry, feature: str, timestamps: FloatArray
+    ) -> Iterator[ByteArray]:
+        """Yields the (H, W, 3) RGB frames of an episode's rows at `timestamps` (T,) [s].
+
+        Raises:
+            EpisodeError: a frame is missing or damaged.
+        """
+        if self.feature(feature, _PICTURES)['dtype'] == 'image':
+            yield from self._images(entry, feature)
+            return
+        part = entry.videos[feature]
+        tolerance = _TIME_TOLERANCE / self.fps
+        try:
+            yield from frames_at(part.file, timestamps + part.start_s, tolerance)
+        except EpisodeError as error:
+            raise EpisodeError(f'{error}{self._stale_video(feature)}') from error
+
+    def _info(self) -> Mapping[str, Any]:
+        file = self.root / _INFO
+        if not file.is_file():
+            raise EpisodeError(f"'{self.root}' is no LeRobot dataset: '{_INFO}' is not there")
+        try:
+            info = read_json(file)
+        except (OSError, ValueError) as error:
+            raise EpisodeError(f"'{file}' is not JSON: {error}") from error
+        if not isinstance(info, Mapping):
+            raise EpisodeError(f"'{file}' must hold keys and values")
+        return info
+
+    def _video_keys(self) -> list[str]:
+        return [name for name, f in self.features.items() if f.get('dtype') == 'video']
+
+    def _episodes_v2(self) -> Iterator[EpisodeEntry]:
+        for row in self._lines('meta/episodes.jsonl'):
+            index = int(row['episode_index'])
+            place = {'episode_index': index, 'episode_chunk': index // self._chunk}
+            yield EpisodeEntry(
+                index=index,
+                length=int(row['length']),
+                data_file=self._file(self._data_path, place),
+                videos={
+                    key: VideoPart(
+                        file=self._file(self._video_path, {**place, 'video_key': key}), start_s=0.0
+                    )
+                    for key in self._video_keys()
+                },
+            )
+
+    def _episodes_v3(self) -> Iterator[EpisodeEntry]:
+        files = sorted((self.root / 'meta/episodes').glob('*/*.parquet'))
+        if not files:
+            raise EpisodeError(f"'{self.root / 'meta/episodes'}' holds no parquet file")
+        for file in files:
+            for row in _read_table(file).to_pylist():
+                videos = {}
+                for key in self._video_keys():
+                    place = {'video_key': key, **_place(row, f'videos/{key}')}
+                    videos[key] = VideoPart(
+                        file=self._file(self._video_path, place),
+                        start_s=float(row[f'videos/{key}/from_timestamp']),
+                    )
+                yield EpisodeEntry(
+                    index=int(row['episode_index']),
+                    length=int(row['length']),
+                    data_file=self._file(self._data_path, _place(row, 'data')),
+                    videos=videos,
+                )
+
+    def _tasks_v2(self) -> dict[int, str]:
+        return {int(r['task_index']): str(r['task']) for r in self._lines('meta/tasks.jsonl')}
+
+    def _tasks_v3(self) -> dict[int, str]:
+        table = _read_table(self.root / 'meta/tasks.parquet')
+        # pandas' index: its name, or `__index_level_0__` where it had none
+        texts = next(name for name in table.column_names if name != 'task_index')
+        rows = zip(table.column('task_index').to_pylist(), table.column(texts).to_pylist(),
+                   strict=True)  # fmt: skip
+        return {int(index): str(text) for index, text in rows}
+
+    def _lines(self, name: str) -> Iterator[dict[str, Any]]:
+        file = self.root / name
+        try:
+            lines = read_text(file, 'json_bytes').splitlines()
+            return iter([parse_json(line, f"'{file}'") for line in lines if line.strip()])
+        except (OSError, ValueError) as error:
+            raise EpisodeError(f"cannot read '{file}': {error}") from error
+
+    def _file(self, template: object, place: Mapping[str, int | str]) -> Path:
+        try:
+            relative = Path(fill_template(template, place))
+        except ValueError as error:
+            key = 'data_path' if template == self._data_path else 'video_path'
+            raise EpisodeError(
+                f"'{self.root / _INFO}': '{key}' is {repr(template)[:_MOST_SHOWN]}: {error}"
+            ) from error
+        if relative.is_absolute() or '..' in relative.parts:
+            raise EpisodeError(f"'{self.root / _INFO}' names '{relative}', outside the dataset")
+        return self.root / relative
+
+    def _table(self, entry: EpisodeEntry, columns: Sequence[str]) -> Any:
+        if not entry.data_file.is_file():
+            raise EpisodeError(
+                f"'{entry.data_file}' is not there{self._stale(entry) or ', but in the metadata'}"
+            )
+        table = _read_table(
+            entry.data_file, columns=columns, filters=[('episode_index', '==', entry.index)]
+        )
+        if table.num_rows != entry.length:
+            raise EpisodeError(
+                f"'{entry.data_file}' has {table.num_rows} rows of episode {entry.index}, the "
+                f'metadata say {entry.length}{self._stale(entry)}'
+            )
+        return table
+
+    def _stale(self, entry: EpisodeEntry) -> str:
+        """Says which other files have the episode's rows; empty where none has."""
+        files = [f for f in self._files_by_episode.get(entry.index, ()) if f != entry.data_file]
+        if not files:
+            return ''
+        named = ', '.join(f"'{file.relative_to(self.root)}'" for file in files)
+        return (
+            f'; rows of it are in {named}: the file index in meta/ is of an earlier state of the '
+            "dataset (the columns 'data/chunk_index' and 'data/file_index' of meta/episodes in "
+            'v3.0); write it again, or merge or convert the dataset anew with LeRobot'
+        )
+
+    def _stale_video(self, feature: str) -> str:
+        """Says which video files no episode names; empty where none."""
+        named = {entry.videos[feature].file for entry in self.episodes.values()}
+        there = {f for f in (self.root / 'videos').rglob('*.mp4') if feature in f.parts}
+        others = sorted(there - named)
+        if not others:
+            return ''
+        shown = ', '.join(f"'{other.relative_to(self.root)}'" for other in others)
+        return (
+            f'; no episode names {shown}: the video index in meta/ is of an earlier state of the '
+            f"dataset (the columns 'videos/{feature}/chunk_index', 'file_index' and "
+            "'from_timestamp' of meta/episodes in v3.0); write it again, or merge or convert the "
+            'dataset anew with LeRobot'
+        )
+
+    @cached_property
+    def _files_by_episode(self) -> dict[int, list[Path]]:
+        """Data files by the number of the episodes that have rows in them."""
+        found: dict[int, list[Path]] = {}
+        for file in sorted((self.root / 'data').rglob('*.parquet')):
+            try:
+                column = _read_table(file, columns=['episode_index']).column('episode_index')
+            except EpisodeError:
+                continue  # the file that is asked for is what is reported
+            for index in column.unique().to_pylist():
+                found.setdefault(int(index), []).append(file)
+        return found
+
+    def _images(self, entry: EpisodeEntry, feature: str) -> Iterator[ByteArray]:
+        table = self._table(entry, [feature, 'frame_index', 'episode_index'])
+        order = np.argsort(table.column('frame_index').to_pylist(), kind='stable')
+        column = table.column(feature)
+        for number in order:
+            try:
+                cell = column[int(number)].as_py()
+            except UnicodeDecodeError as error:  # the path beside the bytes
+                raise EpisodeError(
+                    f"'{entry.data_file}': an image of '{feature}' is damaged: {error}"
+                ) from error
+            yield self._decoded(cell, entry, feature)
+
+    def _image_bytes(self, cell: Any, entry: EpisodeEntry, feature: str) -> bytes:
+        """Return the encoded image of a cell: bytes, a path, or both by key.
+
+        Raises:
+            EpisodeError: the cell holds none, or the file that it names cannot be read.
+        """
+        data, path = (
+            (cell.get('bytes'), cell.get('path')) if isinstance(cell, Mapping) else (cell, None)
+        )
+        if isinstance(data, str):
+            data, path = None, data
+        if isinstance(data, list) and all(isinstance(n, int) and 0 <= n < 256 for n in data):
+            data = bytes(data)
+        if isinstance(data, bytes):
+            return data
+        if data is None and isinstance(path, str):
+            return self._image_file(path, entry, feature)
+        kind = type(cell).__name__ if not isinstance(cell, Mapping) else f'keys {sorted(cell)}'
+        raise EpisodeError(
+            f"'{entry.data_file}': a cell of '{feature}' holds {kind}, must be an encoded image, "
+            'or the path of one'
+        )
+
+    def _image_file(self, path: str, entry: EpisodeEntry, feature: str) -> bytes:
+        """Return the content of an image file; paths of another machine are taken by their end."""
+        parts = [part for part in PurePosixPath(path.replace('\\', '/')).parts if part != '/']
+        if not parts or '..' in parts:
+            raise EpisodeError(
+                f"'{entry.data_file}': an image of '{feature}' is '{path}', outside the dataset"
+            )
+        ends = [Path(*parts[k:]) for k in range(len(parts))]
+        bases = (
+            self.root,
+            entry.data_file.parent,
+            self.root / 'images' / feature / f'episode_{entry.index:06d}',
+        )
+        files = (base / end for end in ends for base in bases)
+        found = next((file for file in files if _is_file(file)), None)
+        if found is None:
+            raise EpisodeError(
+                f"'{entry.data_file}': an image of '{feature}' is '{path}', which is not there, "
+                f"neither in '{self.root}' nor beside the table"
+            )
+        try:
+            return read_bytes(found, 'image_bytes')
+        except (OSError, ValueError) as error:
+            raise EpisodeError(f"image '{found}' cannot be read: {error}") from error
+
+    def _decoded(self, cell: Any, entry: EpisodeEntry, feature: str) -> ByteArray:
+        data = self._image_bytes(cell, entry, feature)
+        if data[:4] == b'\x89PNG' and data[24:26] == _PNG_DEPTH:
+            raise EpisodeError(
+                f"'{entry.data_file}': '{feature}' has 16-bit images of one channel, as of depth; "
+                'a view needs colours'
+            )
+        layout = 'png' if data[:4] == b'\x89PNG' else 'jpeg'
+        try:
+            return compressed_to_rgb(layout, np.frombuffer(data, np.uint8))
+        except ObservationError as error:
+            raise EpisodeError(
+                f"'{entry.data_file}': an image of '{feature}' is damaged: {error}"
+            ) from error
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that no system has
+        return False
+
+
+def _is_depth_map(feature: Mapping[str, Any]) -> bool:
+    """Whether a feature says so of itself, in any of the places where LeRobot has written it."""
+    places = (feature, feature.get('info'), feature.get('video_info'))
+    keys = ('is_depth_map', 'video.is_depth_map')
+    return any(bool(p.get(key)) for p in places if isinstance(p, Mapping) for key in keys)
+
+
+def _place(row: Mapping[str, Any], prefix: str) -> dict[str, int]:
+    return {key: int(row[f'{prefix}/{key}']) for key in ('chunk_index', 'file_index')}
+
+
+def _read_table(file: Path, **options: Any) -> Any:
+    pyarrow, parquet = pyarrow_modules()
+    try:
+        return parquet.read_table(file, **options)
+    except (OSError, pyarrow.ArrowException) as error:
+        raise EpisodeError(f"cannot read '{file}': {' '.join(str(error).split())}") from error
+
+
+def pyarrow_modules() -> tuple[Any, Any]:
+    """Returns `pyarrow` and `pyarrow.parquet`, which are optional."""
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ConfigError(
+            "LeRobot datasets need pyarrow: pip install 'mtv_world_ros[import]'"
+        ) from error
+    return pyarrow, parquet

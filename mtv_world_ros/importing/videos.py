@@ -1,0 +1,301 @@
+"""Recordings that are video files and tables of joints or tool poses, a row a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from glob import escape
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PrivateAttr
+
+from mtv_world_ros.cameras.calibration_file import load_calibration
+from mtv_world_ros.cameras.camera import unknown_camera
+from mtv_world_ros.core.config import read_yaml, validated, wrong
+from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest
+from mtv_world_ros.data.bag_mapping import BagMapping, ViewSource, Written
+from mtv_world_ros.data.episode import Episode, EpisodeInfo, JointStates, Track
+from mtv_world_ros.data.joint_plans import following
+from mtv_world_ros.importing.bags import write_imported
+from mtv_world_ros.importing.camera_parameters import sized_camera
+from mtv_world_ros.importing.convert import import_each, ImportSummary, START_NS
+from mtv_world_ros.importing.mapping import ActionStream, digest_of, load_mapped_robot
+from mtv_world_ros.importing.number_tables import NumberTable, read_table
+from mtv_world_ros.importing.stored_objects import AS_RECORDED, ObjectStage
+from mtv_world_ros.importing.tool_poses import joints_of_poses
+from mtv_world_ros.importing.video_frames import FrameTimes, match_frames, VideoFileFrames
+from mtv_world_ros.robot.file import save_robot
+from mtv_world_ros.robot.joint_columns import column_number, to_positions
+from mtv_world_ros.robot.model import RobotModel
+
+#: units of `time` in a second
+_PER_SECOND = {'s': 1.0, 'ms': 1e3, 'us': 1e6, 'ns': 1e9}
+#: settings that are not among those that older imports were made with
+_LATER = ('time_unit', 'frame_times')
+
+
+def _inside(pattern: str) -> str:
+    path = Path(pattern)
+    if path.is_absolute() or '..' in path.parts:
+        raise wrong('a path inside of the folder of recordings')
+    return pattern
+
+
+class VideoMapping(Written):
+    """A mapping file of videos and tables; `{name}` in a path is the recording's name."""
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+
+    robot: Annotated[RobotModel, BeforeValidator(load_mapped_robot)] = Field(
+        description="name of a bundled robot, or a robot's YAML relative to this file"
+    )
+    rows: Annotated[str, AfterValidator(_inside)] = Field(
+        description='JSON or CSV file of each recording, e.g. `joints/{name}.json`'
+    )
+    views: dict[str, str] = Field(description='video file by view, e.g. `videos/{name}/0.mp4`')
+    state: ActionStream = Field(description='measured joints, or poses of tools, of each row')
+    fps: float | None = Field(
+        default=None, gt=0, le=1000, description='rows a second, without `time`'
+    )
+    time: str = Field(default='', description='column or key of the time of each row')
+    time_unit: Literal['s', 'ms', 'us', 'ns'] = Field(default='s', description='of `time`')
+    frame_times: FrameTimes = Field(
+        default='auto',
+        description='`video` = frames keep the times of the video, from the first row on; `rows` '
+        '= frame k belongs to row k; `auto` = what number, rate and duration tell',
+    )
+    instruction: str = Field(default='', description='text, or `key: NAME` of the JSON file')
+    _robot_file: Path = PrivateAttr(default=Path())
+
+    @property
+    def robot_file(self) -> Path:
+        """The robot's YAML."""
+        return self._robot_file
+
+    @property
+    def unused_settings(self) -> set[str]:
+        """Settings that leave episodes of earlier versions as they are."""
+        fields = type(self).model_fields
+        return {key for key in _LATER if getattr(self, key) == fields[key].default}
+
+    def written(self) -> BagMapping:
+        """Task, outcome and quality of the episodes that are written."""
+        given = {name: getattr(self, name) for name in Written.model_fields}
+        return BagMapping(**given, views={view: ViewSource(image=view) for view in self.views})
+
+
+def load_video_mapping(path: Path) -> VideoMapping:
+    """Reads a mapping file; `config/datasets/videos.yaml` describes its keys.
+
+    Raises:
+        ConfigError: the file is missing, not YAML, or has unknown, missing or wrong values.
+        RobotError: the robot cannot be used.
+    """
+    context: dict[str, Any] = {'folder': path.parent}
+    mapping = validated(
+        VideoMapping, read_yaml(path, 'mapping file', '--mapping'), str(path), context=context
+    )
+    for what in (mapping.rows, *mapping.views.values()):
+        if '{name}' not in what:
+            raise ConfigError(f"'{path}': '{what}' must have {{name}}, the recording's name")
+    if not mapping.views:
+        raise ConfigError(f"'{path}': 'views' is empty; name at least one")
+    if (mapping.fps is None) == (not mapping.time):
+        raise ConfigError(f"'{path}': give either 'fps' or 'time'")
+    if mapping.state.differences or 'delay_frames' in mapping.state.model_fields_set:
+        raise ConfigError(
+            f"'{path}': 'state' is what was measured; 'differences' and 'delay_frames' are of "
+            'commands'
+        )
+    mapping._robot_file = context['robot_file']
+    return mapping
+
+
+@dataclass(frozen=True, slots=True)
+class VideoRecording:
+    """One recording: its name in a folder."""
+
+    folder: Path
+    name: str
+
+    def file(self, pattern: str) -> Path:
+        """A file of it."""
+        return self.folder / pattern.replace('{name}', self.name)
+
+
+def find_recordings(folder: Path, mapping: VideoMapping) -> list[VideoRecording]:
+    """Returns the recordings of a folder that have a file of rows, by name.
+
+    Raises:
+        EpisodeError: there is none.
+    """
+    before, _, after = mapping.rows.partition('{name}')
+    found = []
+    for path in folder.glob(f'{escape(before)}*{escape(after)}'):
+        text = path.relative_to(folder).as_posix()
+        name = text[len(before) : len(text) - len(after)]
+        if path.is_file() and name and '/' not in name:
+            found.append(VideoRecording(folder, name))
+    if not found:
+        raise EpisodeError(f"'{folder}' has no '{mapping.rows}'; give the folder that has them")
+    return sorted(found, key=lambda one: one.name)
+
+
+def import_videos(
+    folder: Path,
+    out: Path,
+    mapping: VideoMapping,
+    *,
+    calibration: Path | None = None,
+    stage: ObjectStage = AS_RECORDED,
+    progress: Callable[[Iterable[VideoRecording]], Iterable[VideoRecording]] = iter,
+) -> ImportSummary[VideoRecording]:
+    """Converts the recordings of a folder into episodes `out/<name>`, with `out/robot/` beside.
+
+    Args:
+        folder: of the files that the mapping names.
+        out: folder of the episodes.
+        mapping: which file and column is what.
+        calibration: file of the cameras; None = not known.
+        stage: names the objects and finds their masks.
+        progress: wraps the recordings, e.g. in a progress bar.
+
+    Raises:
+        EpisodeError: there is no recording.
+    """
+    recordings = find_recordings(folder, mapping)
+    saved = save_robot(mapping.robot_file, out / 'robot')
+    text = mapping.model_dump_json(exclude={'robot', *mapping.unused_settings}).encode()
+    key = digest_of(mapping.robot_file, calibration, start=stage.key + text)
+
+    def convert(one: VideoRecording, path: Path) -> tuple[str, ...]:
+        episode = read_recording(one, mapping, calibration)
+        written = mapping.written()
+        return write_imported(episode, one.name, path, written, mapping.robot, key, stage)
+
+    summary = import_each(progress(recordings), key, lambda one: out / one.name, convert)
+    summary.robot_notes = saved.notes
+    return summary
+
+
+def read_recording(
+    recording: VideoRecording,
+    mapping: VideoMapping,
+    calibration: Path | None = None,
+) -> Episode:
+    """Reads a recording as an episode whose commands are the positions that follow.
+
+    Frames are matched to rows by `match_frames`. A view without calibration gets a placeholder
+    and is named in `unknown`.
+
+    Raises:
+        EpisodeError: a file is missing or cannot be read, or its rows cannot be used.
+        ConfigError: a column is not there.
+    """
+    path = recording.file(mapping.rows)
+    table = read_table(path, mapping.state.features)
+    times = _times(table, mapping)
+    stamps = START_NS + np.round(times * 1e9).astype(np.int64)
+    positions, notes = _positions(table, mapping)
+    images, cameras, unknown = {}, {}, {}
+    known = {} if calibration is None else load_calibration(calibration)
+    for view, pattern in mapping.views.items():
+        frames = VideoFileFrames(recording.file(pattern))
+        images[view], said = _track(frames, times, mapping)
+        notes += [f"view '{view}': {text}" for text in said]
+        height, width = frames[0].shape[:2]
+        if view in known:
+            found = sized_camera(known[view], (width, height))
+            cameras[view] = found.camera
+            notes += [found.note] if found.note else []
+        else:
+            unknown[view] = 'pose and intrinsics'
+            cameras[view] = unknown_camera(view, width, height, mapping.robot.base_link)
+    states = JointStates(
+        stamps_ns=stamps, joint_names=mapping.robot.joint_names, positions=positions
+    )
+    info = EpisodeInfo(path=path, instruction=_instruction(table.keys, mapping, path))
+    return Episode(
+        info=info,
+        views=tuple(mapping.views),
+        cameras=cameras,
+        images=images,
+        joint_states=states,
+        trajectories=following(states, mapping.chunk_s, int(stamps[0])),
+        masks=None,
+        instructions=[],
+        unknown=unknown,
+        warnings=tuple(notes),
+    )
+
+
+def _track(
+    frames: VideoFileFrames, times: FloatArray, mapping: VideoMapping
+) -> tuple[Track, list[str]]:
+    """Return the frames within the rows at `times` (T,) [s], and how they were read."""
+    match = match_frames(
+        frames.times,
+        len(frames),
+        times,
+        rows_are_timed=bool(mapping.time),
+        source=mapping.frame_times,
+    )
+    stamps = START_NS + np.round(match.times * 1e9).astype(np.int64)
+    return Track(stamps, frames.chosen(match.numbers)), list(
+        filter(None, (frames.note, match.note))
+    )
+
+
+def _positions(table: NumberTable, mapping: VideoMapping) -> tuple[FloatArray, list[str]]:
+    """(T, J) [rad or m], and what was odd; joints of tool poses by inverse kinematics."""
+    stream, robot, values, names = mapping.state, mapping.robot, table.values, table.names
+    what = ', '.join(filter(None, stream.features)) or table.path.name
+    count = values.shape[1]
+    table.check_numbers(
+        [column_number(column, names, count, what, 'state') for column in stream.used_columns()]
+    )
+    positions = np.tile(np.clip(0.0, robot.lower, robot.upper), (len(values), 1))
+    at = [robot.joint_names.index(column.joint) for column in stream.columns]
+    positions[:, at] = to_positions(values, names, stream.columns, what)
+    notes = list(table.notes)
+    for arm, poses in stream.tools.items():
+        wanted = poses.wanted(values, names, what)
+        notes.append(joints_of_poses(positions, robot, arm, poses, wanted))
+    return positions, notes
+
+
+def _times(table: NumberTable, mapping: VideoMapping) -> FloatArray:
+    """Return (T,) times of rows, from 0 on [s]."""
+    path, keys, name = table.path, table.keys, mapping.time
+    if mapping.fps is not None:
+        return np.arange(len(table.values)) / mapping.fps
+    if name not in keys:
+        raise EpisodeError(
+            f"'{path}' has no '{name}'{nearest(name, keys)}; it has {', '.join(keys)}"
+        )
+    if name in table.names:
+        table.check_numbers([table.names.index(name)])
+    try:
+        times = np.asarray(keys[name], float).ravel()
+    except (TypeError, ValueError) as error:
+        raise EpisodeError(f"'{path}': '{name}' must hold numbers: {error}") from error
+    if len(times) != len(table.values) or not np.isfinite(times).all():
+        raise EpisodeError(f"'{path}': '{name}' must have a finite number for each row")
+    if (np.diff(times) <= 0).any():
+        row = int(np.argmax(np.diff(times) <= 0)) + 1
+        raise EpisodeError(
+            f"'{path}': '{name}' must increase; it goes from {times[row - 1]:.9g} to "
+            f'{times[row]:.9g} at row {row + 1}'
+        )
+    return (times - times[0]) / _PER_SECOND[mapping.time_unit]
+
+
+def _instruction(keys: Mapping[str, Any], mapping: VideoMapping, path: Path) -> str:
+    word, _, name = mapping.instruction.partition('key:')
+    if word or not name:
+        return mapping.instruction
+    value = keys.get(name.strip(), '')
+    return str(value[0]) if isinstance(value, list) and value else str(value)

@@ -1,0 +1,1 @@
+"""Checks whether calibration, robot, clocks and images of a recording fit together."""

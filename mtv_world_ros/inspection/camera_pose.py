@@ -1,0 +1,167 @@
+"""Estimated camera poses: how they are changed, compared, and how uncertain they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtv_world_ros.cameras.camera import scaled
+from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray
+from mtv_world_ros.core.errors import CalibrationError
+from mtv_world_ros.data.episode import Track
+from mtv_world_ros.inspection.clocks import JointTrack
+
+#: turns [rad] and shifts [m] that change the picture about alike
+UNITS = np.array([0.01] * 3 + [0.005] * 3)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraEstimate:
+    """An estimated pose.
+
+    Attributes:
+        camera: with the estimated pose, at the size of the recorded images.
+        std_mm: standard error of the camera's place [mm].
+        std_deg: standard error of its direction and roll [degrees].
+        evidence: data of the estimate and its residuals, as text.
+        residual_px: median distance of points from where they should be; NaN of silhouettes.
+        match: correlation of drawn and seen motion, -1 .. 1; NaN of points.
+    """
+
+    camera: CameraModel
+    std_mm: float
+    std_deg: float
+    evidence: str
+    residual_px: float = float('nan')
+    match: float = float('nan')
+
+
+def moved(T: FloatArray, parameters: FloatArray, centre: FloatArray) -> FloatArray:
+    """Returns a pose (4, 4) turned about a point by (3,) [rad] and shifted by (3,) [m].
+
+    Turns and shifts are along the pose's own axes. Turned about what a camera looks at, its
+    picture hardly shifts, so that the parameters act on their own.
+    """
+    middle = T.copy()
+    middle[:3, 3] = centre
+    change = np.eye(4)
+    change[:3, :3] = cv2.Rodrigues(np.asarray(parameters[:3], float))[0]
+    change[:3, 3] = parameters[3:]
+    return middle @ change @ np.linalg.inv(middle) @ T
+
+
+def aligned(
+    T: FloatArray,
+    errors: Callable[[FloatArray], NDArray[np.floating]],
+    centre: FloatArray | None = None,
+    *,
+    outlier: float,
+    iterations: int = 10,
+) -> FloatArray:
+    """Returns the pose nearby with the least errors (Levenberg-Marquardt).
+
+    Args:
+        T: the pose (4, 4) to start from.
+        errors: (N,) of a pose.
+        centre: point that it is turned about; None = its own place.
+        outlier: errors from here on count less (Cauchy's loss).
+        iterations: at most.
+    """
+    damping = 0.01
+
+    def cost(values: NDArray[np.floating]) -> float:
+        return float(np.log1p((values / outlier) ** 2).mean())
+
+    now, slopes = errors(T), None
+    for _ in range(iterations):
+        middle = T[:3, 3] if centre is None else centre
+        if slopes is None:  # a step that was refused changes nothing
+            slopes = np.stack(
+                [(errors(moved(T, s, middle)) - errors(moved(T, -s, middle))) / 2
+                 for s in np.diag(UNITS)]
+            )  # fmt: skip
+            weighted = slopes / (1 + (now / outlier) ** 2)
+            normal, gradient = weighted @ slopes.T, weighted @ now
+        damped = normal + damping * np.diag(np.diag(normal)) + 1e-9 * np.eye(6)
+        step = -np.linalg.solve(damped, gradient)
+        step *= min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-9))
+        tried = moved(T, np.asarray(step * UNITS, np.float64), middle)
+        there = errors(tried)
+        if cost(there) < cost(now):
+            T, now, damping, slopes = tried, there, damping / 3, None
+        else:
+            damping *= 10
+        if float(np.abs(step).max()) < 0.01:
+            break
+    return T
+
+
+def with_pose(camera: CameraModel, T_mount_camera: FloatArray) -> CameraModel:
+    """Returns the camera elsewhere."""
+    return replace(camera, T_mount_camera=T_mount_camera)
+
+
+def shrunk(camera: CameraModel, width: int) -> CameraModel:
+    """Returns the camera for images of at most a width."""
+    if camera.width <= width:
+        return camera
+    return scaled(camera, width, max(1, round(camera.height * width / camera.width)))
+
+
+def grey(frame: ByteArray, camera: CameraModel) -> ByteArray:
+    """(H, W) uint8 at the camera's size."""
+    size = (camera.width, camera.height)
+    return np.asarray(
+        cv2.cvtColor(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY),
+        np.uint8,
+    )
+
+
+def covered_frames(track: Track, joints: JointTrack) -> np.ndarray:
+    """Indices of the frames within the joint states.
+
+    Raises:
+        CalibrationError: there are fewer than ten.
+    """
+    indices = np.flatnonzero(joints.covers(track.stamps_ns))
+    if len(indices) < 10:
+        raise CalibrationError(
+            f'only {len(indices)} frames are within the joint states; at least 10 are needed'
+        )
+    return indices
+
+
+def left_out(total: FloatArray, normal: FloatArray, gradient: FloatArray) -> FloatArray:
+    """Returns (6,) how a pose changes without some measurements: turns [rad], shifts [m].
+
+    One step of Gauss and Newton from the pose that was estimated from all.
+
+    Args:
+        total: (6, 6) normal matrix of all measurements, in `UNITS`.
+        normal: (6, 6) that of those left out.
+        gradient: (6,) theirs.
+    """
+    ridge = 1e-6 * np.trace(total) * np.eye(6)
+    return np.asarray(np.linalg.solve(total - normal + ridge, gradient) * UNITS, np.float64)
+
+
+def spread(changes: FloatArray) -> tuple[float, float]:
+    """Jackknife standard errors [mm, degrees] of changes (G, 6): turns [rad], shifts [m].
+
+    Each change is by leaving out one of G groups.
+    """
+    factor = (len(changes) - 1) / len(changes)
+    variances = factor * ((changes - changes.mean(axis=0)) ** 2).sum(axis=0)
+    turn, shift = (float(np.sqrt(part.sum())) for part in np.split(variances, 2))
+    return 1000 * shift, float(np.degrees(turn))
+
+
+def difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
+    """Returns how far two poses are apart [mm, degrees]."""
+    turn = cv2.Rodrigues(a[:3, :3].T @ b[:3, :3])[0]
+    apart = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
+    return 1000 * apart, float(np.degrees(np.linalg.norm(turn)))

@@ -1,0 +1,1 @@
+"""Estimates of camera poses and focal lengths from recordings."""

@@ -1,0 +1,70 @@
+"""A page of frames on which somebody clicks where the finger tips are seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.core.documents import clicked_frame, render
+from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.inspection.clocks import JointTrack
+from mtv_world_ros.robot.model import RobotModel
+
+#: frames of each recording and view
+_NUM_FRAMES = 4
+
+
+def points_page(
+    episodes: Sequence[Episode], views: Sequence[str], robot: RobotModel, tips: int
+) -> str:
+    """Returns the page, in HTML.
+
+    Of each recording it has the frames in which the tool is farthest from where it was in the
+    others.
+
+    Args:
+        episodes: with joint states.
+        views: whose frames are shown.
+        robot: of the recordings.
+        tips: of its tool's fingers, each of which is clicked; what is saved is their middle.
+
+    Raises:
+        EpisodeError: a recording has no frame within its joint states.
+    """
+    shown = {
+        view: [frame for episode in episodes for frame in _frames(episode, view, robot)]
+        for view in views
+    }
+    what = 'is the tool point' if tips == 1 else 'are the finger tips'
+    title = f'Where {what}? {", ".join(views)}'
+    return render('points.html.j2', title=title, file='points.yaml', views=shown, tips=tips)
+
+
+def _frames(episode: Episode, view: str, robot: RobotModel) -> list[dict[str, object]]:
+    track, name = episode.images[view], episode.info.path.name
+    if episode.joint_states is None:
+        raise EpisodeError(f"'{episode.info.path}' has no joint_states")
+    joints = JointTrack(episode.joint_states, robot)
+    covered = np.flatnonzero(joints.covers(track.stamps_ns))
+    if not len(covered):
+        raise EpisodeError(f"'{episode.info.path}', view '{view}': no frame has joint states")
+    places = robot.tool_poses(joints.at(track.stamps_ns[covered]))[0, :, :3, 3]
+    found = []
+    for row in sorted(_far_apart(places)):
+        index = int(covered[row])
+        seconds = float(track.stamps_ns[index] - joints.stamps_ns[0]) * 1e-9
+        found.append(clicked_frame(name, seconds, np.asarray(track.frames[index])))
+    return found
+
+
+def _far_apart(places: FloatArray) -> list[int]:
+    """Rows whose places (T, 3) are far from each other, the first among them."""
+    chosen = [0]
+    away = np.linalg.norm(places - places[0], axis=1)
+    while len(chosen) < min(_NUM_FRAMES, len(places)) and away.max() > 0.02:
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    return chosen

@@ -1,0 +1,179 @@
+"""Pictures without a camera pose: drawn robots, and frozen, still or mirrored recordings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtv_world_ros.cameras.camera import project
+from mtv_world_ros.cameras.silhouettes import project_part
+from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray
+from mtv_world_ros.core.transforms import looking_along
+from mtv_world_ros.data.episode import Track
+from mtv_world_ros.inspection.clocks import JointTrack, Stamps
+from mtv_world_ros.inspection.inspection_report import broken, Finding, suspicious
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.shape import load_shape, RobotShape
+
+_SIZE, _FOCAL = 480, 520.0
+#: colours of x, y and z axes
+_AXES = ((220, 40, 40), (30, 160, 30), (40, 60, 230))
+_AXIS_M = 0.08
+
+
+def robot_picture(robot: RobotModel) -> ByteArray:
+    """Returns (H, W, 3) RGB: front and side, above with grippers shut, below with them open."""
+    shape = load_shape(robot)
+    rows = []
+    for share in (0.0, 1.0):
+        positions = middle_positions(robot, share)
+        rows.append(np.hstack([_tile(robot, shape, positions, angle) for angle in (35, 125)]))
+    return np.vstack(rows)
+
+
+def middle_positions(robot: RobotModel, opening: float) -> FloatArray:
+    """(1, J) all joints half-way between their limits, at most a radian from zero."""
+    lower, upper = (np.clip(limit, -np.pi, np.pi) for limit in (robot.lower, robot.upper))
+    positions = np.clip((lower + upper) / 2, -1.0, 1.0).clip(robot.lower, robot.upper)
+    for tool in robot.tools:
+        if tool.gripper_joint is not None:
+            travel = tool.gripper_open - tool.gripper_closed
+            column = robot.joint_names.index(tool.gripper_joint)
+            positions[column] = tool.gripper_closed + opening * travel
+    return positions[None]
+
+
+def _tile(
+    robot: RobotModel, shape: RobotShape, positions: FloatArray, angle_deg: float
+) -> ByteArray:
+    poses = robot.forward_kinematics(positions)
+    points = [p.points @ poses[p.link][0, :3, :3].T + poses[p.link][0, :3, 3] for p in shape.parts]
+    cloud = np.concatenate([*points, robot.tool_poses(positions)[:, 0, :3, 3]])
+    camera = _camera(cloud, np.radians(angle_deg))
+    image = np.full((_SIZE, _SIZE, 3), 245, np.uint8)
+    depths = [float(project(camera, camera.T_mount_camera, p)[1].mean()) for p in points]
+    for index in np.argsort(depths)[::-1]:
+        part = shape.parts[int(index)]
+        T = camera.T_mount_camera[None]
+        pixels = project_part(part, poses[part.link], camera, T)[0]
+        hull = cv2.convexHull(np.rint(pixels * 16).astype(np.int32))
+        shade = 120 + 23 * (int(index) % 5)
+        cv2.fillConvexPoly(image, hull, (shade, shade, shade + 12), cv2.LINE_AA, 4)
+        cv2.polylines(image, [hull], True, (70, 70, 80), 1, cv2.LINE_AA, 4)
+    for T in robot.tool_poses(positions)[:, 0]:
+        _draw_axes(image, camera, T)
+    return image
+
+
+def _camera(cloud: FloatArray, angle: float) -> CameraModel:
+    """A camera that sees all points, from a direction and slightly above."""
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 0.05)
+    ahead = -np.array([np.cos(angle), np.sin(angle), 0.45])
+    T = np.eye(4)
+    T[:3, :3] = looking_along(ahead)
+    T[:3, 3] = centre - T[:3, 2] * radius * 2.6
+    K = np.array([[_FOCAL, 0, _SIZE / 2], [0, _FOCAL, _SIZE / 2], [0, 0, 1]])
+    return CameraModel(
+        view='picture', width=_SIZE, height=_SIZE, K=K, mount_link='', T_mount_camera=T
+    )
+
+
+def _draw_axes(image: ByteArray, camera: CameraModel, T: FloatArray) -> None:
+    ends = np.stack([T[:3, 3], *(T[:3, 3] + _AXIS_M * T[:3, k] for k in range(3))])
+    pixels, _ = project(camera, camera.T_mount_camera, ends)
+    origin, *tips = [tuple(int(v) for v in np.rint(p)) for p in pixels]
+    for tip, colour in zip(tips, _AXES, strict=True):
+        cv2.line(image, origin, tip, colour, 2, cv2.LINE_AA)
+
+
+#: mean difference of two frames below which they are the same picture [grey levels]
+_SAME_PICTURE = 0.05
+#: joints that move more between two frames must change the picture [rad or m]
+_MOVES = 0.02
+#: share of such frames without change from which a view is suspicious, broken
+_FROZEN, _BROKEN = 0.1, 0.5
+#: frames a second below which motions between frames are guessed
+_LEAST_HZ = 2.5
+#: joint states this long before the first or after the last frame [s]
+_LONGEST_WITHOUT_FRAMES_S = 2.0
+#: frames that are compared at most
+_MOST_FRAMES = 80
+
+
+def check_frozen(track: Track, joints: JointTrack) -> tuple[dict[str, str], list[Finding]]:
+    """Frames that stay the same while joints move."""
+    covered = np.flatnonzero(joints.covers(track.stamps_ns))
+    count = min(len(covered), _MOST_FRAMES)
+    if count < 3:
+        return {}, []
+    first = int((len(covered) - count) // 2)
+    chosen = covered[first : first + count]
+    positions = joints.at(track.stamps_ns[chosen])
+    moves = np.abs(np.diff(positions, axis=0)).max(axis=1) > _MOVES
+    if moves.sum() < 3:
+        return {}, []
+    frames = [np.asarray(track.frames[int(n)])[::4, ::4].astype(np.int16) for n in chosen]
+    changes = np.array([np.abs(b - a).mean() for a, b in zip(frames, frames[1:], strict=False)])
+    share = float((changes[moves] < _SAME_PICTURE).mean())
+    measures = {'frames that do not change while joints move': f'{share:.0%}'}
+    text = (
+        f'{share:.0%} of the frames in which joints move are the same as the one before: the '
+        'camera hangs, or this is not a view of this robot'
+    )
+    if share > _BROKEN:
+        return measures, [broken(text)]
+    return measures, [suspicious(text)] if share > _FROZEN else []
+
+
+def check_lengths(stamps_ns: Stamps, joints: JointTrack) -> tuple[dict[str, str], list[Finding]]:
+    """Rates too low to follow a motion, and joint states without pictures."""
+    findings = []
+    if len(stamps_ns) > 1:
+        rate = 1e9 / float(np.median(np.diff(stamps_ns)))
+        if rate < _LEAST_HZ:
+            findings.append(
+                suspicious(f'{rate:.2g} frames a second: {_LEAST_HZ:g} or more are needed')
+            )
+    ends = (joints.stamps_ns[-1] - stamps_ns[-1], stamps_ns[0] - joints.stamps_ns[0])
+    longest = max(ends) * 1e-9
+    if longest > _LONGEST_WITHOUT_FRAMES_S:
+        where = 'after the last' if ends[0] >= ends[1] else 'before the first'
+        findings.append(
+            suspicious(
+                f'joint states go on for {longest:.1f} s {where} frame: video and joints are of '
+                'different length'
+            )
+        )
+    return {}, findings
+
+
+class MirroredFrames:
+    """Frames that are mirrored left to right when asked for.
+
+    Args:
+        track: the frames.
+    """
+
+    def __init__(self, track: Track) -> None:
+        self._frames = track.frames
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> ByteArray:
+        return np.asarray(self._frames[index])[..., ::-1, :]
+
+    def __array__(self, dtype: object = None, copy: bool | None = None) -> NDArray[np.uint8]:
+        return np.asarray(self._frames)[..., ::-1, :]
+
+
+def mirrored(track: Track, camera: CameraModel) -> tuple[Track, CameraModel]:
+    """Returns a view's frames mirrored left to right, with the camera of such frames."""
+    K = camera.K.copy()
+    K[0, 2] = camera.width - 1 - K[0, 2]
+    frames = MirroredFrames(track)
+    return Track(track.stamps_ns, frames), replace(camera, K=K)  # type: ignore[arg-type]

@@ -1,0 +1,39 @@
+"""Whether the masks that an import stored can be those of the named objects."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mtv_world_ros.data.episode import Episode, MASKS_BY
+from mtv_world_ros.inspection.inspection_report import Finding, suspicious
+
+#: in less than this share of the frames of any view an object is as good as not found
+_SEEN = 0.5
+#: an object that fills more of the frames of a still camera is rather its background
+_LARGE = 0.15
+
+
+def check_masks(episode: Episode) -> tuple[dict[str, str], list[Finding]]:
+    """Returns how often each object is seen, by view, and what is odd; of masks by a segmenter."""
+    by = episode.info.metadata.get(MASKS_BY, '')
+    areas = episode.mask_areas() if by else {}
+    measures, findings = {}, []
+    for number, name in enumerate(episode.info.objects if areas else ()):
+        seen = {view: float((area[number] > 0).mean()) for view, area in areas.items()}
+        measures[f'{name}, seen in'] = ', '.join(f'{v} {s:.0%}' for v, s in seen.items())
+        if max(seen.values()) < _SEEN:
+            findings.append(
+                suspicious(
+                    f"object '{name}' is found in {max(seen.values()):.0%} of the frames of a "
+                    f"view at most, by '{by}': name it otherwise, or draw boxes (--objects)"
+                )
+            )
+        large = [v for v, area in areas.items() if np.median(area[number]) > _LARGE]
+        if len(large) == len(areas):
+            findings.append(
+                suspicious(
+                    f"object '{name}' fills more than {_LARGE:.0%} of every view, by '{by}': "
+                    'is that the object, or what lies behind it?'
+                )
+            )
+    return measures, findings

@@ -1,1 +1,0 @@
-"""The lab: trains, scores, imports and checks."""

@@ -1,1 +1,0 @@
-"""The poses of cameras, from recordings: `mtv-world calibrate-camera`."""

@@ -1,1 +1,0 @@
-"""Fits the success probability to true outcomes."""

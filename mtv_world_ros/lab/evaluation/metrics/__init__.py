@@ -1,1 +1,0 @@
-"""What is measured in predictions, and how certain it is."""

@@ -1,1 +1,0 @@
-"""Fréchet distances of images (FID) and videos (FVD)."""

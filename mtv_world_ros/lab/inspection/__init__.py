@@ -1,1 +1,0 @@
-"""Preflight of a recording: do calibration, robot, clocks and pictures belong together?"""

@@ -1,1 +1,0 @@
-"""Training clips: cutting them from recordings, and batches of them."""

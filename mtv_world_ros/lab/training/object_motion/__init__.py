@@ -1,1 +1,0 @@
-"""How arms follow, and numbers of contact, fitted to recorded episodes."""

@@ -1,0 +1,1 @@
+"""Object motion under commands on MuJoCo, and its numbers."""

@@ -1,0 +1,444 @@
+"""Many futures of a scene, computed side by side on all cores.
+
+Shape letters: K futures, T rows, O solids, D degrees of freedom of the arms, J joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+import logging
+import time
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.core.errors import RolloutPreempted
+from mtv_world_ros.physics.arm_response import PERIOD_S
+from mtv_world_ros.physics.arms import Arms, SOLIDS
+from mtv_world_ros.physics.contact_scene import CompiledScene, kind_of, STEP_S
+from mtv_world_ros.physics.drive_inputs import ArmsState, CoursePlanner, FreeMotion, FULL, SUBSTEPS
+from mtv_world_ros.physics.futures import Future
+from mtv_world_ros.physics.mujoco_import import mujoco, Rollout
+
+#: slower solids are at rest [rad/s], [m/s]; arms that are nearer to their way are on it
+_REST_RAD_S, _REST_M_S = 0.02, 0.002
+_ON_WAY, _ON_WAY_SPEED = 1e-3, 0.02
+#: what comes as near to a solid may touch it [m]
+_NEAR_M = 0.015
+#: fingers that come as near to the table may touch it [m]
+_NEAR_TABLE_M = 0.002
+#: rows for which all is still before arms only pass by
+_STILL_ROWS = 1
+#: what no object does on a table: places [m], speeds [m/s], [rad/s]
+_FAR_M, _FAST_M_S, _FAST_RAD_S = 3.0, 20.0, 1000.0
+#: the last net, as wall time depends on what else runs: a plan may take so many times as long as
+#: what it shows, and so long more [s]
+_SLOW, _LEAST_CAP_S = 20.0, 60.0
+#: constraints (three a contact) from which steps take so long that they are computed in pieces, of
+#: which work is counted; which are those of objects that cannot all be where they were found; and
+#: which a future may have in the mean over a plan
+_CROWDED, _OVERLAPPING, _MOST_TOUCHES = 300, 1500, 400
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BatchState:
+    """State of K futures, between two parts of a plan.
+
+    Attributes:
+        physics: (K, N) of MuJoCo's full physics.
+        arms: state of the arms in free space, as if they had touched nothing.
+        last: the course before; None = the arms rested.
+        still: (K,) rows for which all was at rest.
+        lost: why futures no longer count, by their number.
+    """
+
+    physics: FloatArray
+    arms: ArmsState
+    still: np.ndarray
+    last: FreeMotion | None = None
+    lost: dict[int, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BatchMotion:
+    """Motion of K futures; row 0 is their start.
+
+    Attributes:
+        points: (K, T + 1, O, 3) centres of the solids [m].
+        rotations: (K, T + 1, O, 3, 3).
+        joints: (K, T + 1, J) of the robot, which what it touches may stop [rad or m].
+        steps: of the engine that were computed, of all futures together.
+    """
+
+    points: FloatArray
+    rotations: FloatArray
+    joints: FloatArray
+    steps: int
+
+
+def _log_once(message: str) -> None:
+    """Logs each warning of the engine once; by default they fill a file and the terminal."""
+    kind = message.split(' Time =')[0]
+    if kind not in _told:
+        _told.add(kind)
+        logger.warning('MuJoCo, of a foreseen future: %s', kind)
+
+
+#: warnings that were logged
+_told: set[str] = set()
+
+
+class Engine:
+    """Computes futures of a robot and solids; holds compiled scenes and threads.
+
+    Args:
+        arms: of the robot.
+        threads: number of computing threads.
+    """
+
+    def __init__(self, arms: Arms, threads: int = 1) -> None:
+        self.arms, self.threads = arms, max(threads, 1)
+        self._scenes: dict[tuple[str, ...], tuple[CompiledScene, list[Any]]] = {}
+        mujoco.set_mju_user_warning(_log_once)
+        self._rollout = Rollout(nthread=0 if threads < 2 else threads)
+
+    def scene_of(self, kinds: Sequence[str]) -> tuple[CompiledScene, list[Any]]:
+        """Returns the compiled scene of solids of some kinds, and data of each thread."""
+        key = tuple(kinds)
+        if key not in self._scenes:
+            if len(self._scenes) >= 8:
+                self._scenes.pop(next(iter(self._scenes)))
+            scene = CompiledScene.compiled(self.arms, kinds)
+            self._scenes[key] = scene, [mujoco.MjData(scene.model) for _ in range(self.threads)]
+        return self._scenes[key]
+
+    def begin(self, futures: Sequence[Future]) -> Batch:
+        """Returns what computes futures of solids of the same kinds."""
+        return Batch(self, futures)
+
+    def run(
+        self, models: Sequence[Any], data: Sequence[Any], states: FloatArray, controls: FloatArray
+    ) -> FloatArray:
+        """Returns the states (K, S, N) of K models at S steps from some states (K, N) on."""
+        return self._rollout.rollout(
+            models, data, states, controls, chunk_size=1 if self.threads > 1 else None
+        )[0]
+
+
+class Batch:
+    """K futures of the same robot and kinds of solids.
+
+    Args:
+        engine: that computes them.
+        futures: K.
+
+    Attributes:
+        futures: K.
+    """
+
+    def __init__(self, engine: Engine, futures: Sequence[Future]) -> None:
+        self._engine, self.futures = engine, tuple(futures)
+        first = futures[0]
+        kinds = tuple(map(kind_of, first.solids))
+        self._scene, self._data = engine.scene_of(kinds)
+        self._models = [
+            self._scene.model_of(future.settings, future.solids, self._data[0])
+            for future in futures
+        ]
+        free, _ = engine.scene_of(())
+        self._planner = CoursePlanner(free, first.settings)
+        self._nearby = _Nearby(self._scene, self._models[0])
+        self._delays = [round(future.delay_s / STEP_S) for future in futures]
+        self._gains = np.stack([model.actuator_gainprm[:, 0] for model in self._models])
+
+    @property
+    def model(self) -> Any:
+        """MuJoCo's model of the first future."""
+        return self._models[0]
+
+    def touches_arms(self, positions: FloatArray) -> bool:
+        """Returns whether arms at joints (J,) are near a solid, as one that they hold."""
+        at = self._scene.arms.drives.spread(positions)
+        return not self._nearby.is_clear(
+            self._scene.positions(at, self.futures[0].solids), at[None]
+        )
+
+    def start(self, positions: FloatArray) -> BatchState:
+        """Returns the start of the futures, with the robot at rest at joints (J,)."""
+        scene, model = self._scene, self._models[0]
+        at = scene.arms.drives.spread(positions)
+        physics = np.zeros((len(self.futures), mujoco.mj_stateSize(model, FULL)))
+        for row, future in zip(physics, self.futures, strict=True):
+            row[1 : 1 + model.nq] = scene.positions(at + future.zeros, future.solids)
+        return BatchState(
+            physics=physics,
+            arms=self._planner.begin(positions),
+            still=np.full(len(physics), _STILL_ROWS),
+        )
+
+    def advance(
+        self,
+        commands: FloatArray,
+        every: int,
+        state: BatchState | None = None,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> tuple[BatchMotion, BatchState]:
+        """Returns the motion at each `every`-th of commands, and the state after them.
+
+        Args:
+            commands: (1 + T * every, J), `PERIOD_S` apart [rad or m].
+            every: periods between two rows.
+            state: where they are; None = where they begin.
+            should_stop: asked after every row, and within one that takes long.
+
+        Raises:
+            RolloutPreempted: `should_stop` said so.
+        """
+        state = state or self.start(commands[0])
+        course, arms = self._planner.plan(commands, state.arms)
+        courses = [course.late(delay, state.last) for delay in self._delays]
+        rows = (len(commands) - 1) // every
+        run = _Run(self._scene, self.futures, courses, every * SUBSTEPS, state)
+        cap_s = time.monotonic() + _SLOW * rows * every * PERIOD_S + _LEAST_CAP_S
+
+        def check() -> None:
+            if should_stop():
+                raise RolloutPreempted('stopped while objects were foreseen')
+            if time.monotonic() > cap_s:
+                run.lose_all('took too long')
+
+        for row in range(rows):
+            check()
+            self._advance_row(run, row, check)
+        return run.motion(), replace(
+            state, physics=run.physics, arms=arms, last=course, still=run.still, lost=run.lost
+        )
+
+    def _advance_row(self, run: _Run, row: int, check: Callable[[], None]) -> None:
+        passing = [
+            number in run.lost or (run.may_pass(number, row) and self._is_clear(run, number, row))
+            for number in range(len(self.futures))
+        ]
+        moving = np.flatnonzero(~np.array(passing))
+        if len(moving):
+            self._compute_row(run, row, moving, check)
+        run.finish_row(row, moving)
+
+    def _compute_row(
+        self, run: _Run, row: int, moving: np.ndarray, check: Callable[[], None]
+    ) -> None:
+        """Computes a row of some futures; those that are crowded in pieces, few at a time."""
+        controls = np.stack([self._controls(run, int(number), row) for number in moving])
+        crowded = np.zeros(len(moving), np.bool_)
+        for place, number in enumerate(moving):
+            check()  # of many futures of many parts the counting takes long itself
+            crowded[place] = self._constraints(run, number) > _CROWDED
+        self._compute(run, moving[~crowded], controls[~crowded])
+        few = self._engine.threads
+        slow, goals = moving[crowded], controls[crowded]
+        for first in range(0, len(slow), few):
+            self._compute_crowded(
+                run, slow[first : first + few], goals[first : first + few], check
+            )
+
+    def _compute_crowded(
+        self, run: _Run, moving: np.ndarray, controls: FloatArray, check: Callable[[], None]
+    ) -> None:
+        """Computes a row in pieces of the same length on every machine, which the result shows.
+
+        What counts as too much is a number of constraints, not a time: so the same is lost
+        whatever else a machine does.
+        """
+        for first in range(0, controls.shape[1], SUBSTEPS):
+            check()
+            for number in moving:
+                if number not in run.lost:
+                    run.charge(int(number), self._constraints(run, number), SUBSTEPS)
+            kept = np.array([number not in run.lost for number in moving])
+            self._compute(run, moving[kept], controls[kept, first : first + SUBSTEPS])
+
+    def _compute(self, run: _Run, moving: np.ndarray, controls: FloatArray) -> None:
+        if not len(moving):
+            return
+        models = [self._models[number] for number in moving]
+        states = self._engine.run(models, self._data, run.physics[moving], controls)
+        run.take(moving, states)
+
+    def _constraints(self, run: _Run, number: int) -> int:
+        """Number of constraints, of contacts most, where a future is; they make steps slow."""
+        model, data = self._models[number], self._data[0]
+        mujoco.mj_setState(model, data, run.physics[number], FULL)
+        mujoco.mj_fwdPosition(model, data)
+        return data.nefc
+
+    def _controls(self, run: _Run, number: int, row: int) -> FloatArray:
+        """(S, D) numbers of the drives of a future in a row."""
+        course, steps = run.courses[number], run.steps_of(row)
+        targets = course.controls[steps] + course.pushes[steps] / self._gains[number]
+        return targets + self.futures[number].zeros
+
+    def _is_clear(self, run: _Run, number: int, row: int) -> bool:
+        """Whether the arms pass by all solids in a row."""
+        last = run.first_step(row + 1)
+        steps = [*range(run.first_step(row), last, 2 * SUBSTEPS), last]
+        where = run.courses[number].positions[steps] + self.futures[number].zeros
+        return self._nearby.is_clear(run.qpos(number), where)
+
+
+class _Run:
+    """Futures while they advance by some rows."""
+
+    def __init__(
+        self,
+        scene: CompiledScene,
+        futures: Sequence[Future],
+        courses: Sequence[FreeMotion],
+        steps: int,
+        state: BatchState,
+    ) -> None:
+        self._scene, self._futures, self.courses, self._steps = scene, futures, courses, steps
+        self.physics, self.still = state.physics.copy(), state.still.copy()
+        self.lost, self.computed = dict(state.lost), 0
+        self._spent = np.zeros(len(futures), np.int64)
+        self._rows = [self._read()]
+
+    def first_step(self, row: int) -> int:
+        return row * self._steps
+
+    def steps_of(self, row: int) -> slice:
+        return slice(self.first_step(row), self.first_step(row + 1))
+
+    def qpos(self, number: int) -> FloatArray:
+        return self.physics[number, 1 : 1 + self._scene.model.nq]
+
+    def may_pass(self, number: int, row: int) -> bool:
+        """Whether all is at rest, and the arms are where they go in free air."""
+        if self.still[number] < _STILL_ROWS:
+            return False
+        course, step, scene = self.courses[number], self.first_step(row), self._scene
+        off = self.qpos(number)[scene.arm_qpos] - self._futures[number].zeros
+        speeds = self.physics[number, 1 + scene.model.nq :][scene.arm_dofs]
+        return bool(
+            (np.abs(off - course.positions[step]) < _ON_WAY).all()
+            and (np.abs(speeds - course.velocities[step]) < _ON_WAY_SPEED).all()
+        )
+
+    def take(self, moving: np.ndarray, states: FloatArray) -> None:
+        """Takes what was computed; futures that no object can have are lost."""
+        self.computed += states.shape[0] * states.shape[1]
+        for number, last in zip(map(int, moving), states[:, -1], strict=True):
+            why = self._implausible(last)
+            if why:
+                self.lost[number] = why
+            else:
+                self.physics[number] = last
+
+    def charge(self, number: int, constraints: int, steps: int) -> None:
+        """Counts what steps of a crowded future cost; it is lost where that is too much."""
+        self._spent[number] += constraints * steps
+        if constraints > _OVERLAPPING:
+            self.lost[number] = 'objects overlap: more touches than things on a table can have'
+        elif self._spent[number] > _MOST_TOUCHES * len(self.courses[0].controls):
+            self.lost[number] = 'more touches, for longer, than can be foreseen in time'
+
+    def lose_all(self, why: str) -> None:
+        """Gives up the futures that still count."""
+        self.lost = dict.fromkeys(range(len(self.physics)), why) | self.lost
+
+    def finish_row(self, row: int, moving: np.ndarray) -> None:
+        """Moves the arms of futures that were not computed, and keeps where all is."""
+        scene, step = self._scene, self.first_step(row + 1)
+        nq, moved = scene.model.nq, set(map(int, moving))
+        for number, physics in enumerate(self.physics):
+            if number in self.lost:
+                continue
+            if number not in moved:
+                course = self.courses[number]
+                physics[1 + scene.arm_qpos] = course.positions[step] + self._futures[number].zeros
+                physics[1 + nq + scene.arm_dofs] = course.velocities[step]
+            elif self._at_rest(physics):
+                self.still[number] += 1
+            else:
+                self.still[number] = 0
+        self._rows.append(self._read())
+
+    def motion(self) -> BatchMotion:
+        """Returns what the rows were."""
+        points, rotations, joints = (np.stack(rows, 1) for rows in zip(*self._rows, strict=True))
+        return BatchMotion(points=points, rotations=rotations, joints=joints, steps=self.computed)
+
+    def _read(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Points (K, O, 3), rotations (K, O, 3, 3) and joints (K, J) now."""
+        scene, drives = self._scene, self._scene.arms.drives
+        qpos = self.physics[:, 1 : 1 + scene.model.nq]
+        at = scene.solid_qpos[:, None]
+        turns = _matrices(qpos[:, at + np.arange(3, 7)])
+        zeros = np.stack([future.zeros for future in self._futures])
+        driven = qpos[:, scene.arm_qpos] - zeros
+        joints = drives.joints(driven, len(scene.arms.robot.joint_names))
+        return qpos[:, at + np.arange(3)], turns, joints
+
+    def _speeds(self, physics: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(O, 3) speeds of ways and of turns of the solids."""
+        scene = self._scene
+        rows = physics[1 + scene.model.nq :][scene.solid_dofs[:, None] + np.arange(6)]
+        return rows[:, :3], rows[:, 3:]
+
+    def _at_rest(self, physics: FloatArray) -> bool:
+        ways, turns = self._speeds(physics)
+        return bool((np.abs(ways) < _REST_M_S).all() and (np.abs(turns) < _REST_RAD_S).all())
+
+    def _implausible(self, physics: FloatArray) -> str:
+        """Why nothing can be so; empty = it can."""
+        if not np.isfinite(physics).all():
+            return 'the engine diverged'
+        ways, turns = self._speeds(physics)
+        places = physics[1 + self._scene.solid_qpos[:, None] + np.arange(3)]
+        if (np.abs(places) > _FAR_M).any():
+            return 'an object left the table for good'
+        if (np.abs(ways) > _FAST_M_S).any() or (np.abs(turns) > _FAST_RAD_S).any():
+            return 'an object became faster than anything on a table'
+        return ''
+
+
+class _Nearby:
+    """Tells whether arms come near solids, or fingers to the table."""
+
+    def __init__(self, scene: CompiledScene, model: Any) -> None:
+        self._scene, self._model = scene, model.__copy__()
+        of_arms = self._model.geom_contype > SOLIDS
+        of_solids = self._model.geom_contype == SOLIDS
+        fingers = of_arms & (self._model.geom_priority > 0)
+        self._model.geom_contype[:] = np.where(of_arms, 2, 0) + np.where(fingers, 4, 0)
+        self._model.geom_conaffinity[:] = np.where(of_solids, 2, 0)
+        # the table, where arms touch it
+        self._model.geom_conaffinity[0] = 4 if model.geom_conaffinity[0] < 0 else 0
+        self._model.geom_margin[of_solids], self._model.geom_margin[0] = _NEAR_M, _NEAR_TABLE_M
+        self._data = mujoco.MjData(self._model)
+
+    def is_clear(self, qpos: FloatArray, arms: FloatArray) -> bool:
+        """Whether arms at (T, D) are clear of solids that are where `qpos` has them."""
+        model, data = self._model, self._data
+        data.qpos[:] = qpos
+        for positions in arms:
+            data.qpos[self._scene.arm_qpos] = positions
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            if data.ncon:
+                return False
+        return True
+
+
+def _matrices(quaternions: FloatArray) -> FloatArray:
+    """(..., 3, 3) of quaternions (..., 4), w first."""
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))

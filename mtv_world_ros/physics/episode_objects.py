@@ -1,0 +1,205 @@
+"""The named objects of an imagined episode: detection, foresight and rendering.
+
+Shape letters: V views, O objects, K futures, T frames, H W pixels, J joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from mtv_world_ros.cameras.motion import Motion
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks, Observation
+from mtv_world_ros.core.errors import RolloutPreempted
+from mtv_world_ros.core.images import resize_frames
+from mtv_world_ros.physics.foreseen_motions import foreseen_of, ForeseenMotions
+from mtv_world_ros.physics.object_motion import FoundObjects, ObjectMotionModel
+from mtv_world_ros.robot.chunk_plan import ChunkPlan
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.vision.segmenters.segmenter import Segmenter
+
+#: says which futures (K,) end as most of them do, of the motions until then; None = they do not
+#: tell
+Majority = Callable[[ForeseenMotions], BoolArray | None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObjectForesight:
+    """Objects of an episode; immutable, so calls that change something return a new one.
+
+    Attributes:
+        model: says where objects go; None = no foresight, verdicts rest on frames alone.
+        segmenter: finds them in real frames.
+        robot: whose commands move them.
+        first: the episode's first real observation, at its own size.
+        source: the last one, likewise.
+        found: where they are by now, and how they got there; None = not looked for since.
+    """
+
+    model: ObjectMotionModel | None
+    segmenter: Segmenter
+    robot: RobotModel
+    first: Observation
+    source: Observation
+    found: FoundObjects | None = None
+    _whole: dict[tuple[str, ...], FoundObjects] = field(default_factory=dict)
+
+    def branch(self, source: Observation) -> ObjectForesight:
+        """Returns objects that are looked for in a later real observation.
+
+        What they look like where nothing hides them is kept.
+        """
+        return replace(self, source=source, found=None)
+
+    def foresee(
+        self,
+        plan: ChunkPlan,
+        observation: Observation,
+        names: tuple[str, ...],
+        start_masks: ObjectMasks,
+        majority: Majority,
+        is_begun: bool,
+        should_stop: Callable[[], bool],
+    ) -> ObjectForesight:
+        """Returns the objects at the end of a chunk.
+
+        Pictures go on to show the future that they showed, unless it ends otherwise than most.
+
+        Args:
+            plan: the chunk.
+            observation: first of the episode, at the model's size.
+            names: O of them.
+            start_masks: in its frames.
+            majority: says which futures end as most do.
+            is_begun: whether nothing real was seen since the episode began.
+            should_stop: asked all the time.
+
+        Raises:
+            RolloutPreempted: `should_stop` said so.
+        """
+        if self.model is None:
+            return self
+        found = self.found
+        if found is None or found.names != names:
+            found = self._find(observation, names, start_masks)
+            if should_stop():
+                raise RolloutPreempted('stopped while objects were looked for')
+        shown = found.shown
+        positions = plan.fine_positions(found.tracked.step_s, found.tracked.commands_a_step)
+        found = found.after(positions, should_stop)
+        after = replace(self, found=found)
+        motions = after.motions(plan, is_begun)
+        among = None if motions is None else majority(motions)
+        if plan.chunk == 0 or (among is not None and not among[shown]):
+            shown = found.medoid(among)
+        return replace(
+            after, found=replace(found, shown=shown, shown_before=self._shown_before(shown))
+        )
+
+    def pictures(self, plan: ChunkPlan, motion: Motion) -> ByteArray | None:
+        """Returns the objects on their way through a chunk (V, 1 + T, H, W, 4); None = unknown.
+
+        Args:
+            plan: the chunk.
+            motion: of the robot and the cameras at its 1 + T states.
+        """
+        if self.found is None:
+            return None
+        times = plan.times - plan.times[0]
+        return self.found.pictures(times, motion.cameras, motion.camera_poses)
+
+    def motions(self, plan: ChunkPlan, is_begun: bool) -> ForeseenMotions | None:
+        """Returns the futures until the end of what is kept of a chunk; None = they do not count.
+
+        Args:
+            plan: the chunk.
+            is_begun: whether nothing real was seen since the episode began.
+        """
+        found = self.found
+        # where the rollout began earlier, objects may have been found half hidden, or in a grip
+        if found is None or not (is_begun or found.is_whole):
+            return None
+        left = round(plan.num_left * plan.frame_s / found.tracked.step_s)
+        return foreseen_of(
+            self.robot, found, len(found.motions[0].points) - left, is_begun=is_begun
+        )
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """What speaks against what is foreseen, in words."""
+        return () if self.found is None else self.found.tracked.reasons
+
+    @property
+    def refusal(self) -> str:
+        """The reason to give no verdict; empty = none.
+
+        Where the episode begins, what cannot be foreseen of an object is a reason, too: pictures
+        of objects that cannot be where they were found tell nothing.
+        """
+        if self.found is None:
+            return ''
+        tracked = self.found.tracked
+        doubts = tracked.doubts if self.found.is_whole else {}
+        return tracked.refusal or '; '.join(dict.fromkeys(doubts.values()))
+
+    def _shown_before(self, shown: int) -> int:
+        return shown if self.found is None else self.found.shown
+
+    def _find(
+        self, observation: Observation, names: tuple[str, ...], start_masks: ObjectMasks
+    ) -> FoundObjects:
+        """The named objects where the rollout stands."""
+        # at its own size the real frame shows better where they are; where the names have
+        # changed only an imagined frame shows where they are now
+        source = self.source if self.found is None else observation
+        if source is self.first:
+            return self._find_whole(names, observation, start_masks)
+        frames, masks = observation.frames, start_masks.masks[:, :, 0]
+        if self.found is not None:
+            return self._found_in(source, names, frames, masks)
+        return self._found_in(source, names, frames, masks, self._find_whole(names, observation))
+
+    def _find_whole(
+        self,
+        names: tuple[str, ...],
+        observation: Observation,
+        start_masks: ObjectMasks | None = None,
+    ) -> FoundObjects:
+        """The named objects in the episode's first real frame, in which they count as whole."""
+        if names not in self._whole:
+            height, width = observation.frames.shape[1:3]
+            frames = self.first.frames
+            if frames.shape[1:3] != (height, width):
+                frames = resize_frames(frames, width, height)
+            if start_masks is None:
+                start_masks = self.segmenter.segment(frames[:, None], names)
+            found = self._found_in(self.first, names, frames, start_masks.masks[:, :, 0])
+            self._whole[names] = replace(found, is_whole=True)
+        return self._whole[names]
+
+    def _found_in(
+        self,
+        source: Observation,
+        names: tuple[str, ...],
+        frames: ByteArray,
+        masks: BoolArray,
+        whole: FoundObjects | None = None,
+    ) -> FoundObjects:
+        """Objects of masks (V, O, H, W) in frames (V, H, W, 3) uint8 RGB at the model's size.
+
+        Args:
+            source: the same observation at the recorded size.
+            names: O of them.
+            frames: of all views.
+            masks: in them.
+            whole: the same objects when nothing hid them; None = now.
+        """
+        assert self.model is not None
+        sharp = self.segmenter.segment(source.frames[:, None], names).masks[:, :, 0]
+        poses = Motion.of(self.robot, source.cameras, source.positions[None]).camera_poses[:, 0]
+        given = names, sharp, source.cameras, list(poses)
+        if whole is None:
+            return FoundObjects.at(names, frames, masks, poses, self.model.find(*given))
+        tracked, same, hidden = self.model.find_again(whole.tracked, *given)
+        found = FoundObjects.at(names, frames, masks, poses, tracked).shown_as(whole, hidden)
+        return replace(found, is_whole=bool(same.all()))

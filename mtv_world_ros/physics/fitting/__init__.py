@@ -1,0 +1,1 @@
+"""Fits of the physics: contact, the response of arms, tracks of objects."""

@@ -1,0 +1,761 @@
+"""Friction, weight, grip, delay and table, from masks and joint states of what commands did.
+
+Settings are drawn, and objects foreseen under each of them; those under which objects keep nearest
+to where later masks show them are likelier. Draws are repeated where they are likely (population
+Monte Carlo, Cappe et al. 2004), so that every number has an interval, which becomes its spread in
+futures. Nothing is taken from a simulator, and no pose of an object but those that masks show.
+
+Shape letters: T steps, O objects, J joints, N draws, P numbers, E episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import multivariate_normal, qmc
+
+from mtv_world_ros.cameras.mask_geometry import block_size, CENTROID_NOISE_PX, centroids, locate
+from mtv_world_ros.core.data_types import BoolArray, FloatArray
+from mtv_world_ros.core.errors import TrainingError
+from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.physics.arm_response import PERIOD_S
+from mtv_world_ros.physics.arms import Arms
+from mtv_world_ros.physics.contact_scene import CompiledScene
+from mtv_world_ros.physics.contact_settings import ContactOrigin, ContactSettings
+from mtv_world_ros.physics.drive_inputs import CoursePlanner, SUBSTEPS
+from mtv_world_ros.physics.engine import Engine
+from mtv_world_ros.physics.fitting.tracks import (
+    fine_commands,
+    first_frame,
+    FirstFrame,
+    object_displacements,
+    read_each,
+    recorded_positions,
+)
+from mtv_world_ros.physics.futures import Future, shifted
+from mtv_world_ros.physics.solid_foresight import COMMANDS_A_STEP, STEP_S, table_in
+from mtv_world_ros.physics.solids import bottom_of, fit_solid, is_box, is_vessel, Solid
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.resample import nearest_rows
+
+#: a gripper that is commanded to close by more than this share of its travel may touch something
+_CLOSES = 0.02
+#: errors of grippers above this share of their travel are as bad: they touch something
+_MOST = 0.15
+#: candidates of a round, and the factors within which they are drawn
+_CANDIDATES, _FINGER_FACTORS = 48, (10.0, 3.0, 1.5, 1.2)
+#: episodes that are looked at, and shortest ones [periods]
+_MOST_EPISODES, _SHORTEST = 12, 10
+#: fingers swing if that explains at least this share of the errors
+_EXPLAINS = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FreeGrippers:
+    """Grippers of an episode before they close.
+
+    Attributes:
+        positions: (1 + T, J) commanded, `PERIOD_S` apart [rad or m].
+        recorded: (1 + T, J) recorded likewise; NaN = no gripper, or it may touch something.
+    """
+
+    positions: FloatArray
+    recorded: FloatArray
+
+    @classmethod
+    def of(cls, robot: RobotModel, positions: FloatArray, recorded: FloatArray) -> FreeGrippers:
+        """Returns those of commands and recorded positions (1 + T, J)."""
+        known = np.full_like(recorded, np.nan)
+        last = 1
+        for tool in robot.tools:
+            if tool.gripper_joint is None:
+                continue
+            column = robot.joint_names.index(tool.gripper_joint)
+            travel = abs(tool.gripper_open - tool.gripper_closed)
+            moved = np.abs(positions[:, column] - positions[0, column]) > _CLOSES * travel
+            count = int(moved.argmax()) if moved.any() else len(moved)
+            known[:count, column] = recorded[:count, column]
+            last = max(last, count)
+        return cls(positions=positions[:last], recorded=known[:last])
+
+
+def fit_fingers(
+    grippers: Sequence[FreeGrippers], arms: Arms, settings: ContactSettings
+) -> ContactSettings:
+    """Returns settings with the numbers of fingers that explain what grippers reported.
+
+    The search begins at the settings. Where swinging fingers explain little, they are returned as
+    they were, and fingers do not swing.
+    """
+    known = [one for one in grippers if len(one.positions) >= _SHORTEST]
+    known = [one for one in known if np.isfinite(one.recorded).any()]
+    known = known[:: max(1, len(known) // _MOST_EPISODES)][:_MOST_EPISODES]
+    if not known:
+        return settings
+    scene = CompiledScene.compiled(arms, ())
+    swinging = settings.model_copy(update={'fingers_swing': True})
+    rng = np.random.default_rng(3)
+    names = ('finger_stiffness', 'finger_damping', 'finger_mass_kg')
+    best, least = swinging, np.inf
+    for factor in _FINGER_FACTORS:
+        drawn = rng.uniform(-1, 1, size=(_CANDIDATES, 3))
+        drawn[0] = 0.0
+        middle = np.array([getattr(best, name) for name in names])
+        for numbers in (middle * factor**drawn).tolist():
+            tried = swinging.model_copy(update=dict(zip(names, numbers, strict=True)))
+            loss = _loss(scene, tried, known, least)
+            if loss < least:
+                best, least = tried, loss
+    geared = settings.model_copy(update={'fingers_swing': False})
+    return best if least < (1 - _EXPLAINS) * _loss(scene, geared, known) else settings
+
+
+def _loss(
+    scene: CompiledScene,
+    settings: ContactSettings,
+    grippers: Sequence[FreeGrippers],
+    most: float = np.inf,
+) -> float:
+    """How far grippers report to be from where they are expected, in their travels.
+
+    Recordings after those that make it more than `most` are not looked at.
+    """
+    planner, arms = CoursePlanner(scene, settings), scene.arms
+    names, loss = arms.robot.joint_names, 0.0
+    for one in grippers:
+        if loss > most:
+            break
+        course, _ = planner.plan(one.positions, planner.begin(one.positions[0]))
+        expected = arms.drives.joints(course.positions[::SUBSTEPS], len(names))
+        for tool in arms.robot.tools:
+            if tool.gripper_joint is not None:
+                column = names.index(tool.gripper_joint)
+                travel = abs(tool.gripper_open - tool.gripper_closed)
+                off = np.abs(expected[:, column] - one.recorded[:, column]) / travel
+                loss += float(np.nansum(np.minimum(off, _MOST)))
+    return loss
+
+
+#: what is drawn, and as how large it may be thought before: factors are of the first settings
+RANGES = {
+    'grip_friction': (0.03, 3.0),
+    'table_friction': (0.15, 2.5),
+    'density': (60.0, 3000.0),
+    'finger_stiffness': (0.2, 3.0),
+}
+_FACTORS = frozenset({'finger_stiffness'})
+_WORDS = {
+    'grip_friction': 'friction of fingers',
+    'table_friction': 'friction of all else',
+    'density': 'density [kg/m^3]',
+    'finger_stiffness': 'stiffness of fingers [N/m]',
+    'delay_s': 'commands arrive late by [s]',
+    'table_m': 'height of the table [m]',
+    'camera_m': 'cameras see objects elsewhere by [m]',
+    'hold': 'friction x stiffness of fingers / density: whether things slip [N m^2/kg]',
+}
+#: exponents of numbers that make up for each other: an object slips where this product is small
+_HOLD = {'grip_friction': 1, 'finger_stiffness': 1, 'density': -1}
+#: how far settings usually are from the first ones, as the deviation of a logarithm
+_USUAL = 1.0
+#: draws of a round, and rounds
+_DRAWS, _ROUNDS = 64, 3
+#: draws worth fewer alike ones do not show how uncertain a number is. Where they are worth
+#: fewer than enough, or than a share of all, the likelihood counts less, down to a share
+_FEW, _ENOUGH, _ENOUGH_SHARE, _LEAST_COUNTS = 5.0, 16.0, 1 / 8, 0.01
+#: numbers whose interval is so many times wider than if the others were known are not told apart
+_APART = 2.0
+#: an object this far from where it was foreseen is about as unlikely as it gets [m]; farther ones
+#: may be lost by the masks
+_NEAR_M, _LOST_M = 0.008, 0.1
+#: later draws lie as wide as what is likely, times this; deviation of a logarithm, at least
+_WIDER, _LEAST = 1.3, 0.08
+#: an episode says something of a number whose low and high values differ by this likelihood
+_SAYS = 0.5
+#: delays that are tried [s]
+_DELAYS = np.arange(0.0, 0.31, PERIOD_S)
+#: masks of larger objects have no common middle in two views [m]
+_SMALL_M = 0.1
+#: outlines of masks are no more exact than this, however many there are [m]
+_EXACT_M = 0.0005
+#: heights that differ by more are of several tables [m]
+_ONE_TABLE_M = 0.03
+#: commands that are as near to measured positions are these [rad or m]; then fingers are told to
+#: close further, by a share of their travel
+_SAME_RAD, _SQUEEZE = 1e-6, 0.1
+#: recordings whose table is looked for
+_MOST_TABLES = 8
+#: objects of which less is shown than this share of the first frame's are hidden in part
+_SHOWN = 0.85
+#: slower joints do not show a delay [rad/s or m/s]
+_MOVES = 0.1
+_RESAMPLED, _SEED = 400, 5
+#: spreads in futures are no smaller and no larger: other scenes are not quite as these
+_LEAST_SPREAD, _MOST_SPREAD = 0.1, 0.8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContactRecording:
+    """What an episode says about contact.
+
+    Attributes:
+        names: of O objects.
+        frame: the first.
+        positions: (1 + T * n, J) commanded, `PERIOD_S` apart [rad or m].
+        recorded: (1 + T * n, J) reported by the joints then.
+        displacements: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
+        grippers: before they close.
+    """
+
+    names: tuple[str, ...]
+    frame: FirstFrame
+    positions: FloatArray
+    recorded: FloatArray
+    displacements: FloatArray
+    grippers: FreeGrippers
+
+    def table(self) -> float:
+        """Returns the height of its own table [m]; NaN = no object tells."""
+        frame = self.frame
+        return table_in(self.names, frame.masks, frame.cameras, frame.poses)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FittedNumber:
+    """A number that was found.
+
+    Attributes:
+        name: of the setting, or of a product of settings.
+        value: the mean of what is likely.
+        low: lower end of its 90 % interval, whatever the other numbers are.
+        high: upper end.
+        spread: standard deviation if the other numbers are as found, of factors that of the
+            logarithm.
+        count: recordings, or objects, that say something of it.
+        of: that were looked at.
+        counted: what `count` and `of` are.
+        apart: its interval is hardly wider than if the other numbers were known.
+    """
+
+    name: str
+    value: float
+    low: float
+    high: float
+    spread: float
+    count: int
+    of: int
+    counted: str = 'recordings'
+    apart: bool = True
+
+    def __str__(self) -> str:
+        rests = f'rests on {self.count} of {self.of} {self.counted}'
+        if not self.count:
+            rests = f'none of {self.of} {self.counted} tells: this is what was thought before'
+        elif not self.apart:
+            rests += '; not told apart from the other numbers by these'
+        return f'{_WORDS[self.name]}: {self.value:.3g} [{self.low:.3g}, {self.high:.3g}] ({rests})'
+
+
+def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> ContactRecording:
+    """Reads what an episode says about contact: masks, commands and joint states.
+
+    Raises:
+        EpisodeError: see `object_displacements`.
+    """
+    # poses of objects that a simulator recorded are not looked at
+    episode = replace(read_episode(path, views=tuple(views)), object_poses=None)
+    displacements = object_displacements(episode, robot, views)
+    times, positions = fine_commands(episode, robot, views)
+    assert episode.masks is not None and episode.joint_states is not None
+    stamps_ns = episode.masks[views[0]].stamps_ns[0] + times * 1e9
+    shown = _unhidden(episode, views, len(displacements))
+    recorded = recorded_positions(episode.joint_states, robot, stamps_ns)
+    return ContactRecording(
+        names=tuple(episode.info.objects),
+        frame=first_frame(episode, robot, views),
+        positions=positions,
+        recorded=recorded,
+        displacements=np.where(shown[..., None], displacements, np.nan),
+        grippers=FreeGrippers.of(robot, positions, recorded),
+    )
+
+
+def _unhidden(episode: Episode, views: Sequence[str], num_rows: int) -> BoolArray:
+    """(1 + T, O) whether all views show about as much of an object as at first."""
+    assert episode.masks is not None
+    count = len(episode.info.objects)
+    areas = []
+    for view in views:
+        track = episode.masks[view]
+        wanted = track.stamps_ns[0] + np.arange(num_rows) * STEP_S * 1e9
+        each = np.stack(
+            [
+                np.bincount(np.asarray(track.frames[k]).ravel(), minlength=1 + count)[1:]
+                for k in range(len(track.stamps_ns))
+            ]
+        )
+        areas.append(each[nearest_rows(track.stamps_ns, wanted)][:, :count])
+    shown = np.stack(areas)
+    return np.asarray((shown >= _SHOWN * shown[:, :1]).all(axis=0))
+
+
+def read_recordings(
+    paths: Sequence[Path], robot: RobotModel, views: Sequence[str]
+) -> tuple[list[ContactRecording], dict[str, str]]:
+    """Returns what episodes say about contact, and why others say nothing, by path."""
+    return read_each(paths, lambda path: read_contact(path, robot, views))
+
+
+def first_settings(arms: Arms) -> ContactSettings:
+    """Returns what a search begins with: fingers as their joints follow, objects of plastic."""
+    drives = arms.drives
+    stiffness, damping, mass = 200.0, 10.0, 0.05
+    if drives.fingers.any():
+        squared_travel = drives.travels[drives.fingers] ** 2
+        numbers = (drives.stiffness, drives.damping, drives.armature)
+        found = [float(np.mean(one[drives.fingers] / squared_travel)) for one in numbers]
+        stiffness, damping, mass = (max(one, 1e-6) for one in found)
+    return ContactSettings(
+        finger_stiffness=stiffness,
+        finger_damping=damping,
+        finger_mass_kg=mass,
+        grip_friction=1.0,
+        table_friction=0.5,
+        density=300.0,
+        tray_kg=0.4,
+        num_motions=16,
+    )
+
+
+def fit_contact(
+    recordings: Sequence[ContactRecording],
+    arms: Arms,
+    first: ContactSettings | None = None,
+    threads: int = 1,
+    report: Callable[[str], None] = lambda line: None,
+    progress: Callable[[Sequence[int]], Iterable[int]] = iter,
+) -> tuple[ContactSettings, list[FittedNumber]]:
+    """Returns likely settings with their spread, and what was found with intervals.
+
+    Args:
+        recordings: E episodes.
+        arms: how the recorded robot follows its commands.
+        first: numbers that were found before, where the search begins; None = it begins with
+            `first_settings`, and with fingers as `fit_fingers` finds them.
+        threads: CPU threads of the engine.
+        report: takes a line about each number and round.
+        progress: wraps the numbers of what is foreseen, e.g. in a progress bar.
+
+    Raises:
+        TrainingError: no recording says where an object went.
+        RobotError: see `Arms`.
+    """
+    if not any(np.isfinite(recording.displacements).any() for recording in recordings):
+        raise TrainingError('no episode says where an object went; contact cannot be fitted')
+    if first is None:
+        first = fit_fingers([r.grippers for r in recordings], arms, first_settings(arms))
+    table, delay = find_table(recordings), find_delay(recordings, arms)
+    cameras = find_cameras(recordings)
+    for one in (table, delay, cameras):
+        report(str(one))
+    spread = first.spread.model_copy(
+        update={
+            'camera_m': cameras.value if cameras.count else first.spread.camera_m,
+            'delay_s': max(delay.spread, first.spread.delay_s),
+        }
+    )
+    first = first.model_copy(
+        update={'table_m': table.value, 'delay_s': delay.value, 'spread': spread}
+    )
+    first = settings_of_place(first, recordings, report)
+    engine = Engine(arms, threads)
+    trials = [_Trial.of(one, first) for one in recordings]
+    factors, likelihoods, weights = _populations(engine, trials, first, report, progress)
+    logs = factors + np.log([_scales(first)[name] for name in RANGES])
+    known = _conditional(logs, weights).tolist()
+    found = [
+        _finding(name, values, likelihoods, weights, spread)
+        for name, values, spread in zip(RANGES, logs.T, known, strict=True)
+    ]
+    products = logs @ [_HOLD.get(name, 0) for name in RANGES]
+    hold = _finding('hold', products, likelihoods, weights)
+    values = {one.name: one.value for one in found}
+    heavier = values['density'] / first.density
+    stiffer = values['finger_stiffness'] / first.finger_stiffness
+    values |= {
+        'tray_kg': float(np.clip(first.tray_kg * heavier, 1e-3, 100)),
+        'finger_damping': first.finger_damping * stiffer,
+    }
+    spreads = {
+        key: float(np.clip(one.spread, _LEAST_SPREAD, _MOST_SPREAD))
+        for key, one in zip(('grip', 'friction', 'weight', 'force'), found, strict=True)
+    }
+    spread = first.spread.model_copy(update=spreads)
+    for one in (*found, hold):
+        report(str(one))
+    deciding = _effective_draws(weights)
+    if deciding < _FEW:
+        report(
+            f'{deciding:.1f} draws decide: these numbers are likely together, but their intervals '
+            'are too narrow'
+        )
+    origin = ContactOrigin(
+        by='mtv-world fit-contact',
+        recordings=len(recordings),
+        telling=hold.count,
+    )
+    update = {**values, 'spread': spread, 'fitted': origin}
+    return first.model_copy(update=update), [table, delay, cameras, *found, hold]
+
+
+def settings_of_place(
+    first: ContactSettings,
+    recordings: Sequence[ContactRecording],
+    report: Callable[[str], None],
+) -> ContactSettings:
+    """Returns settings for recordings on several tables, or without commands of their own.
+
+    Args:
+        first: settings otherwise.
+        recordings: E.
+        report: is told what differs.
+    """
+    changed: dict[str, bool | float] = {}
+    each = recordings[:: max(1, len(recordings) // _MOST_TABLES)]
+    heights = np.array([recording.table() for recording in each])
+    heights = heights[np.isfinite(heights)]
+    if len(heights) and np.ptp(heights) > _ONE_TABLE_M:
+        changed['table_varies'] = True
+        report(
+            f'tables are between {heights.min():.3f} and {heights.max():.3f} m high: each is '
+            'looked for in the first frame'
+        )
+    if all(np.allclose(r.positions, r.recorded, atol=_SAME_RAD) for r in recordings):
+        changed['squeeze'] = _SQUEEZE
+        report(
+            'commands are measured positions, which stop at what is held: grippers close further '
+            f'by {_SQUEEZE:.0%} of their travel'
+        )
+    return first.model_copy(update=changed)
+
+
+def _scales(first: ContactSettings) -> dict[str, float]:
+    """What a drawn number is multiplied by."""
+    return {name: getattr(first, name) if name in _FACTORS else 1.0 for name in RANGES}
+
+
+def _populations(
+    engine: Engine,
+    trials: Sequence[_Trial],
+    first: ContactSettings,
+    report: Callable[[str], None],
+    progress: Callable[[Sequence[int]], Iterable[int]],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Draws (N, P) as logarithms, their log likelihoods (N, E), and weights (N,)."""
+    low, high = np.log(np.array(list(RANGES.values())).T)
+    uniform = -float(np.log(high - low).sum())
+    middle = np.log([1.0 if n in _FACTORS else getattr(first, n) for n in RANGES])
+    drawn = qmc.scale(
+        qmc.Sobol(len(RANGES), rng=np.random.default_rng(_SEED)).random(_DRAWS), low, high
+    )
+    draws, likelihoods = np.zeros((0, len(RANGES))), np.zeros((0, len(trials)))
+    proposals: list[tuple[FloatArray, FloatArray] | None] = [None]
+    weights, steps = np.zeros(0), iter(progress(range(_ROUNDS * len(trials))))
+    for number in range(_ROUNDS):
+        draws = np.concatenate([draws, drawn])
+        settings = [_settings(first, one) for one in drawn]
+        rows = np.stack(
+            [trial.likelihoods(engine, settings) for trial, _ in zip(trials, steps, strict=False)],
+            axis=-1,
+        )
+        likelihoods = np.concatenate([likelihoods, rows])
+        densities = [
+            np.full(len(draws), uniform)
+            if one is None
+            else multivariate_normal.logpdf(draws, one[0], one[1])  # type: ignore[arg-type]
+            for one in proposals
+        ]
+        mixture = np.logaddexp.reduce(densities, axis=0) - np.log(len(proposals))
+        usual = -(((draws - middle) / _USUAL) ** 2).sum(-1) / 2
+        weights, counts = _weights(likelihoods.sum(-1), usual - mixture)
+        mean, wide = weights @ draws, _WIDER**2 * _covariance(draws, weights)
+        wide += _LEAST**2 * np.eye(len(mean))
+        tempered = '' if counts == 1 else f', {counts:.2g} of the likelihood counted'
+        worth = f'worth {_effective_draws(weights):.1f} alike'
+        report(f'round {number + 1}: {len(draws)} draws, {worth}{tempered}')
+        proposals.append((mean, wide))
+        rng = np.random.default_rng((_SEED, number))
+        drawn = np.clip(rng.multivariate_normal(mean, wide, _DRAWS), low, high)
+    return draws, likelihoods, weights
+
+
+def _weights(likelihoods: FloatArray, others: FloatArray) -> tuple[FloatArray, float]:
+    """Weights (N,) of draws, which sum to 1, and the share of the likelihood that counts.
+
+    Foresight is rough whatever the settings, which a likelihood of many recordings does not know:
+    few draws would decide. So as much of it counts as leaves enough draws (tempering).
+    `likelihoods` and `others`, all that weighs besides, are logarithms (N,).
+    """
+    enough = min(_ENOUGH, _ENOUGH_SHARE * len(likelihoods))
+    weights, share = np.zeros(0), 1.0
+    for share in np.geomspace(1, _LEAST_COUNTS, 40):
+        logs = share * likelihoods + others
+        weights = np.exp(logs - logs.max())
+        weights /= weights.sum()
+        if _effective_draws(weights) >= enough:
+            break
+    return weights, float(share)
+
+
+def _covariance(draws: FloatArray, weights: FloatArray) -> FloatArray:
+    """(P, P) of draws (N, P) with weights (N,)."""
+    off = draws - weights @ draws
+    return (weights * off.T) @ off
+
+
+def _conditional(draws: FloatArray, weights: FloatArray) -> FloatArray:
+    """(P,) standard deviations of numbers if the others are known, of draws (N, P)."""
+    covariance = _covariance(draws, weights)
+    floor = 1e-9 * np.eye(len(covariance))
+    return np.asarray(np.diag(np.linalg.inv(covariance + floor)) ** -0.5, np.float64)
+
+
+def _effective_draws(weights: FloatArray) -> float:
+    """Number of draws of one weight that would tell as much as these (N,), which sum to 1."""
+    return float(1 / (weights**2).sum())
+
+
+def _settings(first: ContactSettings, logs: FloatArray) -> ContactSettings:
+    """Settings of a draw (P,)."""
+    numbers = dict(zip(RANGES, np.exp(logs).tolist(), strict=True))
+    values = {name: numbers[name] * scale for name, scale in _scales(first).items()}
+    heavier, stiffer = values['density'] / first.density, numbers['finger_stiffness']
+    return first.model_copy(
+        update={
+            **values,
+            'tray_kg': first.tray_kg * heavier,
+            'finger_damping': first.finger_damping * stiffer,
+        }
+    )
+
+
+def _finding(
+    name: str,
+    values: FloatArray,
+    likelihoods: FloatArray,
+    weights: FloatArray,
+    conditional: float | None = None,
+) -> FittedNumber:
+    """What draws of a number say of it.
+
+    Args:
+        name: of the number.
+        values: (N,) logarithms.
+        likelihoods: (N, E) of the draws, by recording.
+        weights: (N,) of the draws, which sum to 1.
+        conditional: standard deviation if the other numbers are known; None = it stands alone.
+    """
+    order = np.argsort(values)
+    shares = np.cumsum(weights[order]) - weights[order] / 2
+    middle = weights @ values
+    low, high = np.interp((0.05, 0.95), shares, values[order])
+    spread = float(np.sqrt(weights @ (values - middle) ** 2))
+    thirds = np.quantile(values[:_DRAWS], (1 / 3, 2 / 3))
+    ends = [likelihoods[:_DRAWS][part].mean(0) for part in
+            (values[:_DRAWS] <= thirds[0], values[:_DRAWS] >= thirds[1])]  # fmt: skip
+    count = int((np.abs(ends[0] - ends[1]) > _SAYS).sum())
+    low, middle, high = np.exp([low, middle, high]).tolist()
+    return FittedNumber(
+        name=name,
+        value=middle,
+        low=low,
+        high=high,
+        spread=spread if conditional is None else conditional,
+        count=count,
+        of=likelihoods.shape[1],
+        apart=conditional is None or bool(spread < _APART * conditional),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Trial:
+    """An episode whose objects are foreseen under several settings.
+
+    Attributes:
+        solids: of the O objects that two views see at first.
+        positions: (1 + T * n, J) commanded.
+        displacements: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
+        table_m: height of its table.
+    """
+
+    solids: tuple[Solid, ...]
+    positions: FloatArray
+    displacements: FloatArray
+    table_m: float
+
+    @classmethod
+    def of(cls, recording: ContactRecording, settings: ContactSettings) -> _Trial:
+        """Returns the trial of a recording on a table as high as the settings say."""
+        frame, points, table = recording.frame, recording.frame.points(), settings.table_m
+        if settings.table_varies and np.isfinite(own := recording.table()):
+            table = own
+        found = [
+            fit_solid(
+                frame.masks[:, item], points[item], frame.cameras, frame.poses, table,
+                is_vessel(name), is_box(name),
+            )
+            for item, name in enumerate(recording.names)
+        ]  # fmt: skip
+        known = [item for item, solid in enumerate(found) if solid is not None]
+        return cls(
+            solids=tuple(solid for solid in found if solid is not None),
+            positions=recording.positions,
+            displacements=recording.displacements[:, known],
+            table_m=table,
+        )
+
+    def likelihoods(self, engine: Engine, settings: Sequence[ContactSettings]) -> FloatArray:
+        """Returns (N,) log likelihoods of where masks show the objects."""
+        still = np.zeros(len(engine.arms.drives.names))
+        drawn = np.random.default_rng(_SEED).normal(size=(len(settings), 3))
+        futures = []
+        for one, draw in zip(settings, drawn, strict=True):
+            # where the cameras see all of it is not known: each draw has a shift of its own
+            shift = one.spread.camera_m * draw * [1, 1, one.table_varies]
+            changed = one.model_copy(update={'table_m': self.table_m + shift[2]})
+            solids = tuple(shifted(solid, shift) for solid in self.solids)
+            futures.append(
+                Future(settings=changed, solids=solids, zeros=still, delay_s=one.delay_s)
+            )
+        motion, state = engine.begin(futures).advance(self.positions, COMMANDS_A_STEP)
+        rows = min(motion.points.shape[1], len(self.displacements))
+        # how it ends counts: at first nothing has moved whatever the settings
+        late = slice(rows // 2, rows)
+        foreseen = motion.points[:, late] - motion.points[:, :1]
+        away = np.linalg.norm(foreseen - self.displacements[late], axis=-1)
+        away = np.minimum(away, _LOST_M)
+        unlikely = np.log1p((away / _NEAR_M) ** 2)
+        known = np.isfinite(self.displacements[late]).all(-1)
+        counted = np.where(known, np.nan_to_num(unlikely), 0.0).sum(1)
+        found = -(counted / np.maximum(known.sum(0), 1)).sum(-1)
+        found[list(state.lost)] = -np.log1p((_LOST_M / _NEAR_M) ** 2) * len(self.solids)
+        return found
+
+
+def find_delay(recordings: Sequence[ContactRecording], arms: Arms) -> FittedNumber:
+    """Returns how much later joints move than commands of now would have them move."""
+    errors = np.stack([_delay_errors(one, arms) for one in recordings])
+    known = errors[np.isfinite(errors).all(-1)]
+    return _resampled(
+        'delay_s', known, len(errors), 'recordings', lambda rows: _lowest(rows.mean(0), _DELAYS)
+    )
+
+
+def _delay_errors(recording: ContactRecording, arms: Arms) -> FloatArray:
+    """Error of the joints by delay; NaN = they do not move."""
+    expected = recording.positions
+    if arms.response is not None:
+        free = replace(arms.response, floor=None)
+        expected = free.follow(arms.robot, recording.positions)[0]
+    speeds = np.abs(np.gradient(expected, PERIOD_S, axis=0))
+    moving = speeds > _MOVES
+    errors = []
+    for delay in np.rint(_DELAYS / PERIOD_S).astype(int):
+        late = np.concatenate([np.repeat(expected[:1], delay, 0), expected])[: len(expected)]
+        off = np.abs(late - recording.recorded)[moving]
+        errors.append(float(np.mean(off)) if len(off) else np.nan)
+    return np.array(errors)
+
+
+def find_cameras(recordings: Sequence[ContactRecording]) -> FittedNumber:
+    """Returns how far from where they are the cameras see objects, alike for all of a scene.
+
+    Errors of cameras let the rays of two views pass each other: where each ray is off by a
+    deviation, they pass by that times the square root of two. Large objects are left out, whose
+    masks in two views have no common middle.
+    """
+    found = [gap for recording in recordings for gap in _ray_gaps(recording.frame)]
+    known = np.array([gap for gap in found if np.isfinite(gap)])
+    return _resampled(
+        'camera_m', known, len(found), 'objects', lambda gaps: np.sqrt((gaps**2).mean() / 2)
+    )
+
+
+def _ray_gaps(frame: FirstFrame) -> list[float]:
+    """By how far the views' rays to each object pass each other [m]; NaN = it does not tell.
+
+    What the middle of a mask is uncertain by is left out, so that it is 0 where cameras are right.
+    """
+    gaps, pixels = [], centroids(frame.masks)
+    for item in range(frame.masks.shape[1]):
+        place = locate(frame.cameras, frame.poses, pixels[:, item])
+        if place is None or not np.isfinite(place.point).all():
+            gaps.append(np.nan)
+            continue
+        areas = frame.masks[:, item].sum((-2, -1)).astype(np.float64)
+        edge = block_size(frame.cameras, frame.poses, areas, place.point)
+        # each ray passes the point between them at half the gap
+        own = (CENTROID_NOISE_PX / max(place.residual_px, CENTROID_NOISE_PX)) ** 2
+        gap = 2 * place.sigma_m * np.sqrt(1 - own)
+        gaps.append(gap if edge < _SMALL_M else np.nan)
+    return gaps
+
+
+def find_table(recordings: Sequence[ContactRecording]) -> FittedNumber:
+    """Returns the height at which what stands on a table ends below."""
+    bottoms = []
+    for recording in recordings[:: max(1, len(recordings) // _MOST_TABLES)]:
+        frame, points = recording.frame, recording.frame.points()
+        for item, name in enumerate(recording.names):
+            seen = frame.masks[:, item], points[item], frame.cameras, frame.poses
+            bottoms.append(bottom_of(*seen, name))
+    known = np.array(bottoms)[np.isfinite(bottoms)]
+    # the middle one: some stand in others
+    found = _resampled('table_m', known, len(bottoms), 'objects', np.median)
+    return replace(found, low=found.low - _EXACT_M, high=found.high + _EXACT_M)
+
+
+def _resampled(
+    name: str,
+    known: FloatArray,
+    of: int,
+    counted: str,
+    middle: Callable[..., Any],
+) -> FittedNumber:
+    """The `middle` of (E, ...) known rows, with an interval from resampled ones.
+
+    `of` rows were looked at; `counted` is what they are.
+    """
+    if not len(known):
+        nothing = dict.fromkeys(('value', 'low', 'high', 'spread'), 0.0)
+        return FittedNumber(name=name, count=0, of=of, counted=counted, **nothing)
+    rng = np.random.default_rng(_SEED)
+    rows = rng.integers(0, len(known), (_RESAMPLED, len(known)))
+    found = np.array([middle(known[row]) for row in rows])
+    low, high = np.quantile(found, (0.05, 0.95))
+    return FittedNumber(
+        name=name,
+        value=float(middle(known)),
+        low=float(low),
+        high=float(high),
+        spread=float(found.std()),
+        count=len(known),
+        of=of,
+        counted=counted,
+    )
+
+
+def _lowest(errors: FloatArray, values: FloatArray) -> float:
+    """Where errors (N,) are least, between the values by a parabola."""
+    at = int(errors.argmin())
+    if not 0 < at < len(values) - 1:
+        return float(values[at])
+    before, least, after = errors[at - 1 : at + 2]
+    bend = before - 2 * least + after
+    shift = 0.5 * (before - after) / bend if bend > 0 else 0.0
+    return float(values[at] + shift * (values[1] - values[0]))

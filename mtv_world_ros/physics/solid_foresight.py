@@ -1,0 +1,400 @@
+"""Objects as solids on MuJoCo: found in masks, foreseen in several futures.
+
+Shape letters: V views, O objects, S solids, K futures, T steps, J joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+import copy
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mtv_world_ros.cameras.mask_geometry import centroids, locate_all
+from mtv_world_ros.core.data_types import BoolArray, CameraModel, FloatArray
+from mtv_world_ros.physics.arm_response import ArmResponse, PERIOD_S
+from mtv_world_ros.physics.arms import Arms
+from mtv_world_ros.physics.contact_settings import ContactSettings
+from mtv_world_ros.physics.engine import Batch, BatchState, Engine
+from mtv_world_ros.physics.futures import draw_futures, Future, STANDS_M
+from mtv_world_ros.physics.object_motion import ObjectMotion
+from mtv_world_ros.physics.solids import bottom_of, find_solid, fit_solid, is_box, is_vessel, Solid
+from mtv_world_ros.robot.model import RobotModel
+
+#: positions that are commanded in a step of a motion, and its length [s]
+COMMANDS_A_STEP = 5
+STEP_S = COMMANDS_A_STEP * PERIOD_S
+#: futures that must be left for a verdict, as a share
+_ENOUGH = 0.5
+#: solids that reach into each other by more were not found well [m]
+_OVERLAP_M = 0.01
+#: solids whose bottoms differ by less stand on one table; it is where the numbers of contact say
+#: if it is as near, and corrected if it is no further away [m]
+_LEVEL_M, _SAME_TABLE_M, _NEAR_TABLE_M = 0.004, 0.003, 0.03
+#: a table of unknown height is looked for so far under the middle of objects, in so many fits [m]
+_HALF_M, _FITS = 0.02, 3
+#: what is further from the robot's base was not found on its table [m]
+_TABLE_REACH_M = 2.0
+
+
+class SolidForesight:
+    """Finds objects in a frame, and predicts their motion under plans in several futures.
+
+    Args:
+        robot: any whose base stands still.
+        response: of the arms to their commands; None = not known yet.
+        settings: of contact.
+        threads: number of computing threads.
+
+    Raises:
+        RobotError: contact of the robot cannot be computed, see `Arms`.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        response: ArmResponse | None,
+        settings: ContactSettings,
+        threads: int = 1,
+    ) -> None:
+        self.robot, self.response, self.settings = robot, response, settings
+        self._threads = threads
+        self.engine = Engine(Arms(robot, response), threads)
+        self.engine.scene_of(())
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was assumed of the robot, in words."""
+        return self.engine.arms.notes
+
+    def with_robot(self, robot: RobotModel) -> SolidForesight:
+        """Returns the same for a robot of the same joints and tools."""
+        return SolidForesight(robot, self.response, self.settings, self._threads)
+
+    def find(
+        self,
+        names: Sequence[str],
+        masks: BoolArray,
+        cameras: Sequence[CameraModel],
+        poses: Sequence[FloatArray],
+    ) -> TrackedSolids:
+        """Returns the objects of masks (V, O, H, W), best of the camera's own size.
+
+        Args:
+            names: O of them; those of vessels say that they are hollow.
+            masks: of one frame.
+            cameras: V cameras at the masks' size.
+            poses: V of T_base_camera (4, 4).
+        """
+        given, unknown = (names, masks, cameras, poses), [None] * len(names)
+        if self.settings.table_varies:
+            height = table_in(*given)
+            here = self._on_table(height if np.isfinite(height) else self.settings.table_m)
+            return here._found(*given, unknown)
+        found, told = self._found(*given, unknown), self.settings.table_m
+        table = _table_under(found.solids)
+        if not _SAME_TABLE_M < abs(table - told) < _NEAR_TABLE_M:
+            return found
+        # solids are drawn to the table that they are fitted on
+        found = self._on_table(table)._found(*given, unknown)
+        again = _table_under(found.solids)
+        table = again if np.isfinite(again) else table
+        word = 'higher' if table > told else 'lower'
+        note = (
+            f'the table seems {1e3 * abs(table - told):.0f} mm {word} than contact.json has it; '
+            'corrected for this episode (mtv-world fit-contact finds it)'
+        )
+        return replace(found, foresight=self._on_table(table), note=note)
+
+    def _on_table(self, height: float) -> SolidForesight:
+        """The same on a table of another height [m]."""
+        other = copy.copy(self)
+        other.settings = self.settings.model_copy(update={'table_m': height})
+        return other
+
+    def find_again(
+        self,
+        whole: TrackedSolids,
+        names: Sequence[str],
+        masks: BoolArray,
+        cameras: Sequence[CameraModel],
+        poses: Sequence[FloatArray],
+    ) -> tuple[TrackedSolids, BoolArray, BoolArray]:
+        """Returns objects that something may hide in part by now; see `ObjectMotionModel`."""
+        points = locate_all(cameras, poses, centroids(masks))
+        floor = whole.foresight.settings.table_m
+        solids = [
+            solid and find_solid(solid, masks[:, item], points[item], cameras, poses, floor)
+            for item, solid in enumerate(whole.solids)
+        ]
+        anew = whole.foresight._found(names, masks, cameras, poses, solids)
+        same = np.array([solid is not None for solid in solids], np.bool_)
+        hidden = np.array([solid is not None and solid.is_hidden for solid in solids], np.bool_)
+        turned = np.tile(np.eye(3), (len(names), 1, 1))
+        reference = anew.centres
+        for item in map(int, np.flatnonzero(hidden)):
+            was, now = whole.solids[item], solids[item]
+            assert was is not None and now is not None
+            turned[item], reference[item] = was.turn_to(now), was.centre
+        # one view alone tells how far away it is by its size, which is not to be relied on
+        by_two = np.asarray(masks.any((-2, -1)).sum(0) > 1)
+        anew = replace(anew, reference=reference, turned=turned, note=whole.note)
+        return anew, same & by_two, hidden
+
+    def _found(
+        self,
+        names: Sequence[str],
+        masks: BoolArray,
+        cameras: Sequence[CameraModel],
+        poses: Sequence[FloatArray],
+        known: Sequence[Solid | None],
+    ) -> TrackedSolids:
+        """Objects, of which those that are not known are fitted to their masks."""
+        points, floor = locate_all(cameras, poses, centroids(masks)), self.settings.table_m
+        solids = tuple(
+            solid
+            or fit_solid(
+                masks[:, item],
+                points[item],
+                cameras,
+                poses,
+                floor,
+                is_vessel(names[item]),
+                is_box(names[item]),
+            )
+            for item, solid in enumerate(known)
+        )
+        return TrackedSolids(
+            foresight=self,
+            names=tuple(names),
+            solids=solids,
+            doubts=_doubts(names, masks, solids, floor),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackedSolids:
+    """State of the objects between two chunks.
+
+    Attributes:
+        foresight: says where they go.
+        names: O of them.
+        solids: O, as found; None = not seen by two views.
+        doubts: number of an object -> why nothing is foreseen of it.
+        note: what was corrected, in words; empty = nothing.
+        reference: (O, 3) where their motions count from [m]; None = where they were found.
+        turned: (O, 3, 3) from there to where they were found.
+        batch: what computes their futures; None = nothing has moved yet.
+        state: where the futures are by now.
+    """
+
+    foresight: SolidForesight
+    names: tuple[str, ...]
+    solids: tuple[Solid | None, ...]
+    doubts: Mapping[int, str] = field(default_factory=dict)
+    note: str = ''
+    reference: FloatArray | None = None
+    turned: FloatArray | None = None
+    batch: Batch | None = None
+    state: BatchState | None = None
+
+    @property
+    def step_s(self) -> float:
+        """Time between the rows of a motion [s]."""
+        return STEP_S
+
+    @property
+    def commands_a_step(self) -> int:
+        """How many joint positions `advance` takes a step: what is quick counts as well."""
+        return COMMANDS_A_STEP
+
+    @property
+    def centres(self) -> FloatArray:
+        """(O, 3) where the solids were found [m], NaN = not seen by two views."""
+        unknown = np.full(3, np.nan)
+        centres = [unknown if one is None else one.centre for one in self.solids]
+        return np.array(centres).reshape(-1, 3)
+
+    @property
+    def sizes(self) -> FloatArray:
+        """(K, O, 3) extents in each of the futures [m], NaN = not known."""
+        sizes = np.full((self.foresight.settings.num_motions, len(self.solids), 3), np.nan)
+        for number, future in enumerate(self.futures()):
+            found = [solid.size for solid in future.solids]
+            sizes[number, self._known] = np.reshape(found, (len(found), 3))  # also of none
+        return sizes
+
+    @property
+    def refusal(self) -> str:
+        """The reason to give no verdict, as most futures are implausible; empty = none."""
+        count = self.foresight.settings.num_motions
+        if self.state is None or not _too_many(self.state, count):
+            return ''
+        return f'{len(self.state.lost)} of {count} foreseen futures are implausible'
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why nothing is foreseen, or what speaks against it, in words."""
+        doubts = (*dict.fromkeys(self.doubts.values()), *([self.note] if self.note else ()))
+        if self.state is None or not self.state.lost:
+            return doubts
+        lost, count = self.state.lost, self.foresight.settings.num_motions
+        why = max(set(lost.values()), key=list(lost.values()).count)
+        return (*doubts, f'{len(lost)} of {count} foreseen futures do not count: {why}')
+
+    def advance(
+        self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
+    ) -> tuple[tuple[ObjectMotion, ...], TrackedSolids]:
+        """Returns where they are at each of 1 + T steps in K futures, and then.
+
+        In the first future all is as it was found. Row 0 is where they are now. What cannot be
+        foreseen is NaN.
+
+        Args:
+            positions: (1 + T * `commands_a_step`, J) that are commanded [rad or m].
+            should_stop: asked all the time.
+
+        Raises:
+            RolloutPreempted: `should_stop` said so.
+        """
+        rows = (len(positions) - 1) // COMMANDS_A_STEP
+        positions = positions[: 1 + rows * COMMANDS_A_STEP]
+        batch = self.batch or self.foresight.engine.begin(self.futures())
+        doubts = (
+            self.doubts if self.batch else {**self._floating(batch, positions[0]), **self.doubts}
+        )
+        motion, state = batch.advance(positions, COMMANDS_A_STEP, self.state, should_stop)
+        num, known = self.foresight.settings.num_motions, self._known
+        points = np.full((num, rows + 1, len(self.solids), 3), np.nan)
+        turns = np.tile(np.eye(3), (num, rows + 1, len(self.solids), 1, 1))
+        # the cameras will see them where they see them now
+        shifts = np.stack([future.shift for future in batch.futures])
+        points[:, :, known] = motion.points - shifts[:, None, None]
+        upright = [_upright(solid) for future in batch.futures for solid in future.solids]
+        first = np.reshape(upright, (num, len(known), 3, 3))  # also of none
+        turns[:, :, known] = motion.rotations @ np.swapaxes(first, -1, -2)[:, None]
+        if self.turned is not None:
+            turns = turns @ self.turned
+        points[:, :, list(doubts)] = np.nan
+        if _too_many(state, num):
+            points[:] = np.nan
+        reference = self.centres if self.reference is None else self.reference
+        openings = self.foresight.robot.gripper_openings
+        motions = tuple(
+            ObjectMotion(
+                reference=reference,
+                points=points[k],
+                rotations=turns[k],
+                openings=openings(motion.joints[k]).T,
+                weight=float(k not in state.lost),
+            )
+            for k in range(num)
+        )
+        return motions, replace(self, batch=batch, state=state, doubts=doubts)
+
+    @property
+    def _known(self) -> list[int]:
+        return [number for number, solid in enumerate(self.solids) if solid is not None]
+
+    def _floating(self, batch: Batch, positions: FloatArray) -> dict[int, str]:
+        """Objects that nothing holds, with the robot at joints (J,)."""
+        if batch.touches_arms(positions):
+            return {}
+        table, known = self.foresight.settings.table_m, self._known
+        solids = [solid for solid in self.solids if solid is not None]
+        return {
+            number: f"'{self.names[number]}' seems to float {1e3 * height:.0f} mm above the table"
+            for number, solid in zip(known, solids, strict=True)
+            if (height := _floats(solid, [s for s in solids if s is not solid], table)) > 0
+        }
+
+    def futures(self) -> tuple[Future, ...]:
+        """Returns the K futures."""
+        if self.batch is not None:
+            return self.batch.futures
+        solids = [solid for solid in self.solids if solid is not None]
+        drives = self.foresight.engine.arms.drives
+        return draw_futures(self.foresight.settings, solids, drives)
+
+
+def table_in(
+    names: Sequence[str],
+    masks: BoolArray,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray],
+) -> float:
+    """Returns the height of a table that nothing is known of [m]; NaN = no object tells.
+
+    It is the middle one of where objects end below; see `SolidForesight.find`.
+    """
+    points = locate_all(cameras, poses, centroids(masks))
+    bottoms = [
+        bottom_of(masks[:, item], point, cameras, poses, names[item], point[2] - _HALF_M, _FITS)
+        for item, point in enumerate(points)
+        if np.isfinite(point).all()
+    ]
+    return float(np.median(bottoms)) if bottoms else float('nan')
+
+
+def _too_many(state: BatchState, count: int) -> bool:
+    """Whether too few of the futures remain for a verdict."""
+    return len(state.lost) > (1 - _ENOUGH) * count
+
+
+def _upright(solid: Solid) -> FloatArray:
+    """(3, 3) of a solid as it was found."""
+    return replace(solid, yaw=0.0).turn_to(solid)
+
+
+def _table_under(solids: Sequence[Solid | None]) -> float:
+    """Height of the table that the lowest solids stand on [m]; NaN = one alone does not tell."""
+    bottoms = np.array([solid.bottom for solid in solids if solid is not None])
+    level = bottoms[bottoms < bottoms.min(initial=np.inf) + _LEVEL_M]
+    return float(level.mean()) if len(level) > 1 else float('nan')
+
+
+def _doubts(
+    names: Sequence[str], masks: BoolArray, solids: Sequence[Solid | None], table: float
+) -> dict[int, str]:
+    """What of the objects cannot be so, in words that name them."""
+    doubts: dict[int, str] = {}
+    seen = masks.any((-2, -1)).sum(0)
+    for number, (name, solid) in enumerate(zip(names, solids, strict=True)):
+        if solid is None and seen[number] == 1:
+            doubts[number] = f"'{name}' is seen by one view alone: where it is is not known"
+        elif solid is not None and np.abs(solid.centre[:2]).max() > _TABLE_REACH_M:
+            doubts[number] = f"'{name}' seems to lie off the table"
+        elif solid is not None and solid.bottom < table - _NEAR_TABLE_M:
+            depth = 1e3 * (table - solid.bottom)
+            doubts[number] = f"'{name}' seems to lie {depth:.0f} mm below the table"
+    known = [(n, s) for n, s in enumerate(solids) if s is not None]
+    for count, (one, solid) in enumerate(known):
+        for other, second in known[:count]:
+            if _overlap(solid, second):
+                text = f"'{names[other]}' and '{names[one]}' seem to be in one place"
+                doubts[one] = doubts[other] = text
+    return doubts
+
+
+def _floats(solid: Solid, others: Sequence[Solid], table: float) -> float:
+    """How far above the table a solid is on which nothing holds it [m]; 0 = it stands."""
+    height = solid.bottom - table
+    if height < 3 * STANDS_M or any(_apart(solid, other) < 0 for other in others):
+        return 0.0
+    return height
+
+
+def _overlap(one: Solid, other: Solid) -> bool:
+    """Whether solids reach into each other, and neither stands in or on the other."""
+    depth = -_apart(one, other)
+    tops = [solid.centre[2] + solid.size[2] / 2 for solid in (one, other)]
+    bottoms = [solid.bottom for solid in (one, other)]
+    over = min(tops) - max(bottoms)
+    return depth > _OVERLAP_M and over > _OVERLAP_M and not (one.is_open or other.is_open)
+
+
+def _apart(one: Solid, other: Solid) -> float:
+    """Gap between the circles within two solids' outlines, seen from above [m]."""
+    way = float(np.linalg.norm(one.centre[:2] - other.centre[:2]))
+    return way - (min(one.size[:2]) + min(other.size[:2])) / 2

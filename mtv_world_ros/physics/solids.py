@@ -1,0 +1,381 @@
+"""Boxes and upright cylinders fitted to objects' masks in calibrated views.
+
+V views, H W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+import re
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+
+from mtv_world_ros.cameras.camera import project, unproject
+from mtv_world_ros.cameras.mask_geometry import centroids
+from mtv_world_ros.core.data_types import BoolArray, CameraModel, FloatArray
+from mtv_world_ros.core.transforms import about_z
+
+#: directions in the image along which outlines are compared
+_ANGLES = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+#: a pixel reaches this far beyond its centre, along each of them [px]
+_PIXEL = np.abs(_DIRECTIONS).sum(1) / 2
+#: corners of outlines, for a size of 1
+_ROUND, _SQUARE = _DIRECTIONS / 2, np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
+#: initial yaw angles [rad]; least size [m]; standard deviation of the height of what stands [m]
+_TURNS, _LEAST_M, _STANDS_M = (0.0, 0.4, 0.8, 1.2), 0.008, 0.002
+#: factor by which the cost of a box must be below that of a cylinder, which has two parameters
+#: less, and that of a larger turn below that of a smaller one
+_BETTER = 0.9
+#: further initial yaw angles where a solid was moved [rad]
+_FURTHER = (0.5, -0.5, 1.0, -1.0)
+#: a solid is found again where masks reach beyond it by no more than this, or so much more than
+#: they did when it was whole [px]; and where this share of its outline is as near to theirs
+_FOUND_PX, _FOUND, _SHOWN = 1.0, 1.5, 0.4
+#: a mask that fills less than this share of the outline that it filled before is partly hidden
+_WHOLE = 0.9
+#: largest residual of a solid that has not moved [px]
+_STAYED_PX = 1.0
+_MAX_EVALUATIONS = 60
+#: what is fitted: a cylinder, and boxes of several turns
+_OUTLINES = ((_ROUND, (None,)), (_SQUARE, _TURNS))
+#: residual below which no other initial turn is tried [px]
+_EXACT_PX = 0.35
+#: parts of a mask that are smaller than this share of its largest one are not the object's
+_PART = 0.2
+#: relative step of finite differences
+_DIFFERENCE = float(np.sqrt(np.finfo(float).eps))
+#: names of boxes, and of vessels: hollow and open at the top
+_BOX = re.compile(r'\b(block|book|box|brick|cube|laptop)\b')
+_VESSEL = re.compile(r'\b(basket|bin|bowl|bucket|cup|dish|glass|jar|mug|plate|pot|tray|vase)s?\b')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Solid:
+    """A box or an upright cylinder.
+
+    Attributes:
+        centre: (3,) of its bounding box [m].
+        size: (3,) along its own x, y and z [m].
+        yaw: rotation about z [rad].
+        is_round: it is a cylinder.
+        is_open: it is hollow, and open at the top.
+        is_hidden: something hid a part of it when it was found again.
+        fills: (V,) how much of its outline its mask fills in each view, 0 = not seen.
+        error_px: root mean square distance of its outline from those of the masks.
+    """
+
+    centre: FloatArray
+    size: FloatArray
+    yaw: float = 0.0
+    is_round: bool = False
+    is_open: bool = False
+    is_hidden: bool = False
+    fills: FloatArray = field(default_factory=lambda: np.zeros(0))
+    error_px: float = 0.0
+
+    @property
+    def bottom(self) -> float:
+        """Height of its lower face [m]."""
+        return float(self.centre[2] - self.size[2] / 2)
+
+    def turn_to(self, now: Solid) -> FloatArray:
+        """Returns (3, 3) how it has turned."""
+        return about_z(now.yaw - self.yaw)
+
+
+def is_vessel(name: str) -> bool:
+    """Returns whether a name is that of a vessel: hollow and open at the top."""
+    return _VESSEL.search(name.lower()) is not None
+
+
+def is_box(name: str) -> bool:
+    """Tells whether what is called so has edges, which small masks hardly show."""
+    return _BOX.search(name.lower()) is not None
+
+
+def bottom_of(
+    masks: BoolArray,
+    point: FloatArray,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray],
+    name: str,
+    floor: float = 0.0,
+    fits: int = 2,
+) -> float:
+    """Returns where an object ends below [m]; NaN = two views do not see it.
+
+    Args:
+        masks: see `fit_solid`; so are the others.
+        point: (3,) where it is, roughly [m].
+        cameras: V.
+        poses: V of T_base_camera (4, 4).
+        name: of the object.
+        floor: where it may stand [m]; a fit is drawn to it.
+        fits: each is drawn to where the one before ended.
+    """
+    for _ in range(fits):
+        solid = fit_solid(masks, point, cameras, poses, floor, is_vessel(name), is_box(name))
+        if solid is None:
+            return float('nan')
+        floor = solid.bottom
+    return floor
+
+
+def fit_solid(
+    masks: BoolArray,
+    point: FloatArray,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray],
+    floor: float = 0.0,
+    is_open: bool = False,
+    is_box: bool = False,
+) -> Solid | None:
+    """Returns the solid whose outlines are nearest to those of an object.
+
+    Of a block whose masks are whole at 384 x 288, place and size are found to half a millimetre.
+    What a mask does not show (hidden parts, hollows) the solid does not have, but `is_open`.
+
+    Args:
+        masks: (V, H, W) of one frame.
+        point: (3,) where it is, roughly [m].
+        cameras: V cameras at the masks' size.
+        poses: V of T_base_camera (4, 4).
+        floor: height on which things stand, most of them [m].
+        is_open: see `Solid`.
+        is_box: it is no cylinder.
+
+    Returns:
+        None where no two views see it.
+    """
+    seen = [view for view in range(len(masks)) if masks[view].any()]
+    if len(seen) < 2 or not np.isfinite(point).all():
+        return None
+    outlines = _Outlines.of(masks, cameras, poses)
+
+    def residuals(numbers: FloatArray, outline: FloatArray) -> FloatArray:
+        stands = (numbers[..., -1:] - floor) / _STANDS_M
+        return np.concatenate([outlines.residuals(_in_space(numbers, outline)), stands], -1)
+
+    height = max(2 * (float(point[2]) - floor), 2 * _LEAST_M)
+    best = None
+    for outline, turns in _OUTLINES[is_box:]:
+        for turn in turns:
+            first = [0.05, height, floor] if turn is None else [turn, 0.05, 0.04, height, floor]
+            given = np.array([point[0], point[1], *first])
+            sizes = slice(2 if turn is None else 3, -1)
+            least = np.full(len(given), -np.inf)
+            least[sizes] = _LEAST_M
+            found = _least_squares(
+                partial(residuals, outline=outline),
+                given,
+                bounds=(least, np.inf),
+                x_scale=np.where(np.isfinite(least), 0.01, 0.1),
+                loss='soft_l1',
+            )
+            is_round = best is not None and best[1].is_round
+            if best is None or found.cost < best[0] * (_BETTER if is_round else 1.0):
+                error = float(np.sqrt(np.mean(found.fun[:-1] ** 2)))
+                best = found.cost, _solid(found.x, turn is None, error)
+            if turn is not None and best[1].error_px < _EXACT_PX:
+                break  # good enough
+    assert best is not None
+    solid = replace(best[1], is_open=is_open)
+    return replace(solid, fills=_fills(solid, masks, cameras, poses))
+
+
+def find_solid(
+    solid: Solid,
+    masks: BoolArray,
+    point: FloatArray,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray],
+    floor: float = 0.0,
+) -> Solid | None:
+    """Returns the pose of a solid of known size that may be partly hidden.
+
+    Most of its outline is that of the masks; a robust loss leaves the hidden part out.
+
+    Args:
+        solid: the object's solid from a frame in which nothing hid it.
+        masks: (V, H, W) of what is seen of it now.
+        point: (3,) the middle of that; NaN = not known, as of one view: then where it would look
+            as large as it does there [m].
+        cameras: V cameras at the masks' size.
+        poses: V of T_base_camera (4, 4).
+        floor: height under which nothing is [m].
+
+    Returns:
+        None where no view sees it, or where it does not look as it did: it lies on its side.
+    """
+    if not masks.any():
+        return None
+    outlines, outline = _Outlines.of(masks, cameras, poses), _SQUARE
+    wide, long, height = size = solid.size
+    if solid.is_round:
+        outline, size = _ROUND, np.array([wide, height])
+
+    def residuals(places: FloatArray) -> FloatArray:
+        sizes = np.broadcast_to(size, (*places.shape[:-1], len(size)))
+        numbers = np.concatenate([places[..., :-1], sizes, places[..., -1:]], -1)
+        return outlines.residuals(_in_space(numbers, outline))
+
+    is_known = bool(np.isfinite(point).all())
+    likely = point if is_known else _at_size(solid, masks, cameras, poses)
+    best = None
+    for centre, turn in _starts(solid, likely):
+        given = [] if solid.is_round else [solid.yaw + turn]
+        given = np.array([*centre[:2], *given, max(centre[2] - height / 2, floor)])
+        least = [*[-np.inf] * (len(given) - 1), floor - _STANDS_M]
+        scale = [0.01, 0.01, *([] if solid.is_round else [0.1]), 0.01]
+        found = _least_squares(
+            residuals, given, bounds=(least, np.inf), x_scale=scale, loss='cauchy'
+        )
+        # a square looks the same after a quarter turn: the smallest turn is taken
+        if best is None or found.cost < _BETTER * best.cost:
+            best = found
+        if np.abs(found.fun).max() < _STAYED_PX:
+            break
+    assert best is not None
+    error = float(np.sqrt(np.mean(np.minimum(best.fun, 0.0) ** 2)))
+    enough = max(_FOUND_PX, _FOUND * solid.error_px)
+    if error > enough or np.mean(np.abs(best.fun) < enough) < _SHOWN:
+        return None
+    now = _solid(np.concatenate([best.x[:-1], size, best.x[-1:]]), solid.is_round, error)
+    now = replace(now, is_open=solid.is_open)
+    fills = _fills(now, masks, cameras, poses)
+    return replace(now, fills=solid.fills, is_hidden=bool((fills < _WHOLE * solid.fills).any()))
+
+
+def _at_size(
+    solid: Solid,
+    masks: BoolArray,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray],
+) -> FloatArray:
+    """(3,) where a solid looks as large as the largest mask; NaN = it was not seen there whole."""
+    view = int(np.argmax(masks.sum((-2, -1))))
+    camera, pose, mask = cameras[view], poses[view], masks[view]
+    _, depth = project(camera, pose, solid.centre)
+    fills = _fills(solid, mask[None], [camera], [pose])
+    if not fills[0] or not solid.fills[view]:
+        return np.full(3, np.nan)
+    # so many times as near as where it was
+    nearer = np.sqrt(fills[0] / solid.fills[view])
+    ray = unproject(camera, centroids(mask)) @ pose[:3, :3].T
+    return np.asarray(pose[:3, 3] + ray / (ray @ pose[:3, 2]) * float(depth) / nearer)
+
+
+def _fills(
+    solid: Solid,
+    masks: BoolArray,
+    cameras: Sequence[CameraModel],
+    poses: Sequence[FloatArray],
+) -> FloatArray:
+    """(V,) share of a solid's outline that its masks (V, H, W) fill; 0 = it is in no picture."""
+    wide, long, height = solid.size
+    sizes = [wide] if solid.is_round else [solid.yaw, wide, long]
+    x, y, z = solid.centre
+    numbers = np.array([x, y, *sizes, height, z - height / 2])
+    corners = _in_space(numbers, _ROUND if solid.is_round else _SQUARE)
+    fills = []
+    for mask, camera, pose in zip(masks, cameras, poses, strict=True):
+        pixels = project(camera, pose, corners)[0]
+        known = np.isfinite(pixels).all()
+        area = cv2.contourArea(cv2.convexHull(pixels.astype(np.float32))) if known else 0.0
+        fills.append(mask.sum() / area if area > 0 else 0.0)
+    return np.array(fills)
+
+
+def _starts(solid: Solid, point: FloatArray) -> Iterator[tuple[FloatArray, float]]:
+    """Initial guesses: where it was, then where it is seen, with several yaw angles."""
+    yield solid.centre, 0.0
+    if np.isfinite(point).all():
+        for turn in (0.0,) if solid.is_round else (0.0, *_FURTHER):
+            yield point, turn
+
+
+@dataclass(frozen=True, slots=True)
+class _Outlines:
+    """Those of masks in the views that see something of them.
+
+    Attributes:
+        views: camera and T_base_camera of each.
+        reach: (N,) how far they reach along each direction in each view [px].
+    """
+
+    views: tuple[tuple[CameraModel, FloatArray], ...]
+    reach: FloatArray
+
+    @classmethod
+    def of(
+        cls, masks: BoolArray, cameras: Sequence[CameraModel], poses: Sequence[FloatArray]
+    ) -> _Outlines:
+        seen = [view for view, mask in enumerate(masks) if mask.any()]
+        reach = np.concatenate([_reach(_corners(masks[view])) + _PIXEL for view in seen])
+        return cls(tuple((cameras[view], poses[view]) for view in seen), reach)
+
+    def residuals(self, corners: FloatArray) -> FloatArray:
+        """(..., N) how far the outline of points (..., M, 3) reaches beyond them [px]."""
+        found = [_reach(project(camera, pose, corners)[0]) for camera, pose in self.views]
+        return np.nan_to_num(np.concatenate(found, -1) - self.reach, nan=1e3)
+
+
+def _least_squares(
+    residuals: Callable[[FloatArray], FloatArray], given: FloatArray, **how: Any
+) -> Any:
+    """Least squares from initial parameters (N,); finite differences in one batch."""
+
+    def slopes(numbers: FloatArray) -> FloatArray:
+        steps = _DIFFERENCE * np.maximum(1.0, np.abs(numbers))
+        rows = residuals(np.concatenate([numbers[None], numbers + np.diag(steps)]))
+        return ((rows[1:] - rows[0]) / steps[:, None]).T
+
+    return least_squares(
+        residuals,
+        given,
+        jac=slopes,  # type: ignore[arg-type]
+        max_nfev=_MAX_EVALUATIONS,
+        **how,
+    )
+
+
+def _solid(numbers: FloatArray, is_round: bool, error_px: float) -> Solid:
+    x, y, *turn, height, bottom = numbers
+    yaw, wide, long = (0.0, turn[0], turn[0]) if is_round else turn
+    return Solid(
+        centre=np.array([x, y, bottom + height / 2]),
+        size=np.array([wide, long, height]),
+        yaw=float(yaw),
+        is_round=is_round,
+        error_px=error_px,
+    )
+
+
+def _in_space(numbers: FloatArray, outline: FloatArray) -> FloatArray:
+    """(..., 2 N, 3) the outline (N, 2) at the bottom and the top, of numbers (..., 5 or 7)."""
+    x, y, *turn, height, bottom = np.moveaxis(numbers, -1, 0)[..., None]
+    yaw, wide, long = (np.zeros_like(x), *turn * 2) if len(turn) == 1 else turn
+    along, across = wide * outline[:, 0], long * outline[:, 1]
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    flat = (x + cos * along - sin * across, y + sin * along + cos * across)
+    ends = [(*flat, np.broadcast_to(z, flat[0].shape)) for z in (bottom, bottom + height)]
+    return np.concatenate([np.stack(end, -1) for end in ends], -2)
+
+
+def _corners(mask: BoolArray) -> FloatArray:
+    """(N, 2) of the hull of its parts but small ones, which belong to what looks alike."""
+    _, parts, sizes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    areas = sizes[1:, cv2.CC_STAT_AREA]
+    rows, columns = np.nonzero(np.isin(parts, 1 + np.flatnonzero(areas >= _PART * areas.max())))
+    return cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32))[:, 0].astype(float)
+
+
+def _reach(points: FloatArray) -> FloatArray:
+    """How far points (..., N, 2) reach along each direction [px]."""
+    return (points @ _DIRECTIONS.T).max(-2)

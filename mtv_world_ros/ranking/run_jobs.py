@@ -1,0 +1,184 @@
+"""Runs the jobs of a ranking, here, in processes or on a Ray cluster; goes on where it stopped."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from mtv_world_ros.core.bounded_input import read_json
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+from mtv_world_ros.core.files import plain, write_json, write_whole
+from mtv_world_ros.core.processes import threads_each
+from mtv_world_ros.core.worker_pool import Outcome, score_all
+from mtv_world_ros.evaluation.result_settings import check_same_settings
+from mtv_world_ros.ranking.rollout_jobs import Job, Result
+from mtv_world_ros.ranking.rollout_runner import make_runner, RolloutConfig, WantedJob
+from mtv_world_ros.rollout.pipeline import Pipeline
+
+FOLDER = 'rollouts'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankedCheckpoint:
+    """A checkpoint that imagines the rollouts.
+
+    Attributes:
+        make_pipeline: called once in every process; has to be picklable for more than one.
+        out: results go into its folder `rollouts`.
+        settings: what the results depend on, e.g. which checkpoint.
+    """
+
+    make_pipeline: Callable[[], Pipeline]
+    out: Path
+    settings: Mapping[str, Any]
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    checkpoints: Sequence[RankedCheckpoint],
+    *,
+    config: RolloutConfig,
+    workers: int = 1,
+    ray_address: str | None = None,
+    overwrite: bool = False,
+    show_progress: bool = True,
+    watch: Callable[[Sequence[Result]], object] = lambda _: None,
+) -> tuple[list[list[Result]], dict[Job, str]]:
+    """Returns each checkpoint's results in the order of the jobs; why others have none, by job.
+
+    Each result is written beside its name and renamed, and so are its last frames as a PNG, real
+    ones over imagined ones, a video, a contact sheet and the frames of both worlds; jobs that are
+    there already with the same settings are not run again.
+
+    Args:
+        jobs: the jobs; each is simulated once for all checkpoints.
+        checkpoints: one or more checkpoints.
+        config: denoising steps, limits and physics of the episodes.
+        workers: number of processes; with Ray, the most that run at once.
+        ray_address: of a Ray cluster, empty = the one at hand or a new one here; None = no Ray.
+        overwrite: replace results of other settings.
+        show_progress: draw a progress bar, on a terminal.
+        watch: is called with the first checkpoint's results, those of an earlier run at first,
+            then each as it comes.
+
+    Raises:
+        ConfigError: less than one worker, Ray is not installed, or the checkpoints' frame rates
+            differ, or a folder holds results of other settings.
+        MtvWorldError: a worker died, or no job has a result.
+    """
+    stores = [_Store(checkpoint, config, jobs, overwrite) for checkpoint in checkpoints]
+    wanted = {job: tuple(k for k, s in enumerate(stores) if job not in s.found) for job in jobs}
+    left = [WantedJob(job, numbers) for job, numbers in wanted.items() if numbers]
+    failed: dict[Job, str] = {}
+    if stores and stores[0].found:
+        watch(list(stores[0].found.values()))
+    make = partial(make_runner, [c.make_pipeline for c in checkpoints], config)
+    outcomes = _scored(left, make, workers, ray_address)
+    bar = tqdm(outcomes, total=len(left), unit='rollout', disable=None if show_progress else True)
+    for done, outcome in bar:
+        if isinstance(outcome, str):
+            failed[done.job] = outcome
+            continue
+        for number, result in outcome.items():
+            stores[int(number)].add(done.job, result)
+            if int(number) == 0:
+                watch([stores[0].found[done.job]])
+    if jobs and not all(store.found for store in stores):
+        job, reason = next(iter(failed.items()))
+        raise MtvWorldError(f'no rollout has a result; the first, {job.name}: {reason}')
+    return [[store.found[job] for job in jobs if job in store.found] for store in stores], failed
+
+
+class _Store:
+    """The results of a checkpoint on disk.
+
+    Attributes:
+        found: results by job.
+    """
+
+    def __init__(
+        self,
+        checkpoint: RankedCheckpoint,
+        config: RolloutConfig,
+        jobs: Sequence[Job],
+        overwrite: bool,
+    ) -> None:
+        self._out = checkpoint.out
+        self._settings = {
+            **checkpoint.settings,
+            'steps': config.num_inference_steps,
+            'max_chunks': config.max_chunks,
+            # what was ranked before episodes could end so goes on
+            **({'hold': config.hold} if config.hold else {}),
+        }
+        check_same_settings(self._out / FOLDER, self._settings, overwrite)
+        stored = {job: self._stored(job, overwrite) for job in jobs}
+        self.found = {job: result for job, result in stored.items() if result is not None}
+
+    def _stored(self, job: Job, overwrite: bool) -> Result | None:
+        """A result of an earlier run, if it is of the same job and settings."""
+        path = _path(self._out, job)
+        try:
+            values = read_json(path)
+            definition = values.get('definition', '')
+        except (OSError, ValueError, AttributeError):
+            return None  # not readable, thus nothing is lost
+        if definition != job.definition and not overwrite:
+            raise ConfigError(
+                f"'{path}' is of another policy with the name '{job.policy}'; give this one "
+                'another name, or --overwrite to replace its results'
+            )
+        try:
+            result = Result.from_json(values['result'])
+            same = values['settings'] == plain(self._settings) and result.seed == job.seed
+        except (ValueError, KeyError, TypeError):
+            return None
+        return result if same and definition == job.definition else None
+
+    def add(self, job: Job, values: dict[str, Any]) -> None:
+        """Writes a result."""
+        path = _path(self._out, job)
+        for suffix, data in values.pop('files', {}).items():
+            write_whole(path.with_name(f'{job.name}{suffix}'), base64.b64decode(data))
+        stored = {'settings': self._settings, 'definition': job.definition, 'result': values}
+        write_json(path, stored)
+        self.found[job] = Result.from_json(values)
+
+
+def _scored(
+    jobs: Sequence[WantedJob], make: Callable[[], Any], workers: int, ray_address: str | None
+) -> Iterator[tuple[WantedJob, Outcome]]:
+    if ray_address is not None:
+        from mtv_world_ros.core.worker_pool import score_with_ray
+
+        return score_with_ray(jobs, make, workers, ray_address)
+    return score_all(jobs, make, workers, threads_each(workers))
+
+
+def _path(out: Path, job: Job) -> Path:
+    return Path(out) / FOLDER / f'{job.name}.json'
+
+
+def read_results(out: Path) -> list[Result]:
+    """Reads the results of a ranking's folder, whatever their settings.
+
+    Raises:
+        ConfigError: one is of another version.
+    """
+    found = []
+    for path in sorted((out / FOLDER).glob('*.json')):
+        try:
+            found.append(Result.from_json(read_json(path)['result']))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            reason = f'{type(error).__name__}: {" ".join(str(error).split())}'
+            raise ConfigError(
+                f"'{path}' cannot be read ({reason}); run `mtv-world rank` again: it goes on "
+                'where it stopped'
+            ) from error
+    return found

@@ -1,1 +1,0 @@
-"""Trajectory videos: the control signal drawn into each view."""

@@ -1,1 +1,0 @@
-"""Recorded episodes replayed through the model without ROS: MCAP to MCAP."""

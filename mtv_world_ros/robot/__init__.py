@@ -1,0 +1,1 @@
+"""Robots: URDF and Denavit-Hartenberg files, kinematics, limits, link shapes."""

@@ -1,0 +1,530 @@
+"""Robot YAML files: a URDF or Denavit-Hartenberg tables become one `RobotModel`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import re
+from typing import Annotated, Any, Literal, Self
+from xml.etree import ElementTree
+
+import numpy as np
+import pinocchio as pin
+from pydantic import Field, model_validator
+import yaml
+
+from mtv_world_ros.core.bounded_input import read_text
+from mtv_world_ros.core.config import ListOf, Metres, Quaternion, read_yaml, Schema, validated
+from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.core.errors import ConfigError, RobotError
+from mtv_world_ros.core.files import whole_folder
+from mtv_world_ros.core.transforms import denavit_hartenberg, pose
+from mtv_world_ros.robot.mesh_pieces import (
+    convex_pieces,
+    find_mesh,
+    load_mesh,
+    MissingMeshError,
+    write_convex_hull,
+)
+from mtv_world_ros.robot.model import Mimic, RobotModel, Tool
+from mtv_world_ros.robot.shape import grip_links, load_shape
+
+#: a calibrated robot differs from its nominal description by less than this [m], [rad]
+_LARGEST_OFFSET = 0.05
+_LARGEST_TURN = 0.2
+_NUM_CONFIGURATIONS = 64
+
+
+def described_robot(expected: RobotModel, urdf: str) -> tuple[RobotModel, float]:
+    """Returns an expected robot with the lengths, offsets and limits of its description (URDF).
+
+    With it comes how far its tool points are off the expected ones, at most over the joints'
+    range [m].
+
+    Raises:
+        RobotError: it is no URDF, or it describes another robot: joints or links are missing, or
+            its tools are elsewhere by more than a calibration explains.
+    """
+    model, mimics, _ = parse_urdf(urdf, 'the robot description')
+    followers = {mimic.joint for mimic in mimics}
+    mimics += [mimic for mimic in expected.mimics if mimic.joint not in followers]
+    try:
+        robot = RobotModel(
+            name=expected.name,
+            model=model,
+            joint_names=expected.joint_names,
+            tools=expected.tools,
+            base_link=expected.base_link,
+            mimics=mimics,
+            file=expected.file,
+        )
+    except RobotError as error:
+        raise RobotError(
+            f"the description is of another robot ('{model.name}'), not of '{expected.name}': "
+            f'{error}'
+        ) from error
+    offset_m, turn = _tool_differences(expected, robot)
+    if offset_m > _LARGEST_OFFSET or turn > _LARGEST_TURN:
+        raise RobotError(
+            f"the description is of another robot ('{model.name}'), not of '{expected.name}': "
+            f'with the same joint positions its tools are up to {offset_m:.3f} m and {turn:.2f} '
+            f'rad elsewhere; a calibration explains {_LARGEST_OFFSET:g} m and {_LARGEST_TURN:g} '
+            'rad'
+        )
+    return robot, offset_m
+
+
+def _tool_differences(one: RobotModel, other: RobotModel) -> tuple[float, float]:
+    """Greatest distance [m] and angle [rad] between the tools of two robots in one posture."""
+    positions = _spread_positions(one)
+    a, b = one.tool_poses(positions), other.tool_poses(positions)
+    distance = np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1)
+    trace = np.einsum('...ij,...ij->...', a[..., :3, :3], b[..., :3, :3])
+    angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    return float(distance.max()), float(angle.max())
+
+
+def _spread_positions(robot: RobotModel) -> FloatArray:
+    """(N, J) positions spread over the joints' range; endless joints over a turn."""
+    lower = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
+    upper = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
+    shares = np.random.default_rng(0).random((_NUM_CONFIGURATIONS, len(lower)))
+    return lower + shares * (upper - lower)
+
+
+_ERROR = re.compile(rb'^Error: *(.+)$', re.MULTILINE)
+
+
+@contextmanager
+def parser_errors() -> Iterator[list[str]]:
+    """Takes the parser's errors off stderr; all else that is written there meanwhile goes on.
+
+    Yields:
+        The errors, filled at the end.
+    """
+    found: list[str] = []
+    try:
+        stderr = os.dup(2)
+    except OSError:  # a process without stderr prints nothing
+        yield found
+        return
+    with os.fdopen(os.memfd_create('urdfdom'), 'w+b') as taken:
+        os.dup2(taken.fileno(), 2)
+        try:
+            yield found
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            taken.seek(0)
+            text = taken.read()
+            found += [line.decode(errors='replace').strip() for line in _ERROR.findall(text)]
+            os.write(2, _without_errors(text))
+
+
+def _without_errors(text: bytes) -> bytes:
+    """What is left without errors and the places in urdfdom's source that follow them."""
+    return re.sub(rb'^Error: .+\n(?: +at line \d+ in .+\n)?', b'', text, flags=re.MULTILINE)
+
+
+#: expanded URDFs may keep xacro in comments, and `$(find ...)` in what is not of the robot
+_COMMENT = re.compile(r'<!--.*?-->', re.DOTALL)
+_EXPRESSION = re.compile(r'\$[{(]')
+_EXPAND = '; expand it first: xacro FILE > robot.urdf'
+#: of a joint [rad or m]; many turns, no encoder counts
+Position = Annotated[float, Field(ge=-1000, le=1000)]
+
+
+class PoseEntry(Schema):
+    """A pose, by default the identity."""
+
+    position: ListOf[Metres] = Field(default=(0, 0, 0), description='x, y, z [m]')
+    quaternion_xyzw: ListOf[Quaternion] = (0, 0, 0, 1)
+
+    @model_validator(mode='after')
+    def _is_a_pose(self) -> Self:
+        self.matrix()
+        return self
+
+    def matrix(self) -> FloatArray:
+        """Returns the (4, 4) pose."""
+        return pose(self.position, self.quaternion_xyzw)
+
+
+class JointEntry(Schema):
+    """A joint that moves between two limits [rad or m]."""
+
+    joint: str
+    lower: Position
+    upper: Position
+
+    @model_validator(mode='after')
+    def _limits_are_in_order(self) -> Self:
+        if self.lower >= self.upper:
+            raise ValueError(f"joint '{self.joint}': lower {self.lower} is not below {self.upper}")
+        return self
+
+
+class DhEntry(JointEntry):
+    """A row of a Denavit-Hartenberg table [m, rad]; its link is named `<joint>_link`."""
+
+    a: Metres
+    alpha: Position
+    d: Metres
+    theta: Position = 0.0
+    type: Literal['revolute', 'prismatic'] = 'revolute'
+
+
+class DhArmEntry(PoseEntry):
+    """An arm as a Denavit-Hartenberg table; its pose is that of frame 0 in the base."""
+
+    arm: str
+    convention: Literal['standard', 'modified'] = Field(
+        default='standard', description='`modified` is Craig'
+    )
+    joints: ListOf[DhEntry]
+    gripper: JointEntry | None = Field(
+        default=None, description="a slide along the last frame's z"
+    )
+
+
+class MimicEntry(Schema):
+    """A joint that follows another one."""
+
+    joint: str
+    source: str
+    multiplier: Position = 1.0
+    offset: Position = 0.0
+
+
+class ToolEntry(PoseEntry):
+    """The tool of an arm; its pose is that of the tool in its link."""
+
+    arm: str
+    link: str
+    gripper_joint: str | None = None
+    gripper_closed: Position = Field(default=0.0, description="the gripper joint's, [rad or m]")
+    gripper_open: Position = Field(default=1.0, description="the gripper joint's, [rad or m]")
+    finger_travel_m: float | None = Field(
+        default=None, ge=-1, le=1, description='way of a finger from closed to open [m]'
+    )
+
+
+class RobotFile(Schema):
+    """A robot file: `urdf` or `dh`, and the tools."""
+
+    name: str
+    urdf: str | None = Field(default=None, description='file, relative to the YAML')
+    dh: ListOf[DhArmEntry] | None = Field(default=None, description='arms, in place of a URDF')
+    base_link: str | None = Field(default=None, description="null = the URDF's root, or `base`")
+    joints: ListOf[str] | None = Field(
+        default=None, description='order of position vectors; null = all that move by themselves'
+    )
+    mimic: ListOf[MimicEntry] = Field(default=(), description="added to the URDF's own")
+    tools: ListOf[ToolEntry]
+
+    @model_validator(mode='after')
+    def _has_one_description(self) -> Self:
+        if len({'urdf', 'dh'} & self.model_fields_set) != 1:
+            raise ValueError("give either 'urdf' or 'dh'")
+        if not self.urdf and not self.dh:
+            raise ValueError("'dh' must be a list of arms")
+        return self
+
+
+def load_robot(path: Path | str) -> RobotModel:
+    """Reads a robot YAML, see `RobotFile`.
+
+    Raises:
+        ConfigError: the file is missing, not YAML, or has unknown, missing or wrong values.
+        RobotError: the description cannot be used.
+    """
+    path = Path(path)
+    file = validated(RobotFile, read_yaml(path, 'robot file', 'robot_file'), str(path))
+    mimics = [Mimic(**dict(entry)) for entry in file.mimic]
+    if file.urdf:
+        model, own_mimics, base = read_urdf(path.parent / file.urdf)
+        mimics += own_mimics
+        base = file.base_link or base
+    else:
+        base = file.base_link or 'base'
+        model = _from_dh(file, base)
+    joints = file.joints or _movable(model, {mimic.joint for mimic in mimics})
+    pose_keys = set(PoseEntry.model_fields)
+    return RobotModel(
+        name=file.name,
+        model=model,
+        joint_names=joints,
+        tools=[
+            Tool(T_link_tool=entry.matrix(), **entry.model_dump(exclude=pose_keys))
+            for entry in file.tools
+        ],
+        base_link=base,
+        mimics=mimics,
+        file=path,
+    )
+
+
+def _movable(model: pin.Model, followers: set[str]) -> list[str]:
+    """Joints of one number that follow no other; floating and planar ones rest."""
+    return [
+        name
+        for name, joint in zip(model.names[1:], list(model.joints)[1:], strict=True)
+        if joint.nv == 1 and name not in followers
+    ]
+
+
+#: names in a folder that holds a copy of a robot
+ROBOT_YAML, _URDF, _MESHES, _PIECES = 'robot.yaml', 'robot.urdf', 'meshes', 'pieces'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SavedRobot:
+    """Copy of a robot file with everything it names.
+
+    Attributes:
+        file: YAML of the copy.
+        notes: meshes that are missing or cannot be read, and links whose size is doubtful.
+    """
+
+    file: Path
+    notes: tuple[str, ...] = ()
+
+
+def save_robot(file: Path, folder: Path) -> SavedRobot:
+    """Copies a robot file, its URDF and the shapes in it; the copy can be moved anywhere.
+
+    Meshes are stored as their convex hulls, which is all that drawing a robot uses; what touches
+    things in a gripper as convex pieces, made here once. The name of a mesh that is missing or
+    cannot be read is kept.
+
+    Args:
+        file: robot YAML.
+        folder: to make; one that is there is replaced.
+
+    Raises:
+        ConfigError, RobotError: the robot cannot be used.
+    """
+    robot = load_robot(file)
+    values = read_yaml(file, 'robot file', 'robot_file')
+    values['base_link'] = robot.base_link
+    missing: list[str] = []
+    with whole_folder(folder) as partial:
+        if values.get('urdf'):
+            urdf = file.parent / values['urdf']
+            tree = _with_hulls(urdf, partial, grip_links(robot), missing)
+            tree.write(partial / _URDF, encoding='utf-8', xml_declaration=True)
+            values['urdf'] = _URDF
+        text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, allow_unicode=True)
+        (partial / ROBOT_YAML).write_text(text, encoding='utf-8')
+    copy = folder / ROBOT_YAML
+    doubts = load_shape(load_robot(copy)).doubts
+    return SavedRobot(file=copy, notes=(*(f'mesh {text}' for text in missing), *doubts))
+
+
+def _with_hulls(urdf: Path, folder: Path, grips: set[str], missing: list[str]) -> Any:
+    """Return the URDF with stored hulls in place of meshes; add those that are missing."""
+    tree = ElementTree.parse(urdf)
+    stored: dict[Path, str] = {}
+    made: list[str] = []
+    for link in tree.iter('link'):
+        if link.get('name') in grips:
+            made += _split_collisions(link, urdf, folder, len(made))
+    for mesh in tree.iter('mesh'):
+        name = mesh.get('filename', '')
+        if name in made:
+            continue
+        try:
+            file = _present_mesh(name, urdf)
+            if file not in stored:
+                vertices = load_mesh(file).vertices
+                stored[file] = f'{_MESHES}/{len(stored)}_{file.stem}.stl'
+                write_convex_hull(vertices, folder / stored[file])
+        except MissingMeshError as error:
+            if str(error) not in missing:
+                missing.append(str(error))
+            continue
+        mesh.set('filename', stored[file])
+    return tree
+
+
+def _present_mesh(name: str, urdf: Path) -> Path:
+    """Return the file of a mesh.
+
+    Raises:
+        MissingMeshError: it is not there.
+    """
+    file = find_mesh(name, urdf)
+    if file is None:
+        raise MissingMeshError(f"'{name}' is not there")
+    return file
+
+
+def _split_collisions(link: Any, urdf: Path, folder: Path, first: int) -> list[str]:
+    """Replaces a link's collision meshes by convex pieces, numbered from `first`; their files."""
+    made: list[str] = []
+    if not link.findall('collision'):  # then what is drawn is what touches
+        for drawn in map(deepcopy, link.findall('visual')):
+            drawn.tag = 'collision'
+            link.append(drawn)
+    for element in link.findall('collision'):
+        mesh = element.find('geometry/mesh')
+        if mesh is None:
+            continue
+        try:
+            file = _present_mesh(mesh.get('filename', ''), urdf)
+            loaded = load_mesh(file)
+        except MissingMeshError:  # the caller names it, as its name stays
+            continue
+        scale = np.array(mesh.get('scale', '1 1 1').split(), float)
+        pieces = convex_pieces(loaded.vertices * scale, loaded.edges())
+        link.remove(element)
+        for points in pieces:
+            made.append(name := f'{_PIECES}/{first + len(made)}_{file.stem}.stl')
+            write_convex_hull(points, folder / name)
+            piece = ElementTree.SubElement(link, 'collision')
+            if (origin := element.find('origin')) is not None:
+                piece.append(origin)
+            ElementTree.SubElement(
+                ElementTree.SubElement(piece, 'geometry'), 'mesh', filename=name
+            )
+    return made
+
+
+def read_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:
+    """Returns a URDF's model, its mimic joints (kept as joints of their own), and the root link.
+
+    Raises:
+        ConfigError: there is no such file.
+        RobotError: the file is not a usable URDF.
+    """
+    try:
+        text = read_text(path, 'urdf_bytes')
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"URDF file '{path}' does not exist; 'urdf' is relative to the YAML"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"URDF file '{path}' cannot be read: {error}") from error
+    return parse_urdf(text, f"URDF '{path}'")
+
+
+def parse_urdf(text: str, what: str) -> tuple[pin.Model, list[Mimic], str]:
+    """Returns what `read_urdf` does of a URDF's text; errors begin with `what`.
+
+    Raises:
+        RobotError: the file is not a usable URDF.
+    """
+    written = _COMMENT.sub('', text)
+    if '<xacro:' in written:
+        raise RobotError(f'{what} is unexpanded xacro{_EXPAND}')
+    try:
+        root = ElementTree.fromstring(text)
+        # Pinocchio must see mimic joints as ordinary ones: RobotModel moves them itself.
+        mimics = [mimic for joint in root.iter('joint') for mimic in _take_mimics(joint)]
+        model = _build(ElementTree.tostring(root, encoding='unicode'))
+    except (ElementTree.ParseError, ValueError, KeyError, RuntimeError) as error:
+        xacro = f'; it has expressions of xacro{_EXPAND}' if _EXPRESSION.search(written) else ''
+        raise RobotError(f'{what} cannot be used: {error}{xacro}') from error
+    children = {child.get('link') for child in root.iter('child')}
+    base = next(link.attrib['name'] for link in root.iter('link')
+                if link.get('name') not in children)  # fmt: skip
+    return model, _resolved(mimics), base
+
+
+def _build(urdf: str) -> pin.Model:
+    """Builds the model; why urdfdom refuses one, which it only prints, is in the error.
+
+    Raises:
+        ValueError: it is not a usable URDF.
+    """
+    with parser_errors() as reasons:
+        try:
+            return pin.buildModelFromXML(urdf)
+        except ValueError as error:
+            refused = error
+    raise ValueError('; '.join(reasons) or str(refused)) from refused
+
+
+def _resolved(mimics: Sequence[Mimic]) -> list[Mimic]:
+    """Followers of followers follow the joint that leads them all.
+
+    Raises:
+        RobotError: joints follow each other in a circle.
+    """
+    leaders = {mimic.joint: mimic for mimic in mimics}
+    resolved = []
+    for mimic in mimics:
+        seen = {mimic.joint}
+        while mimic.source in leaders:
+            if mimic.source in seen:
+                raise RobotError(f"joint '{mimic.joint}' follows itself, by way of {sorted(seen)}")
+            seen.add(mimic.source)
+            leader = leaders[mimic.source]
+            mimic = Mimic(
+                joint=mimic.joint,
+                source=leader.source,
+                multiplier=mimic.multiplier * leader.multiplier,
+                offset=mimic.multiplier * leader.offset + mimic.offset,
+            )
+        resolved.append(mimic)
+    return resolved
+
+
+def _take_mimics(joint: ElementTree.Element) -> list[Mimic]:
+    mimics = []
+    for tag in joint.findall('mimic'):
+        joint.remove(tag)
+        mimics.append(
+            Mimic(
+                joint=joint.attrib['name'],
+                source=tag.attrib['joint'],
+                multiplier=float(tag.get('multiplier', 1.0)),
+                offset=float(tag.get('offset', 0.0)),
+            )
+        )
+    return mimics
+
+
+def _from_dh(file: RobotFile, base: str) -> pin.Model:
+    model = pin.Model()
+    model.name = file.name
+    model.addFrame(pin.Frame(base, 0, 0, pin.SE3.Identity(), pin.FrameType.BODY))
+    for arm in file.dh or ():
+        _add_dh_arm(model, arm)
+    return model
+
+
+def _add_dh_arm(model: pin.Model, arm: DhArmEntry) -> None:
+    parent, placement = 0, pin.SE3(arm.matrix())
+    for row in arm.joints:
+        joint = pin.JointModelRZ() if row.type == 'revolute' else pin.JointModelPZ()
+        before, after = _around_joint(row, arm.convention == 'modified')
+        parent = _add_joint(model, parent, joint, placement * before, row)
+        link = f'{row.joint}_link'
+        model.addFrame(pin.Frame(link, parent, 0, after, pin.FrameType.BODY))
+        placement = after
+    if arm.gripper is not None:
+        _add_joint(model, parent, pin.JointModelPZ(), placement, arm.gripper)
+
+
+def _around_joint(row: DhEntry, modified: bool) -> tuple[pin.SE3, pin.SE3]:
+    """What stands before and after the joint's own motion along or about its z.
+
+    The standard row is Rz(theta) Tz(d) Tx(a) Rx(alpha), the modified one (J. Craig, Introduction
+    to Robotics, 3.4) Rx(alpha) Tx(a) Rz(theta) Tz(d); motions along and about one axis commute.
+    """
+    turn = pin.SE3(denavit_hartenberg(0.0, 0.0, row.d, row.theta))
+    twist = pin.SE3(denavit_hartenberg(row.a, row.alpha, 0.0, 0.0))
+    return (twist * turn, pin.SE3.Identity()) if modified else (turn, twist)
+
+
+def _add_joint(
+    model: pin.Model, parent: int, joint: Any, placement: pin.SE3, entry: JointEntry
+) -> int:
+    free = np.full(1, np.inf)
+    limits = np.array([entry.lower]), np.array([entry.upper])
+    return model.addJoint(parent, joint, placement, entry.joint, free, free, *limits)

@@ -1,0 +1,304 @@
+"""Meshes as convex parts: hulls, slices for silhouettes, pieces for contact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import struct
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.core.errors import RobotError
+from mtv_world_ros.core.files import write_whole
+
+#: directions in which a mesh's outermost points are kept
+_DIRECTIONS = 256
+#: a mesh is cut into slices where they hold less than this share of its hull's volume
+_HOLLOW, _SLICE_DIRECTIONS = 0.8, 96
+#: for silhouettes: so many slices of meshes that are not shorter than this [m]
+_SLICES, _LEAST_SLICED = 5, 0.12
+#: pieces of less than this share of the mesh's hull are left out
+_THINNEST = 1e-4
+#: for contact: most pieces of a mesh, what another one must gain as a share of its hull, and how
+#: many cuts are tried along an axis, by how many edges and directions of hulls
+_MOST_PIECES, _LEAST_GAIN, _CUTS, _SEGMENTS, _CUT_DIRECTIONS = 10, 0.03, 7, 1000, 32
+
+
+def find_mesh(name: str, urdf: Path) -> Path | None:
+    """Returns where a mesh lies, or None.
+
+    `package://<name>/...` is looked for above the URDF, then in the ROS packages that are
+    installed (`AMENT_PREFIX_PATH`).
+    """
+    plain = name.removeprefix('file://')
+    if not plain.startswith('package://'):
+        candidates = [urdf.parent / plain]
+    else:
+        package, _, inside = plain.removeprefix('package://').partition('/')
+        above = urdf.resolve().parents
+        candidates = [folder / package / inside for folder in above]
+        candidates += [folder / inside for folder in above if folder.name == package]
+        installed = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
+        candidates += [Path(prefix) / 'share' / package / inside for prefix in installed]
+    return next((candidate for candidate in candidates if _is_file(candidate)), None)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that no system has
+        return False
+
+
+class MissingMeshError(RobotError):
+    """A mesh that is not there or cannot be read; the text names the file and the reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """Triangle mesh of a file, in metres, before the scale that a URDF gives.
+
+    Attributes:
+        vertices: (N, 3) [m].
+        triangles: Coal's mesh, which has the triangles.
+    """
+
+    vertices: FloatArray
+    triangles: Any
+
+    def edges(self) -> NDArray[np.int64]:
+        """Return (E, 2) vertices that edges of triangles join."""
+        mesh = self.triangles
+        count = range(mesh.num_tris)
+        faces = np.array([[mesh.tri_indices(n)[k] for k in range(3)] for n in count])
+        pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        return np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)
+
+
+def load_mesh(path: Path) -> Mesh:
+    """Read a mesh (STL, DAE, OBJ); the `<unit meter>` of a DAE file is applied.
+
+    Raises:
+        MissingMeshError: the file cannot be read as a mesh, or nothing here reads meshes.
+    """
+    try:
+        import coal  # comes with Pinocchio, but not with every build of it
+    except ImportError as error:
+        raise MissingMeshError(f"'{path.name}' needs the module coal") from error
+    if problem := _not_a_mesh(path):
+        raise MissingMeshError(f"'{path}' {problem}")
+    try:
+        mesh = coal.MeshLoader().load(str(path), np.ones(3))
+        vertices = np.asarray(mesh.vertices(), np.float64)
+    except (ValueError, RuntimeError) as error:
+        raise MissingMeshError(f"'{path}' cannot be read: {_short_reason(error)}") from error
+    if not mesh.num_tris or not vertices.size:
+        raise MissingMeshError(f"'{path}' holds no triangles")
+    unit = _collada_unit_m(path) if path.suffix.lower() == '.dae' else 1.0
+    return Mesh(vertices * unit, mesh)
+
+
+#: beginning of a file that is enough to tell what it is [bytes]
+_HEAD_BYTES = 512
+
+
+def _not_a_mesh(path: Path) -> str:
+    """Return what a file is that takes a mesh's place, and the remedy; empty if it may be one."""
+    try:
+        with path.open('rb') as file:
+            head = file.read(_HEAD_BYTES).lstrip().lower()
+    except OSError as error:
+        return f'cannot be read: {error.strerror or error}'
+    if not head:
+        return 'is empty'
+    if head.startswith(b'version https://git-lfs.github.com/'):
+        return "is a pointer of Git LFS, not the mesh: run 'git lfs pull' in its repository"
+    if head.startswith((b'<!doctype html', b'<html')):
+        return 'is an HTML page, not a mesh: its download failed; fetch the file itself'
+    return ''
+
+
+def _short_reason(error: Exception) -> str:
+    """Return the reason that Coal's message of several lines states."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    kept = [line.removeprefix('message: ') for line in lines if line]
+    dropped = ('From file:', 'in function:', 'at line:', 'Hint:', 'Could not load resource')
+    return '; '.join(line for line in kept if not line.startswith(dropped)) or 'unknown reason'
+
+
+def _collada_unit_m(path: Path) -> float:
+    """Return the length of a DAE file's unit [m], which Coal does not apply.
+
+    URDF tools apply the unit and take no notice of `<up_axis>` (rviz#853).
+
+    Raises:
+        MissingMeshError: the unit is no positive number.
+    """
+    try:
+        for _, element in ElementTree.iterparse(path, events=('start',)):
+            tag = element.tag.rpartition('}')[2]
+            if tag == 'unit':
+                unit = float(element.get('meter', '1'))
+                break
+            if tag.startswith('library_') or tag == 'scene':
+                return 1.0
+        else:
+            return 1.0
+    except (ElementTree.ParseError, ValueError, OSError) as error:
+        raise MissingMeshError(f"'{path}': its <unit> cannot be read: {error}") from error
+    if not 0 < unit < np.inf:
+        raise MissingMeshError(f"'{path}': <unit meter> is {unit:g}, must be positive")
+    return unit
+
+
+def outermost(points: FloatArray, directions: int = _DIRECTIONS) -> FloatArray:
+    """Returns the points (M, 3) of (N, 3) that are outermost in one of some directions."""
+    return points[np.unique((points @ even_directions(directions).T).argmax(axis=0))]
+
+
+def slices(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
+    """Returns the hull's points, or those of slices across the longest axis that hold far less."""
+    whole = outermost(vertices)
+    middle = vertices - vertices.mean(axis=0)
+    axis = np.linalg.svd(middle[:: max(1, len(middle) // 2000)], full_matrices=False)[2][0]
+    along = vertices @ axis
+    cuts = np.linspace(along.min(), along.max(), _SLICES + 1)
+    slices = [_slice(vertices, edges, along, *ends) for ends in zip(cuts, cuts[1:], strict=False)]
+    try:
+        volumes = [float(ConvexHull(points).volume) for points in (whole, *slices)]
+    except (QhullError, ValueError):  # flat
+        return [whole]
+    hollow = sum(volumes[1:]) < _HOLLOW * volumes[0]
+    return slices if hollow and np.ptp(along) > _LEAST_SLICED else [whole]
+
+
+def convex_pieces(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
+    """Returns convex parts (N, 3) of a mesh, with the room that a hand has between its jaws.
+
+    The piece that holds most empty space is cut where its halves' hulls hold least, along one of
+    its principal axes, until no cut gains much.
+
+    Args:
+        vertices: (N, 3) of the mesh, which need not be closed [m].
+        edges: (E, 2) of its triangles.
+    """
+    if _is_convex(vertices):
+        return [outermost(vertices)]
+    whole = vertices[edges]
+    pieces = [(whole, *_best_cut(whole))]
+    least = _LEAST_GAIN * _hull_volume(whole)
+    while len(pieces) < _MOST_PIECES:
+        number = int(np.argmax([gain for _, gain, _ in pieces]))
+        _, gain, halves = pieces[number]
+        if gain <= least:
+            break
+        pieces[number : number + 1] = [(half, *_best_cut(half)) for half in halves]
+    flat = _THINNEST * _hull_volume(whole)
+    bodies = [piece for piece, _, _ in pieces if _hull_volume(piece) > flat]
+    return [outermost(points.reshape(-1, 3)) for points in bodies or [whole]]
+
+
+def write_convex_hull(points: FloatArray, out: Path) -> None:
+    """Writes the convex hull of the outermost of points (N, 3) as a binary STL.
+
+    Raises:
+        RobotError: they have no volume.
+    """
+    import coal
+
+    hull = coal.BVHModelOBBRSS()
+    points = outermost(points)
+    hull.beginModel(0, len(points))
+    for point in points:
+        hull.addVertex(point)
+    hull.endModel()
+    try:
+        hull.buildConvexHull(True, 'Qt')
+    except (ValueError, RuntimeError) as error:
+        raise RobotError(f"the mesh of '{out.name}' has no volume: {error}") from error
+    faces = [hull.convex.polygons(i) for i in range(hull.convex.num_polygons)]
+    corners = np.array(hull.convex.points())[[[face[k] for k in range(3)] for face in faces]]
+    rows = [struct.pack('<12fH', 0, 0, 0, *face.ravel(), 0) for face in corners]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(out, bytes(80) + struct.pack('<I', len(rows)) + b''.join(rows))
+
+
+def _is_convex(vertices: FloatArray) -> bool:
+    """Whether all of the vertices are corners of their hull, as those of pieces made before."""
+    points = np.unique(vertices, axis=0)
+    try:
+        return len(points) < _SEGMENTS and len(ConvexHull(points).vertices) == len(points)
+    except (QhullError, ValueError):
+        return True
+
+
+def _best_cut(segments: FloatArray) -> tuple[float, list[FloatArray]]:
+    """By how much a cut makes hulls smaller [m^3], and the two parts (E, 2, 3)."""
+    whole = segments
+    segments = segments[:: max(1, len(segments) // _SEGMENTS)]  # enough to choose a cut by
+    points = segments.reshape(-1, 3)
+    volume, best = _hull_volume(segments), (0.0, np.zeros(3), 0.0)
+    if not volume:
+        return 0.0, [whole]
+    middle = points - points.mean(axis=0)
+    for axis in np.linalg.svd(middle, full_matrices=False)[2]:
+        along = points @ axis
+        for at in np.linspace(along.min(), along.max(), _CUTS + 2)[1:-1]:
+            halves = [_half(segments, axis, at), _half(segments, -axis, -at)]
+            gain = volume - sum(map(_hull_volume, halves))
+            if gain > best[0]:
+                best = gain, axis, at
+    gain, axis, at = best
+    return gain, [_half(whole, axis, at), _half(whole, -axis, -at)] if gain else [whole]
+
+
+def _half(segments: FloatArray, axis: FloatArray, at: float) -> FloatArray:
+    """What of segments (E, 2, 3) lies below a plane."""
+    along = segments @ axis
+    order = np.argsort(along, axis=1)
+    segments = np.take_along_axis(segments, order[..., None], axis=1)[along.min(axis=1) < at]
+    low, high = np.sort(along, axis=1)[along.min(axis=1) < at].T
+    share = np.where(high > at, (at - low) / np.maximum(high - low, 1e-12), 1.0)[:, None]
+    ends = segments[:, 0] + share * (segments[:, 1] - segments[:, 0])
+    return np.stack([segments[:, 0], ends], axis=1)
+
+
+def _hull_volume(segments: FloatArray) -> float:
+    """Of the convex hull [m^3]; 0 = it is flat."""
+    points = segments.reshape(-1, 3)
+    if len(points) < 4:
+        return 0.0
+    try:
+        return float(ConvexHull(outermost(points, _CUT_DIRECTIONS), qhull_options='Qt Pp').volume)
+    except (QhullError, ValueError):
+        return 0.0
+
+
+def _slice(
+    vertices: FloatArray, edges: NDArray[np.int64], along: FloatArray, low: float, high: float
+) -> FloatArray:
+    """Outermost points between two planes, with where the planes cut edges."""
+    inside = vertices[(along >= low) & (along <= high)]
+    start, end = along[edges].T
+    found = [inside]
+    for cut in (low, high):
+        crossed = (start - cut) * (end - cut) < 0
+        share = ((cut - start[crossed]) / (end - start)[crossed])[:, None]
+        a, b = vertices[edges[crossed, 0]], vertices[edges[crossed, 1]]
+        found.append(a + share * (b - a))
+    points = np.concatenate(found)
+    return outermost(points, _SLICE_DIRECTIONS)
+
+
+def even_directions(count: int) -> FloatArray:
+    """(count, 3) unit vectors spread evenly (a Fibonacci sphere)."""
+    n = np.arange(count) + 0.5
+    up, turn = 1 - 2 * n / count, n * np.pi * (1 + 5**0.5)
+    across = np.sqrt(1 - up**2)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), up], axis=-1)

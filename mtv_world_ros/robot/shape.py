@@ -1,0 +1,371 @@
+"""What a robot's links look like: convex parts by its URDF, or rods; parts filled in a view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+import pinocchio as pin
+
+from mtv_world_ros.core.bounded_input import parse_yaml, read_text
+from mtv_world_ros.core.data_types import CameraModel, FloatArray
+from mtv_world_ros.core.errors import RobotError
+from mtv_world_ros.robot.mesh_pieces import (
+    even_directions,
+    find_mesh,
+    load_mesh,
+    MissingMeshError,
+    outermost,
+    slices,
+)
+from mtv_world_ros.robot.model import RobotModel, Tool
+
+#: corners of a round shape's rims
+_CORNERS = 16
+#: radius of the rods that stand for links of which nothing is known [m]
+ROD_RADIUS_M = 0.03
+#: no vertex of a robot's mesh is further from its link than this [m]
+_MOST_M = 1e4
+#: size above which a link that moves, and one that rests, does not fit the arm [arm lengths]
+_LARGE_MOVING, _LARGE_RESTING = 3.0, 15.0
+#: size below which a link does not fit the arm [arm lengths]
+_SMALL = 1e-3
+_TOO_LARGE = (
+    'is its mesh in millimetres or centimetres? Set scale="0.001 0.001 0.001" or '
+    '"0.01 0.01 0.01" at the mesh in the URDF'
+)
+_TOO_SMALL = 'does the URDF scale a mesh that is in metres, or has a <unit> of its own?'
+#: links closer together than this get no rod between them [m]
+_SHORTEST_ROD_M = 0.01
+#: pixels are drawn with this many fractional bits
+_SHIFT_BITS = 4
+_FAR_PX = 4000
+_PACKAGES = (
+    ' (source the workspace that has the package, or set'
+    ' AMENT_PREFIX_PATH=/path/to/install/PACKAGE)'
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkShape:
+    """A convex part of a link.
+
+    Attributes:
+        link: the link that carries it.
+        points: (N, 3) points whose convex hull it is, in the link's frame [m].
+    """
+
+    link: str
+    points: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotShape:
+    """What a robot looks like.
+
+    Attributes:
+        parts: of its links.
+        source: origin of the shapes, for reports.
+        is_known: False where rods stand for the links.
+        missing: meshes that are not there or cannot be read, and why.
+        doubts: links whose size does not fit the arm.
+    """
+
+    parts: tuple[LinkShape, ...]
+    source: str
+    is_known: bool = True
+    missing: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+
+
+def urdf_path(robot: RobotModel) -> Path | None:
+    """Returns where a robot's URDF lies; None = it is given by a table, or made in code."""
+    if robot.file is None:
+        return None
+    urdf = parse_yaml(read_text(robot.file, 'yaml_bytes')).get('urdf')
+    return None if urdf is None else robot.file.parent / str(urdf)
+
+
+def urdf_links(robot: RobotModel) -> tuple[Path, dict[str, ElementTree.Element]] | None:
+    """Returns the URDF's path and its links by name; None where the robot has none."""
+    path = urdf_path(robot)
+    if path is None:
+        return None
+    tree = ElementTree.fromstring(read_text(path, 'urdf_bytes'))
+    return path, {link.attrib['name']: link for link in tree.iter('link')}
+
+
+def load_shape(robot: RobotModel) -> RobotShape:
+    """Returns the robot's shape.
+
+    The URDF's visual elements; for links where it has none, or where their meshes are not there
+    or cannot be read, its collision elements. Rods from joint to joint where the robot is given
+    by a Denavit-Hartenberg table or made in code, and where a link that moves has none of its
+    shapes.
+
+    Raises:
+        RobotError: a mesh is damaged, or an element has a shape that no URDF has.
+    """
+    if robot.file is None:
+        return rods(robot, 'the robot has no file')
+    described = urdf_links(robot)
+    if described is None:
+        return rods(robot, 'the robot is given by a table')
+    path, links = described
+    found = {name: link_shapes(link, path, sliced=True) for name, link in links.items()}
+    moving = moving_links(robot)
+    parts = tuple(part for shapes, _ in found.values() for part in shapes)
+    missing = tuple(dict.fromkeys(text for _, texts in found.values() for text in texts))
+    bare = [text for name in links if name in moving and not found[name][0]
+            for text in found[name][1]]  # fmt: skip
+    if bare:
+        where = _PACKAGES if 'package://' in bare[0] else ''
+        return rods(robot, f'no mesh: {bare[0]}{where}', missing)
+    if not any(part.link in moving for part in parts):
+        return rods(robot, f"'{path.name}' has no shapes")
+    return RobotShape(
+        parts=parts,
+        source=f"the shapes of '{path.name}'",
+        missing=missing,
+        doubts=size_doubts(robot, parts),
+    )
+
+
+def size_doubts(robot: RobotModel, parts: Sequence[LinkShape]) -> tuple[str, ...]:
+    """Return the links whose shapes are far larger or far smaller than the arm, and the remedy.
+
+    A mesh in millimetres whose URDF gives no scale is 1000 times too large.
+    """
+    moving = moving_links(robot)
+    points: dict[str, list[FloatArray]] = {}
+    for part in parts:
+        points.setdefault(part.link, []).append(part.points)
+    sizes = {
+        link: float(np.linalg.norm(np.ptp(np.concatenate(found), axis=0)))
+        for link, found in points.items()
+    }
+    reach = _arm_length(robot)
+    doubts = []
+    for link, size in sizes.items():
+        large = (_LARGE_MOVING if link in moving else _LARGE_RESTING) * reach
+        if size > large or size < _SMALL * reach:
+            advice = _TOO_LARGE if size > large else _TOO_SMALL
+            text = f"link '{link}' is {size:.3g} m large and the arm {reach:.3g} m long"
+            doubts.append(f'{text}: {advice}')
+    return tuple(doubts)
+
+
+def _arm_length(robot: RobotModel) -> float:
+    """Return the length of the longest arm from its first joint to its tool [m]."""
+    middle = np.clip(0.0, robot.lower, robot.upper)[None]
+    lengths = [
+        float(np.linalg.norm(np.diff(points[:, 0], axis=0), axis=-1).sum())
+        for points in robot.kinematics(middle).arm_points
+    ]
+    ranges = (robot.upper - robot.lower)[robot.slides]
+    return max(lengths, default=0.0) + float(ranges[np.isfinite(ranges)].sum())
+
+
+def moving_links(robot: RobotModel) -> set[str]:
+    """Returns the links that move against the base link, by the robot's kinematics."""
+    joints = _joint_frames(robot)
+    return {name for name, joint in joints.items() if joint != joints[robot.base_link]}
+
+
+def grip_links(robot: RobotModel) -> set[str]:
+    """Returns the links that hold things: those of tools, and what gripper joints move."""
+    frames = _joint_frames(robot)
+    hands = {frames[tool.link] for tool in robot.tools if tool.gripper_joint} - {0}
+    moved = {link for tool in robot.tools for link in gripper_links(robot, tool)}
+    return moved | {link for link, joint in frames.items() if joint in hands}
+
+
+def gripper_links(robot: RobotModel, tool: Tool) -> set[str]:
+    """Returns the links that a tool's gripper joint moves, itself or by mimics; none without."""
+    model, gripper = robot.pinocchio_model, tool.gripper_joint
+    moved = {m.joint for m in robot.mimics if m.source == gripper} | {gripper}
+    return {
+        link
+        for link, joint in _joint_frames(robot).items()
+        if any(model.names[j] in moved for j in model.supports[joint])
+    }
+
+
+def _joint_frames(robot: RobotModel) -> dict[str, int]:
+    """The joint that carries each link."""
+    return {
+        f.name: f.parentJoint for f in robot.pinocchio_model.frames if f.type == pin.FrameType.BODY
+    }
+
+
+def rods(robot: RobotModel, why: str, missing: Sequence[str] = ()) -> RobotShape:
+    """Returns rods between neighbouring joints, and from the last ones to the tools."""
+    model, neutral = robot.pinocchio_model, pin.neutral(robot.pinocchio_model)
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, neutral)
+    first: dict[int, Any] = {}
+    for frame in model.frames:
+        if frame.type == pin.FrameType.BODY:
+            first.setdefault(frame.parentJoint, frame)
+    found = []
+    for joint, frame in first.items():
+        T_link_joint = frame.placement.inverse()
+        children = [c for c in range(1, model.njoints) if model.parents[c] == joint and joint]
+        found += [
+            _rod(frame.name, T_link_joint.translation,
+                 (T_link_joint * model.jointPlacements[child]).translation)
+            for child in children
+        ]  # fmt: skip
+    found += [_rod(tool.link, np.zeros(3), tool.T_link_tool[:3, 3]) for tool in robot.tools]
+    parts = tuple(rod for rod in found if rod is not None)
+    return RobotShape(
+        parts=parts,
+        source=f'rods from joint to joint ({why})',
+        is_known=False,
+        missing=tuple(missing),
+    )
+
+
+def _rod(link: str, start: FloatArray, end: FloatArray) -> LinkShape | None:
+    length = float(np.linalg.norm(end - start))
+    if length < _SHORTEST_ROD_M:
+        return None
+    T = np.eye(4)
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0, 1]), (end - start) / length)
+    T[:3, :3], T[:3, 3] = turn.toRotationMatrix(), (start + end) / 2
+    return LinkShape(link=link, points=_moved(T, _cylinder(ROD_RADIUS_M, length)))
+
+
+def link_shapes(
+    link: ElementTree.Element, urdf: Path, *, sliced: bool = False
+) -> tuple[list[LinkShape], list[str]]:
+    """Returns a link's shapes, and meshes that are missing; collisions stand in for visuals.
+
+    With `sliced`, a mesh that is far from convex is given in slices.
+
+    Raises:
+        RobotError: see `load_shape`.
+    """
+    missing: list[str] = []
+    name, cut = link.attrib['name'], slices if sliced else None
+    for kind in ('visual', 'collision'):
+        try:
+            found = [element_shapes(one, name, urdf, cut) for one in link.findall(kind)]
+            shapes = list(chain.from_iterable(found))
+        except MissingMeshError as error:
+            missing.append(str(error))
+            continue
+        if shapes:
+            return shapes, missing
+    return [], missing
+
+
+def element_shapes(
+    element: ElementTree.Element,
+    link: str,
+    urdf: Path,
+    cut: Callable[[FloatArray, NDArray[np.int64]], list[FloatArray]] | None = None,
+) -> Iterator[LinkShape]:
+    """Yields the convex parts of a `visual` or `collision`: none where it describes nothing.
+
+    Args:
+        element: of the URDF.
+        link: name of its link.
+        urdf: its file, beside which meshes are looked for.
+        cut: makes convex parts of a mesh's vertices and edges, e.g. `convex_pieces`; None = its
+            hull stands for it.
+
+    Raises:
+        MissingMeshError: a mesh is not there or cannot be read.
+        RobotError: see `load_shape`.
+    """
+    geometry = element.find('geometry')
+    if geometry is None or len(geometry) == 0:
+        return
+    try:
+        pieces = _pieces(geometry[0], urdf, cut)
+    except KeyError as error:
+        raise RobotError(
+            f"'{urdf}': a {geometry[0].tag} of link '{link}' lacks {error}"
+        ) from error
+    pose = shape_origin(element.find('origin'))
+    for points in pieces:
+        yield LinkShape(link=link, points=_moved(pose, points))
+
+
+def _pieces(
+    shape: ElementTree.Element,
+    urdf: Path,
+    cut: Callable[[FloatArray, NDArray[np.int64]], list[FloatArray]] | None,
+) -> list[FloatArray]:
+    """Convex parts (N, 3) of a shape, of a mesh as it is cut."""
+    if shape.tag != 'mesh':
+        return [_points(shape, urdf)]
+    scale = np.array(shape.attrib.get('scale', '1 1 1').split(), float)
+    file = find_mesh(shape.attrib['filename'], urdf)
+    if file is None:
+        raise MissingMeshError(f"'{shape.attrib['filename']}' is not there")
+    mesh = load_mesh(file)
+    vertices = mesh.vertices * scale
+    if not (np.abs(vertices) < _MOST_M).all():
+        raise RobotError(
+            f"'{file}': a vertex is further than {_MOST_M:g} m away or no number; is the file "
+            "damaged, or the 'scale' of the mesh in the URDF wrong?"
+        )
+    return [outermost(vertices)] if cut is None else cut(vertices, mesh.edges())
+
+
+def _points(shape: ElementTree.Element, urdf: Path) -> FloatArray:
+    values = shape.attrib
+    if shape.tag == 'box':
+        corners = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
+        return corners * np.array(values['size'].split(), float) / 2
+    if shape.tag in ('cylinder', 'capsule'):
+        return _cylinder(float(values['radius']), float(values['length']))
+    if shape.tag == 'sphere':
+        return float(values['radius']) * even_directions(64)
+    raise RobotError(
+        f"'{urdf}' has a shape '{shape.tag}'; known are box, capsule, cylinder, mesh, sphere"
+    )
+
+
+def _cylinder(radius: float, length: float) -> FloatArray:
+    angles = np.arange(_CORNERS) * 2 * np.pi / _CORNERS
+    rim = radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    ends = [np.column_stack([rim, np.full(_CORNERS, z)]) for z in (-length / 2, length / 2)]
+    return np.concatenate(ends)
+
+
+def shape_origin(element: ElementTree.Element | None) -> FloatArray:
+    """Returns the (4, 4) pose of an `<origin>`."""
+    T = np.eye(4)
+    if element is not None:
+        T[:3, 3] = np.array(element.get('xyz', '0 0 0').split(), float)
+        T[:3, :3] = pin.rpy.rpyToMatrix(np.array(element.get('rpy', '0 0 0').split(), float))
+    return T
+
+
+def _moved(T: FloatArray, points: FloatArray) -> FloatArray:
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def fill(parts: Sequence[FloatArray], camera: CameraModel) -> NDArray[np.uint8]:
+    """(T, H, W) the convex hulls of the parts' pixels; parts behind the camera are left out."""
+    images = np.zeros((len(parts[0]), camera.height, camera.width), np.uint8)
+    size = np.array([camera.width, camera.height])
+    for part in parts:
+        with np.errstate(invalid='ignore'):
+            low, high = part.min(axis=1), part.max(axis=1)
+            seen = ((high > -1) & (low < size)).all(axis=1)  # NaN is not seen
+        fixed = np.nan_to_num(part).clip(-_FAR_PX, _FAR_PX) * 2**_SHIFT_BITS
+        fixed = np.rint(fixed).astype(np.int32)
+        for row in np.flatnonzero(seen):
+            cv2.fillConvexPoly(images[row], cv2.convexHull(fixed[row]), 1, shift=_SHIFT_BITS)
+    return images

@@ -1,0 +1,1 @@
+"""The product: pipeline, rollouts of imagined episodes, offline replay."""

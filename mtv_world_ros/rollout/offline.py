@@ -1,0 +1,299 @@
+"""Offline replay: a recorded episode in, predictions out, MCAP to MCAP, without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from mtv_world_ros.core.data_types import FloatArray, JointTrajectory, Observation, SuccessEstimate
+from mtv_world_ros.core.errors import EpisodeError, MtvWorldError, ObservationError
+from mtv_world_ros.data.bag_mapping import EpisodeSource
+from mtv_world_ros.data.episode import Episode
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.recording import DEFAULT, frame_indices, Recording
+from mtv_world_ros.robot.chunk_plan import Plan
+from mtv_world_ros.robot.resample import match_joints
+from mtv_world_ros.rollout.observed_episode import ObservedEpisode
+from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.rollout.prediction import Prediction
+from mtv_world_ros.rollout.prediction_writer import ERROR, OK, PredictionWriter
+from mtv_world_ros.rollout.rollout_options import RolloutOptions
+
+#: beyond these a trajectory is rejected, as by the node: age of the newest frames and joint states
+#: at its start, and time between the views' frames [s]
+IMAGE_AGE_S, JOINT_STATE_AGE_S, VIEW_SKEW_S = 0.5, 0.5, 0.05
+
+
+@dataclass(slots=True, kw_only=True)
+class ReplaySummary:
+    """What a replay did.
+
+    Attributes:
+        out: folder with the predictions.
+        num_trajectories: imagined.
+        num_chunks: imagined.
+        num_frames: frames a view written.
+        model_s: time spent in the pipeline [s].
+        video_s: time the written frames cover [s].
+        probabilities: success estimate at the end of each trajectory; NaN = abstains.
+        rejected: (stamp [ns], reason) of trajectories that were not imagined.
+        warnings: problems of the episode.
+    """
+
+    out: Path
+    num_trajectories: int = 0
+    num_chunks: int = 0
+    num_frames: int = 0
+    model_s: float = 0.0
+    video_s: float = 0.0
+    probabilities: list[float] = field(default_factory=list)
+    rejected: list[tuple[int, str]] = field(default_factory=list)
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def real_time_factor(self) -> float:
+        """Seconds of video for a second of computing; NaN before the first chunk."""
+        return self.video_s / self.model_s if self.model_s else float('nan')
+
+    def __str__(self) -> str:
+        estimates = ', '.join(
+            'abstains' if np.isnan(value) else f'{value:.2f}' for value in self.probabilities
+        )
+        counts = f'{self.num_trajectories} trajectories, {self.num_chunks} chunks'
+        lines = [
+            f'{counts}, {self.num_frames} frames a view -> {self.out}',
+            f'{self.model_s:.1f} s of computing, real-time factor {self.real_time_factor:.2f}',
+            f'success estimates: {estimates}',
+            *(f'rejected at {stamp / 1e9:.3f} s: {why}' for stamp, why in self.rejected),
+            *(f'warning: {text}' for text in self.warnings),
+        ]
+        return '\n'.join(lines)
+
+
+def replay_offline(
+    pipeline: Pipeline,
+    episode_path: Path | str,
+    out: Path | str,
+    *,
+    source: EpisodeSource = DEFAULT,
+    seed: int = 0,
+    num_inference_steps: int = 0,
+    overwrite: bool = False,
+    show_progress: bool = True,
+) -> ReplaySummary:
+    """Imagines every joint trajectory of an episode from the newest frames before it.
+
+    The estimates remember the episode's recorded frames since its first trajectory, as the node's
+    do in mode observe.
+
+    The predictions hold the recorded images of the same times too. Frames that the next
+    trajectory supersedes are left out. What is wrong with one trajectory
+    rejects that one alone, with its reason in the summary and in `/world_model/report`.
+
+    Args:
+        pipeline: imagines.
+        episode_path: rosbag2 folder or .mcap file, also one that was cut off.
+        out: folder for the predictions; appears only when all is written.
+        source: topics and robot of an episode that is not in this package's format.
+        seed: of the noise; the k-th trajectory uses `seed + 1000 k`.
+        num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
+        overwrite: replace an existing folder of predictions.
+        show_progress: draw a progress bar, on a terminal.
+
+    Raises:
+        EpisodeError: the episode cannot be read, or none of its trajectories can be imagined.
+        CalibrationError: a view is not calibrated.
+    """
+    spec = pipeline.spec
+    episode = read_episode(
+        episode_path,
+        views=spec.views,
+        calibration=source.calibration,
+        with_masks=False,
+        mapping=source.mapping,
+        robot=pipeline.robot,
+    )
+    if not episode.trajectories:
+        raise EpisodeError(f"'{episode_path}' holds no joint_trajectory message to imagine")
+    summary = ReplaySummary(out=Path(out), warnings=episode.warnings)
+    stored = episode.info.objects if pipeline.describer is None else ()
+    observed = ObservedEpisode(pipeline)
+    starts = [stamp for stamp, _ in episode.trajectories]
+    bar = tqdm(total=len(starts), unit='trajectory', disable=None if show_progress else True)
+    with bar, PredictionWriter(out, pipeline.robot.joint_names, overwrite=overwrite) as writer:
+        for index, (stamp, trajectory) in enumerate(episode.trajectories):
+            until = starts[index + 1] if index + 1 < len(starts) else None
+            try:
+                observation = observe(episode, pipeline, stamp)
+                before = starts[index - 1] if index else stamp
+                for seen in _seen_between(episode, pipeline, before, stamp):
+                    observed.see(seen)
+                text = instruction_at(episode, stamp)
+                options = RolloutOptions(
+                    instruction=text,
+                    objects=stored,
+                    seed=seed + 1000 * index,
+                    num_inference_steps=num_inference_steps,
+                )
+                imagined = observed.begin(observation, options)
+                plan = Plan.of(trajectory, pipeline.robot, imagined.observation, stamp_ns=stamp)
+                _write_rollout(writer, imagined.extend(plan), summary, until, spec.fps)
+            except MtvWorldError as error:
+                summary.rejected.append((stamp, str(error)))
+                writer.write_report(stamp, ERROR, f'rejected: {error}', {})
+            bar.update()
+        _write_observed(writer, episode, spec.fps)
+        if not summary.num_chunks:
+            raise EpisodeError(
+                f"'{episode_path}': none of its {len(starts)} trajectories can be imagined; the "
+                f'first one: {summary.rejected[0][1]}'
+            )
+    return summary
+
+
+def _write_rollout(
+    writer: PredictionWriter,
+    chunks: Iterator[Prediction],
+    summary: ReplaySummary,
+    until: int | None,
+    fps: float,
+) -> None:
+    last: Prediction | None = None
+    for chunk in chunks:
+        summary.num_chunks += 1
+        summary.model_s += sum(chunk.seconds.values())
+        count = writer.write_chunk(chunk, until)
+        summary.num_frames += count
+        summary.video_s += count / fps
+        last = chunk
+        end_ns = chunk.stamp_ns + round(float(chunk.video.times[-1]) * 1e9)
+        writer.write_report(end_ns, OK, 'imagined', _chunk_values(chunk))
+        if until is not None and end_ns >= until:
+            break
+    if last is not None:
+        summary.num_trajectories += 1
+        summary.probabilities.append(last.success.probability)
+
+
+def _write_observed(writer: PredictionWriter, episode: Episode, fps: float) -> None:
+    """What the cameras showed when frames were predicted: the nearest within half a frame."""
+    reach_ns = round(0.5e9 / fps)
+    for view, camera in episode.cameras.items():
+        known = episode.images[view].stamps_ns
+        chosen = {
+            index
+            for stamp_ns in writer.frame_stamps
+            for index in [int(np.abs(known - stamp_ns).argmin())]
+            if abs(int(known[index]) - stamp_ns) <= reach_ns
+        }
+        for index in sorted(chosen):
+            writer.write_observed(camera, int(known[index]), episode.images[view].frames[index])
+
+
+def _chunk_values(chunk: Prediction) -> dict[str, object]:
+    return {
+        'chunk': chunk.chunk,
+        'num_chunks': chunk.num_chunks,
+        'chunk_seed': chunk.seed,
+        'observation_stamp_ns': chunk.stamp_ns,
+        'success': chunk.success.probability,
+        'success_low': chunk.success.interval[0],
+        'success_high': chunk.success.interval[1],
+        'success_reasons': chunk.success.reasons,
+        **{f'stage_s.{stage}': seconds for stage, seconds in chunk.seconds.items()},
+    }
+
+
+def observe(episode: Episode, pipeline: Pipeline, stamp_ns: int) -> Observation:
+    """Returns what was seen last before a moment.
+
+    Raises:
+        ObservationError: nothing was seen yet, too long ago, or at different times by the views.
+    """
+    views = pipeline.spec.views
+    newest = [_last_before(episode.images[view].stamps_ns, stamp_ns) for view in views]
+    for view, index in zip(views, newest, strict=True):
+        if index < 0:
+            raise ObservationError(f"view '{view}' has no frame before the trajectory starts")
+    common = min(int(episode.images[v].stamps_ns[i]) for v, i in zip(views, newest, strict=True))
+    picked = [int(np.abs(episode.images[view].stamps_ns - common).argmin()) for view in views]
+    stamps = [int(episode.images[v].stamps_ns[i]) for v, i in zip(views, picked, strict=True)]
+    _check('the newest frames are', stamp_ns - min(stamps), IMAGE_AGE_S, 'old')
+    _check('the views are', max(stamps) - min(stamps), VIEW_SKEW_S, 'apart')
+    return Observation(
+        cameras=tuple(episode.camera(v, i) for v, i in zip(views, picked, strict=True)),
+        frames=np.stack([episode.images[v].frames[i] for v, i in zip(views, picked, strict=True)]),
+        positions=_positions(episode, pipeline, stamp_ns),
+        stamp_ns=min(stamps),
+    )
+
+
+def _seen_between(
+    episode: Episode, pipeline: Pipeline, begin_ns: int, end_ns: int
+) -> Iterator[Observation]:
+    """What was seen between two moments, once a frame of the model."""
+    period_ns = round(1e9 / pipeline.spec.fps)
+    for stamp_ns in range(begin_ns + period_ns, end_ns, period_ns):
+        with suppress(ObservationError):
+            yield observe(episode, pipeline, stamp_ns)
+
+
+def _positions(episode: Episode, pipeline: Pipeline, stamp_ns: int) -> FloatArray:
+    states = episode.joint_states
+    index = -1 if states is None else _last_before(states.stamps_ns, stamp_ns)
+    if states is None or index < 0:
+        raise ObservationError('there are no joint_states before the trajectory starts')
+    age = stamp_ns - int(states.stamps_ns[index])
+    _check('the newest joint states are', age, JOINT_STATE_AGE_S, 'old')
+    row = JointTrajectory(
+        joint_names=states.joint_names,
+        times=np.zeros(1),
+        positions=states.positions[index][None],
+    )
+    return match_joints(row, pipeline.robot).positions[0]
+
+
+def _last_before(stamps_ns: np.ndarray, stamp_ns: int) -> int:
+    """Index of the last stamp not after a moment, -1 if there is none."""
+    return int(np.searchsorted(stamps_ns, stamp_ns, side='right')) - 1
+
+
+def _check(what: str, value_ns: int, limit_s: float, how: str) -> None:
+    if value_ns > limit_s * 1e9:
+        raise ObservationError(f'{what} {value_ns / 1e9:.3f} s {how}; allowed are {limit_s:g} s')
+
+
+def instruction_at(episode: Episode, stamp_ns: int) -> str:
+    """Returns the instruction that held at a moment, or the episode's."""
+    before = [text for stamp, text in episode.instructions if stamp <= stamp_ns]
+    return before[-1] if before else episode.info.instruction
+
+
+def judge(pipeline: Pipeline, recording: Recording) -> SuccessEstimate:
+    """Returns the success estimate at the end of a recorded episode.
+
+    Args:
+        pipeline: finds the objects and judges; see `load_pipeline`.
+        recording: V views on the model's clock, e.g. of `load_recording(path, pipeline.spec,
+            pipeline.robot)`.
+
+    Raises:
+        EpisodeError: the recording is shorter than a frame of the model, or has a gap.
+        ObservationError: its views are not the model's.
+    """
+    spec = pipeline.spec
+    seconds = float(recording.times[-1] - recording.times[0])
+    rows = frame_indices(recording, 0, spec, num_frames=int(seconds * spec.fps + 1e-3))
+    if rows is None or len(rows) < 2:
+        raise EpisodeError(
+            f"'{recording.path}' cannot be judged: it lasts {seconds:.2f} s, has a gap or fewer "
+            f'than two frames at {spec.fps:g} Hz; record images without a break'
+        )
+    options = RolloutOptions(instruction=recording.instruction)
+    episode = pipeline.begin(recording.observation(0), options)
+    return episode.observe(recording.frames[:, rows[1:]], recording.positions[rows]).success

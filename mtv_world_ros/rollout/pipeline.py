@@ -1,0 +1,371 @@
+"""The main path: an observation and a joint trajectory in, imagined video and estimate out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Protocol
+
+from mtv_world_ros.cameras.motion import Motion
+from mtv_world_ros.control.arm_pictures import arm_pictures
+from mtv_world_ros.control.trajectory_video import render_trajectory_video, TrajectoryVideoConfig
+from mtv_world_ros.core.data_types import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    History,
+    MultiViewVideo,
+    ObjectMasks,
+    Observation,
+    WorldModelSpec,
+)
+from mtv_world_ros.physics.episode_objects import Majority, ObjectForesight
+from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
+from mtv_world_ros.physics.object_motion import ObjectMotionModel
+from mtv_world_ros.robot.chunk_plan import ChunkPlan
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.shape import LinkShape
+from mtv_world_ros.rollout.imagined_episode import ObservedChunk, Rollout
+from mtv_world_ros.rollout.prediction import Prediction, StageClock
+from mtv_world_ros.rollout.rollout_options import DEFAULT_OPTIONS, RolloutOptions
+from mtv_world_ros.rollout.rollout_state import RolloutState
+from mtv_world_ros.success.calibration import Fits, HorizonCurve
+from mtv_world_ros.success.doubts import doubted, Grounds, widened
+from mtv_world_ros.success.estimator import JudgedChunk, SuccessEstimator
+from mtv_world_ros.success.rollout_memory import footage_of
+from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
+from mtv_world_ros.vision.describers.describer import Describer, name_objects
+from mtv_world_ros.vision.segmenters.segmenter import Segmenter
+
+#: of an estimate for which the model was shown no motion
+_UNSEEN = 'no view shows a tool at any time'
+
+
+class WorldModel(Protocol):
+    """Predicts one chunk of frames."""
+
+    @property
+    def spec(self) -> WorldModelSpec:
+        """Its frame size, rate and views."""
+        ...
+
+    def predict(
+        self,
+        start_frame: ByteArray,
+        trajectory_frames: ByteArray,
+        *,
+        positions: FloatArray,
+        seed: int,
+        num_inference_steps: int,
+        should_stop: Callable[[], bool],
+        history: History | None = None,
+    ) -> ByteArray:
+        """Returns (V, T, H, W, 3) uint8 RGB predicted frames.
+
+        Args:
+            start_frame: (V, H, W, 3) uint8 RGB, the frame the chunk starts from.
+            trajectory_frames: (V, 1 + T, H, W, 3) uint8 RGB; frame k shows the state after
+                command k, frame 0 the start.
+            positions: (1 + T, J) what was drawn: row 0 where the robot stands, row k command k
+                [rad or m]; for models that take actions as numbers.
+            seed: seed of the noise.
+            num_inference_steps: denoising steps.
+            should_stop: asked between steps.
+            history: the frames before the start frame; None = the episode begins there.
+
+        Raises:
+            RolloutPreempted: `should_stop` said so.
+            ModelMemoryError: the device ran out of memory.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pipeline:
+    """Imagines and judges; stateless: `begin` returns the rollout, which holds the state.
+
+    Attributes:
+        robot: joints, limits and tools.
+        world_model: predicts chunks.
+        segmenter: finds the objects' masks.
+        estimator: judges the outcome.
+        rendering: how trajectory videos look; must be what the model was trained with.
+        object_mask: whether trajectory videos carry the object masks.
+        objects: names of the objects; empty = the describer's.
+        describer: names the objects of an episode's first frame; None = the instruction's words.
+        horizon: measured J by horizon; None = not measured.
+        object_motion: foresees object motions, for models whose trajectory videos show them;
+            None = objects are drawn where they were.
+        camera_checker: compares the first frames with the arm's outline; None = no check.
+        grounds: what estimates that are not calibrated may rest on.
+        parts: shapes of the robot's links, for `rendering.arm_pictures`; empty = none are drawn.
+        picture_fits: fits to rollouts without foreseen object motion, for `without_foresight`;
+            None = the estimate stays as it is, e.g. bare.
+    """
+
+    robot: RobotModel
+    world_model: WorldModel
+    segmenter: Segmenter
+    estimator: SuccessEstimator
+    rendering: TrajectoryVideoConfig
+    object_mask: bool = True
+    objects: tuple[str, ...] = ()
+    describer: Describer | None = None
+    horizon: HorizonCurve | None = None
+    object_motion: ObjectMotionModel | None = None
+    camera_checker: CameraChecker | None = None
+    grounds: Grounds = Grounds()
+    parts: tuple[LinkShape, ...] = ()
+    picture_fits: Fits | None = None
+
+    @property
+    def spec(self) -> WorldModelSpec:
+        """The world model's frame size, rate and views."""
+        return self.world_model.spec
+
+    def with_robot(self, robot: RobotModel) -> Pipeline:
+        """Returns the pipeline for a robot of the same joints and tools, e.g. a calibrated one."""
+        motion, checker = self.object_motion, self.camera_checker
+        return replace(
+            self,
+            robot=robot,
+            camera_checker=None if checker is None else checker.with_robot(robot),
+            object_motion=None if motion is None else motion.with_robot(robot),
+        )
+
+    def without_foresight(self) -> Pipeline:
+        """Return the pipeline without foreseen object motion: the imagined frames alone decide.
+
+        Trajectory videos show what else the model was trained with. A model that was trained with
+        the masks of the first frame gets them, which is the paper's method; one that was trained
+        with foreseen objects (`rendering.object_motion`) gets no objects.
+        """
+        if self.object_motion is None:
+            return self
+        fits = self.picture_fits
+        if fits is None:
+            return replace(self, object_motion=None)
+        return replace(
+            self,
+            object_motion=None,
+            estimator=self.estimator.with_calibration(fits.calibration),
+            horizon=fits.horizon,
+            grounds=Grounds.of('', fits.calibration is not None),
+        )
+
+    def begin(
+        self, observation: Observation, options: RolloutOptions = DEFAULT_OPTIONS
+    ) -> Rollout:
+        """Returns an episode that begins at an observation (V views, any image size).
+
+        Raises:
+            ObservationError: the views are not the model's.
+        """
+        checker = self.camera_checker
+        check = CameraCheck() if checker is None else checker.check(observation)
+        observation = check.corrected_observation(observation)
+        objects = self._objects_in(observation)
+        state = RolloutState.at(observation, self.spec, objects, check)
+        return Rollout(pipeline=self, options=options, _states=(state,))
+
+    def name_objects(
+        self, options: RolloutOptions, first_frame: Callable[[], ByteArray]
+    ) -> tuple[str, ...]:
+        """Returns the names of the objects of a rollout.
+
+        Args:
+            options: may name them; else the pipeline does, its describer, or the instruction.
+            first_frame: returns the first real frame (H, W, 3) uint8 RGB, for the describer.
+
+        Raises:
+            DescriptionError: the describer failed.
+        """
+        return name_objects(
+            options.instruction,
+            given=options.objects or self.objects,
+            describer=self.describer,
+            first_frame=first_frame,
+        )
+
+    def imagine(
+        self, state: RolloutState, plan: ChunkPlan, options: RolloutOptions
+    ) -> tuple[Prediction, RolloutState]:
+        """Returns one chunk of one rollout, stage by stage, and the rollout's state after it."""
+        start, clock = state.observation, StageClock()
+        num_steps = options.num_inference_steps or self.spec.num_inference_steps
+        links = {part.link for part in self.parts}
+        motion = Motion.of(self.robot, start.cameras, plan.positions, links)
+        in_view = motion.tools_in_view()
+        start_masks = self.find(state, options)
+        clock.lap('start masks')
+        objects = state.objects.foresee(
+            plan,
+            start,
+            options.objects,
+            start_masks,
+            self._majority(state, options),
+            state.is_begun,
+            options.should_stop,
+        )
+        pictures = objects.pictures(plan, motion)
+        clock.lap('object motion')
+        arms = arm_pictures(self.parts, motion, start.frames)
+        control = self.draw(motion, plan.times, start_masks, pictures, arms)
+        clock.lap('trajectory video')
+        frames = self.world_model.predict(
+            start.frames,
+            control.frames,
+            positions=plan.positions,
+            seed=options.seed,
+            num_inference_steps=num_steps,
+            should_stop=options.should_stop,
+            history=state.history,
+        )[:, : plan.num_frames]
+        clock.lap('model')
+        masks = self.follow(state, start_masks, frames, options)
+        clock.lap('masks')
+        motion = motion.first(plan.num_frames + 1)
+        foreseen = objects.motions(plan, state.is_begun)
+        success, memory = self.judge(state, motion, start_masks, masks, options, foreseen)
+        unseen = () if in_view.any() else (_UNSEEN,)
+        success = doubted(success, (*objects.reasons, *unseen))
+        success = doubted(success, refusal=objects.refusal)
+        clock.lap('success')
+        times = plan.times[1 : plan.num_frames + 1]
+        stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
+        state = state.after(
+            frames, motion.positions[-1], stamp_ns, self.spec.num_history, memory, objects
+        )
+        prediction = Prediction(
+            start=start,
+            video=MultiViewVideo(views=start.views, times=times, frames=frames),
+            seed=options.seed,
+            positions=motion.positions[1:],
+            trajectory_video=control,
+            start_masks=start_masks,
+            masks=masks,
+            success=success,
+            stamp_ns=plan.stamp_ns,
+            chunk=plan.chunk,
+            num_chunks=plan.num_chunks,
+            imagined_seconds=state.num_imagined / self.spec.fps,
+            horizon=self.horizon,
+            segmenter=self.segmenter.name,
+            num_inference_steps=num_steps,
+            foreseen=None if foreseen is None else foreseen.at_frames(plan),
+            in_view=in_view,
+            seconds=MappingProxyType(clock.seconds),
+        )
+        return prediction, state
+
+    def observe(
+        self,
+        state: RolloutState,
+        frames: ByteArray,
+        positions: FloatArray,
+        options: RolloutOptions,
+    ) -> tuple[ObservedChunk, RolloutState]:
+        """Returns masks and estimate of real frames, and the rollout's state after them.
+
+        Args:
+            state: before them.
+            frames: (V, T, H, W, 3) uint8 RGB after it, at the model's size and frame rate.
+            positions: (1 + T, J) measured [rad or m]; row 0 at the state.
+            options: names of the objects, and the instruction.
+        """
+        start_masks = self.find(state, options)
+        masks = self.follow(state, start_masks, frames, options)
+        motion = Motion.of(self.robot, state.observation.cameras, positions)
+        success, memory = self.judge(state, motion, start_masks, masks, options, is_real=True)
+        stamp_ns = state.observation.stamp_ns + round(frames.shape[1] / self.spec.fps * 1e9)
+        after = state.after(
+            frames, positions[-1], stamp_ns, self.spec.num_history, memory, state.objects
+        )
+        return ObservedChunk(start_masks=start_masks, masks=masks, success=success), after
+
+    def find(self, state: RolloutState, options: RolloutOptions) -> ObjectMasks:
+        """Returns masks of the frame that a chunk starts from (T = 1)."""
+        return self.segmenter.segment(state.observation.frames[:, None], options.objects)
+
+    def draw(
+        self,
+        motion: Motion,
+        times: FloatArray,
+        start_masks: ObjectMasks,
+        objects: ByteArray | None = None,
+        arms: ByteArray | None = None,
+    ) -> MultiViewVideo:
+        """Returns the 1 + T frames of the trajectory video, at the cameras' size.
+
+        Args:
+            motion: 1 + T states of the robot, seen by V cameras.
+            times: (1 + T,) [s].
+            start_masks: of the start frame.
+            objects: (V, 1 + T, H, W, 4) of `moved_pictures`, in place of the masks.
+            arms: (V, 1 + T, H, W, 4) of `arm_pictures`.
+        """
+        return render_trajectory_video(
+            motion=motion,
+            times=times,
+            object_masks=start_masks.masks[:, :, 0] if self.object_mask else None,
+            objects=objects,
+            arms=arms,
+            config=self.rendering,
+        )
+
+    def follow(
+        self,
+        state: RolloutState,
+        start_masks: ObjectMasks,
+        frames: ByteArray,
+        options: RolloutOptions,
+    ) -> ObjectMasks:
+        """Returns masks of the frames (V, T, H, W, 3) after the start frame."""
+        return self.segmenter.segment(
+            frames,
+            options.objects,
+            first_masks=start_masks.masks[:, :, 0],
+            first_frames=state.observation.frames,
+        )
+
+    def judge(
+        self,
+        state: RolloutState,
+        motion: Motion,
+        start_masks: ObjectMasks,
+        masks: ObjectMasks,
+        options: RolloutOptions,
+        foreseen: ForeseenMotions | None = None,
+        *,
+        is_real: bool = False,
+    ) -> JudgedChunk:
+        """Returns the estimate after a chunk of 1 + T states, and what it remembers."""
+        check, footage = state.camera_check, footage_of(motion, start_masks, masks)
+        judged = self.estimator.estimate(
+            footage, options.instruction, state.memory, foreseen, is_real=is_real
+        )
+        estimate = judged.estimate if is_real else self.grounds.bear(judged.estimate)
+        estimate = doubted(estimate, check.notes, check.refusal)
+        return judged._replace(
+            estimate=widened(estimate, options.doubt) if options.doubt else estimate
+        )
+
+    def _majority(self, state: RolloutState, options: RolloutOptions) -> Majority:
+        """The rule that selects futures of majority outcome, for pictures and estimate."""
+
+        def majority(motions: ForeseenMotions) -> BoolArray | None:
+            ends = self.estimator.foresee(motions, options.instruction, state.memory)
+            return None if ends is None else ends.is_majority
+
+        return majority
+
+    def _objects_in(self, observation: Observation) -> ObjectForesight:
+        """The objects of an episode that begins at an observation."""
+        return ObjectForesight(
+            model=self.object_motion if self.rendering.object_motion else None,
+            segmenter=self.segmenter,
+            robot=self.robot,
+            first=observation,
+            source=observation,
+        )

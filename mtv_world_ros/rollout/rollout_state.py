@@ -1,0 +1,132 @@
+"""The state of a rollout between two chunks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from mtv_world_ros.cameras.camera import scaled
+from mtv_world_ros.core.data_types import (
+    ByteArray,
+    CameraModel,
+    FloatArray,
+    History,
+    Observation,
+    WorldModelSpec,
+)
+from mtv_world_ros.core.errors import ObservationError
+from mtv_world_ros.core.images import resize_frames
+from mtv_world_ros.physics.episode_objects import ObjectForesight
+from mtv_world_ros.success.rollout_memory import RolloutMemory
+from mtv_world_ros.vision.camera_check import CameraCheck
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RolloutState:
+    """The state of one seed's rollout, which its next chunk starts from.
+
+    Attributes:
+        observation: its last frame, at the model's size.
+        history: the frames before that one.
+        objects: foreseen poses of the named objects.
+        memory: of the success estimate; None before the first chunk.
+        num_imagined: frames since the last real one.
+        camera_check: calibration check on the episode's first frames; its corrections are
+            applied.
+    """
+
+    observation: Observation
+    history: History
+    objects: ObjectForesight
+    memory: RolloutMemory | None = None
+    num_imagined: int = 0
+    camera_check: CameraCheck = CameraCheck()
+
+    @classmethod
+    def at(
+        cls,
+        observation: Observation,
+        spec: WorldModelSpec,
+        objects: ObjectForesight,
+        camera_check: CameraCheck,
+    ) -> RolloutState:
+        """Returns the state of an episode that begins at a real observation.
+
+        Raises:
+            ObservationError: the views are not the model's.
+        """
+        start = fit_observation(observation, spec)
+        return cls(
+            observation=start,
+            history=History.begin(start.frames),
+            objects=objects,
+            camera_check=camera_check,
+        )
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether no real frame was observed since the episode began."""
+        return self.memory is None or self.memory.num_frames == 1 + self.num_imagined
+
+    def after(
+        self,
+        frames: ByteArray,
+        positions: FloatArray,
+        stamp_ns: int,
+        num_history: int,
+        memory: RolloutMemory,
+        objects: ObjectForesight,
+    ) -> RolloutState:
+        """Returns the state at the last of the frames (V, T, H, W, 3).
+
+        Args:
+            frames: (V, T, H, W, 3) uint8 RGB after `observation`.
+            positions: (J,) commanded at the last one [rad or m].
+            stamp_ns: of the last one [ns].
+            num_history: most frames to keep before it.
+            memory: of the success estimate after the chunk.
+            objects: foreseen poses after the chunk.
+        """
+        start = self.observation
+        return replace(
+            self,
+            observation=replace(
+                start, frames=frames[:, -1], positions=positions, stamp_ns=stamp_ns
+            ),
+            history=self.history.after(start.frames, frames, num_history),
+            objects=objects,
+            memory=memory,
+            num_imagined=self.num_imagined + frames.shape[1],
+        )
+
+    def seen_by(self, cameras: tuple[CameraModel, ...] | None) -> RolloutState:
+        """Returns the state at a real frame, from which objects are looked for anew.
+
+        Args:
+            cameras: as they are at that frame, at the model's size; None = as before.
+        """
+        observation = self.observation
+        if cameras is not None:
+            corrected = self.camera_check.corrected(cameras)
+            observation = replace(observation, cameras=corrected)
+        objects = self.objects.branch(observation)
+        return replace(self, observation=observation, num_imagined=0, objects=objects)
+
+
+def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observation:
+    """Returns the observation with frames and cameras at the model's size.
+
+    Raises:
+        ObservationError: the views are not the model's.
+    """
+    if observation.views != spec.views:
+        raise ObservationError(
+            f'the observation has views {list(observation.views)}, the model was trained on '
+            f'{list(spec.views)} in this order'
+        )
+    if observation.frames.shape[1:3] == (spec.height, spec.width):
+        return observation
+    return replace(
+        observation,
+        cameras=tuple(scaled(c, spec.width, spec.height) for c in observation.cameras),
+        frames=resize_frames(observation.frames, spec.width, spec.height),
+    )

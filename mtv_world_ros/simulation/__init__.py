@@ -1,0 +1,1 @@
+"""The simulator: tasks, scenes, arms, cameras and physics."""

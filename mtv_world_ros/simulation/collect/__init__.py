@@ -1,0 +1,1 @@
+"""Data sets of simulated episodes with their card."""

@@ -1,0 +1,207 @@
+"""Collects a data set of simulated episodes: seeded, resumable, in parallel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+import fcntl
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from mtv_world_ros.core.errors import SimulatorError
+from mtv_world_ros.core.images import encode_png
+from mtv_world_ros.core.worker_pool import run_all
+from mtv_world_ros.simulation.collect.contact_sheet import contact_sheet, SHEET_FILE
+from mtv_world_ros.simulation.collect.dataset_card import (
+    card_of,
+    CardEntry,
+    check_same_set,
+    read_entries,
+    read_entry,
+    remove_leftovers,
+    TASKS_SET,
+    write_card,
+    write_file,
+    ZERO_SHOT_SET,
+)
+from mtv_world_ros.simulation.collect.dataset_readme import write_readme
+from mtv_world_ros.simulation.collect.episode_jobs import (
+    CollectJob,
+    jobs_of,
+    NUM_MISSED,
+    zero_shot_jobs,
+)
+from mtv_world_ros.simulation.collect.episode_maker import (
+    CollectConfig,
+    EpisodeMaker,
+    plain_config,
+)
+from mtv_world_ros.simulation.opengl import load_mujoco
+from mtv_world_ros.simulation.tasks import tasks_named
+from mtv_world_ros.simulation.zero_shot import kinds_named
+
+#: episodes between two writings of the card
+CARD_EVERY = 20
+LOCK_FILE = '.lock'
+SHEETS_FOLDER = 'sheets'
+
+
+def collect(
+    tasks: str | Sequence[str],
+    num_episodes: int,
+    seed: int,
+    out: Path | str,
+    *,
+    zero_shot: str | Sequence[str] = (),
+    workers: int = 1,
+    config: CollectConfig | None = None,
+    failures_of_ten: int = NUM_MISSED,
+    sheets: bool = False,
+    progress: bool = True,
+) -> list[CardEntry]:
+    """Makes the missing episodes of a data set, its card and its contact sheet.
+
+    The same arguments give the same episodes, whatever the number of workers; episodes that
+    are there already are kept, so an interrupted run is continued by starting it again.
+
+    Args:
+        tasks: names, comma-separated names, or `all`.
+        num_episodes: episodes per task; of zero-shot sets, in all.
+        seed: the data set's random seed.
+        out: folder of the data set; one episode folder appears in it at a time.
+        zero_shot: kinds of a zero-shot set (`view`, `task`, `object`); none = an ordinary set.
+        workers: processes.
+        config: randomisation and sampling.
+        failures_of_ten: number of episodes in ten of a task that miss their grasp; none in
+            zero-shot sets.
+        sheets: also write a larger contact sheet of every task.
+        progress: show a progress bar, on a terminal.
+
+    Returns:
+        The entries of the episodes that were asked for.
+
+    Raises:
+        SimulatorError: unknown task or kind, no OpenGL library, `out` holds another set or
+            cannot be written.
+    """
+    chosen = tasks_named(tasks if isinstance(tasks, str) else ','.join(tasks))
+    kinds = kinds_named(zero_shot)
+    if num_episodes < 1 or workers < 1:
+        raise SimulatorError(
+            f'episodes is {num_episodes} and workers is {workers}; both must be at least 1'
+        )
+    out, config = Path(out), config or CollectConfig()
+    if kinds and (config.policies or config.moved_share):
+        raise SimulatorError(
+            'a zero-shot set is acted by the expert and brings its own cameras; leave '
+            '--policies and --moved-cameras out, or --zero-shot'
+        )
+    load_mujoco()
+    if kinds:
+        jobs = zero_shot_jobs(kinds, chosen, num_episodes, seed, out)
+    else:
+        num_missed = 0 if config.kinds else failures_of_ten
+        jobs = jobs_of(chosen, num_episodes, seed, out, num_missed, config.policies)
+    with locked(out):
+        data_set = _DataSet(out, ZERO_SHOT_SET if kinds else TASKS_SET, seed, config, jobs)
+        data_set.make(jobs, workers, config, progress=progress)
+        data_set.describe(sheets=sheets)
+    return [data_set.entries[job.path.name] for job in jobs]
+
+
+def _maker(config: CollectConfig) -> Callable[[CollectJob], None]:
+    return EpisodeMaker(config).make
+
+
+@contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Holds the data set's lock, which ends with the process however that ends.
+
+    Raises:
+        SimulatorError: another process collects into the folder, or it cannot be written.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        stream = (out / LOCK_FILE).open('a')
+    except OSError as error:
+        raise SimulatorError(
+            f"cannot write into '{out}': {error}; choose another --out"
+        ) from error
+    with stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise SimulatorError(
+                f"another `collect` is writing into '{out}'; wait for it, or choose another --out"
+            ) from error
+        except OSError:
+            pass  # a file system without locks
+        yield
+
+
+class _DataSet:
+    """A data set's folder: its episodes, card and contact sheets."""
+
+    def __init__(
+        self, out: Path, kind: str, seed: int, config: CollectConfig, jobs: Sequence[CollectJob]
+    ) -> None:
+        self._out, self._kind, self._seed = out, kind, seed
+        self._config = plain_config(config)
+        check_same_set(out, kind, seed, self._config)
+        remove_leftovers(out)
+        self.entries = read_entries(out, {job.path.name for job in jobs})
+        self._write_card()
+
+    def make(
+        self, jobs: Sequence[CollectJob], workers: int, config: CollectConfig, *, progress: bool
+    ) -> None:
+        """Makes the missing episodes."""
+        missing = [job for job in jobs if job.path.name not in self.entries]
+        done = len(jobs) - len(missing)
+        try:
+            finished = run_all(missing, partial(_maker, config), workers)
+            with tqdm(
+                total=len(jobs), initial=done, unit='ep', disable=None if progress else True
+            ) as bar:
+                self._show(bar, jobs)
+                for number, (job, _) in enumerate(finished, 1):
+                    self.entries[job.path.name] = read_entry(job.path)
+                    bar.update()
+                    self._show(bar, jobs)
+                    if number % CARD_EVERY == 0:
+                        self._write_card()
+        except BaseException:
+            # the first error is the one to report
+            with suppress(SimulatorError):
+                self._write_card()
+            raise
+
+    def _show(self, bar: Any, jobs: Sequence[CollectJob]) -> None:
+        names = [job.path.name for job in jobs]
+        outcomes = [self.entries[name].outcome for name in names if name in self.entries]
+        success = outcomes.count('success')
+        share = f' ({100 * success / len(outcomes):.0f} %)' if outcomes else ''
+        bar.set_postfix_str(f'{success} success{share}, {len(outcomes) - success} failure')
+
+    def describe(self, *, sheets: bool) -> None:
+        """Writes the card as data and as text, and the contact sheets."""
+        self._write_card()
+        entries = list(self.entries.values())
+        write_file(self._out / SHEET_FILE, encode_png(contact_sheet(self._out, entries)))
+        write_readme(self._out, self._card(), entries)
+        if not sheets:
+            return
+        for key in sorted({(entry.zero_shot, entry.task) for entry in entries}, key=str):
+            chosen = [e for e in entries if (e.zero_shot, e.task) == key]
+            name = '_'.join(part for part in key if part)
+            sheet = contact_sheet(self._out, chosen, pairs=4, num_frames=8, width=240)
+            write_file(self._out / SHEETS_FOLDER / f'{name}.png', encode_png(sheet))
+
+    def _card(self) -> dict[str, Any]:
+        return card_of(self._kind, self._seed, self._config, self.entries.values())
+
+    def _write_card(self) -> None:
+        write_card(self._out, self._card())

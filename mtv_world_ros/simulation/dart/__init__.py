@@ -1,0 +1,1 @@
+"""A second physics engine as another ground truth."""

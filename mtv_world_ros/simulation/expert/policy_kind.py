@@ -1,0 +1,53 @@
+"""The policy kind `scripted`: what assembly and recorded episodes ask of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from mtv_world_ros.core.errors import PolicyError
+from mtv_world_ros.policies.policy import EpisodeOrigin, Policy, ScriptedPolicySettings
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.simulation.expert.expert import Expert
+from mtv_world_ros.simulation.expert.scripted_policy import policy_of_recording, scripted_policy
+from mtv_world_ros.simulation.faults.catalogue import parse_variant, refuse_test_kinds
+
+__all__ = ['check', 'fault_kinds', 'policy_maker', 'refuse_test_kinds']
+
+
+def check(settings: ScriptedPolicySettings) -> None:
+    """Checks the name of a variant.
+
+    Raises:
+        PolicyError: there is no such policy, or a fault's size is out of range.
+    """
+    parse_variant(settings.variant)
+
+
+def policy_maker(
+    settings: ScriptedPolicySettings, robot: RobotModel
+) -> Callable[[EpisodeOrigin], Policy]:
+    """Returns what makes the policy of a variant for an episode's task and scene."""
+    variant, expert = settings.variant, Expert(robot)
+
+    def make(origin: EpisodeOrigin) -> Policy:
+        if origin.recording:
+            return policy_of_recording(variant, Path(origin.recording), expert, settings.hold_s)
+        task, scene_seed = origin.task, origin.scene_seed
+        if not task or scene_seed < 0:
+            raise PolicyError(
+                f"policy '{variant}' knows its scene instead of looking at it: set 'task' and "
+                "'scene_seed' to those of the recorded episode"
+            )
+        return scripted_policy(variant, task, scene_seed, expert, hold_s=settings.hold_s)
+
+    return make
+
+
+def fault_kinds(variant: str) -> tuple[str, ...]:
+    """Returns the fault kinds of a variant.
+
+    Raises:
+        PolicyError: it has an unknown fault.
+    """
+    return parse_variant(variant).kinds

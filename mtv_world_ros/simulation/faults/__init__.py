@@ -1,0 +1,1 @@
+"""Faults of commands and of the surroundings, as data."""

@@ -1,0 +1,314 @@
+"""The fault catalogue: what can be wrong with a scripted policy, and its sizes.
+
+The kinds are data, in `config/faults`. A policy's name says its faults and their sizes:
+`expert-joint_noise-0.02`, `expert-grasp_height-0.03-gripper_delay-0.3`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from inspect import signature
+from math import isfinite
+import re
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator
+
+from mtv_world_ros.core.config import ListOf, Number, read_yaml, Schema, validated
+from mtv_world_ros.core.errors import nearest, PolicyError
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.simulation.faults.commands import COMMANDS
+from mtv_world_ros.simulation.faults.drawn import drawn_names, DRAWN_SETS, drawn_values, is_drawn
+from mtv_world_ros.simulation.faults.edits import PRIMITIVES, ROW
+from mtv_world_ros.simulation.faults.second_arm import SecondArm
+
+EXPERT = 'expert'
+#: of fault kinds; kinds of `test` never enter training, calibration or the choice of anything
+SPLITS = ('train', 'calibrate', 'test')
+#: in the order of the catalogue, which random policies depend on
+_FILES = (
+    *('timing', 'height', 'lateral', 'wrist', 'opening', 'release', 'collision', 'object'),
+    *('speed', 'joint', 'regrasp'),
+)
+Steps = ListOf[dict[str, dict[str, Any]]]
+
+
+def _known_steps(primitives: Mapping[str, Callable[..., Any]], steps: Steps) -> Steps:
+    """Refuses steps whose primitive does not exist, or does not have their options."""
+    for name, options in (item for step in steps for item in step.items()):
+        if name not in primitives:
+            raise ValueError(f"unknown step '{name}'{nearest(name, primitives)}")
+        parameters = signature(primitives[name]).parameters.values()
+        known = {p.name for p in parameters if p.kind is p.KEYWORD_ONLY} | {'scale'}
+        known |= {*ROW} if any(p.kind is p.VAR_KEYWORD for p in parameters) else set()
+        for row, keys in (
+            (options, known),
+            *((r, {*ROW, 'like'}) for r in options.get('rows', ())),
+        ):
+            for key in row.keys() - keys:
+                raise ValueError(f"step '{name}' has no option '{key}'{nearest(key, keys)}")
+    return steps
+
+
+class FaultSize(Schema):
+    """How large a fault may be.
+
+    Attributes:
+        typical: size at which success and failure are about as frequent.
+        largest: largest size of a policy.
+        unit: unit of all sizes; empty = a share or a number.
+        none: size that means no fault.
+        ranked: sizes in the rankings of the kind's split.
+    """
+
+    typical: Number
+    largest: Number
+    unit: str = ''
+    none: Number = 0.0
+    ranked: ListOf[Number] = ()
+
+
+class FaultKind(Schema):
+    """One way in which a policy fails: an entry of `config/faults`.
+
+    Attributes:
+        alias: another name, which earlier recordings have.
+        family: group of kinds, e.g. `timing` or `release`.
+        split: `train`, `calibrate` or `test`.
+        size: its typical, largest and ranked sizes.
+        text: meaning of the size, in words.
+        contact: whether its failures are failures of contact, which do not show in the arm's path
+            alone.
+        needs: parts that a robot must have for it.
+        keeps_tempo: added way points take time of their own; else they share the move's.
+        edits: steps that change the way points of a move.
+        second_arm: visit of another arm during the move.
+        commands: steps that change the commands of the whole plan.
+    """
+
+    alias: str = ''
+    family: str
+    split: Literal['train', 'calibrate', 'test']
+    size: FaultSize
+    text: str
+    contact: bool = True
+    needs: ListOf[Literal['gripper', 'two_arms']] = ()
+    keeps_tempo: bool = False
+    edits: Annotated[Steps, AfterValidator(partial(_known_steps, PRIMITIVES))] = ()
+    second_arm: SecondArm | None = None
+    commands: Annotated[Steps, AfterValidator(partial(_known_steps, COMMANDS))] = ()
+
+
+def _read() -> dict[str, FaultKind]:
+    """All kinds; `defaults` of a file hold for its entries where these do not say otherwise."""
+    kinds: dict[str, FaultKind] = {}
+    for name in _FILES:
+        path = share_path('config', 'faults', f'{name}.yaml')
+        entries = read_yaml(path, 'fault file', 'config/faults')
+        defaults = entries.pop('defaults')
+        for kind, values in entries.items():
+            kinds[kind] = validated(FaultKind, {**defaults, **values}, f"{path}: '{kind}'")
+    return kinds
+
+
+class _Catalogue(dict[str, FaultKind]):
+    """Kinds by name; drawn ones are made when they are asked for."""
+
+    def __missing__(self, name: str) -> FaultKind:
+        if not is_drawn(name):
+            raise KeyError(name)
+        return FaultKind(**drawn_values(name))
+
+
+#: kinds by name
+FAULTS: Mapping[str, FaultKind] = _Catalogue(_read())
+_NAMES = {name: kind for kind, fault in FAULTS.items() for name in (kind, fault.alias)}
+_ALL = f"the {len(FAULTS)} kinds that 'mtv-world faults' prints"
+
+
+def kind_named(name: str) -> str:
+    """Returns the kind of a name or an alias.
+
+    Raises:
+        PolicyError: no such kind; the text names the nearest known one.
+    """
+    if is_drawn(name):
+        return name
+    if name not in _NAMES:
+        raise PolicyError(
+            f"unknown fault kind '{name}'{nearest(name, _NAMES)}; known are the splits "
+            f'{", ".join(SPLITS)} and {_ALL}'
+        )
+    return _NAMES[name]
+
+
+def kinds_named(text: str) -> tuple[str, ...]:
+    """Returns the fault kinds of a split, or of a comma-separated list, as they are called there.
+
+    Raises:
+        PolicyError: no such split or kind; the text names the nearest known one.
+    """
+    names = tuple(name.strip() for name in text.split(',') if name.strip())
+    if not names or names[0] in SPLITS or ':' in text:
+        return kinds_of(text.strip())
+    for name in names:
+        kind_named(name)
+    return names
+
+
+def kinds_of(split: str) -> tuple[str, ...]:
+    """Returns the fault kinds of a split, of `drawn:SEED` or of `drawn_contact:SEED`.
+
+    Raises:
+        PolicyError: no such split.
+    """
+    word, _, seed = split.partition(':')
+    if word in DRAWN_SETS and seed.isdecimal() and len(seed) < 10:
+        return drawn_names(int(seed), word)
+    if split not in SPLITS:
+        raise PolicyError(
+            f"unknown split of fault kinds '{split}'{nearest(split, SPLITS)}; known are "
+            f'{", ".join((*SPLITS, *(f"{drawn}:SEED" for drawn in DRAWN_SETS)))}'
+        )
+    return tuple(name for name, kind in FAULTS.items() if kind.split == split)
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyVariant:
+    """The expert's faults; none is the expert.
+
+    Attributes:
+        sizes: (name or alias of a kind, size), each kind once, in the catalogue's order.
+    """
+
+    sizes: tuple[tuple[str, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, value in self.sizes:
+            largest = FAULTS[kind_named(name)].size.largest
+            if not (isfinite(value) and 0 <= value <= largest):
+                raise PolicyError(f"policy fault '{name}' is {value}; it must be 0 to {largest:g}")
+
+    @classmethod
+    def of(cls, sizes: Mapping[str, float]) -> PolicyVariant:
+        """Returns the variant of sizes by kind; kinds whose size means no fault are left out."""
+        names = in_order(sizes)
+        given = ((name, float(sizes[name])) for name in names)
+        return cls(tuple((n, s) for n, s in given if s != FAULTS[kind_named(n)].size.none))
+
+    def size(self, kind: str) -> float:
+        """Returns the size of one fault."""
+        return dict(self.faults).get(kind_named(kind), FAULTS[kind_named(kind)].size.none)
+
+    @property
+    def faults(self) -> tuple[tuple[str, float], ...]:
+        """(kind, size) of its faults."""
+        return tuple((kind_named(name), size) for name, size in self.sizes)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of its faults."""
+        return tuple(kind for kind, _ in self.faults)
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """The splits of its faults."""
+        return tuple(sorted({FAULTS[kind].split for kind in self.kinds}))
+
+    @property
+    def name(self) -> str:
+        """The name that `parse_variant` reads, with the names that it was given."""
+        return '-'.join([EXPERT, *(f'{name}-{size:g}' for name, size in self.sizes)])
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Returns names of kinds in the order of the catalogue; drawn kinds follow."""
+    order = {kind: number for number, kind in enumerate(FAULTS)}
+    return sorted(names, key=lambda name: (order.get(kind_named(name), len(order)), name))
+
+
+def parse_variant(text: str) -> PolicyVariant:
+    """Returns the variant of a name: `expert`, then any of its faults, each with its size.
+
+    Raises:
+        PolicyError: no such name, a fault twice or without a size, a size out of range.
+    """
+    name = text.strip()
+    if not re.fullmatch(rf'{EXPERT}(-[a-z][a-z_0-9]*-\d*\.?\d+)*', name):
+        raise PolicyError(
+            f"'{text}' is no scripted policy{_near(name)}; they are called '{EXPERT}', followed "
+            f"by faults with their sizes, like '{EXPERT}-joint_noise-0.02' or "
+            f"'{EXPERT}-gripper_delay-0.3-grasp_missed-0.5'; {_ALL}"
+        )
+    sizes: dict[str, float] = {}
+    for fault, size in re.findall(r'-([a-z][a-z_0-9]*)-([\d.]+)', name):
+        if fault not in _NAMES and not is_drawn(fault):
+            raise PolicyError(
+                f"policy '{text}': unknown fault '{fault}'{nearest(fault, _NAMES)}; known are "
+                f'{_ALL}'
+            )
+        if kind_named(fault) in map(kind_named, sizes):
+            raise PolicyError(f"policy '{text}': fault '{fault}' is given twice")
+        sizes[fault] = float(size)
+    PolicyVariant(tuple(sizes.items()))  # sizes that mean no fault are checked, too
+    return PolicyVariant.of(sizes)
+
+
+def draw_variant(kinds: Sequence[str], rng: np.random.Generator) -> PolicyVariant:
+    """Returns a random policy: the expert, or one or two faults of sizes around the typical one.
+
+    Args:
+        kinds: fault kinds to choose from.
+        rng: generator that draws.
+    """
+    count = int(rng.choice([0, 1, 2], p=[0.12, 0.5, 0.38]))
+    chosen = rng.choice(kinds, size=min(count, len(kinds)), replace=False)
+    sizes = {}
+    for kind in map(str, chosen):
+        allowed = FAULTS[kind_named(kind)].size
+        size = min(allowed.typical * 2 ** rng.normal(0.0, 0.9), allowed.largest)
+        sizes[kind] = float(f'{size:.3g}')
+    return PolicyVariant.of(sizes)
+
+
+def policies_of(split: str) -> tuple[str, ...]:
+    """Returns the policies of a ranking: the expert, and kinds of a split in their sizes.
+
+    Raises:
+        PolicyError: no such split.
+    """
+    faults = ((kind, size) for kind in kinds_of(split) for size in FAULTS[kind].size.ranked)
+    return (EXPERT, *(PolicyVariant.of({kind: size}).name for kind, size in faults))
+
+
+def refuse_test_kinds(names: Iterable[str], what: str) -> None:
+    """Refuses policies with faults of the split `test`.
+
+    Args:
+        names: names of policies.
+        what: purpose that they are refused for, e.g. `training`.
+
+    Raises:
+        PolicyError: names the policies and their kinds.
+    """
+    test, *others = SPLITS[::-1]
+    found = {
+        name: bad
+        for name in names
+        if (bad := [k for k in parse_variant(name).kinds if FAULTS[k].split == test])
+    }
+    if found:
+        listed = '; '.join(f"'{name}' has {', '.join(kinds)}" for name, kinds in found.items())
+        raise PolicyError(
+            f'fault kinds of the split {test} are not for {what}: {listed}; choose kinds of '
+            f'{", ".join(others[::-1])} (config/faults)'
+        )
+
+
+def _near(name: str) -> str:
+    """Of the first word alone: what follows may be right."""
+    first = name.split('-')[0]
+    return '' if first == EXPERT else nearest(first, [EXPERT])

@@ -1,0 +1,609 @@
+"""Primitives that change the commands of a plan, as `config/faults` names them.
+
+Shape letters: T commands, J joints, A arms, G grippers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+
+import numpy as np
+
+from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.simulation.faults.glitches import with_glitches
+from mtv_world_ros.simulation.faults.signals import Commands, crossed
+
+#: time in which commands jump [s], and in which a constant error sets in [s]
+_JUMP_S, _SET_IN_S = 0.1, 1.0
+#: part of a plan in which something happens once, as shares of it
+_ONCE = (0.1, 0.7)
+#: period of gripper jerks [s]; range of the durations of a flicker [s], their number, and the time
+#: before a gripper passes its middle at which it is still at rest [s]
+_TWITCH_EVERY_S, _FLICKER_S, _NUM_FLICKERS, _BEFORE_S = 0.8, (0.1, 0.3), 30, 0.6
+#: opening of a gripper at which arms flinch; change of the opening between two commands below
+#: which it stands still, both as shares of its range; speed factor of the way back
+_FLINCH_OPEN, _STANDS, _FLINCH_SPEED = 0.1, 1e-3, 2
+#: number of wrist joints, the last ones of an arm; tool travel up to which an arm is at rest [m]
+_NUM_WRIST, _RESTS_M = 3, 1e-6
+#: length of a chunk of commands [s]; how often commands are lost
+_CHUNK_S, _NUM_LOST = 0.8, 3
+#: damping of swinging arms, as a share of the critical one; onset, duration and end of a swap of
+#: commands [s]; periods of a wavy error over one turn of a joint
+_DAMPING, _SWAP_S, _NUM_WAVES = 0.2, (0.2, 0.4, 0.2), 4
+#: times of sinking, lying and rising of arms that give way [s]; period of vertical waves [s]; step
+#: of the numerical derivative of the tools' heights [rad], and its least square [m2/rad2]
+_SLUMP_S, _HEAVE_S, _STEP_RAD, _LEAST_SLOPE = (0.3, 0.4, 0.6), 2.0, 1e-4, 1e-3
+#: number and duration of outliers [s]; frequency of a tremor [Hz]; time between the draws that a
+#: slow error is interpolated from [s]
+_NUM_SPIKES, _SPIKE_S, _TREMBLE_HZ, _KNOT_S = 3, 0.4, 2.5, 0.5
+
+Rng = np.random.Generator
+
+
+def _own(rng: Rng) -> Rng:
+    """A generator of the fault's own, so that its draws do not change those of later faults."""
+    return np.random.default_rng(rng.integers(2**32))
+
+
+def _read(at: FloatArray, positions: FloatArray) -> FloatArray:
+    """(N, J) positions (T, J) at numbers of rows (N,), between them linear."""
+    rows = np.arange(len(positions))
+    return np.stack([np.interp(at, rows, column) for column in positions.T], axis=1)
+
+
+def _blended(before: FloatArray, rest: FloatArray, num: int) -> FloatArray:
+    """(N, J) `rest`, to which a row before (J,) passes within `num` rows."""
+    whole, num = rest.copy(), min(num, len(rest))
+    blend = (np.arange(1, num + 1) / num)[:, None] if num else np.zeros((0, 1))
+    whole[:num] = (1 - blend) * before + blend * whole[:num]
+    return whole
+
+
+def delay(c: Commands, size: float, rng: Rng, *, only: str = '') -> FloatArray:
+    """The grippers follow later [s]; `only` where they open: `opening`."""
+    whole, late = c.delayed(c.num(size))
+    opens, follows = np.sign(c.travel), late[:, c.grippers]
+    if only == 'opening':
+        follows = np.minimum(whole[:, c.grippers] * opens, follows * opens) * opens
+    whole[:, c.grippers] = follows
+    return whole
+
+
+def lead(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """The grippers go ahead of the arms [s]."""
+    ahead = np.minimum(np.arange(len(c.positions)) + c.num(size), len(c.positions) - 1)
+    return c.grippers_of(c.positions[ahead][:, c.grippers])
+
+
+def _followed(c: Commands, rule: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
+    """(T, J) of joints whose next position follows from their last one and the command."""
+    whole = c.positions.copy()
+    for row in range(1, len(whole)):
+        whole[row] = rule(whole[row - 1], c.positions[row])
+    return whole
+
+
+def lag(c: Commands, size: float, rng: Rng, *, joints: str) -> FloatArray:
+    """`grippers` or `wrists` follow with a first-order lag, of a time constant [s]."""
+    share = 1 - np.exp(-1 / (size / c.period))
+    late = _followed(c, lambda last, now: last + share * (now - last))
+    if joints == 'grippers':
+        return c.grippers_of(late[:, c.grippers])
+    whole, columns = c.positions.copy(), c.arms[:, -_NUM_WRIST:].ravel()
+    whole[:, columns] = late[:, columns]
+    return whole
+
+
+def give_way(c: Commands, size: float, rng: Rng, *, by: str) -> FloatArray:
+    """Grippers open to at least a share of their range, weighted by one of `GIVE_WAY`."""
+    opens = np.sign(c.travel)
+    least = c.closed + np.minimum(size * GIVE_WAY[by](c), 1.0) * c.travel
+    return c.grippers_of(np.maximum(c.positions[:, c.grippers] * opens, least * opens) * opens)
+
+
+def _twitches(c: Commands) -> FloatArray:
+    """(T, 1) from 0, which is most of the time, to 1."""
+    knots = _JUMP_S * np.arange(4)
+    return np.interp(c.times % _TWITCH_EVERY_S, knots, [0.0, 1.0, 1.0, 0.0])[:, None]
+
+
+def _haste(c: Commands) -> FloatArray:
+    """(T, G) speed of the arm of each gripper, as a share of its top speed."""
+    steps = np.gradient(c.positions, axis=0)
+    steps[:, c.grippers] = 0.0
+    speeds = np.linalg.norm(steps.reshape(len(steps), c.num_arms, -1), axis=2)
+    top = speeds.max(axis=0)
+    return (speeds / np.where(top > 0, top, 1.0))[:, _arms_of_grippers(c)]
+
+
+def _reach(c: Commands) -> FloatArray:
+    """(T, G) reach of the arm of each gripper over the table, as a share of its largest."""
+    tools = np.stack([poses[:, :2, 3] for poses in c.robot.tool_poses(c.positions)], axis=1)
+    ways = np.linalg.norm(tools - tools[0], axis=2)
+    most = ways.max(axis=0)
+    return (ways / np.where(most > _RESTS_M, most, 1.0))[:, _arms_of_grippers(c)]
+
+
+def _arms_of_grippers(c: Commands) -> np.ndarray:
+    return np.array(c.grippers) // (c.positions.shape[1] // c.num_arms)
+
+
+def _since_shut(c: Commands) -> FloatArray:
+    """(T, G) time since a gripper was last more open than shut [s]."""
+    is_open = (c.positions[:, c.grippers] - c.middles) * np.sign(c.travel) > 0
+    rows = c.rows[:, None]
+    return (rows - np.maximum.accumulate(np.where(is_open, rows, 0))) * c.period
+
+
+GIVE_WAY: Mapping[str, Callable[[Commands], FloatArray]] = {
+    'jerks': _twitches,
+    'speed': _haste,
+    'reach': _reach,
+    'time_shut': _since_shut,
+}
+
+
+def _passes(c: Commands) -> list[tuple[int, float, int]]:
+    """Column, middle and row of every time that a gripper passes its middle."""
+    return [
+        (column, float(middle), int(row) + 1)
+        for column, middle in zip(c.grippers, c.middles, strict=True)
+        for row in np.flatnonzero(np.diff(c.positions[:, column] > middle))
+    ]
+
+
+def flicker(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """For a while [s] after a gripper has passed its middle, it goes back and forth."""
+    own, whole = _own(rng), c.positions.copy()
+    for column, _, row in _passes(c):
+        since = c.times - c.times[row]
+        knots = np.cumsum(own.uniform(*_FLICKER_S, size=_NUM_FLICKERS))
+        back = np.interp(since, knots, np.arange(_NUM_FLICKERS) % 2)
+        back *= np.clip((size - since) / _JUMP_S + 1, 0.0, 1.0)
+        before = c.positions[max(row - c.num(_BEFORE_S), 0), column]
+        whole[:, column] += back * (before - whole[:, column])
+    return whole
+
+
+def pause_half_way(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Whenever a gripper passes its middle, it stands there for a while [s] first."""
+    whole = c.positions.copy()
+    for column, middle, row in _passes(c):
+        after = np.maximum(np.arange(len(whole) - row) - c.num(size), 0)
+        blend = np.minimum(after * c.period / _JUMP_S, 1.0)
+        whole[row:, column] = middle + blend * (c.positions[row:, column] - middle)
+    return whole
+
+
+def hurry(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """While a gripper is shut, all goes faster, by a share."""
+    is_shut = c.robot.gripper_openings(c.positions).min(axis=0) < 0.5
+    times = np.cumsum(np.where(is_shut, 1 / (1 + size), 1.0)) - 1
+    at = np.interp(np.arange(int(times[-1]) + 1), times, c.rows)
+    return _read(at, c.positions)
+
+
+def pause(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """From a drawn time on, the arms are later than the grippers [s]."""
+    first, num = int(_own(rng).uniform(0.15, 0.6) * len(c.positions)), c.num(size)
+    stands = np.repeat(c.positions[first : first + 1], num, axis=0)
+    arms = np.concatenate([c.positions[:first], stands, c.positions[first:]])
+    arms[:, c.grippers] = c.delayed(num)[0][:, c.grippers]
+    return arms
+
+
+def jump(
+    c: Commands, size: float, rng: Rng, *, between: Sequence[float], back: bool, seconds: float
+) -> FloatArray:
+    """Once, between shares of the plan, it jumps ahead or back [s], within some seconds."""
+    at = int(float(_own(rng).uniform(between[0], between[1])) * len(c.positions))
+    to = max(at - c.num(size), 0) if back else at + c.num(size)
+    rest = _blended(c.positions[at - 1], c.positions[to:], c.num(seconds))
+    return np.concatenate([c.positions[:at], rest])
+
+
+def flinch(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Once, as a gripper opens or closes, the arms go back on their way [s], and return.
+
+    The gripper goes on, and stands still at the end of its way until they are there again.
+    """
+    own, ways = _own(rng), []
+    for opening in c.robot.gripper_openings(c.positions):
+        stands = np.append(np.abs(np.diff(opening)) < _STANDS, True)
+        for change in np.flatnonzero(np.diff(opening > _FLINCH_OPEN)):
+            begin = int(change - np.argmax(stands[change::-1]))
+            ways.append((begin, int(change + np.argmax(stands[change:]))))
+    if not ways:
+        return c.positions
+    begin, end = ways[int(own.integers(len(ways)))]
+    back = np.arange(begin, max(begin - c.num(size), 0), -_FLINCH_SPEED)
+    rows = np.arange(len(c.positions))
+    whole = c.positions[np.insert(rows, begin, [*back, *back[::-1]])]
+    hands = np.insert(rows, end, np.full(2 * len(back), end))
+    whole[:, c.grippers] = c.positions[hands][:, c.grippers]
+    return whole
+
+
+def mix(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Commands are the mean of those of now and of a while ago, drawn up to the size [s]."""
+    whole, late = c.delayed(c.num(_own(rng).uniform() * size))
+    return (whole + late) / 2
+
+
+def restart(c: Commands, size: float, rng: Rng, *, seconds: float) -> FloatArray:
+    """Once, at a share of the plan up to the size, it goes back and starts all over."""
+    share, num = float(size * _own(rng).uniform()), c.num(seconds)
+    end = 1 + int(share * (len(c.positions) - 1))
+    back = np.repeat(c.positions[:1], num, axis=0)
+    back = _blended(c.positions[end - 1], back, num)
+    return np.concatenate([c.positions[:end], back, c.positions[1:]])
+
+
+def shuffle(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Once, the later one of two chunks [s] comes first."""
+    share, rows = float(_own(rng).uniform()), np.arange(len(c.positions))
+    num = min(c.num(size), (len(rows) - 1) // 2)
+    begin = 1 + int(share * (len(rows) - 1 - 2 * num))
+    middle, end = begin + num, begin + 2 * num
+    order = np.concatenate([rows[:begin], rows[middle:end], rows[begin:middle], rows[end:]])
+    whole, num = c.positions[order], min(c.num(_JUMP_S), num)
+    for first in (begin, middle, end):
+        after = whole[first : first + num].copy()
+        blend = (np.arange(1, len(after) + 1) / num)[:, None]
+        whole[first : first + num] = (1 - blend) * whole[first - 1] + blend * after
+    return whole
+
+
+def seams(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Every chunk of commands but the first is ahead or behind, by up to the size [s]."""
+    own, most = _own(rng), size / c.period
+    whole, _ = c.delayed(int(np.ceil(most)))
+    rows, num = np.arange(len(whole)), c.num(_CHUNK_S)
+    chunks = rows // num
+    ahead = np.rint(most * own.uniform(-1.0, 1.0, chunks[-1] + 1)).astype(int)
+    ahead[0] = 0
+    before, now = (
+        whole[np.clip(rows + ahead[numbers], 0, len(whole) - 1)]
+        for numbers in (np.maximum(chunks - 1, 0), chunks)
+    )
+    blend = np.minimum((rows % num + 1) * c.period / _JUMP_S, 1.0)[:, None]
+    return (1 - blend) * before + blend * now
+
+
+def delay_each(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Every arm joint follows later, by up to the size [s]."""
+    own, most = _own(rng), size / c.period
+    whole, _ = c.delayed(int(np.ceil(most)))
+    rows, behind = np.arange(len(whole)), most * own.uniform(size=whole.shape[1])
+    behind[c.grippers] = 0.0
+    columns = zip(behind, whole.T, strict=True)
+    return np.stack([np.interp(rows - by, rows, column) for by, column in columns], axis=1)
+
+
+def gripper_tempo(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """The grippers are faster than the arms, or slower, by a share of up to the size."""
+    share = size * _own(rng).uniform(-1.0, 1.0)
+    tempo = 1 + share if share > 0 else 1 / (1 - share)
+    whole, _ = c.delayed(int(np.ceil(max(-share, 0.0) * len(c.positions))))
+    rows = np.arange(len(whole))
+    for column in c.grippers:
+        whole[:, column] = np.interp(tempo * rows, rows, whole[:, column])
+    return whole
+
+
+def hold_all(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """The first of the commands of every `size` [s] is held until the next."""
+    num = c.num(size)
+    if num < 2:
+        return c.positions
+    rows = np.arange(len(c.positions))
+    held = rows // num * num
+    blend = np.minimum((rows - held + 1) * c.period / _JUMP_S, 1.0)[:, None]
+    return (1 - blend) * c.positions[np.maximum(held - num, 0)] + blend * c.positions[held]
+
+
+def _average(positions: FloatArray, num: int) -> FloatArray:
+    """(T, J) moving average, `num` rows about each."""
+    if num < 2:
+        return positions
+    before = np.repeat(positions[:1], num // 2, axis=0)
+    after = np.repeat(positions[-1:], num - 1 - num // 2, axis=0)
+    padded = np.concatenate([before, positions, after])
+    return np.lib.stride_tricks.sliding_window_view(padded, num, axis=0).mean(axis=-1)
+
+
+def quantise(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """The arms are at multiples of the size [rad] from the first row on, and jump between them."""
+    steps = size * np.rint((c.positions - c.positions[0]) / size)
+    return c.arms_of(_average(c.positions[0] + steps, c.num(_JUMP_S)))
+
+
+def play(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """An arm joint stays where it is until its command is more than half the size off [rad]."""
+    slack = size / 2
+    return c.arms_of(_followed(c, lambda last, now: np.clip(last, now - slack, now + slack)))
+
+
+def stick(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """An arm joint stands until its command is more than the size off [rad], and jumps there."""
+    whole = _followed(c, lambda last, now: np.where(np.abs(now - last) <= size, last, now))
+    return c.arms_of(_average(whole, c.num(_JUMP_S)))
+
+
+def _of_one(
+    change: Callable[[Commands, FloatArray, float, Rng], FloatArray],
+) -> Callable[[Commands, float, Rng], FloatArray]:
+    """A primitive that changes the way (T,) of one of the arm joints that move, drawn."""
+
+    @wraps(change)
+    def primitive(c: Commands, size: float, rng: Rng) -> FloatArray:
+        own, whole = _own(rng), c.positions.copy()
+        joint = c.moving(own)
+        whole[:, joint] = change(c, whole[:, joint].copy(), size, own)
+        return whole
+
+    return primitive
+
+
+@_of_one
+def scale_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
+    """The joint lacks a share of its way."""
+    return way - size * (way - way[0])
+
+
+@_of_one
+def stop_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
+    """The joint stands still for a while [s], then catches up."""
+    first = int(rng.uniform(*_ONCE) * len(way))
+    after = np.maximum(np.arange(len(way)) - first - c.num(size), 0)
+    blend = np.minimum(after * c.period / _JUMP_S, 1.0)
+    return np.where(c.rows < first, way, way[first] + blend * (way - way[first]))
+
+
+@_of_one
+def limit_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
+    """The joint does not come to the ends of its travel, by a share."""
+    far = way - way[0]
+    return way[0] + np.clip(far, (1 - size) * far.min(), (1 - size) * far.max())
+
+
+@_of_one
+def bind_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
+    """The joint sticks at one place until its command is the size further [rad]."""
+    away = way - rng.uniform(way.min(), way.max())
+    side = away[0]
+    for row, far in enumerate(away):
+        if far * side < 0 and abs(far) < size:
+            way[row] -= far
+        elif far:
+            side = far
+    return _average(way[:, None], c.num(_JUMP_S))[:, 0]
+
+
+@_of_one
+def slip_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
+    """The joint skips to one side [rad], and is off from there on."""
+    first = int(rng.uniform(*_ONCE) * len(way))
+    return way + rng.choice((-size, size)) * c.ramp(_JUMP_S, c.times[first])
+
+
+def tow(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """A joint takes the next one of its arm along, by a share, to a side that is drawn."""
+    own, whole, ways = _own(rng), c.positions.copy(), size * (c.positions - c.positions[0])
+    for arm in c.arms:
+        whole[:, arm[1:]] += ways[:, arm[:-1]] * own.choice((-1.0, 1.0), len(arm) - 1)
+    return whole
+
+
+def lose_one_way(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """An arm joint loses a share of its way to one side, drawn, and its error adds up."""
+    sides = _own(rng).choice((-1.0, 1.0), c.positions.shape[1])
+    steps, whole = np.diff(c.positions, axis=0), c.positions.copy()
+    whole[1:] -= np.cumsum(np.where(steps * sides > 0, size * steps, 0.0), axis=0)
+    return c.arms_of(whole)
+
+
+def average(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """The commands of the arms are averaged over a time [s]."""
+    return c.arms_of(_average(c.positions, c.num(size)))
+
+
+def limit_speed(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """No arm joint turns faster than at its top speed less a share, and so it is behind."""
+    most = (1 - size) * np.abs(np.diff(c.positions, axis=0)).max(axis=0)
+    return c.arms_of(_followed(c, lambda last, now: last + np.clip(now - last, -most, most)))
+
+
+def lose_steps(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Once, the steps of the arms over a time [s] are lost, and never made up for."""
+    begin, num = int(float(_own(rng).uniform(*_ONCE)) * len(c.positions)), c.num(size)
+    steps, lost = np.diff(c.positions, axis=0), np.zeros_like(c.positions)
+    lost[begin + 1 : begin + 1 + num] = steps[begin : begin + num]
+    return c.arms_of(c.positions - np.cumsum(lost, axis=0))
+
+
+def sink_once(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Once, all tools sink by the size [m], and rise again."""
+    share = float(_own(rng).uniform(*_ONCE))
+    return _lowered(c, size * c.pulse(share * len(c.positions), *_SLUMP_S))
+
+
+def heave(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """All tools go up and down in waves [m], once they have set in."""
+    phase = float(_own(rng).uniform(0.0, 2 * np.pi))
+    return _lowered(c, size * c.ramp(_SET_IN_S) * np.sin(2 * np.pi * c.times / _HEAVE_S + phase))
+
+
+def _lowered(c: Commands, sunk: FloatArray) -> FloatArray:
+    """(T, J): all tools are lower by `sunk` (T,) [m].
+
+    A joint gives way by as much as its arm's weight turns it: by how much it lowers the tool.
+    """
+
+    def heights(at: FloatArray) -> FloatArray:
+        return np.stack([poses[:, 2, 3] for poses in c.robot.tool_poses(at)], axis=1)
+
+    now, slopes = heights(c.positions), np.zeros((c.num_arms, *c.positions.shape))
+    for joint in c.arms.ravel():
+        step = _STEP_RAD * (np.arange(c.positions.shape[1]) == joint)
+        slopes[:, :, joint] = ((heights(c.positions + step) - now) / _STEP_RAD).T
+    squares = np.maximum((slopes**2).sum(axis=2, keepdims=True), _LEAST_SLOPE)
+    return c.positions - (sunk[:, None] * slopes / squares).sum(axis=0)
+
+
+def fade(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """The later it is, the less far all arm joints go, by a share at the end."""
+    shares = np.linspace(0.0, size, len(c.positions))[:, None]
+    return c.arms_of(c.positions - shares * (c.positions - c.positions[0]))
+
+
+def warp(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """An arm joint is off by a wave over its angle [rad]; the plan begins where the arms are."""
+    phases = _own(rng).uniform(0.0, 2 * np.pi, c.positions.shape[1])
+    waves = np.sin(_NUM_WAVES * c.positions + phases)
+    return c.arms_of(c.positions + size * (waves - waves[0]))
+
+
+def swap_arms(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Once, the arms take a share of each other's commands."""
+    first = int(float(_own(rng).uniform(0.1, 0.9)) * len(c.positions))
+    weights = size * c.pulse(first, *_SWAP_S)[:, None]
+    others = c.positions[0] + crossed(c.positions, c.positions.shape[1] // c.num_arms)
+    return c.positions + weights * (others - c.positions)
+
+
+def swing(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """The arms follow as masses on springs do, with a period of the size [s]."""
+    angle = 2 * np.pi * c.period / size
+    damped = angle * np.sqrt(1 - _DAMPING**2)
+    decay, cos, sin = np.exp(-_DAMPING * angle), np.cos(damped), np.sin(damped)
+    part = _DAMPING * angle / damped
+    whole, speed = c.positions.copy(), np.zeros_like(c.positions[0])
+    for row in range(1, len(whole)):
+        away = whole[row - 1] - c.positions[row]
+        whole[row] += decay * ((cos + part * sin) * away + sin / damped * speed)
+        speed = decay * ((cos - part * sin) * speed - angle**2 / damped * sin * away)
+    return c.arms_of(whole)
+
+
+def freeze(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Commands of a time [s] are lost at a few places, where the last one holds."""
+    held, own = np.arange(len(c.positions)), _own(rng)
+    for first in (own.uniform(0.1, 0.9, _NUM_LOST) * len(held)).astype(int):
+        held[first : first + c.num(size)] = held[first]
+    return c.positions[held]
+
+
+def glitches(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """A number of glitches, drawn at random."""
+    return with_glitches(c, round(size), _own(rng))
+
+
+def error(c: Commands, size: float, rng: Rng, *, of: str) -> FloatArray:
+    """Adds one of `ERRORS` to the arms' commands."""
+    added = ERRORS[of](c, size, rng)
+    added[:, c.grippers] = 0.0
+    return c.positions + added
+
+
+def _offsets(c: Commands, size: float, rng: Rng) -> FloatArray:
+    drawn = _own(rng).normal(0.0, size, c.positions.shape[1])
+    return c.ramp(_SET_IN_S)[:, None] * drawn
+
+
+def _drifts(c: Commands, size: float, rng: Rng) -> FloatArray:
+    return c.times[:, None] * _own(rng).normal(0.0, size, c.positions.shape[1])
+
+
+def _mirrored(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Arms at rest mirror the motion of the arm before them in the order of the joints."""
+    is_still = (c.positions == c.positions[0]).astype(np.float64)
+    at_rest = _average(is_still, c.num(_SET_IN_S))
+    return size * at_rest * crossed(c.positions, c.positions.shape[1] // c.num_arms)
+
+
+def _tremors(c: Commands, size: float, rng: Rng) -> FloatArray:
+    phases = _own(rng).uniform(0.0, 2 * np.pi, c.positions.shape[1])
+    waves = np.sin(2 * np.pi * _TREMBLE_HZ * c.times[:, None] + phases)
+    return size * c.ramp(_SET_IN_S)[:, None] * waves
+
+
+def _spikes(c: Commands, size: float, rng: Rng) -> FloatArray:
+    own = _own(rng)
+    middles = own.uniform(0.1, 0.9, _NUM_SPIKES) * len(c.positions)
+    return _triangles(c, middles, c.positions.shape[1], size, own)
+
+
+def _kicks(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Whenever a gripper opens or closes, its arm jerks, once."""
+    is_open, own = c.robot.gripper_openings(c.positions) > 0.5, _own(rng)
+    arm = c.positions.shape[1] // len(is_open)
+    changes = (np.flatnonzero(np.diff(one)).astype(np.float64) for one in is_open)
+    return np.hstack([_triangles(c, rows, arm, size, own) for rows in changes])
+
+
+def _triangles(
+    c: Commands, middles: FloatArray, num_joints: int, deviation: float, rng: Rng
+) -> FloatArray:
+    """(T, J) short triangles about some rows, of heights drawn for each joint."""
+    away = np.abs(c.rows[:, None] - middles) * c.period / (_SPIKE_S / 2)
+    return np.maximum(1 - away, 0.0) @ rng.normal(0.0, deviation, (len(middles), num_joints))
+
+
+def _with_grippers(c: Commands, size: float, rng: Rng) -> FloatArray:
+    shut = 1 - c.robot.gripper_openings(c.positions).T
+    drawn = _own(rng).normal(0.0, size, c.positions.shape[1])
+    return np.repeat(shut, c.positions.shape[1] // c.num_arms, axis=1) * drawn
+
+
+def _slow_noise(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """(T, J) error, zero at first, drawn every half second and linear in between."""
+    knots = np.arange(0.0, c.times[-1] + 2 * _KNOT_S, _KNOT_S)
+    drawn = rng.normal(0.0, size, (len(knots), c.positions.shape[1]))
+    drawn[0] = 0.0
+    return np.stack([np.interp(c.times, knots, column) for column in drawn.T], axis=1)
+
+
+ERRORS: Mapping[str, Callable[[Commands, float, Rng], FloatArray]] = {
+    'offsets': _offsets,
+    'drifts': _drifts,
+    'mirrored_arm': _mirrored,
+    'tremors': _tremors,
+    'spikes': _spikes,
+    'kicks': _kicks,
+    'grippers': _with_grippers,
+    'slow_noise': _slow_noise,
+}
+
+
+def tempo(c: Commands, size: float, rng: Rng, *, faster: bool) -> FloatArray:
+    """All is faster or slower by a share, cut off or held at the end."""
+    last, speed = len(c.positions) - 1, 1 + size if faster else 1 / (1 + size)
+    return _read(np.minimum(np.arange(last + 1) * speed, last), c.positions)
+
+
+def opening_noise(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """A slow error of how far the grippers open, as a share of their range."""
+    added = _slow_noise(c, size, rng)[:, c.grippers] * c.travel
+    return c.grippers_of(c.positions[:, c.grippers] + added)
+
+
+def stop(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """After a share of the plan all stands still."""
+    whole, last = c.positions.copy(), int(size * (len(c.positions) - 1))
+    whole[last:] = whole[last]
+    return whole
+
+
+#: primitives in the order in which a policy's faults are applied
+COMMANDS: Mapping[str, Callable[..., FloatArray]] = {
+    change.__name__: change
+    for change in (
+        *(delay, lead, lag, give_way, flicker, pause_half_way, hurry, pause, jump, flinch, mix),
+        *(restart, shuffle, seams, delay_each, gripper_tempo, hold_all, quantise, play, stick),
+        *(scale_one, stop_one, limit_one, bind_one, slip_one, tow, lose_one_way, average),
+        *(limit_speed, lose_steps, sink_once, heave, fade, warp, swap_arms, swing, freeze),
+        *(glitches, error, tempo, opening_noise, stop),
+    )
+}

@@ -1,0 +1,145 @@
+"""Applies the faults of a policy variant to a move's way points and to a plan's commands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.core.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.core.errors import PolicyError
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.simulation.expert.way_points import Draws, Stops, WayPoint
+from mtv_world_ros.simulation.faults.catalogue import FAULTS, PolicyVariant
+from mtv_world_ros.simulation.faults.commands import COMMANDS, Commands
+from mtv_world_ros.simulation.faults.edits import edited
+from mtv_world_ros.simulation.faults.second_arm import Visit, visit_of
+
+#: way points of a move at most
+_MOST_STOPS = 40
+
+
+class WayPointFaults:
+    """The faults of a variant that change the way points of one move.
+
+    Which move, and to which side, is drawn from a generator of its own: siblings of a scene differ
+    by the kind and the size of their fault alone.
+
+    Args:
+        variant: the policy variant.
+        rng: generator that draws move and side.
+    """
+
+    def __init__(self, variant: PolicyVariant, rng: np.random.Generator) -> None:
+        # what a second arm does begins before all else
+        kinds = [(FAULTS[kind], size) for kind, size in variant.faults]
+        self._faults = sorted(kinds, key=lambda fault: bool(fault[0].second_arm))
+        self._move = float(rng.uniform())
+        self._drawn: dict[str, Any] = {
+            'angle': float(rng.uniform(0, 2 * np.pi)),
+            'sign': float(rng.choice((-1.0, 1.0))),
+            'errors': rng.normal(size=(_MOST_STOPS, 3)),
+            'openings': rng.normal(size=_MOST_STOPS),
+            'play': np.random.default_rng(rng.integers(2**32)),
+        }
+
+    @property
+    def keeps_tempo(self) -> bool:
+        """Whether added way points take time of their own; else they share the move's."""
+        return any(fault.keeps_tempo for fault, _ in self._faults)
+
+    def move_of(self, num_moves: int) -> int:
+        """Returns the number of the faulty move."""
+        return int(self._move * num_moves)
+
+    def draws(
+        self, yaw: float, objects: Sequence[FloatArray], other_home: FloatArray | None = None
+    ) -> Draws:
+        """Returns the random draws for the faulty move.
+
+        Args:
+            yaw: of its grasp [rad]; the fingers travel along it.
+            objects: (3,) centre of every object of the scene [m].
+            other_home: (3,) where another arm's tool rests [m].
+        """
+        return Draws(yaw=yaw, objects=objects, other_home=other_home, **self._drawn)
+
+    def applied(self, stops: Stops, draws: Draws) -> Stops:
+        """Returns the way points of a move with all faults, in the catalogue's order."""
+        for fault, size in self._faults:
+            stops = edited(fault.edits, stops, size, draws)
+        return stops
+
+    def visits(
+        self, stops: Stops, draws: Draws, home: WayPoint, times: Sequence[float]
+    ) -> list[Visit]:
+        """Returns the visits of a second arm during the move.
+
+        Args:
+            stops: way points of the move, with its faults.
+            draws: what is drawn for it.
+            home: way point at which the second arm rests.
+            times: of the way points, before scaling [s].
+        """
+        visits = (
+            visit_of(fault.second_arm, stops, size, draws, home, times)
+            for fault, size in self._faults
+            if fault.second_arm
+        )
+        return sorted(visits, key=lambda visit: (not visit.waits, not visit.is_timed, visit.meets))
+
+
+def with_faults(
+    plan: JointTrajectory, variant: PolicyVariant, robot: RobotModel, rng: np.random.Generator
+) -> JointTrajectory:
+    """Returns the plan (T, J) as a variant carries it out; joints stay within their limits.
+
+    Args:
+        plan: equally spaced.
+        variant: its faults of commands are applied.
+        robot: the robot that these joints belong to.
+        rng: generator that draws the noise.
+
+    Raises:
+        PolicyError: a fault of two arms, of a robot that has one, or of a gripper, of a robot
+            that has none.
+    """
+    refuse_robot(variant, robot)
+    commands = Commands(np.array(plan.positions), float(plan.times[1] - plan.times[0]), robot)
+    order = list(COMMANDS)
+    steps = [
+        (order.index(name), size * options.get('scale', 1.0), options)
+        for kind, size in variant.faults
+        for step in FAULTS[kind].commands
+        for name, options in step.items()
+    ]
+    for number, size, options in sorted(steps, key=lambda step: step[0]):
+        given = {key: value for key, value in options.items() if key != 'scale'}
+        commands = commands.at(COMMANDS[order[number]](commands, size, rng, **given))
+    return JointTrajectory(
+        joint_names=plan.joint_names,
+        times=commands.times,
+        positions=commands.positions,
+        velocities=np.gradient(commands.positions, commands.period, axis=0),
+    )
+
+
+def refuse_robot(variant: PolicyVariant, robot: RobotModel) -> None:
+    """Refuses faults that a robot cannot have.
+
+    Raises:
+        PolicyError: a fault of two arms, of a robot that has one, or of a gripper, of a robot
+            that has none.
+    """
+    arms, grippers = len(robot.tools), [t.gripper_joint for t in robot.tools if t.gripper_joint]
+    for need, lacks, what in (
+        ('two_arms', arms < 2, f"two arms, robot '{robot.name}' has {arms}"),
+        ('gripper', not grippers, f"a gripper, robot '{robot.name}' has none"),
+    ):
+        pairs = zip(dict(variant.sizes), variant.kinds, strict=True)
+        names = [name for name, kind in pairs if need in FAULTS[kind].needs]
+        if lacks and names:
+            raise PolicyError(
+                f"policy '{variant.name}': {', '.join(names)} takes {what}; leave it out"
+            )

@@ -1,0 +1,129 @@
+"""The base checkpoint of a training: a transformer to adapt, and frozen encoders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.core.errors import TrainingError
+from mtv_world_ros.model.card import CheckpointCard, SHARED_KEYS
+from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
+from mtv_world_ros.model.parts import check_video
+from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+from mtv_world_ros.training.adapter import add_adapter
+from mtv_world_ros.training.encoding import Encoders
+from mtv_world_ros.training.training_config import TrainingConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Base:
+    """A loaded checkpoint, ready to be trained.
+
+    Attributes:
+        folder: of the checkpoint.
+        checkpoint: its parts; the transformer has a new adapter where the preset trains one.
+        encoders: on the device.
+        digest: identifies its transformer's weights.
+    """
+
+    folder: Path
+    checkpoint: Checkpoint
+    encoders: Encoders
+    digest: str
+
+
+def needs_base(config: TrainingConfig) -> bool:
+    """Whether the preset trains on top of a checkpoint: an adapter, or a model with text."""
+    return config.lora.rank > 0 or config.transformer.get('context') != 'none'
+
+
+def load_base(
+    config: TrainingConfig,
+    folder: Path | None,
+    device: torch.device,
+    dtype: torch.dtype,
+    *,
+    seed: int,
+) -> Base:
+    """Loads a checkpoint and adds a new adapter, drawn by the seed, where the preset trains one.
+
+    Encoders have the number format of forward and backward, as in serving. umT5 is loaded to
+    encode the prompt, then freed.
+
+    Raises:
+        TrainingError: there is no folder, or its model is not the preset's.
+        CheckpointError: the checkpoint cannot be loaded.
+    """
+    if folder is None:
+        raise TrainingError(
+            'this preset trains on top of a checkpoint; give --init FOLDER, which '
+            "'mtv-world import-weights' makes of public weights"
+        )
+    loaded = load_checkpoint(folder, dtype=dtype)
+    _check_transformer(config, loaded.transformer, folder)
+    _check_card(config, loaded.card, folder)
+    autoencoder = place(loaded.autoencoder, device, dtype).eval().requires_grad_(False)
+    check_video(autoencoder, loaded.transformer.config, loaded.card.spec)
+    text = image = None
+    if loaded.text_encoder is not None and loaded.image_encoder is not None:
+        text = loaded.text_encoder.encode(loaded.card.prompt, device).clone()
+        image = loaded.image_encoder.to(device, dtype)
+    digest = _digest(loaded.transformer)
+    if config.lora.rank:
+        torch.manual_seed(seed)
+        add_adapter(loaded.transformer, rank=config.lora.rank, alpha=config.lora.alpha)
+    return Base(
+        folder=folder,
+        checkpoint=loaded,
+        encoders=Encoders(autoencoder=autoencoder, text=text, image=image, history=config.history),
+        digest=digest,
+    )
+
+
+def _check_transformer(
+    config: TrainingConfig, transformer: MultiViewWanTransformer, folder: Path
+) -> None:
+    held: Any = transformer.config
+    for name, wanted in config.transformer.items():
+        value = held.get(name)
+        if _plain(value) != _plain(wanted):
+            raise TrainingError(
+                f"the transformer of '{folder}' has {name} {value}, the preset {wanted}; give "
+                '--preset the one it was made with, or --init another checkpoint'
+            )
+
+
+def _check_card(config: TrainingConfig, card: CheckpointCard, folder: Path) -> None:
+    """An adapter is served with its base's card, so it has to be trained with it."""
+    mine = config.card({}).plain()
+    rendering = TrajectoryVideoConfig(**card.rendering).model_dump()
+    theirs = {**card.plain(), 'rendering': rendering}
+    for name in (*SHARED_KEYS, 'rendering', 'history'):
+        held, wanted = theirs.get(name), mine.get(name)
+        if _plain(held) != _plain(wanted):
+            section = f'video.{name}' if name in SHARED_KEYS else name
+            raise TrainingError(
+                f"'{folder}' says {name} {held} in world_model.json, the preset {wanted}; set "
+                f'{section} to the same, or make the checkpoint with this preset'
+            )
+
+
+def _digest(transformer: MultiViewWanTransformer) -> str:
+    """Digest of the first numbers of every tensor, in the coarsest number format."""
+    digest = hashlib.sha256()
+    for name, tensor in transformer.state_dict().items():
+        first = tensor.flatten()[:64].to('cpu', torch.bfloat16).view(torch.int16)
+        digest.update(name.encode() + first.numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _plain(value: Any) -> Any:
+    """Returns the value as JSON stores it: tuples become lists."""
+    return json.loads(json.dumps(value))

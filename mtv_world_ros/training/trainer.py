@@ -1,0 +1,417 @@
+"""The trainer: one loop, resumable at any step, in one process or many; its loss and export."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+import math
+from pathlib import Path
+import time
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from mtv_world_ros.core.errors import TrainingError
+from mtv_world_ros.model.card import OPTIONAL_KEYS, ROBOT_FOLDER
+from mtv_world_ros.model.checkpoint import (
+    Checkpoint,
+    load_checkpoint,
+    OBJECT_MOTION_FOLDER,
+    save_checkpoint,
+)
+from mtv_world_ros.model.conditioning import check_history
+from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
+from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.serving import compile_blocks
+from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+from mtv_world_ros.training.adapter import save_adapter
+from mtv_world_ros.training.averaged_weights import AveragedWeights
+from mtv_world_ros.training.base_checkpoint import Base
+from mtv_world_ros.training.batches import BatchSource, ClipBatch
+from mtv_world_ros.training.distributed import memory_errors_named, Processes
+from mtv_world_ros.training.encoding import drop_conditions, encode_batch, EncodedBatch, Encoders
+from mtv_world_ros.training.latent_cache import CachedSource
+from mtv_world_ros.training.objective import (
+    add_noise,
+    draw_sigmas,
+    Loss,
+    NoiseDraws,
+    sample_loss,
+    sigma_weights,
+)
+from mtv_world_ros.training.resume import (
+    architecture,
+    check_card,
+    load_state,
+    read_card,
+    save_state,
+    STATE,
+)
+from mtv_world_ros.training.self_rollout import SelfRollout
+from mtv_world_ros.training.training_config import OptimizerConfig, TrainingConfig
+
+#: losses averaged for the progress bar and the log
+_WINDOW = 50
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepReport:
+    """Report of a step.
+
+    Attributes:
+        step: its number, from 1.
+        loss: over all clips of the step, of all processes.
+        average: of the recent losses.
+        learning_rate: of the step.
+        grad_norm: before clipping.
+        seconds: duration, waiting included.
+        waited: seconds of it spent waiting for the batch.
+    """
+
+    step: int
+    loss: float
+    average: float
+    learning_rate: float
+    grad_norm: float
+    seconds: float = math.nan
+    waited: float = math.nan
+
+
+def learning_rate(step: int, config: OptimizerConfig) -> float:
+    """Rate of a step (from 0): warm-up, constant, then linear to zero over the last share."""
+    warm = min(1.0, (step + 1) / max(config.warmup, 1))
+    decay_steps = max(1, round(config.decay_share * config.steps))
+    left = (config.steps - step) / decay_steps
+    return config.learning_rate * min(warm, max(0.0, min(1.0, left)))
+
+
+class Trainer:
+    """Trains the transformer of a preset.
+
+    Every process computes the clips of `clips`, a share of each step's; errors, weights and
+    float32 gradients are summed over the processes, so that all make the same step.
+
+    Args:
+        config: the preset.
+        folder: gets state, logs and checkpoints.
+        seed: of weights, noise and batches.
+        device: e.g. `cpu`, `cuda`.
+        dtype: of forward and backward; master weights stay float32.
+        trained_on: entry of the checkpoint's card.
+        processes: that train together; None: those that the launcher started.
+        base: checkpoint to train on top of; None: all weights are new.
+
+    Raises:
+        TrainingError: fewer clips per step than processes times accumulated parts.
+    """
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        folder: Path,
+        *,
+        seed: int,
+        device: str,
+        dtype: torch.dtype,
+        trained_on: dict[str, object],
+        processes: Processes | None = None,
+        base: Base | None = None,
+    ) -> None:
+        torch.manual_seed(seed)
+        settings = config.optimizer
+        self.processes = processes or Processes(device)
+        self.clips = self._clips(settings)
+        self.config, self.folder, self.seed = config, Path(folder), seed
+        self.device = self.processes.device
+        self.trained_on, self.base = trained_on, base
+        if base is None:
+            autoencoder = place(build_autoencoder(config.autoencoder), self.device, torch.float32)
+            self.encoders = Encoders(autoencoder=autoencoder, history=config.history)
+            transformer = MultiViewWanTransformer(**config.transformer)
+        else:
+            self.encoders, transformer = base.encoders, base.checkpoint.transformer
+        check_history(config.history, self.encoders.autoencoder, transformer.config)
+        if settings.gradient_checkpointing:
+            transformer.enable_gradient_checkpointing()
+        self.weights = AveragedWeights(transformer, self.device, dtype, settings.ema_decay)
+        if settings.compile:
+            compile_blocks(self.weights.worker, self.device)
+        self.optimizer = torch.optim.AdamW(
+            self.weights.parameters,
+            lr=settings.learning_rate,
+            betas=(0.9, 0.95),
+            weight_decay=settings.weight_decay,
+        )
+        self.step = 0
+        self._object_motion: Path | None = None
+        self._recent: deque[float] = deque(maxlen=_WINDOW)
+
+    def _clips(self, settings: OptimizerConfig) -> range:
+        count, parts = self.processes.count, settings.accumulation
+        if settings.batch_size < count * parts:
+            raise TrainingError(
+                f'optimizer.batch_size is {settings.batch_size}, less than {count} processes x '
+                f'{parts} accumulated parts; raise it, or start fewer processes'
+            )
+        return self.processes.share(settings.batch_size)
+
+    def start_from(self, folder: Path) -> None:
+        """Loads the weights of a checkpoint of the same architecture; the optimizer state is new.
+
+        Its physics (`object_motion/`) comes along where robot and views are the same and
+        `rendering.object_motion` is on.
+
+        Raises:
+            CheckpointError: the folder holds no checkpoint.
+            TrainingError: its transformer is of another shape.
+        """
+        loaded = load_checkpoint(folder)
+        theirs, video = loaded.card, self.config.video
+        if not self.config.rendering.object_motion:
+            self._object_motion = None  # its trajectory videos will not show what is foreseen
+        elif (theirs.robot, len(theirs.spec.views)) == (video.robot, len(video.views)):
+            self._object_motion = loaded.object_motion
+        elif loaded.object_motion is not None and self.processes.is_main:
+            tqdm.write(
+                f"what foresees objects in '{folder}' is left out: it is of robot "
+                f"'{theirs.robot}' with {len(theirs.spec.views)} views; run fit-contact"
+            )
+        given = loaded.transformer.state_dict()
+        try:
+            self.weights.worker.load_state_dict(given)
+        except RuntimeError as error:
+            there, here = dict(loaded.transformer.config), dict(self.weights.worker.config)
+            differ = [
+                f'{name} is {there.get(name)} there and {value} here'
+                for name, value in here.items()
+                if not name.startswith('_') and there.get(name) != value
+            ]
+            raise TrainingError(
+                f"'{folder}' does not fit the preset's transformer: {'; '.join(differ) or error}. "
+                'Give --preset the one it was trained with, set what differs '
+                '(--set transformer.NAME=VALUE), or leave --init out'
+            ) from error
+        self.weights.load(given)
+        self.weights.ema.shadow_params = [p.detach().clone() for p in self.weights.parameters]
+
+    def run(
+        self,
+        source: BatchSource | CachedSource,
+        *,
+        save_every: int,
+        on_save: Callable[[int], None],
+        save_seconds: float = math.inf,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> Iterator[StepReport]:
+        """Trains to `config.optimizer.steps`, yielding a report for each step.
+
+        When `should_stop` says so in any of the processes, the state is saved and the reports
+        end early.
+
+        Args:
+            source: makes the clips of `clips`.
+            save_every: steps between saved states.
+            on_save: called with the step after each save, in the main process only.
+            save_seconds: longest time between saved states [s].
+            should_stop: asked after each step.
+
+        Raises:
+            TrainingError: the loss is not finite, the device is out of memory, a state cannot be
+                written, or another process is gone; the last saved state stays whole.
+        """
+        rollout = self._self_rollout(source)
+        saved, stops = time.monotonic(), False
+        while self.step < self.config.optimizer.steps and not stops:
+            started = time.perf_counter()
+            batch = source.batch(self.step)
+            waited = time.perf_counter() - started
+            if rollout is not None and isinstance(batch, ClipBatch) and any(batch.lead_ins):
+                with self.weights.averaged_worker() as transformer:
+                    batch = rollout.apply(batch, transformer)
+            with memory_errors_named(self.device):
+                report = self.train_step(batch)
+            self.step += 1
+            yield replace(report, seconds=time.perf_counter() - started, waited=waited)
+            stops = self.processes.any(should_stop())
+            due = self.step % save_every == 0 or self.step == self.config.optimizer.steps
+            due |= stops or time.monotonic() - saved >= save_seconds
+            if due and self.processes.is_main:
+                self.save_state()
+                on_save(self.step)
+                saved = time.monotonic()
+
+    def _self_rollout(self, source: BatchSource | CachedSource) -> SelfRollout | None:
+        """What imagines the start frames of clips; None where all start from recorded ones."""
+        if not self.config.self_rollout.share or not isinstance(source, BatchSource):
+            return None
+        return SelfRollout(
+            source.controls,
+            self.encoders,
+            build_scheduler(self.config.scheduler),
+            num_inference_steps=self.config.sampling.num_inference_steps,
+            seed=self.seed,
+            device=self.device,
+        )
+
+    def loss(self, batch: ClipBatch | EncodedBatch) -> Loss:
+        """The loss of a batch, or of a part of one."""
+        draws = NoiseDraws(self.seed, batch.step, batch.numbers)
+        worker = self.weights.worker
+        return batch_loss(worker, self.encoders, batch, self.config, draws, self.device)
+
+    def gradients(self, batch: ClipBatch | EncodedBatch) -> float:
+        """Leaves the gradients of a step in the float32 weights and returns the step's loss.
+
+        Raises:
+            TrainingError: the loss is not finite, or another process is gone.
+        """
+        sums = torch.zeros(2, device=self.device)
+        for parameter in self.weights.parameters:
+            parameter.grad = None
+        for part in batch.parts(self.config.optimizer.accumulation):
+            loss = self.loss(part)
+            sums += torch.stack([loss.total.detach(), loss.weight]).float()
+            loss.total.backward()
+            self.weights.collect()
+        total, weight = self.processes.summed(sums).tolist()
+        if not math.isfinite(total / weight):
+            raise TrainingError(
+                f'the loss is {total / weight} at step {self.step}; the last good state is in '
+                f"'{self.folder / STATE}'; lower optimizer.learning_rate"
+            )
+        found = [p.grad for p in self.weights.parameters if p.grad is not None]
+        self.processes.sum_into(found)
+        torch._foreach_div_(found, weight)
+        return total / weight
+
+    def train_step(self, batch: ClipBatch | EncodedBatch) -> StepReport:
+        """Makes a step with this process's part of its clips."""
+        loss = self.gradients(batch)
+        settings, parameters = self.config.optimizer, self.weights.parameters
+        norm = torch.nn.utils.clip_grad_norm_(parameters, settings.max_grad_norm)
+        rate = learning_rate(self.step, settings)
+        for group in self.optimizer.param_groups:
+            group['lr'] = rate
+        self.optimizer.step()
+        self.weights.ema.step(parameters)
+        self.weights.share()
+        self._recent.append(loss)
+        return StepReport(
+            step=self.step + 1,
+            loss=loss,
+            average=math.fsum(self._recent) / len(self._recent),
+            learning_rate=rate,
+            grad_norm=norm.item(),
+        )
+
+    def save_state(self) -> None:
+        """Writes everything a resumed run needs, atomically."""
+        card = {'step': self.step, 'recent': list(self._recent), **self._identity()}
+        save_state(self.folder, self.weights, self.optimizer, card)
+
+    def _identity(self) -> dict[str, Any]:
+        """Values that must be the same in a resumed run."""
+        return {
+            **architecture(self.config),
+            'seed': self.seed,
+            'base': self.base and self.base.digest,
+        }
+
+    def load_state(self) -> bool:
+        """Continues from the saved state; returns whether there was one.
+
+        Raises:
+            TrainingError: the state is damaged, or of another model, seed or base.
+        """
+        card = read_card(self.folder)
+        if card is None:
+            return False
+        check_card(self.folder, card, self._identity())
+        load_state(self.folder, self.weights, self.optimizer)
+        self._recent.extend(card.get('recent', []))
+        self.step = card['step']
+        return True
+
+    @property
+    def result(self) -> Path:
+        """Folder of the result: a checkpoint, or an adapter for the base."""
+        return self.folder / ('adapter' if self.config.lora.rank else 'checkpoint')
+
+    def export(self, folder: Path, *, dtype: torch.dtype = torch.float16) -> None:
+        """Writes the averaged weights, with all other parts of a checkpoint beside them.
+
+        Of an adapter, which is in float32, the weights that are trained beside it and its card.
+        """
+        base = self.base
+        theirs = base.checkpoint.card.plain() if base else {}  # prompt and guidance
+        card = self.config.card({**self.trained_on, 'steps': self.step, 'seed': self.seed})
+        card = card.replace(**{name: theirs[name] for name in OPTIONAL_KEYS if name in theirs})
+        if self.config.lora.rank:
+            averages = self.weights.averages()
+            return save_adapter(self.weights.worker, folder, weights=averages, card=card)
+        # what `fit-contact` put there stays
+        mine = folder / OBJECT_MOTION_FOLDER
+        parts = Checkpoint(
+            transformer=self.weights.averaged(),
+            autoencoder=self.encoders.autoencoder,
+            scheduler=build_scheduler(self.config.scheduler),
+            card=card,
+            object_motion=mine if mine.is_dir() else self._object_motion,
+            robot=self.robot,
+            text_encoder=base and base.checkpoint.text_encoder,
+            image_encoder=base and base.checkpoint.image_encoder,
+        )
+        save_checkpoint(parts, folder, dtype=dtype)
+
+    @property
+    def robot(self) -> Path | None:
+        """Folder of the robot that checkpoints carry, where `train` has put one."""
+        folder = self.folder / ROBOT_FOLDER
+        return folder if folder.is_dir() else None
+
+
+def batch_loss(
+    transformer: MultiViewWanTransformer,
+    encoders: Encoders,
+    batch: ClipBatch | EncodedBatch,
+    config: TrainingConfig,
+    draws: NoiseDraws,
+    device: torch.device,
+) -> Loss:
+    """Returns the loss of a batch, or of what a latent cache holds of one, as sums over its clips.
+
+    Transformer and encoders are on the device; noise levels, noise and what is dropped are drawn
+    for each clip.
+    """
+    objective, dtype = config.objective, transformer.dtype
+    if isinstance(batch, ClipBatch):
+        batch = encode_batch(encoders, batch, objective, device)
+    clean = batch.clean
+    sigmas = draw_sigmas(draws, objective)
+    noise = draws.normal(*clean.shape[1:]).to(device)
+    noisy = add_noise(clean, noise, sigmas.to(device))
+    cond = batch.conditioning
+    if transformer.start_image == 'either':
+        cond = cond.with_one_start()
+    cond = drop_conditions(cond, config.augment, draws)
+    if cond.history is not None:
+        cond = cond.with_noisy_history(draws.normal(*cond.history.shape[1:]).to(device))
+    cond = cond.in_dtype(dtype)
+    predicted = transformer(
+        noisy.to(dtype),
+        (sigmas * 1000).to(device),
+        control=cond.control,
+        start=cond.start,
+        reference=cond.reference,
+        start_control=cond.start_control,
+        encoder_hidden_states=None if cond.text is None else cond.text.to(dtype),
+        encoder_hidden_states_image=None if cond.image is None else cond.image.to(dtype),
+        anchor=cond.anchor,
+        history=cond.history,
+        history_timestep=cond.history_timestep,
+    )
+    target = clean if transformer.prediction == 'sample' else noise - clean
+    by_sigma = sigma_weights(sigmas, objective).to(device)
+    return sample_loss(predicted, target, batch.weights, objective.huber_delta, by_sigma)

@@ -1,0 +1,354 @@
+"""Training presets, and a training as a whole: preset, data, where and how it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import ceil
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.core.config import (
+    Count,
+    expected,
+    Factor,
+    ListOf,
+    read_yaml,
+    Schema,
+    Share,
+    validated,
+    Wait,
+)
+from mtv_world_ros.core.data_types import WorldModelSpec
+from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.files import bundled
+from mtv_world_ros.data.bag_mapping import EpisodeSource
+from mtv_world_ros.model.card import CheckpointCard, HistorySettings, TRAJECTORY_VIDEO
+
+#: in a loss
+Weight = Annotated[float, Field(ge=0, le=1000)]
+
+
+class VideoConfig(Schema):
+    """What the model sees and predicts."""
+
+    section: ClassVar = 'video'
+
+    views: ListOf[str] = ('low', 'high')
+    fps: float = Field(default=5.0, gt=0, le=1000, description='frames a second')
+    num_frames: Count = Field(default=16, description='T, predicted frames of a chunk')
+    width: Count = Field(default=96, description='[px]')
+    height: Count = Field(default=72, description='[px]')
+    robot: str = 'yam_bimanual'
+    object_mask: bool = Field(
+        default=True, description="the trajectory video carries the objects' masks"
+    )
+    clip_stride_s: Wait = Field(
+        default=0.0,
+        description='time between starts of training clips [s]; 0 = one from every frame',
+    )
+
+
+class ObjectiveConfig(Schema):
+    """The loss: see `objective.py`."""
+
+    section: ClassVar = 'objective'
+
+    sigma_shift: Factor = Field(default=5.0, description='draws noise levels towards high noise')
+    full_noise_share: Share = Field(
+        default=0.25, description='share of samples at noise level 1, where sampling starts'
+    )
+    sigma_weighting: Literal['uniform', 'middle'] = Field(
+        default='uniform',
+        description="weight of a sample by its noise level; `middle` is DiffSynth-Studio's",
+    )
+    huber_delta: Annotated[
+        float | None, Field(gt=0, le=1000), expected('positive, or null for the squared error')
+    ] = Field(default=0.1, description='in units of the latents; null = squared error, as Wan')
+    change_weight: Weight = Field(
+        default=4.0, description='extra weight of pixels that differ from the start frame'
+    )
+    object_weight: Weight = Field(default=6.0, description='extra weight of pixels on objects')
+    moved_weight: Weight = Field(
+        default=10.0, description='extra weight of pixels where objects came or went'
+    )
+
+
+class AugmentConfig(Schema):
+    """Disturbances of the start frame and of colours, and which episodes are seen how often."""
+
+    section: ClassVar = 'augment'
+
+    start_noise: Share = Field(
+        default=0.5, description='probability of a start frame that is blurred and noisy'
+    )
+    start_noise_std: Share = Field(
+        default=0.04,
+        description='largest standard deviation of that noise, as a share of full range',
+    )
+    colour_permutation: Share = Field(
+        default=0.3, description='probability of exchanged colour channels'
+    )
+    failure_share: Share | None = Field(
+        default=None,
+        description='share of clips drawn from failed episodes alone, on top of those that come '
+        'by chance: they are few, and a model that rarely sees a miss imagines grasps instead',
+    )
+    name_dropout: Share = Field(
+        default=0.0,
+        description='probability of a clip of which only some objects, or none, are named, so '
+        'that what an instruction does not name stays in the picture',
+    )
+    control_dropout: Share = Field(
+        default=0.0, description='probability of a sample without its trajectory video'
+    )
+    reference_dropout: Share = Field(
+        default=0.0, description='probability of a sample without its reference image'
+    )
+    start_dropout: Share = Field(
+        default=0.0, description="probability of a sample without its start image's channel slot"
+    )
+    image_dropout: Share = Field(
+        default=0.0, description="probability of a sample without its start image's CLIP tokens"
+    )
+
+
+class HistoryConfig(HistorySettings):
+    """How clips are shown what came before them; see `clips/clip_controls.py`."""
+
+    max_noise: Annotated[float, Field(ge=0, lt=1)] = Field(
+        default=0.3,
+        description='noise levels are drawn from 0 to this; serving uses `noise_level`',
+    )
+    first_share: Share = Field(
+        default=0.3,
+        description='share of clips that start a rollout, without anything before them',
+    )
+    dropout: Share = Field(
+        default=0.1, description='probability that a clip within a rollout has no history tokens'
+    )
+
+    @model_validator(mode='after')
+    def _serving_shows_nothing_new(self) -> Self:
+        if self.noise_level > self.max_noise:
+            raise ValueError(
+                f'max_noise is {self.max_noise}; it must be below 1 and at least '
+                f'history.noise_level, {self.noise_level}, so that serving shows nothing new'
+            )
+        return self
+
+
+class SelfRolloutConfig(Schema):
+    """Clips that start from the end of the model's own rollout; see `self_rollout.py`."""
+
+    section: ClassVar = 'self_rollout'
+
+    share: Share = Field(
+        default=0.0,
+        description="probability of a clip that starts where the model's own rollout of the "
+        'chunks before it ends, if the episode is long enough; 0 = off',
+    )
+    max_chunks: Count = Field(
+        default=2, description='longest rollout [chunks]; all lengths from 1 on are equally likely'
+    )
+    start_step: int = Field(default=0, ge=0, description='first training step with such clips')
+
+
+class SamplingConfig(Schema):
+    """How its checkpoints are sampled unless told otherwise."""
+
+    section: ClassVar = 'sampling'
+
+    num_inference_steps: Count = Field(default=4, description='denoising steps')
+    guidance_scale: float = Field(
+        default=1.0,
+        ge=-1000,
+        le=1000,
+        description='of models with text; 1 = no guidance, and half the work',
+    )
+    negative_prompt: str = Field(default='', description='text that guidance leads away from')
+
+
+class OptimizerConfig(Schema):
+    """AdamW with warm-up, a constant stretch and a linear decay to zero."""
+
+    section: ClassVar = 'optimizer'
+
+    learning_rate: float = Field(default=6e-4, ge=0, le=100, description='after the warm-up')
+    weight_decay: Weight = 0.01
+    warmup_steps: int = Field(
+        default=200, description='of the learning rate; at most a fifth of the steps'
+    )
+    decay_share: Share = Field(
+        default=0.35, description='share of the steps in which the rate decays'
+    )
+    max_grad_norm: float = Field(
+        default=1.0, gt=0, le=1e6, description='longer gradients are scaled down to it'
+    )
+    ema_decay: Share = Field(default=0.999, description='of the averaged weights, the checkpoint')
+    batch_size: int = Field(
+        default=4, description='clips of a step, over all processes and accumulated parts'
+    )
+    accumulation: int = Field(
+        default=1,
+        description='parts that a process computes one after the other; more take less memory',
+    )
+    gradient_checkpointing: bool = Field(
+        default=False, description='recompute blocks in the backward pass instead of keeping them'
+    )
+    compile: bool = Field(
+        default=False, description="compile the transformer's repeated block; minutes on a CPU"
+    )
+    steps: int = Field(default=5000, description='of the whole training')
+    epochs: Annotated[float | None, expected('positive, or null')] = Field(
+        default=None,
+        gt=0,
+        le=1e6,
+        description='instead of `steps`: a multiple of the number of clips',
+    )
+
+    @property
+    def warmup(self) -> int:
+        """Steps of the warm-up, shorter than `warmup_steps` in a short training."""
+        return min(self.warmup_steps, self.steps // 5)
+
+    @model_validator(mode='after')
+    def _parts_have_clips(self) -> Self:
+        if not 1 <= self.accumulation <= self.batch_size:
+            raise ValueError(
+                f'accumulation is {self.accumulation}, must be 1 to '
+                f'optimizer.batch_size, {self.batch_size}'
+            )
+        return self
+
+
+class LoraSettings(Schema):
+    """A LoRA adapter on frozen weights, see `lora.py`."""
+
+    section: ClassVar = 'lora'
+
+    rank: Annotated[int, expected('positive, at most 4096, or 0 for none')] = Field(
+        default=0, ge=0, le=4096, description='0 = all weights are trained'
+    )
+    alpha: Factor = 32.0
+
+
+class TrainingConfig(Schema):
+    """A whole preset."""
+
+    section: ClassVar = ''
+
+    transformer: dict[str, Any] = Field(
+        default={}, description='arguments of `MultiViewWanTransformer`'
+    )
+    autoencoder: dict[str, Any] = Field(default={}, description='arguments of the autoencoder')
+    scheduler: dict[str, Any] = Field(default={}, description='arguments of the noise schedule')
+    video: VideoConfig = VideoConfig()
+    rendering: TrajectoryVideoConfig = TrajectoryVideoConfig()
+    objective: ObjectiveConfig = ObjectiveConfig()
+    augment: AugmentConfig = AugmentConfig()
+    history: HistoryConfig = HistoryConfig()
+    self_rollout: SelfRolloutConfig = SelfRolloutConfig()
+    sampling: SamplingConfig = SamplingConfig()
+    lora: LoraSettings = LoraSettings()
+    optimizer: OptimizerConfig = OptimizerConfig()
+
+    @property
+    def spec(self) -> WorldModelSpec:
+        """What a model of this configuration takes and gives."""
+        return self.card({}).spec
+
+    def with_steps(self, num_clips: int) -> TrainingConfig:
+        """Returns a copy with `epochs` converted to steps, if it counts in epochs."""
+        optimizer = self.optimizer
+        if optimizer.epochs is None:
+            return self
+        steps = max(1, ceil(optimizer.epochs * num_clips / optimizer.batch_size))
+        return self.replace(optimizer=optimizer.replace(steps=steps))
+
+    def card(self, trained_on: Mapping[str, Any], **text: Any) -> CheckpointCard:
+        """Returns the checkpoint's card; `trained_on` says where weights come from."""
+        return CheckpointCard(
+            **self.video.model_dump(mode='json', exclude={'clip_stride_s'}),
+            control=TRAJECTORY_VIDEO,
+            rendering=self.rendering.model_dump(),
+            **self.history.as_card(),
+            num_inference_steps=self.sampling.num_inference_steps,
+            trained_on=dict(trained_on),
+            **text,
+        )
+
+
+class TrainingRun(Schema):
+    """A training as a whole: preset, data, device, saving."""
+
+    section: ClassVar = ''
+
+    config: TrainingConfig = Field(description='the preset')
+    dataset: Path | ListOf[Path] = Field(description='folder of episodes, or the episode folders')
+    out: Path = Field(
+        description='gets `state/` (to resume), `log.jsonl`, TensorBoard events and `checkpoint/`'
+    )
+    num_episodes: Count | None = Field(
+        default=None, description='use this many episodes, spread evenly over the data set'
+    )
+    broken: dict[str, str] = Field(
+        default={}, description='episodes to leave out, and why, by path'
+    )
+    source: EpisodeSource = Field(
+        default=EpisodeSource(),
+        description="how episodes are read that are not this package's own",
+    )
+    initial: Path | None = Field(
+        default=None,
+        description='checkpoint whose weights a new run starts from; a resumed run has its own. '
+        'For an adapter or a model with text, its other parts are used too, also when resumed',
+    )
+    seed: int = Field(default=0, description='of weights, noise and batches')
+    device: str = Field(default='cpu', description='e.g. `cpu`, `cuda`')
+    dtype: str = Field(
+        default='float32', description='of forward and backward, of `runtime.choose_dtype`'
+    )
+    save_every: Count = Field(default=250, description='steps between saved states')
+    save_minutes: float = Field(
+        default=10.0, ge=0, le=1e5, description='longest time between saved states [min]'
+    )
+    cache: Path | None = Field(
+        default=None,
+        description="keeps the recordings at the model's size; default: `out/cache`. Runs may "
+        'share it',
+    )
+    latent_cache: Path | None = Field(
+        default=None,
+        description='keeps what the encoders make of the clips; None = encode in every step',
+    )
+    data_workers: int = Field(
+        default=0, ge=0, description='processes that prepare clips; 0 = a thread of this one'
+    )
+    peak_tflops: float | None = Field(
+        default=None,
+        ge=0,
+        le=1e6,
+        description="peak rate of a process's device [10^12 operations/s], for the utilisation in "
+        'the log; 0 = measure it, None = log no utilisation',
+    )
+
+
+def load_training_config(
+    preset: str | Path, overrides: Mapping[str, Any] | None = None
+) -> TrainingConfig:
+    """Reads a preset by name (`small`) or path, and lays overrides like `optimizer.steps` on it.
+
+    Raises:
+        ConfigError: no such preset, an unknown key (names the nearest known one) or wrong value.
+    """
+    path = bundled('models', preset, '--preset')
+    values = read_yaml(path, 'preset file', '--preset') or {}
+    for dotted, value in (overrides or {}).items():
+        section, _, key = dotted.partition('.')
+        if not key:
+            raise ConfigError(f"override '{dotted}' must look like section.key, e.g. video.fps")
+        values.setdefault(section, {})[key] = value
+    return validated(TrainingConfig, values, str(path))

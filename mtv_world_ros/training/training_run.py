@@ -1,0 +1,553 @@
+"""`mtv-world train`: from a folder of episodes to a checkpoint."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+import json
+import math
+from pathlib import Path
+import signal
+import threading
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from mtv_world_ros.cameras.calibration_file import save_calibration
+from mtv_world_ros.cameras.camera import camera_poses, project
+from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.core.bounded_input import read_json
+from mtv_world_ros.core.data_types import CameraModel, WorldModelSpec
+from mtv_world_ros.core.errors import (
+    ConfigError,
+    EpisodeError,
+    MtvWorldError,
+    TrainingError,
+    TrainingInterrupted,
+)
+from mtv_world_ros.core.files import write_whole
+from mtv_world_ros.data.bag_mapping import EpisodeSource
+from mtv_world_ros.data.episode_reader import list_episodes, read_info
+from mtv_world_ros.data.recording import DEFAULT, Recording
+from mtv_world_ros.data.recordings import cached_recording, clip_starts, described_objects
+from mtv_world_ros.model.card import CAMERAS, CARD, read_card, ROBOT_FOLDER
+from mtv_world_ros.model.runtime import check_device, choose_dtype
+from mtv_world_ros.robot.file import save_robot
+from mtv_world_ros.robot.model import check_positions, RobotModel
+from mtv_world_ros.robot.shape import moving_links
+from mtv_world_ros.training.base_checkpoint import load_base, needs_base
+from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.distributed import Processes
+from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
+from mtv_world_ros.training.latent_cache import cached, CachedSource
+from mtv_world_ros.training.log import TrainingLog
+from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
+from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
+from mtv_world_ros.vision.describers.describer import Describer
+from mtv_world_ros.vision.segmenters.segmenter import Segmenter
+
+
+def find_episodes(dataset: Path) -> list[Path]:
+    """Returns the episode folders (those with a `metadata.yaml`) below a folder, sorted.
+
+    Raises:
+        TrainingError: there is none.
+    """
+    found = list_episodes(dataset)
+    if not found:
+        raise TrainingError(
+            f"'{dataset}' holds no episodes (folders with metadata.yaml and an .mcap); record "
+            "some with 'ros2 bag record -s mcap' or 'mtv-world collect'"
+        )
+    return found
+
+
+def spread(paths: Sequence[Path], count: int | None) -> list[Path]:
+    """Returns `count` of them, spread evenly: the first ones by name are all of one task."""
+    if count is None or count >= len(paths):
+        return list(paths)
+    return [paths[index * len(paths) // count] for index in range(count)]
+
+
+def load_recordings(
+    paths: Sequence[Path],
+    spec: WorldModelSpec,
+    robot: RobotModel,
+    cache: Path,
+    source: EpisodeSource = DEFAULT,
+    describer: Describer | None = None,
+    broken: Mapping[str, str] = MappingProxyType({}),
+) -> tuple[list[Recording], dict[str, str]]:
+    """Returns the usable recordings, and the reason for each one left out, by path.
+
+    Args:
+        paths: folders of episodes.
+        spec: sizes and rates of the model's inputs and outputs.
+        robot: kinematics and limits of the recorded robot.
+        cache: folder of the decoded recordings.
+        source: topics and calibration of the episodes.
+        describer: names the objects; None = the names stored with the episodes, else those of
+            the instructions.
+        broken: why episodes are to be left out, by path.
+
+    Raises:
+        TrainingError: none is usable.
+        DiskError: the cache cannot be written.
+    """
+    recordings, skipped = [], {}
+    for path in tqdm(paths, desc='reading episodes', unit='ep', disable=None):
+        try:
+            if str(path) in broken:
+                raise EpisodeError(broken[str(path)])
+            with disk_errors_named(cache):
+                recording = cached_recording(path, spec, robot, cache, source)
+            check_clips(recording, spec)
+            check_recording(recording, robot)
+            if describer is not None:
+                named = described_objects(path, describer, spec.views[0], source)
+                recording = replace(recording, described=named)
+        except DiskError:
+            raise
+        except MtvWorldError as error:
+            skipped[str(path)] = str(error)
+        else:
+            recordings.append(recording)
+    if not recordings:
+        reasons = '; '.join(counted(skipped) or ['none given'])
+        raise TrainingError(f'no usable episode: {_other_robot(paths, robot)}{reasons}')
+    return recordings, skipped
+
+
+#: joints outside their limits by more are of another unit, zero or robot [rad or m]
+_LIMIT_TOLERANCE = 0.05
+#: joints that move more between two frames change the picture, by more than this [grey levels]
+_MOVES, _SAME_PICTURE = 0.02, 0.02
+#: share of the frames in which joints move that may stay as they were
+_MOST_FROZEN = 0.5
+#: joints so far beside the picture may still show their links [share of its size]
+_MARGIN = 0.1
+#: episodes that are named with the reason why they were left out
+_NAMED = 3
+
+
+def check_recording(recording: Recording, robot: RobotModel) -> None:
+    """Refuses what would teach nonsense: joints in another unit, views that show no robot.
+
+    Raises:
+        TrajectoryError: measured joints are far outside their limits.
+        EpisodeError: a view never has the arm in its picture, or hardly changes while the joints
+            move.
+    """
+    check_positions(robot, recording.positions, tolerance=_LIMIT_TOLERANCE)
+    _check_arm_is_seen(recording, robot)
+    moves = np.abs(np.diff(recording.positions, axis=0)).max(axis=1) > _MOVES
+    if moves.sum() < 3:
+        return
+    for view, frames in zip((camera.view for camera in recording.cameras), recording.frames,
+                            strict=True):  # fmt: skip
+        pairs = zip(frames[:-1][moves], frames[1:][moves], strict=True)
+        changes = np.array([np.abs(b.astype(np.int16) - a).mean() for a, b in pairs])
+        share = float((changes < _SAME_PICTURE).mean())
+        if share > _MOST_FROZEN:
+            raise EpisodeError(
+                f"view '{view}': {share:.0%} of the frames in which joints move are the same as "
+                'the one before: frozen, or no view of this robot (see mtv-world doctor)'
+            )
+
+
+def _check_arm_is_seen(recording: Recording, robot: RobotModel) -> None:
+    moving = moving_links(robot)
+    points = np.concatenate(robot.kinematics(recording.positions).arm_points)
+    for camera in recording.cameras:
+        if camera.mount_link in moving or camera.view in recording.camera_tracks:
+            continue
+        poses = camera_poses(camera, robot, recording.positions)
+        pixels, _ = project(camera, poses, points)
+        size = np.array([camera.width, camera.height])
+        if not ((pixels > -_MARGIN * size) & (pixels < (1 + _MARGIN) * size)).all(-1).any():
+            raise EpisodeError(
+                f"view '{camera.view}' never sees the arm, by its calibration: no joint is ever "
+                'in the picture; leave the view out with --views, or calibrate it anew '
+                '(mtv-world calibrate-camera)'
+            )
+
+
+def _other_robot(paths: Sequence[Path], robot: RobotModel) -> str:
+    """What to set where the first episode is of a robot of another name; else empty."""
+    with suppress(MtvWorldError, IndexError):
+        name = read_info(paths[0]).robot
+        if name not in ('', robot.name):
+            return (
+                f"they are of robot '{name}', and video.robot is '{robot.name}'; give --set "
+                'video.robot=FILE (of imported episodes: robot/robot.yaml beside them): '
+            )
+    return ''
+
+
+def train(
+    run: TrainingRun,
+    *,
+    robot: RobotModel,
+    segmenter: Segmenter,
+    describer: Describer | None = None,
+    held_out: HeldOut | None = None,
+) -> Path:
+    """Trains, resuming what `run.out` holds, and returns the folder of the result.
+
+    That is a checkpoint, or an adapter for the checkpoint `run.initial` where the preset trains
+    one. Started by `torchrun` or `accelerate launch`, each process trains a share of every step's
+    clips, and the main one alone writes; `out` and `cache` must be the same for all.
+
+    Args:
+        run: preset, data, device, saving.
+        robot: of the episodes.
+        segmenter: finds the objects of the first frames.
+        describer: names the objects; None = see `load_recordings`.
+        held_out: scores checkpoints on held-out episodes and keeps the best.
+
+    Raises:
+        ConfigError: the device is not there.
+        TrainingInterrupted: Ctrl-C or SIGTERM; the state of the last step is saved.
+        TrainingError: no usable episode, the loss is not finite, another process is gone, or `out`
+            holds a training of another architecture.
+        DiskError: a file cannot be written.
+    """
+    config = run.config.replace(video=run.config.video.replace(robot=robot.name))  # not a path
+    out, dtype = run.out, choose_dtype(run.dtype, run.device)
+    check_device(run.device)
+    check_architecture(out, config)
+    processes = Processes(run.device)
+    out.mkdir(parents=True, exist_ok=True)
+    paths = find_episodes(run.dataset) if isinstance(run.dataset, Path) else run.dataset
+    with processes.main_first():
+        recordings, skipped = load_recordings(
+            spread(paths, run.num_episodes),
+            config.spec,
+            robot,
+            run.cache or out / 'cache',
+            run.source,
+            describer,
+            run.broken,
+        )
+    _save_robot(robot, recordings, out / ROBOT_FOLDER, processes)
+    source: BatchSource | CachedSource = BatchSource(
+        recordings,
+        config,
+        robot=robot,
+        segmenter=segmenter,
+        seed=run.seed,
+        workers=run.data_workers,
+        numbers=processes.share(config.optimizer.batch_size),
+    )
+    base = None
+    if needs_base(config):
+        base = load_base(config, run.initial, processes.device, dtype, seed=run.seed)
+    if run.latent_cache is not None:
+        with processes.main_first():
+            source = cached(
+                source,
+                run.latent_cache,
+                config,
+                base,
+                seed=run.seed,
+                dtype=dtype,
+                processes=processes,
+            )
+    trainer = Trainer(
+        config.with_steps(source.num_clips),
+        out,
+        seed=run.seed,
+        device=run.device,
+        dtype=dtype,
+        trained_on={
+            'episodes': len(recordings),
+            'skipped': len(skipped),
+            'tasks': sorted({recording.task for recording in recordings}),
+            'clips': source.num_clips,
+        },
+        processes=processes,
+        base=base,
+    )
+    with processes.main_first():
+        resumed = trainer.load_state()
+    if run.initial is not None and base is None and not resumed:
+        trainer.start_from(run.initial)
+    if resumed and processes.is_main and _steps_of(trainer.result) != trainer.step:
+        trainer.export(trainer.result)  # killed after the state was saved
+    if processes.is_main:
+        write_whole(out / 'skipped.json', json.dumps(skipped, indent=2))
+        tqdm.write(
+            f'{len(recordings)} episodes, {len(skipped)} left out (see {out / "skipped.json"}), '
+            f'{source.num_clips} clips, {num_dropped(recordings, config.spec)} dropped for '
+            f'gaps; {"resumed at" if resumed else "starting from"} step {trainer.step}; '
+            f'{processes.count} processes'
+        )
+        left_out = [f'left out: {line}' for line in counted(skipped)]
+        told = notes(trainer.config, recordings, None if resumed else run.initial)
+        for line in [*left_out, *told]:
+            tqdm.write(line)
+    ideal = None
+    if run.peak_tflops is not None and processes.is_main:
+        peak = 1e12 * run.peak_tflops or measured_peak(processes.device, dtype)
+        ideal = ideal_seconds(config, dtype, peak * processes.count)
+    try:
+        with disk_errors_named(out):
+            _loop(trainer, source, run, held_out, ideal)
+    finally:
+        source.close()
+    return trainer.result
+
+
+def _save_robot(
+    robot: RobotModel, recordings: Sequence[Recording], folder: Path, processes: Processes
+) -> None:
+    """Puts what checkpoints carry of the robot and its cameras into a folder."""
+    if robot.file is None or not processes.is_main:
+        return
+    with disk_errors_named(folder):
+        save_robot(robot.file, folder)
+        cameras = common_cameras(recordings)
+        if cameras is not None:
+            save_calibration(folder / CAMERAS, {camera.view: camera for camera in cameras})
+
+
+def notes(
+    config: TrainingConfig, recordings: Sequence[Recording], initial: Path | None = None
+) -> list[str]:
+    """What a user should know of a training before it runs.
+
+    Args:
+        config: of the training.
+        recordings: it learns from.
+        initial: checkpoint whose weights it starts from.
+    """
+    found, optimizer = [], config.optimizer
+    if initial is not None:
+        found += _drawn_otherwise(config.rendering, read_card(initial).rendering)
+    if optimizer.warmup < optimizer.warmup_steps:
+        found.append(
+            f'the learning rate warms up over {optimizer.warmup} steps, a fifth of the training, '
+            f'instead of optimizer.warmup_steps = {optimizer.warmup_steps}'
+        )
+    common = common_cameras(recordings)
+    if common is None:
+        kinds = len({tuple(_camera_key(camera) for camera in r.cameras) for r in recordings})
+        found.append(
+            f'the episodes have {kinds} different calibrations, none of them that of more than '
+            'half: the checkpoint gets no default calibration, and the node needs '
+            "'calibration_file'"
+        )
+        return found
+    usual = tuple(_camera_key(camera) for camera in common)
+    others = [
+        recording.path.name
+        for recording in recordings
+        if tuple(_camera_key(camera) for camera in recording.cameras) != usual
+    ]
+    if others:
+        more = ', ...' * (len(others) > _NAMED)
+        found.append(
+            f'episodes of other calibrations than most: {len(others)} '
+            f'({", ".join(others[:_NAMED])}{more}); each is drawn by its own'
+        )
+    return found
+
+
+def _drawn_otherwise(now: TrajectoryVideoConfig, before: Mapping[str, Any]) -> list[str]:
+    """What a checkpoint was trained to read in trajectory videos and will not be shown."""
+    other = [
+        f'rendering.{name}={json.dumps(value)}'
+        for name, value in before.items()
+        if value != now.model_dump().get(name)
+    ]
+    if not other:
+        return []
+    return [
+        'the weights that it starts from were trained with ' + ', '.join(other) + ', which is '
+        'drawn otherwise here: give --set for each to go on with what they know'
+    ]
+
+
+def common_cameras(recordings: Sequence[Recording]) -> tuple[CameraModel, ...] | None:
+    """Returns the calibration that more than half of the recordings have, or None."""
+    keys = [tuple(_camera_key(camera) for camera in r.cameras) for r in recordings]
+    key, count = Counter(keys).most_common(1)[0]
+    return recordings[keys.index(key)].cameras if 2 * count > len(keys) else None
+
+
+def _camera_key(camera: CameraModel) -> tuple[object, ...]:
+    numbers = np.concatenate([camera.K.ravel(), camera.T_mount_camera.ravel(), camera.distortion])
+    model = (camera.view, camera.mount_link, camera.distortion_model)
+    return (*model, *numbers.round(6).tolist())
+
+
+def _best_score(file: Path) -> float:
+    """Score of the best checkpoint so far; the lowest where none is known."""
+    try:
+        return float(read_json(file)['score'])
+    except (OSError, ValueError, LookupError, TypeError):
+        return -math.inf
+
+
+def _steps_of(result: Path) -> int | None:
+    """Steps that a checkpoint or adapter was trained for; None if there is none."""
+    card = result / CARD
+    return read_card(result).trained_on['steps'] if card.is_file() else None
+
+
+def _loop(
+    trainer: Trainer,
+    source: BatchSource | CachedSource,
+    run: TrainingRun,
+    held_out: HeldOut | None,
+    ideal: float | None,
+) -> None:
+    folder, is_main = trainer.folder, trainer.processes.is_main
+    total = trainer.config.optimizer.steps
+    log = TrainingLog(folder, step=trainer.step, total=total, active=is_main, ideal_seconds=ideal)
+    with StopSignals() as signals, log:
+        reports = trainer.run(
+            source,
+            save_every=run.save_every,
+            save_seconds=60 * run.save_minutes,
+            on_save=lambda _: trainer.export(trainer.result),
+            should_stop=signals.came,
+        )
+        for report in reports:
+            log.add(report)
+            if held_out is not None and is_main:
+                held_out.after(report.step, trainer, log)
+    if trainer.step < total:
+        raise TrainingInterrupted(
+            f"stopped at step {trainer.step} of {total}, which is saved in '{folder / STATE}'",
+            signals.number or signal.SIGTERM,
+        )
+
+
+class StopSignals:
+    """Notes SIGINT and SIGTERM in place of their effect; a second one has its effect again.
+
+    A context manager; outside the main thread, which alone gets signals, it does nothing.
+
+    Attributes:
+        number: of the signal that came; 0 = none.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._before: dict[signal.Signals, Any] = {}
+
+    def came(self) -> bool:
+        """Whether one came."""
+        return self.number != 0
+
+    def __enter__(self) -> StopSignals:
+        if threading.current_thread() is threading.main_thread():
+            for kind in (signal.SIGINT, signal.SIGTERM):
+                self._before[kind] = signal.signal(kind, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for kind, handler in self._before.items():
+            signal.signal(kind, handler)
+        self._before.clear()
+
+    def _note(self, number: int, _: object) -> None:
+        self.number = number
+        tqdm.write('saving after this step; once more to stop at once')
+        self.__exit__()
+
+
+def check_clips(recording: Recording, spec: WorldModelSpec) -> None:
+    """Refuses an episode too short for a clip.
+
+    Raises:
+        EpisodeError: the episode is too short, or frames are missing everywhere.
+    """
+    if len(clip_starts(recording, spec)):
+        return
+    periods = np.diff(recording.times)
+    rate = 1 / float(np.median(periods)) if len(periods) else 0.0
+    if 0 < rate < 0.7 * spec.fps:
+        raise EpisodeError(
+            f"episode '{recording.path}' has {rate:.3g} frames a second, fewer than the model's "
+            f'{spec.fps:g}: set video.fps to {rate:.3g} or less'
+        )
+    raise EpisodeError(
+        f"episode '{recording.path}' is too short, or has too large gaps, for a clip of "
+        f'{spec.num_frames} frames at {spec.fps} Hz ({spec.chunk_seconds:.1f} s)'
+    )
+
+
+def counted(skipped: Mapping[str, str]) -> list[str]:
+    """Returns a line for each reason with the names of its first episodes, the frequent first.
+
+    Args:
+        skipped: reasons by the episode's path.
+    """
+    episodes: dict[str, list[str]] = {}
+    for path, reason in skipped.items():
+        name = Path(path).name
+        said = reason.replace(path, '...').replace(f"'{name}'", "'...'")
+        episodes.setdefault(said, []).append(name)
+    frequent = sorted(episodes.items(), key=lambda item: -len(item[1]))
+    return [
+        f'{len(names)} x {reason} ({", ".join(names[:_NAMED])}{", ..." * (len(names) > _NAMED)})'
+        for reason, names in frequent
+    ]
+
+
+def num_dropped(recordings: Sequence[Recording], spec: WorldModelSpec) -> int:
+    """Returns how many clips cannot be cut because frames are missing within them."""
+    dropped = 0
+    for recording in recordings:
+        last = recording.times[-1] - spec.chunk_seconds + 1e-6
+        dropped += int((recording.times <= last).sum())
+        dropped -= int((recording.times[clip_starts(recording, spec)] <= last).sum())
+    return dropped
+
+
+_BEST = 'best.json'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldOutScores:
+    """Score of a checkpoint on held-out episodes (NaN = undefined), and numbers by name."""
+
+    score: float
+    numbers: Mapping[str, float]
+
+
+#: scores the checkpoint in a folder at a step; injected, since training does not import evaluation
+Judge = Callable[[Path, int], HeldOutScores]
+
+
+class HeldOut:
+    """Scores checkpoints by a judge at every so many steps of a training, and at the last one.
+
+    Raises:
+        ConfigError: `every` is not positive.
+    """
+
+    def __init__(self, judge: Judge, every: int) -> None:
+        if every < 1:
+            raise ConfigError(f'--sample-every is {every}; give at least 1 step')
+        self._judge, self._every = judge, every
+
+    def after(self, step: int, trainer: Trainer, log: TrainingLog) -> None:
+        """Scores the averaged weights if due; the best go to the result's folder with `-best`."""
+        if step % self._every and step != trainer.config.optimizer.steps:
+            return
+        folder = trainer.folder
+        trainer.export(trainer.result)
+        judged = self._judge(trainer.result, step)
+        log.write(step, dict(judged.numbers))
+        best = folder / _BEST
+        if judged.score > _best_score(best):
+            trainer.export(folder / f'{trainer.result.name}-best')
+            write_whole(best, json.dumps({'step': step, 'score': judged.score}))

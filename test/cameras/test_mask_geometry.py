@@ -1,0 +1,71 @@
+"""Leans of long objects from their masks."""
+
+import cv2
+import numpy as np
+import pytest
+
+from mtv_world_ros.cameras.camera import project
+from mtv_world_ros.cameras.mask_geometry import lean
+from mtv_world_ros.core.data_types import CameraModel
+from mtv_world_ros.core.transforms import looking_along
+
+PLACE = np.array([0.05, 0.35, 0.1])
+
+
+def make_camera(position, distortion=(0.1, -0.05)):
+    """A camera at a position that looks at `PLACE`, and its pose."""
+    K = np.array([[150.0, 0, 64], [0, 150.0, 48], [0, 0, 1]])
+    camera = CameraModel(
+        view='low', width=128, height=96, K=K, distortion_model='plumb_bob',
+        distortion=np.array([*distortion, 0, 0, 0]), mount_link='base_link',
+        T_mount_camera=np.eye(4),
+    )  # fmt: skip
+    pose = np.eye(4)
+    pose[:3, :3] = looking_along(PLACE - position)
+    pose[:3, 3] = position
+    return camera, pose
+
+
+def make_mask(camera, pose, axis):
+    """The mask of a rod of 12 cm."""
+    ends = PLACE + 0.06 * np.outer([-1, 1], axis / np.linalg.norm(axis))
+    (a, b), _ = project(camera, pose, ends)
+    mask = np.zeros((camera.height, camera.width), np.uint8)
+    cv2.line(mask, np.round(16 * a).astype(int), np.round(16 * b).astype(int), 1, 7, shift=4)
+    return mask.astype(bool)
+
+
+def seen_lean(axis, *positions):
+    cameras, poses = zip(*[make_camera(np.array(p)) for p in positions], strict=True)
+    masks = [make_mask(c, pose, axis) for c, pose in zip(cameras, poses, strict=True)]
+    return lean(cameras, poses, masks)
+
+
+LOW, SIDE, ABOVE = (0.0, -0.4, 0.3), (0.9, 0.3, 0.4), (0.1, 0.1, 0.9)
+
+
+@pytest.mark.parametrize(('x', 'y'), [(0, 0), (0.3, 0), (-0.4, 0), (0, 0.35), (0.3, -0.3)])
+def test_two_views_tell_a_lean_in_any_direction(x, y):
+    axis = np.array([x, y, np.sqrt(1 - x**2 - y**2)])
+    assert seen_lean(axis, LOW, SIDE) == pytest.approx([x, y], abs=0.04)
+    assert seen_lean(-axis, LOW, SIDE) == pytest.approx([x, y], abs=0.04)
+
+
+@pytest.mark.parametrize('x', [-0.5, -0.2, 0.0, 0.2, 0.5])
+def test_views_from_one_side_tell_a_lean_across_their_line_of_sight(x):
+    axis = np.array([x, 0, np.sqrt(1 - x**2)])
+    low, high = (0.05, -0.4, 0.2), (0.05, -0.2, 0.8)
+    assert seen_lean(axis, low) == pytest.approx([x, 0], abs=0.05)
+    assert seen_lean(axis, low, high) == pytest.approx([x, 0], abs=0.05)
+
+
+def test_a_lean_along_the_line_of_sight_is_not_made_up():
+    along = seen_lean(np.array([0, 0.4, np.sqrt(1 - 0.16)]), (0.05, -0.4, 0.2))
+    assert np.linalg.norm(along) < 0.05
+
+
+def test_a_round_mask_tells_nothing():
+    camera, pose = make_camera(np.array(ABOVE))
+    mask = np.zeros((96, 128), np.uint8)
+    cv2.circle(mask, (60, 50), 9, 1, -1)
+    assert np.abs(lean([camera], [pose], [mask.astype(bool)])).max() < 0.02

@@ -1,0 +1,24 @@
+from mtv_world_ros.cli.demo.run_demo import sheet_notes
+
+_J = {'j_object_mean': 0.8, 'j_moving': 0.5, 'j_copy_mean': 0.7, 'j_copy_moving': 0.25}
+
+
+def test_the_sheet_has_a_line_of_every_view():
+    views = ('low', 'high', 'left wrist')
+    report = {
+        'views': {view: _J | {'j_moving': 0.1 * k} for k, view in enumerate(views)},
+        'success_by_chunk': [0.25, None],
+        'outcome': 'success',
+        'latency_s': [1.5],
+        'lead_s': [0.5],
+        'chunks': 2,
+        'frames_received': 32,
+        'frames_published': 32,
+        'real_time_factor': 1.0,
+    }
+    notes = sheet_notes(report, views)
+    assert [note.split(' moving objects: J ')[0].strip() for note in notes[:3]] == [*views]
+    assert [note.split()[note.split().index('J') + 1] for note in notes[:3]] == [
+        '0.000,', '0.100,', '0.200,',
+    ]  # fmt: skip
+    assert '0.25, abstains (recorded outcome: success)' in notes[3] and len(notes) == 6

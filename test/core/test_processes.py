@@ -1,0 +1,133 @@
+"""Processes that stand still are found and ended."""
+
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+from worker_jobs import LongJobs, make_held_back, make_stopping
+
+from mtv_world_ros.core.errors import MtvWorldError, TrainingError
+from mtv_world_ros.core.processes import stop_process, STOPPED_S, StoppedProcesses
+from mtv_world_ros.core.worker_pool import run_all, run_job, WorkerPool
+from mtv_world_ros.training.batches import ClipWorkers
+
+
+@pytest.fixture
+def child():
+    """A process that waits, and takes signals by now.
+
+    It sleeps in short pieces: Python sees a signal that arrives just before a sleep after it.
+    """
+    code = 'import time\nprint(flush=True)\nwhile True: time.sleep(0.05)'
+    with subprocess.Popen([sys.executable, '-c', code], stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline()
+        yield process
+        process.kill()
+
+
+def test_one_that_stands_still_is_named_and_one_at_work_is_not(child):
+    stopped = StoppedProcesses()
+    child.send_signal(signal.SIGSTOP)
+    begin_s = time.monotonic()
+    while not (said := stopped.report({'child': child, 'self': child})):
+        assert time.monotonic() - begin_s < 12 * STOPPED_S
+        time.sleep(0.1)
+    assert "'child' was stopped" in said and time.monotonic() - begin_s >= STOPPED_S
+    child.send_signal(signal.SIGCONT)
+    time.sleep(0.3)
+    assert not stopped.report({'child': child})
+
+
+def test_one_that_stands_still_hears_that_it_is_to_end(child):
+    child.send_signal(signal.SIGSTOP)
+    stop_process(child)
+    assert child.poll() == -signal.SIGINT  # it is killed where it hears nothing
+
+
+def test_a_stopped_worker_is_an_error_within_seconds():
+    begin_s, done = time.monotonic(), []
+    with pytest.raises(MtvWorldError, match='2 workers died'):
+        for number, result in run_all([1, 2, 3, 4], make_stopping, 2):
+            assert number == result
+            done.append(number)
+    assert done and 3 not in done
+    assert time.monotonic() - begin_s < 60.0
+
+
+def test_forked_workers_that_note_sigterm_as_training_does_end_with_a_broken_pool():
+    before = signal.signal(signal.SIGTERM, lambda *_: None)
+    workers = ClipWorkers(lambda step, number: os.getpid(), 2)
+    try:
+        (pid, _) = workers.clips(0, (0, 1))
+        os.kill(pid, signal.SIGKILL)
+        with pytest.raises(TrainingError, match='was killed at step 1'):
+            for _ in range(100):
+                workers.clips(1, (0, 1))
+                time.sleep(0.01)
+    finally:
+        begin_s = time.monotonic()
+        workers.close()
+        signal.signal(signal.SIGTERM, before)
+    assert time.monotonic() - begin_s < 12 * STOPPED_S
+
+
+#: the pool of OpenCV's threads has been used before clips are made
+AFTER_OPENCV = """
+import os, time, cv2, numpy as np
+from mtv_world_ros.training.batches import ClipWorkers
+cv2.setNumThreads(3)
+image, grid = np.zeros((600, 600), np.uint8), np.zeros((600, 600), np.float32)
+tasks = len(os.listdir('/proc/self/task'))
+cv2.remap(image, grid, grid, cv2.INTER_LINEAR)
+assert len(os.listdir('/proc/self/task')) > tasks, 'OpenCV has no pool here'
+time.sleep(0.5)  # its threads wait
+workers = ClipWorkers(lambda step, number: cv2.remap(image, grid, grid, 1).sum(), 2)
+assert workers.clips(0, (0, 1)) == [0, 0]
+workers.close()
+"""
+
+
+def test_forked_workers_begin_after_opencv_had_threads():
+    """Its pool does not survive the fork: whoever waits for its threads waits for ever."""
+    subprocess.run([sys.executable, '-c', AFTER_OPENCV], check=True, timeout=180)
+
+
+def test_an_interrupted_command_does_not_wait_for_the_jobs_of_its_workers(tmp_path):
+    def interrupt():
+        while not list(tmp_path.iterdir()):
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    threading.Thread(target=interrupt, daemon=True).start()
+    begin_s = time.monotonic()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            list(run_all([1, 2, 3], LongJobs(tmp_path), 2))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert time.monotonic() - begin_s < 45.0  # of a busy machine; a job takes 60
+    assert not [pid for pid in tmp_path.iterdir() if is_alive(pid.name)]
+
+
+def is_alive(pid):
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.parametrize('method', ['spawn', 'fork'])
+def test_a_worker_neither_gets_nor_holds_back_the_ctrl_c_of_a_terminal(method):
+    pool = WorkerPool(make_held_back, 1, method=method)
+    try:
+        found = pool.submit(run_job).result(60)
+    finally:
+        pool.shutdown()
+    assert found == (False, True)
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])

@@ -1,0 +1,110 @@
+import os
+import signal
+import sys
+
+import pytest
+
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+from mtv_world_ros.core.worker_pool import score_all, score_with_ray
+
+
+@pytest.fixture
+def make_scorer():
+    """Classes made here travel to Ray's processes, which cannot import this file, by value."""
+
+    class Half:
+        def __init__(self, job):
+            self.job = job
+
+        def as_json(self):
+            return {'job': self.job, 'half': self.job / 2, 'nothing': float('nan')}
+
+    class HalfScorer:
+        def score(self, job):
+            if job == 3:
+                raise MtvWorldError('three has no half')
+            return Half(job)
+
+    return HalfScorer
+
+
+@pytest.fixture
+def ray_environment():
+    """Ray is installed; what it sets in this process is given back."""
+    pytest.importorskip('ray', reason="Ray is not installed: pip install 'mtv_world_ros[rank]'")
+    environment, handler = dict(os.environ), signal.getsignal(signal.SIGTERM)
+    yield
+    os.environ.clear()
+    os.environ.update(environment)
+    signal.signal(signal.SIGTERM, handler)
+
+
+@pytest.fixture
+def make_mortal(make_scorer, tmp_path):
+    """A scorer whose process dies of a job, as often as the job says."""
+    base, folder = make_scorer, tmp_path
+
+    class Mortal(base):
+        def score(self, job):
+            name, deaths = job
+            died = len(list(folder.glob(f'{name}_*')))
+            if died < deaths:
+                (folder / f'{name}_{died}').touch()
+                os._exit(1)
+            return super().score(name)
+
+    return Mortal
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures('ray_environment')
+def test_a_job_whose_ray_worker_died_goes_to_another(make_mortal, capsys):
+    jobs = [(1, 0), (2, 2), (4, 0)]
+    found = dict(score_with_ray(jobs, make_mortal, 3))
+    assert {job[0]: outcome['half'] for job, outcome in found.items()} == {1: 0.5, 2: 1.0, 4: 2.0}
+    assert capsys.readouterr().out.count('a Ray worker died') == 2
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures('ray_environment')
+def test_a_job_that_ray_workers_die_of_is_an_error_after_three(make_mortal):
+    jobs = [(5, 9), *((number, 0) for number in (6, 8, 10))]
+    with pytest.raises(MtvWorldError, match='3 Ray workers died of the same job'):
+        dict(score_with_ray(jobs, make_mortal, 4))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures('ray_environment')
+def test_without_a_ray_worker_left_it_is_an_error(make_mortal):
+    with pytest.raises(MtvWorldError, match='all Ray workers died'):
+        dict(score_with_ray([(7, 9)], make_mortal, 1))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures('ray_environment')
+def test_more_ray_workers_than_cores_wait_and_do_no_harm(make_scorer):
+    workers = 1 + (os.cpu_count() or 1)
+    found = dict(score_with_ray(range(4, 9), make_scorer, workers))
+    assert {job: outcome['half'] for job, outcome in found.items()} == {
+        job: job / 2 for job in range(4, 9)
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures('ray_environment')
+def test_ray_scores_as_processes_do(make_scorer):
+    jobs = [1, 2, 3, 4]
+    found = dict(score_with_ray(jobs, make_scorer, 1))
+    assert found == dict(score_all(jobs, make_scorer, 1, 1))
+    assert found[3] == 'three has no half' and found[4] == {'job': 4, 'half': 2.0, 'nothing': None}
+
+
+def test_without_ray_the_extra_is_named(make_scorer, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'ray', None)
+    with pytest.raises(ConfigError, match=r'mtv_world_ros\[rank\].*--workers'):
+        next(score_with_ray([1], make_scorer, 1))
+
+
+def test_less_than_one_worker_is_refused(make_scorer):
+    with pytest.raises(ConfigError, match='workers is 0'):
+        next(score_with_ray([1], make_scorer, 0))

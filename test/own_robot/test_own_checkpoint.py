@@ -1,0 +1,86 @@
+"""A checkpoint of a robot that is not in config/ carries it, and loads from anywhere."""
+
+import json
+import shutil
+
+from crane import load, make_cameras, make_positions, write_episode
+import pytest
+from sources import set_options, TINY_MODEL
+
+from mtv_world_ros.cameras.calibration_file import load_calibration
+from mtv_world_ros.cli import main
+from mtv_world_ros.core.errors import CalibrationError, CheckpointError, ConfigError
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.robot.shape import load_shape
+from mtv_world_ros.rollout.assembly import checkpoint_cameras, checkpoint_robot
+
+TINY = set_options(
+    {
+        **TINY_MODEL,
+        'transformer.frames_per_token': 2,
+        'video.num_frames': 2,
+        'optimizer.warmup_steps': 1,
+        'optimizer.steps': 2,
+    }
+)
+
+
+@pytest.fixture(scope='module')
+def trained(tmp_path_factory):
+    """Folder with `dataset/` and a checkpoint that was moved away from robot and training."""
+    folder = tmp_path_factory.mktemp('crane')
+    robot, cameras = load(folder), make_cameras()
+    del cameras['palm']
+    write_episode(folder / 'dataset' / 'one', robot, cameras, make_positions(3.0))
+    command = ['train', str(folder / 'dataset'), '--out', str(folder / 'run')]
+    command += ['--views', 'door,window', '--threads', '1', f'--set=video.robot={robot.file}']
+    assert main([*command, *TINY]) == 0
+    shutil.move(folder / 'run' / 'checkpoint', folder / 'elsewhere')
+    shutil.rmtree(folder / 'run')
+    shutil.rmtree(folder / 'crane')
+    return folder
+
+
+def test_it_carries_robot_shapes_and_calibration(trained):
+    robot = checkpoint_robot(trained / 'elsewhere')
+    assert robot.name == 'crane'
+    assert json.loads((trained / 'elsewhere/world_model.json').read_text())['robot'] == 'crane'
+    shape = load_shape(robot)
+    assert shape.is_known and 'hand' in {part.link for part in shape.parts}
+    cameras = load_calibration(checkpoint_cameras(trained / 'elsewhere'))
+    assert list(cameras) == ['door', 'window']
+
+
+def test_evaluate_and_replay_take_it_without_flags(trained, capsys, monkeypatch):
+    monkeypatch.chdir(trained)
+    options = ['--no-ceiling', '--actions', 'true', '--threads', '1', '--no-report']
+    assert main(['evaluate', 'elsewhere', 'dataset', '--out', 'scores', *options]) == 0
+    assert (trained / 'scores' / 'metrics.json').is_file()
+    command = ['replay', 'dataset/one', '--offline', '--checkpoint', 'elsewhere', '--out', 'said']
+    assert main([*command, '--threads', '1']) == 0, capsys.readouterr().err
+
+
+def test_another_file_of_the_same_robot_can_be_given_but_not_another_robot(trained, tmp_path):
+    copy = shutil.copytree(trained / 'elsewhere' / 'robot', tmp_path / 'mine')
+    assert checkpoint_robot(trained / 'elsewhere', copy / 'robot.yaml').file.parent == copy
+    with pytest.raises(CheckpointError, match="trained with robot 'crane'"):
+        checkpoint_robot(trained / 'elsewhere', 'yam_bimanual')
+
+
+def test_older_checkpoints_find_their_robot_by_name_or_path(trained, tmp_path):
+    assert checkpoint_robot('bundled').name == 'yam_bimanual'
+    assert checkpoint_cameras('bundled').is_file()
+    older = tmp_path / 'older'
+    older.mkdir()
+    card = json.loads((trained / 'elsewhere' / 'world_model.json').read_text())
+    card['robot'] = str(trained / 'elsewhere' / 'robot' / 'robot.yaml')
+    (older / 'world_model.json').write_text(json.dumps(card))
+    assert checkpoint_robot(older).name == 'crane'
+    with pytest.raises(CalibrationError, match='no default calibration'):
+        checkpoint_cameras(older)
+    card['robot'] = str(tmp_path / 'gone.yaml')
+    (older / 'world_model.json').write_text(json.dumps(card))
+    with pytest.raises(ConfigError, match=r'gone.yaml.* does not exist'):
+        checkpoint_robot(older)
+    yam = share_path('config', 'robots', 'yam_bimanual.yaml')
+    assert checkpoint_robot(older, yam).name == 'yam_bimanual'

@@ -1,0 +1,89 @@
+"""The page on which points are clicked, in a browser: what it saves is where the clicks were."""
+
+import json
+from urllib.parse import unquote
+
+from browser import Browser
+from crane import load, make_cameras, make_positions, write_episode
+import numpy as np
+import pytest
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.inspection.cameras.shared_camera import load_points
+
+#: of frame f, number k of all, `at` clicks a pixel of the recorded image (320 px wide)
+CLICK = (
+    "const all = [...document.querySelectorAll('.frame')];"
+    'for (const [k, f] of all.entries()) {'
+    "const i = f.querySelector('img'), b = i.getBoundingClientRect(), s = b.width / 320;"
+    "const at = (x, y) => i.dispatchEvent(new MouseEvent('click', {bubbles: true,"
+    'clientX: b.left + (x + .5) * s, clientY: b.top + (y + .5) * s}));'
+)
+
+
+@pytest.fixture
+def page(tmp_path, capsys):
+    """A page of two recordings."""
+    robot = load(tmp_path)
+    for number in (0, 1):
+        write_episode(tmp_path / 'data' / f'e{number}', robot, {'door': make_cameras()['door']},
+                      make_positions(2.0, seed=number))  # fmt: skip
+    file = tmp_path / 'points.html'
+    command = ['calibrate-camera', str(tmp_path / 'data'), '--view', 'door']
+    assert main([*command, '--robot', str(robot.file), '--click', str(file)]) == 0
+    assert f'page: {file}' in capsys.readouterr().out
+    return file
+
+
+def test_it_has_frames_of_every_recording_far_apart(page):
+    text = page.read_text()
+    assert text.count('data-episode="e0"') >= 2 and text.count('data-episode="e1"') >= 2
+    assert 'data-seconds="0.0"' in text and 'http://' not in text and 'https://' not in text
+
+
+def test_what_it_saves_is_where_the_clicks_were(page, tmp_path):
+    browser = Browser(tmp_path / 'profile')
+    try:
+        browser.open(page.as_uri())
+        # both finger tips at known pixels, as a user clicks: on the screen, at another scale
+        browser.run(CLICK + 'at(90 + k, 55 + 2 * k); at(110 + k, 65 + 2 * k)}; 0')
+        frames = browser.run(
+            "[...document.querySelectorAll('.frame')].map(f => [f.dataset.episode,"
+            'Number(f.dataset.seconds)])'
+        )
+        browser.run(
+            'HTMLAnchorElement.prototype.click = function() {window.saved = this.href}; '
+            "document.getElementById('save').dispatchEvent(new MouseEvent('click')); 0"
+        )
+        saved = browser.run('window.saved')
+    finally:
+        browser.close()
+    file = tmp_path / 'points.yaml'
+    file.write_text(unquote(saved.partition(',')[2]))
+    assert json.loads(file.read_text()).keys() == {'door'}
+    rows = [(name, row) for name, rows in load_points(file, 'door').items() for row in rows]
+    assert len(rows) == len(frames) >= 4
+    for k, ((name, row), (episode, seconds)) in enumerate(zip(rows, frames, strict=True)):
+        assert name == episode
+        np.testing.assert_allclose(
+            row, [seconds, 100 + k, 60 + 2 * k], atol=0.6
+        )  # whole pixels of the screen
+
+
+def test_a_click_is_corrected_and_a_frame_that_lacks_a_finger_tip_is_not_saved(page, tmp_path):
+    browser = Browser(tmp_path / 'profile')
+    try:
+        browser.open(page.as_uri())
+        # both tips of all frames but the last, and the second one corrected by a third click
+        browser.run(CLICK + 'at(100, 60); if (k + 1 < all.length) {at(140, 90); at(120, 80)}}; 0')
+        count, told, marks = browser.run(
+            "[document.querySelectorAll('.frame').length,"
+            "document.getElementById('count').textContent, document.querySelectorAll('i').length]"
+        )
+        saved = browser.run('saved()')
+    finally:
+        browser.close()
+    assert told == f'{count - 1} points, 1 frames lack a finger tip' and marks == 2 * count - 1
+    rows = [row for rows in saved['door'].values() for row in rows]
+    assert len(rows) == count - 1
+    np.testing.assert_allclose(np.array(rows)[:, 1:], [[110, 70]] * (count - 1), atol=0.6)

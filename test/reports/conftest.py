@@ -1,0 +1,11 @@
+"""The small episodes, for every test of the reports."""
+
+from small_episodes import episodes, make_episode, make_pipeline, oracle, recordings
+
+__all__ = [
+    'episodes',
+    'make_episode',
+    'make_pipeline',
+    'oracle',
+    'recordings',
+]

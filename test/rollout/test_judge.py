@@ -1,0 +1,49 @@
+"""The estimate on real frames, and the names at the door of the package."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+import mtv_world_ros
+from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.data.recording import load_recording
+
+
+@pytest.fixture(scope='module')
+def pipeline():
+    return mtv_world_ros.load_pipeline(segmenter='colour', num_threads=1)
+
+
+@pytest.fixture(scope='module')
+def recording(pipeline):
+    return load_recording(share_path('resource', 'demo_episode'), pipeline.spec, pipeline.robot)
+
+
+def test_a_recorded_success_is_judged_as_one_and_its_beginning_is_not(pipeline, recording):
+    assert recording.outcome == 'success'
+    assert mtv_world_ros.judge(pipeline, recording).probability > 0.75
+    early = recording.times < 3.0  # the arm still carries the block
+    cut = replace(
+        recording,
+        times=recording.times[early],
+        frames=recording.frames[:, early],
+        positions=recording.positions[early],
+    )
+    assert mtv_world_ros.judge(pipeline, cut).probability < 0.5
+
+
+def test_a_recording_with_a_gap_is_refused(pipeline, recording):
+    times = recording.times.copy()
+    times[40:] += 2.0
+    with pytest.raises(EpisodeError, match='has a gap'):
+        mtv_world_ros.judge(pipeline, replace(recording, times=times))
+
+
+def test_what_the_robot_saw_at_a_frame_is_an_observation(recording):
+    seen = recording.observation(7)
+    assert seen.stamp_ns == recording.stamp_ns + round(float(recording.times[7]) * 1e9)
+    assert (seen.positions == recording.positions[7]).all()
+    assert tuple(camera.view for camera in seen.cameras) == ('low', 'high')

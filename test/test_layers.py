@@ -1,0 +1,122 @@
+"""The node and offline replay need no laboratory; commands are found by entry points."""
+
+from __future__ import annotations
+
+from importlib import metadata
+import subprocess
+import sys
+
+import grimp
+import pytest
+
+from mtv_world_ros import cli
+from mtv_world_ros.core import entry_points
+from mtv_world_ros.core.entry_points import COMMANDS, load, POLICIES, registered, ROLLOUTS
+from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.rollout.assembly import policy_settings, robot_path
+
+PRODUCT = ('ros.world_model.node', 'ros.policy.node', 'rollout.offline')
+LABORATORY = ('training', 'evaluation', 'simulation', 'ranking', 'reports')
+
+
+@pytest.fixture(scope='module')
+def graph():
+    """All imports of the package, those inside of functions included."""
+    return grimp.build_graph('mtv_world_ros')
+
+
+@pytest.mark.parametrize('module', PRODUCT)
+def test_no_laboratory_is_reached_from(graph, module):
+    reached = graph.find_upstream_modules(f'mtv_world_ros.{module}')
+    rooms = tuple(f'mtv_world_ros.{room}' for room in LABORATORY)
+    assert len(reached) > 20 and not [name for name in reached if name.startswith(rooms)]
+
+
+def test_the_bundled_checkpoint_is_loaded_without_the_simulator():
+    code = (
+        'import sys\n'
+        'from mtv_world_ros.rollout.assembly import load_pipeline\n'
+        "load_pipeline(segmenter='colour', num_threads=1)\n"
+        "print([n for n in sys.modules if n.startswith('mtv_world_ros.simulation')])"
+    )
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == '[]'
+
+
+def test_every_command_of_help_is_registered_and_in_its_order():
+    found = registered(COMMANDS)
+    assert set(cli._ORDER) == {
+        name for name, entry in found.items() if entry.value.startswith('mtv_world_ros.')
+    }
+    modules = [load(found[name]).__name__ for name in cli._ORDER]
+    assert modules[0] == 'mtv_world_ros.cli.demo.command'
+    assert [load(entry).__name__ for entry in cli._commands()][: len(modules)] == modules
+
+
+def registering(monkeypatch, **entries):
+    """Replaces what is registered: group -> name = module."""
+    listed = {
+        group: [metadata.EntryPoint(name=n, value=v, group=group) for n, v in pairs.items()]
+        for group, pairs in ((getattr(entry_points, key), pairs) for key, pairs in entries.items())
+    }
+    monkeypatch.setattr(metadata, 'entry_points', lambda group: listed.get(group, []))
+
+
+def test_a_command_of_another_package_comes_last(monkeypatch):
+    registering(
+        monkeypatch,
+        COMMANDS={'aaa': 'mtv_world_ros.cli.view', 'demo': 'mtv_world_ros.cli.demo.command'},
+    )
+    modules = [load(entry).__name__ for entry in cli._commands()]
+    assert modules == ['mtv_world_ros.cli.demo.command', 'mtv_world_ros.cli.view']
+
+
+def test_an_installation_without_commands_says_what_to_do(monkeypatch, capsys):
+    registering(monkeypatch)
+    assert cli.main(['demo']) == 1
+    assert 'registers no commands; install it again: make' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('text', 'says'),
+    [
+        ("raise RuntimeError('no such display')", 'no such display'),
+        ('def add(:', 'invalid syntax'),
+        ('', "no attribute 'add'"),
+        ("def add(commands): commands.add_parser('demo')", 'conflicting subparser: demo'),
+    ],
+)
+def test_a_package_with_a_broken_command_is_named(monkeypatch, tmp_path, capsys, text, says):
+    (tmp_path / 'of_somebody.py').write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, 'of_somebody', raising=False)
+    pairs = {'demo': 'mtv_world_ros.cli.demo.command', 'mine': 'of_somebody'}
+    registering(monkeypatch, COMMANDS=pairs)
+    assert cli.main(['demo', '--help']) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "entry point 'mine = of_somebody'" in line and says in line
+
+
+def test_an_entry_point_that_cannot_be_imported_is_named(monkeypatch, capsys):
+    registering(monkeypatch, COMMANDS={'mine': 'no_such_package.commands'})
+    assert cli.main(['--help']) == 1
+    assert "entry point 'mine = no_such_package.commands'" in capsys.readouterr().err
+
+
+def test_without_the_simulator_a_scripted_policy_says_what_to_install(monkeypatch):
+    robot = load_robot(robot_path('yam_bimanual'))
+    assert policy_settings('expert-miss-0.5', robot).variant == 'expert-miss-0.5'
+    registering(monkeypatch)
+    with pytest.raises(ConfigError, match=r"kind 'scripted'.*mtv_world_ros\[sim\]"):
+        policy_settings('expert-miss-0.5', robot)
+
+
+def test_policies_and_rollouts_of_the_package_are_registered():
+    assert load(registered(POLICIES)['scripted']).fault_kinds('expert-miss-0.5') == (
+        'grasp_missed',
+    )
+    assert {load(entry).FILE for entry in registered(ROLLOUTS).values()} >= {
+        'ranking.json',
+        'metrics.json',
+    }
