@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from functools import partial
 import hashlib
 from importlib import import_module
@@ -24,6 +24,7 @@ from mtv_world_ros.robot.file import described_robot
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
+from mtv_world_ros.ros.node_events import NodeEvents
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.qos_profiles import LATCHED
 from mtv_world_ros.ros.sensing.observations import SensedScene
@@ -40,24 +41,22 @@ class RobotDescription:
     Args:
         node: owner of the subscription.
         expected: the checkpoint's robot.
-        on_robot: gets the same robot with the described kinematics and limits.
-        guarded: wraps a handler so that it never raises.
+        events: takes the same robot with the described kinematics and limits.
     """
 
     def __init__(
         self,
         node: Node,
         expected: RobotModel,
-        on_robot: Callable[[RobotModel], None],
-        guarded: Callable[[Handler], Handler],
+        events: NodeEvents,
     ) -> None:
-        self._expected, self._on_robot = expected, on_robot
+        self._expected, self._events = expected, events
         self._log = node.get_logger()
         self._seen = b''
         self.problem = ''
         self._offset_m: float | None = None
         self._topic = node.resolve_topic_name(TOPIC)
-        node.create_subscription(String, TOPIC, guarded(self._take), LATCHED)
+        node.create_subscription(String, TOPIC, events.guarded(self._take), LATCHED)
 
     def check(self) -> None:
         """Refuses to go on while another robot is described.
@@ -94,14 +93,11 @@ class RobotDescription:
             )
             raise Rejection(Reason.ROBOT_DESCRIPTION, self.problem) from error
         self.problem, self._offset_m = '', offset_m
-        self._on_robot(robot)
+        self._events.on_robot(robot)
         self._log.info(
             f"{self._topic}: robot '{robot.name}'; its tools are up to "
             f"{1000 * offset_m:.1f} mm off those of the checkpoint's description"
         )
-
-
-Handler = Callable[[Any], None]
 
 
 def tf_message() -> Any | None:
@@ -118,8 +114,7 @@ class Extrinsics:
     Args:
         node: owner of the subscriptions and the publisher.
         links: of the robot, those whose pose its joint states determine.
-        settings: the present parameters.
-        guarded: wraps a handler so that it never raises.
+        events: has the present parameters.
 
     Raises:
         ConfigError: poses are to come from TF, and tf2_msgs is not installed.
@@ -129,11 +124,10 @@ class Extrinsics:
         self,
         node: Node,
         links: Collection[str],
-        settings: Callable[[], Settings],
-        guarded: Callable[[Handler], Handler],
+        events: NodeEvents,
     ) -> None:
-        self._node, self._links, self._settings = node, frozenset(links), settings
-        self._tree = TransformTree(settings().tf_prefix)
+        self._node, self._links, self._settings = node, frozenset(links), events.settings
+        self._tree = TransformTree(events.settings().tf_prefix)
         self._used: dict[str, Mount] = {}
         self._sources: dict[str, str] = {}
         self._own: dict[str, tuple[str, FloatArray]] = {}
@@ -143,13 +137,13 @@ class Extrinsics:
         if self._message is None:
             self._log_absence()
             return
-        if settings().publish_tf:
+        if events.settings().publish_tf:
             self._publisher = node.create_publisher(self._message, '/tf_static', LATCHED)
         for topic, qos, latched in (
             ('/tf', QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT), False),
             ('/tf_static', QoSProfile(depth=100, durability=LATCHED.durability), True),
         ):
-            take = guarded(partial(self._take, latched=latched))
+            take = events.guarded(partial(self._take, latched=latched))
             node.create_subscription(self._message, topic, take, qos)
 
     def pose(self, view: str, frame: str, stamp_ns: int) -> Mount | None:

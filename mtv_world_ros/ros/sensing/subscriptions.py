@@ -18,6 +18,7 @@ from trajectory_msgs.msg import JointTrajectory
 from mtv_world_ros.cameras.camera_info import RECTIFIED
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.ros import parameters
+from mtv_world_ros.ros.node_events import NodeEvents
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 
 Handler = Callable[[Any], None]
@@ -37,9 +38,7 @@ class Inputs:
         views: names of the views; parameters give each its camera topic.
         compressed: whether images come as JPEG or PNG.
         buffer: gets images, camera infos and joint states.
-        on_instruction: gets the instruction.
-        on_trajectory: gets the trajectories.
-        guarded: wraps a handler so that it never raises.
+        events: takes instructions and plans.
     """
 
     def __init__(
@@ -49,17 +48,15 @@ class Inputs:
         *,
         compressed: bool,
         buffer: ObservationBuffer,
-        on_instruction: Handler,
-        on_trajectory: Handler,
-        guarded: Callable[[Handler], Handler],
+        events: NodeEvents,
     ) -> None:
         self._observations = subscribe_observations(
-            node, views, compressed=compressed, buffer=buffer, guarded=guarded
+            node, views, compressed=compressed, buffer=buffer, guarded=events.guarded
         )
         self._all = [*self._observations]
-        instruction = guarded(on_instruction)
+        instruction = events.guarded(events.on_instruction)
         self._all.append(MatchedSubscription(node, String, 'instruction', instruction, depth=1))
-        handle = guarded(on_trajectory)
+        handle = events.guarded(events.on_plan)
         self._plans = MatchedSubscription(
             node,
             JointTrajectory,

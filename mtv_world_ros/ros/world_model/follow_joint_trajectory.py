@@ -22,7 +22,7 @@ from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
-from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.node_events import NodeEvents
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request, Result
 
 NAME = '~/follow_joint_trajectory'
@@ -85,10 +85,7 @@ class FollowJointTrajectory:
         action: the type of the action.
         node: owner of the server.
         robot: whose joints goals move.
-        settings: the present parameters.
-        on_goal: gets the goals, to hand them back by `started` or `refused`.
-        start_waiting: hands back those that wait.
-        give_up: pre-empts a plan, by the number of its rollout, with a text.
+        events: takes goals as plans, to hand them back by `started` or `refused`.
     """
 
     def __init__(
@@ -96,14 +93,9 @@ class FollowJointTrajectory:
         action: Any,
         node: Node,
         robot: RobotModel,
-        settings: Callable[[], Settings],
-        *,
-        on_goal: Callable[[Goal], None],
-        start_waiting: Callable[[], None],
-        give_up: Callable[[int, str], None],
+        events: NodeEvents,
     ) -> None:
-        self._action, self._robot, self._settings = action, robot, settings
-        self._on_goal, self._start_waiting, self._give_up = on_goal, start_waiting, give_up
+        self._action, self._robot, self._events = action, robot, events
         self._goals: dict[int, Goal] = {}
         self._server = _Server(
             node,
@@ -141,13 +133,13 @@ class FollowJointTrajectory:
 
     def _on_accepted(self, handle: ServerGoalHandle) -> None:
         handle.execute()
-        self._on_goal(Goal(handle=handle))
+        self._events.on_plan(Goal(handle=handle))
 
     def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        self._start_waiting()  # it may have come with the goal
+        self._events.start_waiting()  # it may have come with the goal
         for rollout, goal in self._goals.items():
             if goal.handle == handle:
-                self._give_up(rollout, 'cancelled by its client')
+                self._events.give_up(rollout, 'cancelled by its client')
                 return CancelResponse.ACCEPT
         return CancelResponse.REJECT
 
@@ -180,7 +172,7 @@ class FollowJointTrajectory:
         )
         goal.handle.publish_feedback(feedback)
         if goal.violation:
-            self._give_up(request.rollout, goal.violation[1])
+            self._events.give_up(request.rollout, goal.violation[1])
 
     def _outcome(self, goal: Goal, ended: Ended) -> tuple[str, str, str]:
         """The goal's last event, the name of its code, and why in words."""
@@ -189,7 +181,7 @@ class FollowJointTrajectory:
             code, text = goal.violation
             return 'abort', code, f'{text}; {verdict}'
         if ended.state == 'done':
-            least = self._settings().least_goal_success
+            least = self._events.settings().least_goal_success
             probability = ended.last.prediction.success.probability if ended.last else float('nan')
             if least and not probability >= least:
                 text = f"'least_goal_success' asks for {least:g}"

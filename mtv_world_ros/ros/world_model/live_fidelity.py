@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from threading import Condition, Thread
 from typing import NamedTuple
@@ -22,6 +22,7 @@ from mtv_world_ros.rollout.rollout_options import RolloutOptions
 from mtv_world_ros.ros.messages import image_messages
 from mtv_world_ros.ros.messages.conversions import NANO, to_multi_array, to_ns
 from mtv_world_ros.ros.messages.rejection import Rejection
+from mtv_world_ros.ros.node_events import NodeEvents
 from mtv_world_ros.ros.status_publisher import create_publisher
 from mtv_world_ros.ros.world_model.worker import Chunk, Request, Result
 from mtv_world_ros.success.doubts import PhysicsWatch, unforeseen
@@ -96,21 +97,19 @@ class LiveFidelity:
     Args:
         node: owner of the publisher.
         pipeline: observes the real frames as it does imagined ones.
-        on_scored: called from the executor with every chunk that was compared.
-        on_error: called from the executor with what went wrong.
+        events: takes chunks that were compared, and what went wrong.
     """
 
     def __init__(
         self,
         node: Node,
         pipeline: Pipeline,
-        on_scored: Callable[[ScoredChunk], None],
-        on_error: Callable[[Exception], None],
+        events: NodeEvents,
     ) -> None:
         self.watch = PhysicsWatch()
         # imagined frames begin chunks, too, and cameras were checked before
         self._pipeline, self._spec = replace(pipeline, camera_checker=None), pipeline.spec
-        self._on_scored, self._on_error = on_scored, on_error
+        self._events = events
         self._tolerance_ns = round(MAX_OFFSET / self._spec.fps * NANO)
         self._changed = Condition()
         self._images: deque[tuple[str, Image | CompressedImage]] = deque(maxlen=MAX_WAITING)
@@ -182,11 +181,11 @@ class LiveFidelity:
         while self._results:
             result = self._results.popleft()
             if isinstance(result, Exception):
-                self._on_error(result)
+                self._events.on_error(result)
                 continue
             self._kept.append(result.mean)
             self._publisher.publish(to_multi_array(result.jaccard, ('view', 'object')))
-            self._on_scored(result)
+            self._events.on_scored(result)
 
     def _run(self) -> None:
         while True:

@@ -24,7 +24,7 @@ from mtv_world_ros.ros.messages.conversions import (
     to_multi_array,
 )
 from mtv_world_ros.ros.messages.image_messages import scale_camera_info, to_compressed, to_image
-from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.node_events import ignore_sent, NodeEvents
 from mtv_world_ros.ros.status_publisher import create_publisher
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Result
 
@@ -122,11 +122,7 @@ class PredictionPublisher:
         node: owner of the publishers and timers.
         spec: of the world model.
         joint_names: J names, in the robot's order.
-        settings: the present parameters.
-        on_judged: called with a chunk when its estimate is out.
-        on_sent: called with a chunk when its last frame is out, or when the rest was dropped.
-        on_ended: called with a request's end, after the estimates of its chunks.
-        on_error: called with what publishing raised.
+        events: has the present parameters; takes chunks that are judged or sent, and ends.
     """
 
     def __init__(
@@ -134,15 +130,10 @@ class PredictionPublisher:
         node: Node,
         spec: WorldModelSpec,
         joint_names: Sequence[str],
-        settings: Callable[[], Settings],
-        *,
-        on_judged: Callable[[Chunk], None],
-        on_sent: Callable[[Chunk, Sent], None],
-        on_ended: Callable[[Ended], None],
-        on_error: Callable[[Exception], None],
+        events: NodeEvents,
     ) -> None:
-        self._node, self._joint_names, self._settings = node, tuple(joint_names), settings
-        self._on_judged, self._on_ended, self._on_error = on_judged, on_ended, on_error
+        self._node, self._joint_names, self._events = node, tuple(joint_names), events
+        self._settings = events.settings
         self._period_s = 1.0 / spec.fps
         # a chunk, and the one before it should a subscriber still ask for a frame of that again
         depth = 2 * spec.num_frames
@@ -150,9 +141,11 @@ class PredictionPublisher:
         self._joints = create_publisher(node, JointState, '~/predicted/joint_states', depth)
         self._success = create_publisher(node, Float64, '~/success', 10)
         self._jaccard = create_publisher(node, Float32MultiArray, '~/jaccard', 10)
-        self._images = FrameQueue(node, self._publish_images, self._wait_s, on_sent, on_error)
+        self._images = FrameQueue(
+            node, self._publish_images, self._wait_s, events.on_sent, events.on_error
+        )
         self._masks = FrameQueue(
-            node, self._publish_masks, _burst_wait_s, lambda chunk, sent: None, on_error
+            node, self._publish_masks, _burst_wait_s, ignore_sent, events.on_error
         )
 
     def subscriber_counts(self) -> dict[str, int]:
@@ -169,13 +162,13 @@ class PredictionPublisher:
         first chunk of a newer one: they show a future that is no longer planned.
         """
         if isinstance(result, Ended):
-            self._on_ended(result)
+            self._events.on_ended(result)
             return
         try:
             self._publish_estimate(result)
         except Exception as error:  # the node goes on
-            self._on_error(error)
-        self._on_judged(result)
+            self._events.on_error(error)
+        self._events.on_judged(result)
         for frames in (self._masks, self._images):
             if not result.request.imagine:
                 frames.drop_others(result.request.rollout)

@@ -146,8 +146,8 @@ _ENTITIES = ('publisher', 'subscription', 'service', 'timer', 'guard_condition')
 class Rollouts:
     """Plans in, predictions out.
 
-    Callbacks store; a worker thread runs the model; results are published from the executor.
-    Plans are refused until `activate`.
+    It is the `NodeEvents` of its parts. Callbacks store; a worker thread runs the model; results
+    are published from the executor. Plans are refused until `activate`.
 
     Attributes:
         description: views, sizes and robot in words.
@@ -169,7 +169,10 @@ class Rollouts:
         settings: Callable[[], Settings],
         reporter: Reporter,
     ) -> None:
-        self._node, self._settings, self._reporter = node, settings, reporter
+        self._node, self.settings, self._reporter = node, settings, reporter
+        self.guarded, self.on_error = reporter.guarded, reporter.crash
+        self.on_judged, self.on_sent = reporter.judged, reporter.sent
+        self.on_ended, self.on_scored = reporter.ended, reporter.scored
         self._spec, self._robot = pipeline.spec, pipeline.robot
         self._is_active = False
         self.description = (
@@ -183,66 +186,52 @@ class Rollouts:
             self._undo = undo.pop_all()
 
     def _build(self, pipeline: Pipeline, undo: ExitStack) -> None:
-        node, settings, reporter = self._node, self._settings, self._reporter
+        node, settings = self._node, self.settings
         check = refusing(lambda changed: check_calibration(changed, settings(), self._spec))
         node.add_on_set_parameters_callback(check)
         undo.callback(node.remove_on_set_parameters_callback, check)
-        self._worker = RolloutWorker(pipeline, lambda: self._results.trigger())
+        self._worker = RolloutWorker(pipeline, self.on_results)
         undo.callback(self._worker.close)
         self._adapter = AdapterSwitch(node, pipeline.world_model, self._worker.run_between)
         undo.callback(self._adapter.close)
-        links = self._robot.posed_links
-        self._extrinsics = Extrinsics(node, links, settings, reporter.guarded)
+        self._extrinsics = Extrinsics(node, self._robot.posed_links, self)
         self._description: RobotDescription | None = None
         if settings().use_robot_description:
-            self._description = RobotDescription(
-                node, self._robot, self._on_robot, reporter.guarded
-            )
+            self._description = RobotDescription(node, self._robot, self)
         self._buffer = ObservationBuffer(
             cameras=load_cameras(settings(), self._spec),
             joint_names=self._robot.joint_names,
             width=self._spec.width,
             height=self._spec.height,
             limits=settings,
-            on_image=self._on_image,
+            on_image=self.on_image,
             pose=self._extrinsics.pose,
         )
         self._maker = RequestMaker(
             self._robot, self._buffer, settings, lambda: self._worker.last_scene
         )
-        self._fidelity = LiveFidelity(node, pipeline, reporter.scored, reporter.crash)
+        self._fidelity = LiveFidelity(node, pipeline, self)
         self._worker.doubt = lambda: self._fidelity.watch.doubt
         undo.callback(self._fidelity.close)
-        self._publisher = PredictionPublisher(
-            node,
-            self._spec,
-            self._robot.joint_names,
-            settings,
-            on_judged=reporter.judged,
-            on_sent=reporter.sent,
-            on_ended=reporter.ended,
-            on_error=reporter.crash,
-        )
+        self._publisher = PredictionPublisher(node, self._spec, self._robot.joint_names, self)
         self._arrived: deque[tuple[float, JointTrajectoryMsg | Goal]] = deque()
-        self._arrivals = node.create_guard_condition(self._start_rollouts)
+        self._arrivals = node.create_guard_condition(self.start_waiting)
         self._results = node.create_guard_condition(self._publish_results)
         self._inputs = Inputs(
             node,
             self._spec.views,
             compressed=settings().compressed_input,
             buffer=self._buffer,
-            on_instruction=self._on_instruction,
-            on_trajectory=self._on_trajectory,
-            guarded=reporter.guarded,
+            events=self,
         )
         self._action = self._offer_action(undo)
-        node.create_service(Trigger, '~/reset', reporter.served(self._on_reset))
-        node.create_service(SetBool, '~/imagine', reporter.served(self._on_imagine))
+        node.create_service(Trigger, '~/reset', self._reporter.served(self._on_reset))
+        node.create_service(SetBool, '~/imagine', self._reporter.served(self._on_imagine))
         back = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
         )
         jumps = node.get_clock().create_jump_callback(
-            back, post_callback=reporter.guarded(self._on_jump)
+            back, post_callback=self.guarded(self._on_jump)
         )
         undo.callback(jumps.unregister)
         self._worker.start()
@@ -252,15 +241,7 @@ class Rollouts:
         if kind is None:
             node.get_logger().info(f'control_msgs is not installed: no {NAME}', once=True)
             return None
-        action = FollowJointTrajectory(
-            kind,
-            node,
-            self._robot,
-            self._settings,
-            on_goal=self._on_trajectory,
-            start_waiting=self._start_rollouts,
-            give_up=self._worker.give_up,
-        )
+        action = FollowJointTrajectory(kind, node, self._robot, self)
         undo.callback(action.close)
         return action
 
@@ -271,7 +252,7 @@ class Rollouts:
     def deactivate(self) -> None:
         """Refuses plans from now on; one that runs or waits is reported as pre-empted."""
         self._is_active = False
-        self._start_rollouts()  # plans that came before are reported as well
+        self.start_waiting()  # plans that came before are reported as well
         self._give_up('preempted', 'the node was deactivated')
         self._publish_results()
 
@@ -281,7 +262,7 @@ class Rollouts:
 
     def refresh(self) -> None:
         """Looks at the worker and at the publishers again; to be called now and then."""
-        self._worker.supervise(self._settings().stuck_after_s)
+        self._worker.supervise(self.settings().stuck_after_s)
         self._inputs.refresh()
         self._look_again()
 
@@ -300,7 +281,7 @@ class Rollouts:
         """Keys and values for `/diagnostics`."""
         return {
             'mode': 'imagine' if self._maker.imagine else 'observe',
-            'checkpoint': self._settings().checkpoint,
+            'checkpoint': self.settings().checkpoint,
             'adapter': self._adapter.in_use,
             'views': self._spec.views,
             'busy': self._worker.busy,
@@ -315,7 +296,15 @@ class Rollouts:
             **({'camera_notes': '; '.join(notes)} if (notes := self._buffer.notes) else {}),
         }
 
-    def _on_image(self, view: str, message: Image | CompressedImage) -> None:
+    def on_results(self) -> None:
+        """Wakes the executor, which publishes the results; called from any thread."""
+        self._results.trigger()
+
+    def give_up(self, rollout: int, text: str) -> None:
+        """Pre-empts one plan if it still runs or waits."""
+        self._worker.give_up(rollout, text)
+
+    def on_image(self, view: str, message: Image | CompressedImage) -> None:
         """Passes real images on, and one observation of all views per frame of the model."""
         if not self._is_active:
             return
@@ -327,19 +316,21 @@ class Rollouts:
                     self._buffer.observe(self._node.get_clock().now().nanoseconds).observation
                 )
 
-    def _on_instruction(self, message: String) -> None:
+    def on_instruction(self, message: String) -> None:
+        """Takes the instruction for the plans to come."""
         with rejected_as(Reason.INSTRUCTION_TOO_LONG):
             check_limit('instruction_characters', len(message.data), 'the instruction')
         self._maker.instruction = message.data
 
-    def _on_trajectory(self, plan: JointTrajectoryMsg | Goal) -> None:
+    def on_plan(self, plan: JointTrajectoryMsg | Goal) -> None:
         """Queues a plan, so that images that came with it are stored before it is checked."""
         self._arrived.append((time.monotonic(), plan))
         self._arrivals.trigger()
 
-    def _start_rollouts(self) -> None:
+    def start_waiting(self) -> None:
+        """Starts the plans that wait, up to one that is early."""
         while self._arrived and not (self._is_active and self._is_early(*self._arrived[0])):
-            self._reporter.guarded(self._start_rollout)(self._arrived.popleft())
+            self.guarded(self._start_rollout)(self._arrived.popleft())
 
     def _look_again(self) -> None:
         """Checks a waiting plan again: its observation may be here, or it waited long enough."""
@@ -391,13 +382,13 @@ class Rollouts:
             takers = [self._fidelity.expect, self._publisher.add]
             takers += [self._action.take] if self._action is not None else []
             for take in takers:
-                self._reporter.guarded(take)(result)
+                self.guarded(take)(result)
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._give_up()
         try:
             self._extrinsics.accept()
-            self._buffer.accept_cameras(reload_cameras(self._settings(), self._spec))
+            self._buffer.accept_cameras(reload_cameras(self.settings(), self._spec))
         except Rejection as error:
             self._reporter.reject(error)
             response.message = f'not reset: {error}'
@@ -416,8 +407,8 @@ class Rollouts:
         response.message = 'imagine' if request.data else 'observe'
         return response
 
-    def _on_robot(self, robot: RobotModel) -> None:
-        """The robot as it describes itself."""
+    def on_robot(self, robot: RobotModel) -> None:
+        """Takes the robot as it describes itself."""
         self._maker.robot = robot
         for part in (self._worker, self._fidelity):
             part.use_robot(robot)

@@ -1,0 +1,83 @@
+"""Events of a configured node: one object that its parts report to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, TYPE_CHECKING
+
+from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
+
+from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.ros.parameters import Settings
+
+if TYPE_CHECKING:
+    from mtv_world_ros.ros.world_model.follow_joint_trajectory import Goal
+    from mtv_world_ros.ros.world_model.live_fidelity import ScoredChunk
+    from mtv_world_ros.ros.world_model.prediction_publisher import Sent
+    from mtv_world_ros.ros.world_model.worker import Chunk, Ended
+
+
+class NodeEvents(Protocol):
+    """Events of a configured node; see `Rollouts`. All but `on_results` come from the executor."""
+
+    def settings(self) -> Settings:
+        """Returns the present parameters."""
+        ...
+
+    def guarded(self, handle: Callable[..., None]) -> Callable[..., None]:
+        """Returns the handler as a callback that no message makes raise."""
+        ...
+
+    def on_image(self, view: str, message: Image | CompressedImage) -> None:
+        """Takes a real image that was stored."""
+        ...
+
+    def on_instruction(self, message: String) -> None:
+        """Takes the instruction."""
+        ...
+
+    def on_plan(self, plan: JointTrajectoryMsg | Goal) -> None:
+        """Takes a plan of the topic or of the action."""
+        ...
+
+    def on_robot(self, robot: RobotModel) -> None:
+        """Takes the robot as it describes itself."""
+        ...
+
+    def on_results(self) -> None:
+        """Notes that the worker has results; called from any thread."""
+        ...
+
+    def on_judged(self, chunk: Chunk) -> None:
+        """Takes a chunk whose estimate is out."""
+        ...
+
+    def on_sent(self, chunk: Chunk, sent: Sent) -> None:
+        """Takes a chunk whose last frame is out, or whose rest was dropped."""
+        ...
+
+    def on_ended(self, ended: Ended) -> None:
+        """Takes the end of a plan, after the estimates of its chunks."""
+        ...
+
+    def on_scored(self, scored: ScoredChunk) -> None:
+        """Takes a chunk that was compared with the real frames."""
+        ...
+
+    def on_error(self, error: Exception) -> None:
+        """Takes an error that nobody raised on purpose."""
+        ...
+
+    def start_waiting(self) -> None:
+        """Starts the plans that wait."""
+        ...
+
+    def give_up(self, rollout: int, text: str) -> None:
+        """Pre-empts one plan, by the number of its rollout, for a reason in words."""
+        ...
+
+
+def ignore_sent(chunk: Any, sent: Any) -> None:
+    """Takes frames of which nobody is told."""
