@@ -19,7 +19,7 @@ from mtv_world_ros.cli.calibrate_camera import (
     robot_file,
 )
 from mtv_world_ros.cli.shared_options import add_options, names
-from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 
 if TYPE_CHECKING:
     from mtv_world_ros.core.data_types import CameraModel, FloatArray
@@ -63,17 +63,23 @@ def _robot(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.rollout.assembly import robot_path
 
     path = Path(arguments.file)
+    guessed: Path | None = None
     if path.suffix in ('.urdf', '.xml'):
-        path = _write_guess(path, arguments.out or path.with_suffix('.yaml'))
+        path = guessed = _write_guess(path, arguments.out or path.with_suffix('.yaml'))
     elif path.suffix == '.xacro':
         raise ConfigError(f"'{path}' is a xacro file; expand it first: xacro {path} > robot.urdf")
     elif arguments.out is not None:
         raise ConfigError('--out is for a URDF; a robot YAML is only read')
     else:
         path = robot_path(arguments.file)
-    robot = load_robot(path)
+    try:
+        robot = load_robot(path)
+        shape = load_shape(robot)
+    except MtvWorldError:
+        if guessed is not None:  # or the next call would find a file that cannot be used
+            guessed.unlink()
+        raise
     print(describe(robot))
-    shape = load_shape(robot)
     print(f'shapes: {shape.source}')
     print(*(f'missing: {name}\n' for name in shape.missing), sep='', end='')
     print(*(f'suspicious: {text}\n' for text in shape.doubts), sep='', end='')

@@ -25,8 +25,11 @@ _FINGER_JOINTS = 6
 _TIP_M = 0.0085
 #: finger links that end this far behind the others have no tip [m]
 _BESIDE_TIP_M = 0.015
-#: joints an arm has at least
-_ARM_JOINTS = 3
+#: joints of an arm at least; an arm of fewer, down to the second number, is one where no other is
+#: longer, or where it ends in fingers by their names or because they follow each other
+_ARM_JOINTS, _SHORT_ARM_JOINTS = 3, 2
+#: depth of a fork at the end of a short arm that is a gripper [joints]
+_SHORT_ARM_FINGER_JOINTS = 2
 #: names of tool frames, the best first
 _TOOL_NAMES = ('tcp', 'tool0', 'tool_center_point', 'grasp', 'tool', 'ee_link', 'ee', 'flange')
 _FINGER_NAMES = ('finger', 'gripper', 'jaw', 'knuckle', 'hand')
@@ -71,7 +74,7 @@ def guess_robot(urdf: Path) -> GuessedRobot:
         notes.append(f'joints of several numbers rest: {", ".join(resting)}')
     arms = _arms(model, {mimic.joint for mimic in mimics})
     if not arms:
-        raise RobotError(f"'{urdf}' has no arm: no chain of {_ARM_JOINTS} joints that move")
+        raise RobotError(f"'{urdf}' has no arm: no chain of {_SHORT_ARM_JOINTS} joints that move")
     base = _base_link(model, arms)
     notes.append(f"base link '{base}': nothing that moves carries it")
     names = _arm_names(model, arms)
@@ -83,7 +86,11 @@ def guess_robot(urdf: Path) -> GuessedRobot:
         used += [gripper] if gripper else []
     followers = {mimic.joint for mimic in mimics}
     leaders = {m.source for m in mimics if m.source not in used and m.source not in followers}
-    joints = [n for n, j in _named_joints(model) if (n in used or n in leaders) and j.nv == 1]
+    joints = [
+        n
+        for n, j in _named_joints(model)
+        if (n in used or n in leaders) and n not in followers and j.nv == 1
+    ]
     for name, joint in _named_joints(model):
         if name in joints and joint.nq == 1:
             low, high = (
@@ -119,11 +126,13 @@ def _arms(model: pin.Model, followers: set[str]) -> list[_Arm]:
     for joint in range(1, model.njoints):
         beyond = [child for child in children[joint] if not is_finger[child]]
         chain = tuple(j for j in list(model.supports[joint])[1:] if model.joints[j].nv == 1)
-        if is_finger[joint] or beyond or len(chain) < _ARM_JOINTS:
+        if is_finger[joint] or beyond or len(chain) < _SHORT_ARM_JOINTS:
             continue
         fingers = [c for child in children[joint] for c in _below(child, children)]
         arms.append(_Arm(chain=chain, fingers=tuple(fingers)))
     longest = max((len(arm.chain) for arm in arms), default=0)
+    if longest >= _ARM_JOINTS:  # a head that pans and tilts is none
+        arms = [arm for arm in arms if len(arm.chain) >= _ARM_JOINTS or arm.fingers]
     return [arm for arm in arms if len(arm.chain) >= min(longest, 5) or arm.fingers]
 
 
@@ -133,20 +142,33 @@ def _is_finger(
     """Whether a joint and all beyond it belong to a gripper.
 
     It is one of several short chains that fork off beyond an arm, or a last joint that is called
-    a finger, or stands beyond such a joint.
+    a finger, or stands beyond such a joint. Beyond two joints, names or mimic joints must say so:
+    arms fork off there as well.
     """
-    if len(model.supports[joint]) - 2 < _ARM_JOINTS:
+    before = len(model.supports[joint]) - 2
+    if before < _SHORT_ARM_JOINTS:
         return False
     parent = model.parents[joint]
     siblings = children[parent]
-    if len(siblings) > 1 and all(_depth(c, children) <= _FINGER_JOINTS for c in siblings):
+    coupled = followers if len(siblings) > 1 else set[str]()
+    looks_so = any(_is_called_finger(model, c, coupled) for c in siblings)
+    deepest = max(_depth(c, children) for c in siblings)
+    if before < _ARM_JOINTS:
+        return looks_so and deepest <= _SHORT_ARM_FINGER_JOINTS
+    if len(siblings) > 1 and deepest <= _FINGER_JOINTS:
         return True
-    link = next((f.name for f in model.frames if f.parentJoint == joint and _is_body(f)), '')
-    named = any(word in name.lower() for word in _FINGER_NAMES for name in (model.names[joint],
-                                                                             link))  # fmt: skip
-    if not children[joint] and (named or model.names[joint] in followers):
+    if not children[joint] and _is_called_finger(model, joint, followers):
         return True
     return _is_finger(model, parent, children, followers)
+
+
+def _is_called_finger(model: pin.Model, joint: int, followers: set[str]) -> bool:
+    """Whether a joint or its link is called a finger, or the joint follows another one."""
+    link = next((f.name for f in model.frames if f.parentJoint == joint and _is_body(f)), '')
+    names = (model.names[joint].lower(), link.lower())
+    return model.names[joint] in followers or any(
+        word in name for word in _FINGER_NAMES for name in names
+    )
 
 
 def _depth(joint: int, children: dict[int, list[int]]) -> int:

@@ -139,6 +139,76 @@ def test_a_floating_joint_rests_and_is_named(crane, tmp_path):
     assert load(tmp_path / 'again').joint_names == tuple(guessed.values['joints'])
 
 
+def _chain(*joints):
+    """A URDF of joints (name, kind, parent, child, more) between links of boxes."""
+    links = dict.fromkeys(link for _, _, *ends, _ in joints for link in ends)
+    box = '<geometry><box size="0.02 0.02 0.06"/></geometry>'
+    parts = [f'<link name="{link}"><visual>{box}</visual></link>' for link in links]
+    parts += [
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="0 {0.03 * ("right" in name)} 0.2"/><axis xyz="0 1 0"/>'
+        f'<limit lower="0" upper="0.5" effort="1" velocity="1"/>{more}</joint>'
+        for name, kind, parent, child, more in joints
+    ]
+    return f'<robot name="r">{"".join(parts)}</robot>'
+
+
+_SHORT = [('j1', 'revolute', 'base', 'upper', ''), ('j2', 'revolute', 'upper', 'hand', '')]
+_JAWS = [
+    ('finger_left', 'prismatic', 'hand', 'left', ''),
+    ('finger_right', 'prismatic', 'hand', 'right', '<mimic joint="finger_left"/>'),
+]
+
+
+def test_an_arm_of_two_joints_has_its_gripper(tmp_path, capsys):
+    (tmp_path / 'r.urdf').write_text(_chain(*_SHORT, *_JAWS))
+    command = ['robot', str(tmp_path / 'r.urdf'), '--picture', str(tmp_path / 'r.png')]
+    assert main(command) == 0
+    robot = load_robot(tmp_path / 'r.yaml')
+    assert robot.joint_names == ('j1', 'j2', 'finger_left')
+    assert [(tool.link, tool.gripper_joint) for tool in robot.tools] == [('hand', 'finger_left')]
+    assert 'guessed' in capsys.readouterr().out
+
+
+def test_an_arm_of_two_joints_without_a_gripper_is_one(tmp_path):
+    (tmp_path / 'r.urdf').write_text(_chain(*_SHORT))
+    values = guess_robot(tmp_path / 'r.urdf').values
+    assert values['joints'] == ['j1', 'j2'] and values['tools'][0]['link'] == 'hand'
+
+
+def test_two_arms_beyond_a_torso_of_two_joints_are_no_fingers(tmp_path):
+    arms = [
+        (f'{side}_{k}', 'revolute', f'{side}_{k - 1}' if k else 'hand', f'{side}_{k}', '')
+        for side in ('left', 'right')
+        for k in range(4)
+    ]
+    (tmp_path / 'r.urdf').write_text(_chain(*_SHORT, *arms))
+    values = guess_robot(tmp_path / 'r.urdf').values
+    assert [tool['link'] for tool in values['tools']] == ['left_3', 'right_3']
+
+
+def test_a_joint_of_the_arm_that_follows_another_is_not_commanded(tmp_path):
+    joints = [
+        ('j1', 'revolute', 'base', 'a', ''),
+        ('j2', 'revolute', 'a', 'b', ''),
+        ('j3', 'revolute', 'b', 'c', '<mimic joint="j2" multiplier="-1"/>'),
+        ('j4', 'revolute', 'c', 'd', ''),
+    ]
+    (tmp_path / 'r.urdf').write_text(_chain(*joints))
+    assert guess_robot(tmp_path / 'r.urdf').values['joints'] == ['j1', 'j2', 'j4']
+
+
+def test_a_guess_that_cannot_be_used_leaves_no_file(crane, tmp_path, capsys):
+    mesh = crane.parent / 'meshes' / 'hand.stl'
+    data = bytearray(mesh.read_bytes())
+    data[96:100] = np.float32(np.nan).tobytes()  # a vertex
+    mesh.write_bytes(bytes(data))
+    out = tmp_path / 'guessed.yaml'
+    assert main(['robot', str(crane.with_name('crane.urdf')), '--out', str(out)]) == 1
+    assert "hand.stl'" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_what_has_no_arm_is_refused(tmp_path):
     (tmp_path / 'box.urdf').write_text('<robot name="box"><link name="base"/></robot>')
     with pytest.raises(RobotError, match='has no arm'):

@@ -1,0 +1,232 @@
+"""Data sets whose state and action are split into features, and whose images are files."""
+
+import json
+from pathlib import Path
+import shutil
+
+import cv2
+import numpy as np
+import pyarrow
+from pyarrow import parquet
+import pytest
+import yaml
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.importing.convert import import_dataset
+
+ARM, GRIPPER = ['shoulder', 'elbow'], ['gripper']
+TABLE = 'data/chunk-000/episode_{:06d}.parquet'
+
+
+def split(root, parts, columns=lambda name, table: table):
+    """Rewrite `observation.state` and `action` as several features.
+
+    Args:
+        root: data set of format v2.1 with states and actions of shoulder, elbow, gripper, force.
+        parts: slice of the columns and their names by the end of a feature's name.
+        columns: changes the values (T, C) of a feature, by its name.
+    """
+    info = json.loads((root / 'meta/info.json').read_text())
+    for stem in ('observation.state', 'action'):
+        del info['features'][stem]
+        for end, (part, names) in parts.items():
+            count = part.stop - part.start
+            info['features'][f'{stem}.{end}'] = {
+                'dtype': 'float32', 'shape': [count], 'names': names}  # fmt: skip
+    (root / 'meta/info.json').write_text(json.dumps(info))
+    for episode in range(2):
+        file = root / TABLE.format(episode)
+        table = parquet.read_table(file)
+        for stem in ('observation.state', 'action'):
+            values = np.array(table.column(stem).to_pylist())
+            values[:, 0] = np.radians(values[:, 0])  # the joints' own units
+            values[:, 2] = 0.0004 * (100 - values[:, 2])
+            table = table.drop_columns([stem])
+            for end, (part, _) in parts.items():
+                found = columns(f'{stem}.{end}', values[:, part])
+                cells = found[:, 0].tolist() if found.shape[1] == 1 else found.tolist()
+                table = table.append_column(f'{stem}.{end}', pyarrow.array(cells))
+        parquet.write_table(table, file)
+    return root
+
+
+def expected(episode, rows, ahead=0):
+    """(rows, 3) positions, as `conftest.state` has them, in rad and m."""
+    k = np.arange(rows) + ahead
+    return np.stack([np.radians(3.0 * k + episode), 0.1 * k - 0.2, 0.0004 * 5 * k], axis=1)
+
+
+def check(episode_folder, number, rows):
+    episode = read_episode(episode_folder, with_cameras=False)
+    np.testing.assert_allclose(episode.joint_states.positions, expected(number, rows), atol=1e-6)
+    found = np.concatenate([t.positions for _, t in episode.trajectories])
+    np.testing.assert_allclose(found, expected(number, rows, 1), atol=1e-6)
+
+
+@pytest.fixture
+def copy(datasets, tmp_path):
+    return lambda: shutil.copytree(datasets('v2.1'), tmp_path / 'set')
+
+
+BY_NAME = {'arm.position': (slice(0, 2), ARM), 'effector.position': (slice(2, 3), GRIPPER)}
+WITHOUT = {'arm': (slice(0, 2), None), 'force': (slice(3, 4), None), 'grip': (slice(2, 3), None)}
+
+
+def streams(ends, joints, columns=None):
+    return {
+        key: {'feature': [f'{stem}.{end}' for end in ends],
+              **({'joints': dict(zip(('shoulder', 'elbow', 'gripper'), joints, strict=True))}
+                 if joints else {})}
+        for key, stem in (('state', 'observation.state'), ('action', 'action'))
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('parts', 'ends', 'joints'),
+    [
+        (BY_NAME, list(BY_NAME), None),  # named like the robot's joints
+        (BY_NAME, list(BY_NAME), [0, 1, 2]),
+        (BY_NAME, ['effector.position', 'arm.position'], [1, 2, 0]),  # in the order of the list
+        (WITHOUT, ['arm', 'force', 'grip'], [0, 1, 3]),
+    ],
+    ids=['names', 'numbers', 'another_order', 'without_names'],
+)
+def test_state_and_action_are_joined_from_several_features(
+    copy, make_mapping, tmp_path, parts, ends, joints
+):
+    root, file = split(copy(), parts), make_mapping()
+    values = yaml.safe_load(file.read_text()) | streams(ends, joints)
+    file.write_text(yaml.safe_dump(values))
+    summary = import_dataset(root, file, tmp_path / 'out')
+    assert summary.made == [0, 1] and not summary.failed
+    check(tmp_path / 'out/episode_000000', 0, 12)
+    check(tmp_path / 'out/episode_000001', 1, 9)
+
+
+def test_columns_without_a_name_of_their_own_are_called_by_their_feature(
+    copy, make_mapping, tmp_path
+):
+    root, file = split(copy(), WITHOUT), make_mapping()
+    values = yaml.safe_load(file.read_text())
+    for key, stem in (('state', 'observation.state'), ('action', 'action')):
+        names = [f'{stem}.arm/0', f'{stem}.arm/1', f'{stem}.grip']
+        values[key] = streams(WITHOUT, names)[key]
+    file.write_text(yaml.safe_dump(values))
+    assert import_dataset(root, file, tmp_path / 'out').made == [0, 1]
+    check(tmp_path / 'out/episode_000000', 0, 12)
+    values['state']['joints']['gripper'] = 'grip'
+    file.write_text(yaml.safe_dump(values))
+    failed = import_dataset(root, file, tmp_path / 'other').failed[0]
+    assert "no column 'grip'" in failed and 'observation.state.grip' in failed
+
+
+def test_two_features_may_name_their_columns_alike(copy, make_mapping, tmp_path):
+    same = {'arm.position': (slice(0, 2), ARM), 'arm.velocity': (slice(1, 3), ARM),
+            'effector.position': (slice(2, 3), GRIPPER)}  # fmt: skip
+    root, file = split(copy(), same), make_mapping()
+    values = yaml.safe_load(file.read_text())
+    for key, stem in (('state', 'observation.state'), ('action', 'action')):
+        names = [f'{stem}.arm.position/shoulder', f'{stem}.arm.position/elbow', 'gripper']
+        values[key] = streams(same, names)[key]
+    file.write_text(yaml.safe_dump(values))
+    assert import_dataset(root, file, tmp_path / 'out').made == [0, 1]
+    check(tmp_path / 'out/episode_000001', 1, 9)
+
+
+@pytest.mark.parametrize('velocities', [False, True])
+def test_split_features_need_no_mapping_where_columns_are_named_like_joints(
+    copy, make_mapping, tmp_path, velocities
+):
+    parts = {**BY_NAME, **({'arm.velocity': (slice(1, 3), ARM)} if velocities else {})}
+    root, folder = split(copy(), parts), make_mapping().parent
+    files = ['--robot', str(folder / 'robot.yaml'), '--calibration',
+             str(folder / 'calibration.yaml'), '--out', str(tmp_path / 'out')]  # fmt: skip
+    assert main(['import-dataset', str(root), *files]) == 0
+    check(tmp_path / 'out/episode_000000', 0, 12)
+
+
+def test_a_feature_of_the_list_that_is_not_there_is_named(copy, make_mapping, tmp_path):
+    root, file = split(copy(), BY_NAME), make_mapping()
+    values = yaml.safe_load(file.read_text()) | streams(['arm.position', 'efector.position'], None)
+    file.write_text(yaml.safe_dump(values))
+    with pytest.raises(ConfigError, match=r"efector.position' \(did you mean"):
+        import_dataset(root, file, tmp_path / 'out')
+
+
+def with_image_files(root, cell, place):
+    """Write the images of the front view as files; cells are made from their paths."""
+    for episode in range(2):
+        file = root / TABLE.format(episode)
+        table = parquet.read_table(file)
+        cells = table.column('observation.images.front').to_pylist()
+        made = []
+        for k, found in enumerate(cells):
+            path = place.format(episode, k)
+            (root / path).parent.mkdir(parents=True, exist_ok=True)
+            (root / path).write_bytes(found['bytes'])
+            made.append(cell(path, found['bytes']))
+        at = table.column_names.index('observation.images.front')
+        parquet.write_table(
+            table.set_column(at, 'observation.images.front', pyarrow.array(made)), file
+        )
+    return root
+
+
+PLACE = 'images/observation.images.front/episode_{:06d}/frame_{:06d}.png'
+
+
+def levels(folder):
+    track = read_episode(folder, with_cameras=False).images['front']
+    return [float(np.asarray(frame).mean()) for frame in track.frames]
+
+
+@pytest.mark.parametrize(
+    ('cell', 'place'),
+    [
+        (lambda path, data: {'bytes': None, 'path': path}, PLACE),
+        (lambda path, data: path, PLACE),
+        (lambda path, data: {'bytes': None, 'path': f'/home/someone/cache/name/{path}'}, PLACE),
+        (lambda path, data: {'bytes': None, 'path': Path(path).name}, PLACE),
+        (lambda path, data: {'bytes': None, 'path': 'C:\\sets\\' + path.replace('/', '\\')},
+         PLACE),
+        (lambda path, data: path.removeprefix('data/chunk-000/'),
+         'data/chunk-000/pictures/{}_{}.png'),
+        (lambda path, data: data, PLACE),
+        (lambda path, data: list(data), PLACE),
+    ],
+    ids=['path', 'text', 'another_machine', 'name', 'windows', 'beside_the_table', 'bytes',
+         'numbers'],
+)  # fmt: skip
+def test_images_are_read_from_the_files_that_the_table_names(
+    datasets, make_mapping, tmp_path, cell, place
+):
+    root = with_image_files(shutil.copytree(datasets('images'), tmp_path / 'set'), cell, place)
+    summary = import_dataset(root, make_mapping(), tmp_path / 'out')
+    assert summary.made == [0, 1] and not summary.failed
+    np.testing.assert_allclose(
+        levels(tmp_path / 'out/episode_000001'), 20 + 16 * np.arange(9) + 3, atol=2
+    )
+
+
+@pytest.mark.parametrize(
+    ('cell', 'said'),
+    [
+        ({'bytes': None, 'path': 'images/none.png'}, "is 'images/none.png', which is not there"),
+        ({'bytes': None, 'path': '../secret.png'}, 'outside the dataset'),
+        ({'bytes': None, 'path': None}, r"holds keys \['bytes', 'path'\], must be an encoded"),
+        ([1000, 2], 'holds list, must be an encoded image'),
+    ],
+    ids=['missing', 'outside', 'nothing', 'numbers'],
+)
+def test_an_image_that_is_nowhere_is_named(datasets, make_mapping, tmp_path, cell, said):
+    root = shutil.copytree(datasets('images'), tmp_path / 'set')
+    (tmp_path / 'secret.png').write_bytes(
+        cv2.imencode('.png', np.zeros((48, 64, 3), np.uint8))[1].tobytes()
+    )
+    root = with_image_files(root, lambda path, data: cell, PLACE)
+    summary = import_dataset(root, make_mapping(), tmp_path / 'out')
+    assert set(summary.failed) == {0, 1}
+    with pytest.raises(AssertionError, match=said):
+        raise AssertionError(summary.failed[0])
