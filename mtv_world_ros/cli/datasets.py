@@ -296,8 +296,8 @@ def _add_import_videos(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         'import-videos',
         help='convert video files with tables of joints or tool poses into episodes',
-        epilog='config/datasets/videos.yaml describes the mapping file and how frames belong '
-        'to rows. Call it again to continue: finished episodes are kept. Exit status: 1 if one failed.',
+        epilog='config/datasets/videos.yaml describes the mapping file. Call it again to '
+        'continue: finished episodes are kept. Exit status: 1 if one failed.',
     )
     parser.add_argument('folder', type=Path, help='of the files that the mapping names')
     parser.add_argument(
