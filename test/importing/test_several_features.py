@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.importing.convert import import_dataset
 
 ARM, GRIPPER = ['shoulder', 'elbow'], ['gripper']
