@@ -1,6 +1,6 @@
 # `make` installs into .venv; nothing here needs root. `make help` lists the targets.
 .DEFAULT_GOAL := install
-.PHONY: help install demo test tests style types fuzz kills soak attacks lint format docs clean distclean
+.PHONY: help install demo test tests style types fuzz kills soak attacks lint format docs clean distclean upstream
 
 # .venv has its own ROS: a native one that is sourced, or wheels of another environment, would load
 # in its place.
@@ -65,6 +65,10 @@ attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy 
 	$(BIN)/python test/robustness/listeners.py
 	MTV_WORLD_ATTACKS=all $(BIN)/python -m pytest -q test/robustness/test_commands.py test/robustness/test_examples.py
 
+upstream:  ## show what libraries do otherwise than documented, and which work-around of ours each guards (minutes)
+	@for script in test/upstream/*.sh; do echo "== $$script"; bash $$script || failed="$$failed $$script"; done; \
+		[ -z "$$failed" ] || { echo "changed:$$failed"; exit 1; }
+
 format: $(STAMP)  ## sort imports and format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -75,7 +79,7 @@ docs: $(STAMP)  ## build the documentation; open out/docs/index.html
 
 clean:  ## remove what the demo, the tests and colcon left behind; data/ and runs/ stay
 	rm -rf out build install log *.egg-info .pytest_cache .ruff_cache .import_linter_cache
-	find mtv_world_ros test benchmark launch -name __pycache__ -type d -prune -exec rm -rf {} +
+	find mtv_world_ros test experiments launch -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean  ## remove .venv, too
 	rm -rf .venv

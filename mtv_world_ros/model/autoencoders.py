@@ -262,7 +262,7 @@ class SpaceToDepthAutoencoder(ModelMixin, ConfigMixin):
     """Maps RGB video in [-1, 1] to latents of `3 * block_size**2` channels and back, exactly.
 
     A learned autoencoder beside a model as small as `small` costs more than it gives (measured,
-    see `benchmark/results/`). The interface is that of diffusers' as far as it is used.
+    see `experiments/results/`). The interface is that of diffusers' as far as it is used.
 
     Shapes: B batch, F frames, H W pixels, h w = H / block_size, W / block_size.
     """

@@ -47,7 +47,7 @@ def test_results_are_few_and_short():
     words = (ROOT / 'docs' / 'results.md').read_text().split()
     tables = [line for line in (ROOT / 'docs' / 'results.md').open() if line.startswith('|--')]
     assert len(words) <= 1350 and len(tables) == 1
-    assert len(list((ROOT / 'benchmark' / 'results').glob('*.md'))) <= 15
+    assert len(list((ROOT / 'experiments' / 'results').glob('*.md'))) <= 15
 
 
 def test_the_readme_and_the_results_page_have_the_same_table():
@@ -83,9 +83,9 @@ def test_every_page_is_linked_from_the_readme():
 
 
 def test_the_index_of_benchmarks_has_every_page():
-    index = (ROOT / 'docs' / 'benchmarks.md').read_text()
-    for page in (ROOT / 'benchmark' / 'results').glob('*.md'):
-        assert f'(../benchmark/results/{page.name})' in index, page.name
+    index = (ROOT / 'docs' / 'experiments.md').read_text()
+    for page in (ROOT / 'experiments' / 'results').glob('*.md'):
+        assert f'(../experiments/results/{page.name})' in index, page.name
 
 
 def test_every_example_is_run():

@@ -13,12 +13,12 @@ from mtv_world_ros.core.files import content_digest
 from mtv_world_ros.rollout.assembly import checkpoint_path
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = sorted((ROOT / 'benchmark' / 'results').glob('*.md'))
+PAGES = sorted((ROOT / 'experiments' / 'results').glob('*.md'))
 
 
 @pytest.fixture(scope='module')
 def page():
-    spec = importlib.util.spec_from_file_location('page', ROOT / 'benchmark' / 'page.py')
+    spec = importlib.util.spec_from_file_location('page', ROOT / 'experiments' / 'page.py')
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

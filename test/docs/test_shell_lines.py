@@ -54,7 +54,16 @@ LANGUAGES = {'bash', 'python', 'text', 'yaml'}
 #: has the options that `mtv-world replay` passes on
 PLAYER = ROOT / 'mtv_world_ros' / 'ros' / 'bags' / 'player.py'
 #: folders of the repository that lines may name files of
-FOLDERS = ('benchmark', 'config', 'docs', 'examples', 'launch', 'requirements', 'resource', 'test')
+FOLDERS = (
+    'config',
+    'docs',
+    'examples',
+    'experiments',
+    'launch',
+    'requirements',
+    'resource',
+    'test',
+)
 #: options of other programs that the texts mention
 FOREIGN_OPTIONS = {
     '--feedback', '--generate', '--head', '--show-args', '--symlink-install',
@@ -371,8 +380,8 @@ def test_lines_are_right(block):
         ('mtv-world replay resource/demo_epsiode --offline', 'does not exist'),
         ('mtv-world replay resource/demo_episode --lockstep', 'unrecognized arguments'),
         ('mtv-world evaluate bundled x --out y --serving compil=true', 'compil'),
-        ('python benchmark/serving_speed.py --thread 2', 'has no'),
-        ('python benchmark/serving.py', 'does not exist'),
+        ('python experiments/serving_speed.py --thread 2', 'has no'),
+        ('python experiments/serving.py', 'does not exist'),
         ('python -m mtv_world_ros.ros.policy_node', 'there is no module'),
         ('world_model --ros-args -p modes:=imagine', 'no such parameter'),
         ('ros2 launch mtv_world_ros world_model.launch.py mod:=imagine', 'has no argument'),
@@ -409,7 +418,7 @@ def test_commands_stand_in_blocks_marked_bash(page):
 @pytest.mark.parametrize('page', TEXTS)
 def test_options_and_commands_in_the_text_exist(page):
     known = {option for parser in parsers().values() for option in parser._option_string_actions}
-    shared = [PLAYER, *(ROOT / 'benchmark').glob('*.py')]
+    shared = [PLAYER, *(ROOT / 'experiments').glob('*.py')]
     known |= {o for path in shared for o in re.findall(r"'(--[\w-]+)'", path.read_text())}
     for code in _CODE.findall(TEXTS[page]):
         words = code.split()

@@ -21,14 +21,14 @@ ROOT = Path(__file__).resolve().parents[2]
 def scripts() -> SimpleNamespace:
     """The benchmarks as modules."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'benchmark'))
+        patch.syspath_prepend(str(ROOT / 'experiments'))
         names = ('gpu', 'wan_floor', 'wan_import')
         return SimpleNamespace(**{name: __import__(name) for name in names})
 
 
 def test_the_run_on_a_gpu_goes_through_on_a_cpu_at_tiny_size(tmp_path: Path) -> None:
     # the tests themselves are in this suite, and 14B is the script of Speed again
-    command = [sys.executable, ROOT / 'benchmark' / 'gpu.py', 'run', '--tiny', '--out', tmp_path]
+    command = [sys.executable, ROOT / 'experiments' / 'gpu.py', 'run', '--tiny', '--out', tmp_path]
     command += ['--parts', 'Speed', 'Training']
     told = subprocess.run(command, capture_output=True, text=True, check=False)
     assert told.returncode == 0, told.stdout + told.stderr

@@ -1,9 +1,9 @@
 """A chunk takes no longer than what keeps the three figures of 22 November 2026, on any machine.
 
 Those are .37, .44 and .46 s from a plan to its verdict, at a plan every 4 s, 1 Hz and 5 Hz, on two
-quiet cores (`benchmark/foresight.py`). Tests run on busy and unlike machines, so what counts here
-is the processor's time of one thread, against that of a computation that never changes: steps of
-an engine, and layers of a network.
+quiet cores (`experiments/foresight.py`). Tests run on busy and unlike machines, so what counts
+here is the processor's time of one thread, against that of a computation that never changes:
+steps of an engine, and layers of a network.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mtv_world_ros.rollout.rollout_options import RolloutOptions
 #: turns, of which the fastest counts: other work only ever makes one slower
 TURNS = 6
 #: a chunk of 3.2 s in units of the computation. It took 20.8 (.8 s) when it took .44 of what one
-#: of the tag v0.1.0 does (`benchmark/foresight_engines.py --chunks`), which needs .64, .82 and
+#: of the tag v0.1.0 does (`experiments/foresight_engines.py --chunks`), which needs .64, .82 and
 #: .87 s from plan to verdict; the figures are .53 of those and more, and lost from here on
 MOST_UNITS = 24.5
 BOXES = ''.join(

@@ -24,7 +24,7 @@ FAULTY = 'expert-grip_loose-1'
 def benchmark():
     """The benchmark's script, which imports its neighbour `page`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'benchmark'))
+        patch.syspath_prepend(str(ROOT / 'experiments'))
         yield importlib.import_module('shifted_worlds')
     for name in ('shifted_worlds', 'page'):
         sys.modules.pop(name, None)

@@ -7,7 +7,7 @@ from tiny_vision import save_dino, save_sam2, save_sam3
 @pytest.fixture(scope='session')
 def weights(tmp_path_factory) -> Path:
     """A folder with one tiny model of each kind, in subfolders of arbitrary names."""
-    # up to 5.19 SAM 2's own settings are read wrongly: findings/transformers_sam2_video_config.sh
+    # test/upstream/transformers_sam2_video_config.sh: up to 5.19 SAM 2's settings are misread
     pytest.importorskip('transformers', '5.20')
     root = tmp_path_factory.mktemp('weights')
     save_dino(root / 'some org' / 'detector')

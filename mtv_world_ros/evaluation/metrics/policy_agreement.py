@@ -186,7 +186,7 @@ def _root_times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
 #: fewer policies than this have no interval of r or MMRV
 MIN_POLICIES = 3
 #: of the posterior below and above an interval; with .025 an interval held the truth too rarely
-#: (`benchmark/interval_coverage.py`)
+#: (`experiments/interval_coverage.py`)
 _TAILS = (0.0125, 0.0125)
 #: the same of r where policies have few episodes, up to so many; from many on, it is as above
 _TAILS_OF_FEW, _FEW, _MANY = (0.0075, 0.0025), 20, 60

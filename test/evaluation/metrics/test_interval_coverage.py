@@ -18,7 +18,7 @@ def benchmark(tmp_path_factory):
     import importlib
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'benchmark'))
+        patch.syspath_prepend(str(ROOT / 'experiments'))
         yield importlib.import_module('interval_coverage')
     for name in ('interval_coverage', 'page'):
         sys.modules.pop(name, None)
@@ -27,7 +27,7 @@ def benchmark(tmp_path_factory):
 @pytest.mark.parametrize('name', ['t, mean of J', 'Wilson, share of independent trials'])
 def test_the_table_is_what_the_code_gives_and_93_to_97_percent_hold(benchmark, name):
     """Any change of an interval, or of the draws, changes it."""
-    (page,) = (ROOT / 'benchmark' / 'results').glob('interval_coverage_*.md')
+    (page,) = (ROOT / 'experiments' / 'results').glob('interval_coverage_*.md')
     row = re.search(rf'^\| {name} \| mild \| (.+) \|$', page.read_text(), re.M)
     told = [float(cell.split()[0]) for cell in row[1].split(' | ')]
     found = [benchmark.coverage(name, num, 1000, 0)[0] for num in benchmark.SIZES]

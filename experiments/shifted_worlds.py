@@ -1,0 +1,659 @@
+"""What are verdicts worth where the truth is another physics, and who earns them?
+
+    python experiments/shifted_worlds.py --faults drawn:4 --log out/shifted.jsonl
+    python experiments/shifted_worlds.py --physics nominal,bold --contact out/fitted --log out/fitted.jsonl
+
+In each physics of `config/physics.yaml` the expert and faulty policies act in the same scenes of the
+simulator; kinds of faults have the size `--size`, a factor of what was drawn. Each plan is foreseen
+from the pictures of the first frame alone, as the node does: cameras are checked against the arm's
+outline, objects are found by the segmenter. Judges: *foreseen motions alone*, the share of futures
+that succeed; where `--pictures` says so, *pictures alone* (no motion foreseen) and *both* (the estimate);
+where `--real` says so, *real frames*, the estimate on the simulator's; where `--contact FOLDER` has a
+folder `FOLDER/PHYSICS` that `fit-contact` wrote in that physics, *foreseen motions, fitted there*; the
+*no-picture rule*: an object sticks to a gripper that closes near it. From .75 on it is called a success,
+below .5 a failure.
+False success is of real failures that have a verdict, false failure of real successes. Intervals over
+scenes: AUROC jackknife, shares clustered Wilson. The log keeps what was done, and the same command
+goes on; physics that show the same first picture share what is imagined. `--no-camera-check` leaves
+cameras as they are told. Flips of contact, as `mtv-world rank` has them: of rollouts whose true outcome
+is another than the expert's in the same scene, the share in which the last imagined frame is nearer to
+what really happened than to what the expert's commands make happen, where objects are. The last table is
+of the node's watch, which compares the end of every executed chunk (here where objects truly are) with
+the futures: how many rollouts it takes to say that the physics is another one, over random orders.
+"""  # noqa: E501
+
+from __future__ import annotations
+
+import argparse
+import base64
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+import json
+from math import isfinite, nan
+from pathlib import Path
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+from page import parse_arguments, publish, table
+
+from mtv_world_ros.cameras.camera import camera_poses
+from mtv_world_ros.core.data_types import (
+    ByteArray,
+    FloatArray,
+    JointTrajectory,
+    Observation,
+    SuccessEstimate,
+)
+from mtv_world_ros.core.errors import MtvWorldError, PolicyError, SimulatorError
+from mtv_world_ros.core.images import encode_png, resize_frames
+from mtv_world_ros.data.episode import NOMINAL
+from mtv_world_ros.evaluation.metrics.statistics import clustered_wilson
+from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
+from mtv_world_ros.physics.arm_response import PERIOD_S
+from mtv_world_ros.physics.checkpoint_files import load_foresight
+from mtv_world_ros.physics.foreseen_motions import foreseen_of
+from mtv_world_ros.physics.object_motion import FoundObjects, ObjectMotionModel
+from mtv_world_ros.ranking.flips import is_nearer, objects_png
+from mtv_world_ros.ranking.judges import area_interval
+from mtv_world_ros.ranking.no_picture_rule import judge_without_pictures
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.resample import resample
+from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros.rollout.imagined_episode import Rollout
+from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.simulation.collect.episode_jobs import episode_seed
+from mtv_world_ros.simulation.collect.record import carry_out, RecordConfig, Take
+from mtv_world_ros.simulation.expert.expert import Expert
+from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
+from mtv_world_ros.simulation.faults.catalogue import EXPERT, FAULTS, kinds_of, PolicyVariant
+from mtv_world_ros.simulation.faults.drawn import is_drawn
+from mtv_world_ros.simulation.physics import catalogue, physics_named
+from mtv_world_ros.simulation.simulator import CONTROL_PERIOD_S, SimEpisode
+from mtv_world_ros.simulation.tasks import task_named
+from mtv_world_ros.success.doubts import Grounds, NEAR_M, PhysicsWatch, unforeseen
+from mtv_world_ros.success.estimator import capped, stated_probability, verdict
+from mtv_world_ros.success.situation import CannotTell
+from mtv_world_ros.vision.camera_check import CameraCheck
+
+#: how rollouts are recorded
+_RECORD = RecordConfig()
+TASKS = (
+    'place_block_a2b_left', 'stack_blocks_two', 'place_cup_plate', 'collect_toy',
+    'place_bread_plate', 'move_object_two',
+)  # fmt: skip
+HEAD = (
+    'truth', 'judged by', 'n', 'succeed', 'AUROC', 'false success', 'false failure', 'no verdict',
+    'from .9 on succeed',
+)  # fmt: skip
+ACROSS = ('judged by', 'truths', 'AUROC, mean', 'worst', 'false success, mean', 'worst',
+          'no verdict, mean')  # fmt: skip
+WATCHED = (
+    'truth', 'foreseen by', 'chunks that ended unforeseen',
+    'says so after rollouts: median [5 %, 95 %]', 'orders in which it never does',
+)  # fmt: skip
+FLIPPED = ('truth', 'imagined by', 'flips of contact that are imagined')
+FORESEEN, PICTURES, BOTH = 'foreseen motions alone', 'pictures alone', 'both'
+REAL, RULE, FITTED = 'real frames', 'no-picture rule', 'foreseen motions, fitted there'
+#: random orders of rollouts in which the watch sees them
+_ORDERS = 100
+#: what pictures are made for
+IMAGINED = (PICTURES, BOTH)
+Job = tuple[str, str, int, int, str]
+Said = dict[str, Any]
+
+
+def more(parser: argparse.ArgumentParser) -> None:
+    """Adds options."""
+    parser.add_argument('--physics', default=','.join(catalogue()))
+    parser.add_argument('--pictures', default='', metavar='PHYSICS', help='of these, or all')
+    parser.add_argument('--real', default='', metavar='PHYSICS', help='of these, or all')
+    parser.add_argument('--checkpoints', default='bundled', help='each sees the same rollouts')
+    parser.add_argument('--contact', type=Path, help='FOLDER/PHYSICS, which fit-contact wrote')
+    parser.add_argument('--faults', default='drawn:0', help='a split, or drawn:SEED')
+    parser.add_argument('--size', type=float, default=1.1, help='of drawn kinds')
+    parser.add_argument('--tasks', default=','.join(TASKS))
+    parser.add_argument('--scenes', type=int, default=1, help='of each task')
+    parser.add_argument('--policies', type=int, default=13, help='in each scene, with the expert')
+    parser.add_argument('--log', type=Path, required=True, help='JSON lines of what was done')
+    parser.add_argument('--no-camera-check', action='store_true')
+    parser.add_argument('--until', type=float, default=1e9, help='begins no policy after so long')
+
+
+def policies_of(faults: str, size: float, count: int) -> list[str]:
+    """Returns the expert and a policy of each kind of fault; known ones in their usual size."""
+    kinds = kinds_of(faults)
+    sizes = {kind: size if is_drawn(kind) else FAULTS[kind].size.typical for kind in kinds}
+    return [EXPERT, *(PolicyVariant.of({k: v}).name for k, v in sizes.items())][:count]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ahead:
+    """What is foreseen of a rollout.
+
+    Attributes:
+        share: of the futures that succeed; NaN = they do not tell.
+        names: of the O objects.
+        points: (K, 1 + C, O, 3) centres at first and at the ends of chunks [m].
+        times: (1 + C,) [s].
+    """
+
+    share: float
+    names: tuple[str, ...]
+    points: FloatArray
+    times: FloatArray
+
+    def said(self, sim: SimEpisode, take: Take) -> Said:
+        """Returns the share, and how far each chunk's end truly was from all futures [m]."""
+        items = {item.name: number for number, item in enumerate(sim.scene.objects)}
+        known = [number for number, name in enumerate(self.names) if name in items]
+        frames = np.rint(self.times / _RECORD.frame_period_s).astype(int)
+        centres = take.object_poses[..., :3, 3]
+        columns = [items[self.names[number]] for number in known]
+        real = centres[np.minimum(frames, len(centres) - 1)][:, columns]
+        points = self.points[:, :, known]
+        chunks = [slice(chunk, chunk + 2) for chunk in range(len(self.times) - 1)]
+        apart = [unforeseen(points[:, chunk], real[chunk]) for chunk in chunks]
+        return {'value': self.share if isfinite(self.share) else None, 'apart': apart}
+
+
+def foreseen_by(
+    pipeline: Pipeline, episode: Rollout, observation: Observation, commands: FloatArray
+) -> Ahead:
+    """Returns what is foreseen of commands (C, J)."""
+    model, names = pipeline.object_motion, episode.names
+    assert model is not None  # `Scenes._ask` asks only pipelines that foresee
+    masks = pipeline.segmenter.segment(observation.frames[:, None], names).masks[:, :, 0]
+    poses = np.stack(
+        [
+            camera_poses(camera, pipeline.robot, observation.positions[None])[0]
+            for camera in observation.cameras
+        ]
+    )
+    tracked = model.find(names, masks, observation.cameras, list(poses))
+    objects = FoundObjects.at(names, observation.frames, masks, poses, tracked)
+    (ahead,) = objects.foresee([commands])
+    num_rows = len(ahead.motions[0].points)
+    motions = foreseen_of(pipeline.robot, ahead, num_rows)
+    ends = pipeline.estimator.foresee(motions, episode.options.instruction)
+    each = round(pipeline.spec.num_frames / pipeline.spec.fps / motions.step_s)
+    rows = np.array([*range(0, num_rows - 1, each), num_rows - 1])
+    return Ahead(
+        share=nan if ends is None or ahead.tracked.refusal else ends.share,
+        names=names,
+        points=motions.points[:, rows],
+        times=rows * motions.step_s,
+    )
+
+
+def features_of(estimate: SuccessEstimate) -> dict[str, float] | None:
+    """Return the features of an estimate, calibrated or not; None = it abstains."""
+    return dict(estimate.features) if isfinite(estimate.probability) else None
+
+
+def imagined(pipeline: Pipeline, episode: Rollout, commands: FloatArray) -> Said:
+    """Returns what the estimate rests on after commands (C, J) are imagined."""
+    times = PERIOD_S * np.arange(1, len(commands), dtype=np.float64)
+    plan = JointTrajectory(
+        joint_names=pipeline.robot.joint_names, times=times, positions=commands[1:]
+    )
+    *_, last = episode.extend(plan)
+    return {'features': features_of(last.success), 'ends': packed(episode.observation.frames)}
+
+
+def packed(frames: ByteArray) -> str:
+    """Returns frames (V, H, W, 3) uint8 RGB, views in a row, as text."""
+    return base64.b64encode(encode_png(np.concatenate(list(frames), axis=1))).decode()
+
+
+def unpacked(text: str) -> ByteArray:
+    """Returns what `packed` was given, (H, V * W, 3)."""
+    data = np.frombuffer(base64.b64decode(text), np.uint8)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+
+
+def ends_of(pipeline: Pipeline, sim: SimEpisode, names: tuple[str, ...]) -> dict[str, str]:
+    """Returns the picture that a rollout ends with, and where objects are in it, as text."""
+    last = observed(sim, sim.observe())
+    size = pipeline.spec.width, pipeline.spec.height
+    frames = np.stack([resize_frames(frame[None], *size)[0] for frame in last.frames])
+    masks = pipeline.segmenter.segment(frames[:, None], names).masks[:, :, 0]
+    objects = base64.b64encode(objects_png(masks)).decode()
+    return {'ends': packed(frames), 'objects': objects}
+
+
+def observed(sim: SimEpisode, seen: Any) -> Observation:
+    """Returns what a policy sees, with the cameras as they are told."""
+    cameras = sim.calibrated_cameras
+    frames = np.stack([seen.images[camera.view] for camera in cameras])
+    return Observation(cameras=cameras, frames=frames, positions=seen.positions, stamp_ns=1)
+
+
+def frames_judged(pipeline: Pipeline, episode: Rollout, take: Take) -> Said:
+    """Returns what the estimate rests on at the end of the simulator's own frames."""
+    each = round(1 / (pipeline.spec.fps * _RECORD.frame_period_s))
+    kept = take.observations[::each]
+    positions = np.stack([seen.positions for seen in kept])
+    num, success = pipeline.spec.num_frames, None
+    for first in range(0, len(kept) - 1, num):
+        chunk = kept[first + 1 : first + 1 + num]
+        frames = np.stack(
+            [[seen.images[c.view] for seen in chunk] for c in episode.observation.cameras]
+        )
+        success = episode.observe(frames, positions[first : first + 1 + len(chunk)]).success
+    assert success is not None
+    return {'features': features_of(success)}
+
+
+class Scenes:
+    """What several physics share: expert's plans are of one table, imagination of one picture."""
+
+    def __init__(self, pipelines: dict[str, Pipeline], options: argparse.Namespace) -> None:
+        self._pipelines, self._known = pipelines, dict[tuple, Any]()
+        self._fitted = dict[str, ObjectMotionModel]()
+        for physics in options.physics.split(',') if options.contact else ():
+            folder = options.contact / physics / OBJECT_MOTION_FOLDER
+            robot = next(iter(pipelines.values())).robot
+            if folder.is_dir() and (motion := load_foresight(folder, robot)) is not None:
+                self._fitted[physics] = motion
+        self._of = {
+            key: set(catalogue()) if names == 'all' else set(names.split(','))
+            for key, names in (('pictures', options.pictures), ('real', options.real))
+        }
+        self._group: tuple | None = None
+
+    def wanted(self, physics: str) -> list[str]:
+        """Returns the judges of a physics."""
+        more = [FITTED] if physics in self._fitted else []
+        more += IMAGINED if physics in self._of['pictures'] else ()
+        return [FORESEEN, *more, *([REAL] if physics in self._of['real'] else ())]
+
+    def rollout(self, job: Job) -> dict[str, Any]:
+        """Returns what really happens, and what each checkpoint and the rule say."""
+        physics, task, _, seed, policy = job
+        if self._group != job[1:]:
+            self._group, self._known = job[1:], {}
+        robot = next(iter(self._pipelines.values())).robot
+        plan, home = self._plan(job, robot)
+        sim = SimEpisode(robot, home, physics=physics)
+        is_real = physics in self._of['real']
+        record = replace(_RECORD, pictures='all' if is_real else 'first')
+        try:
+            seen = sim.reset(seed, task)
+            first = observed(sim, seen)
+            take = carry_out(sim, task_named(task), plan, seen, record)
+            ends: dict[str, str] = {}
+            if physics in self._of['pictures']:
+                names = tuple(item.name for item in sim.scene.objects)
+                ends = ends_of(next(iter(self._pipelines.values())), sim, names)
+        finally:
+            sim.close()
+        end = take.control_positions.shape[0] * CONTROL_PERIOD_S
+        commands = resample(take.commands, sim.home, np.arange(0.0, end, PERIOD_S))
+        said: dict[str, Any] = {}
+        for name, pipeline in self._pipelines.items():
+            judges = [judge for judge in self.wanted(physics) if judge not in (REAL, FITTED)]
+            found = {
+                judge: self._once(name, judge, first, sim.instruction, commands, seed)
+                for judge in judges[::-1]
+            }
+            if physics in self._fitted:
+                motion = self._fitted[physics]
+                found[FITTED] = self._once(
+                    name, FITTED, first, sim.instruction, commands, seed, motion
+                )
+            said[name] = {
+                judge: one.said(sim, take) if isinstance(one, Ahead) else one
+                for judge, one in found.items()
+            }
+            if is_real:
+                begun = pipeline.begin(
+                    first, RolloutOptions(instruction=sim.instruction, seed=seed)
+                )
+                said[name][REAL] = frames_judged(pipeline, begun, take)
+        rule = self._once(name, RULE, first, sim.instruction, commands, seed)
+        return {'final': take.final, 'said': said, 'rule': rule, **ends}
+
+    def _plan(self, job: Job, robot: RobotModel) -> tuple[JointTrajectory, FloatArray]:
+        """The policy's plan, and where it begins; one a table and size of objects."""
+        physics, task, _, seed, policy = job
+        truth = physics_named(physics)
+        key = (truth.table_m, truth.object_size)
+        if key not in self._known:
+            expert = Expert(robot, physics=physics)
+            acting = scripted_policy(policy, task, seed, expert)
+            acting.reset(seed=seed)
+            self._known[key] = acting.plan, expert.home
+        return self._known[key]
+
+    def _once(
+        self,
+        name: str,
+        judge: str,
+        first: Observation,
+        instruction: str,
+        commands: FloatArray,
+        seed: int,
+        motion: ObjectMotionModel | None = None,
+    ) -> Said | Ahead:
+        """What a judge says, who is asked once for all physics that look the same.
+
+        The motion is that of the physics, and None is the checkpoint's.
+        """
+        cameras = [camera.T_mount_camera.tobytes() for camera in first.cameras]
+        same = (first.frames.tobytes(), first.positions.tobytes(), commands.tobytes(), *cameras)
+        key = (name, judge, motion, *same)
+        if key not in self._known:
+            whole = self._pipelines[name]
+            check = self._check(whole, (name, *same), first)
+            if check.refusal and judge != RULE:
+                return {'refused': True}
+            motion = motion or whole.object_motion
+            pipeline = replace(whole, camera_checker=None, object_motion=motion)
+            if judge == PICTURES:
+                pipeline = pipeline.without_foresight()
+            # features are logged whether or not weights were ever fitted to them
+            pipeline = replace(pipeline, grounds=Grounds())
+            first = check.corrected_observation(first)
+            begun = pipeline.begin(
+                first, RolloutOptions(instruction=instruction, seed=seed, num_inference_steps=1)
+            )
+            self._known[key] = self._ask(judge, pipeline, begun, first, commands)
+        return self._known[key]
+
+    def _check(self, pipeline: Pipeline, key: tuple, first: Observation) -> CameraCheck:
+        """What the first picture says about the cameras."""
+        checker = pipeline.camera_checker
+        if checker is None:
+            return CameraCheck()
+        if key not in self._known:
+            self._known[key] = checker.check(first)
+        return self._known[key]
+
+    @staticmethod
+    def _ask(
+        judge: str,
+        pipeline: Pipeline,
+        episode: Rollout,
+        first: Observation,
+        commands: FloatArray,
+    ) -> Said | Ahead:
+        if judge == RULE:
+            try:
+                return {'value': float(judge_without_pictures(pipeline, episode, commands))}
+            except CannotTell:
+                return {'value': None}
+        if judge in IMAGINED:
+            return imagined(pipeline, episode, commands)
+        if pipeline.object_motion is None:  # of a checkpoint that foresees nothing: no verdict
+            return {'value': None}
+        return foreseen_by(pipeline, episode, first, commands)
+
+
+def jobs(options: argparse.Namespace) -> Iterator[Job]:
+    """Yields physics, task, number of the scene, its seed, policy: all physics take turns."""
+    policies = policies_of(options.faults, options.size, options.policies)
+    for index in range(options.scenes):
+        for policy in policies:
+            for task in options.tasks.split(','):
+                seed = episode_seed(options.seed, task, index, 0)
+                for physics in options.physics.split(','):
+                    yield physics, task, index, seed, policy
+
+
+def run(options: argparse.Namespace, pipelines: dict[str, Pipeline]) -> list[dict[str, Any]]:
+    """Runs what is missing in the log; returns all of it that the options ask for."""
+    begun, scenes = time.monotonic(), Scenes(pipelines, options)
+    done: dict[Job, dict[str, Any]] = {}
+    if options.log.is_file():
+        lines = [json.loads(line) for line in options.log.read_text().splitlines()]
+        done = {tuple(line['job']): line for line in lines}
+    options.log.parent.mkdir(parents=True, exist_ok=True)
+    found, last = [], None
+    for job in jobs(options):
+        known = done.get(job)
+        if known is None or not is_whole(known, scenes.wanted(job[0]), pipelines):
+            # all physics of a policy or none, so that they are comparable
+            if time.monotonic() - begun > options.until and job[1:] != last:
+                break
+            try:
+                known = {'job': job, **scenes.rollout(job)}
+            except (SimulatorError, PolicyError) as error:
+                known = {'job': job, 'skipped': str(error)}
+            with options.log.open('a') as stream:
+                stream.write(json.dumps(known) + '\n')
+        last = job[1:]
+        if 'skipped' not in known:
+            found.append(known)
+    return found
+
+
+def is_whole(known: dict[str, Any], judges: Sequence[str], names: Iterable[str]) -> bool:
+    """Tells whether a line of the log has all that is asked for."""
+    if 'skipped' in known:
+        return True
+    return all(set(judges) <= set(known['said'].get(name, ())) for name in names)
+
+
+def estimated(pipeline: Pipeline, judge: str, said: Said) -> float:
+    """Returns the probability of success that a judge gives; NaN = it abstains.
+
+    Estimates are those of the checkpoint as it is calibrated now; of one that is not calibrated
+    for rollouts of this kind, those of the stated weights.
+    """
+    if said.get('value') is not None:
+        return float(said['value'])
+    features, judging = said.get('features'), pipeline
+    if judge == PICTURES:
+        judging = pipeline.without_foresight()
+    if features is None:
+        return nan
+    calibration = judging.estimator.calibration
+    if calibration is None:
+        return capped(stated_probability(features), features)
+    weights = calibration.given(judge == REAL, isfinite(features.get('foreseen', nan)))
+    return capped(weights.probability(features), features)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What a judge reached in a physics; shares are NaN where there is none to share."""
+
+    physics: str
+    judge: str
+    cells: list[str]
+    auroc: float
+    false_success: float
+    unknown: float
+
+
+def row(physics: str, judge: str, rows: Sequence[dict[str, Any]], said: FloatArray) -> Row:
+    """Returns a row of the table, of estimates (N,)."""
+    real = np.array([r['final'] for r in rows], np.bool_)
+    scenes = [(r['job'][1], r['job'][2]) for r in rows]
+    known = np.isfinite(said)
+    calls = np.array([verdict(float(value)) for value in said])
+    cells = [physics, judge, str(len(rows)), str(int(real.sum()))]
+    auroc, text = nan, '–'
+    if known.any() and len(set(real[known])) == 2:
+        chosen = [scene for scene, is_known in zip(scenes, known, strict=True) if is_known]
+        auroc, (low, high) = area_interval([said[known]], real[known], chosen)
+        text = f'{auroc:.2f}' + (f' [{low:.2f}, {high:.2f}]' if isfinite(low) else '')
+    failed = ~real & np.isfinite(calls)
+    wrong = [_share(calls == 1, failed, scenes),
+             _share(calls == 0, real & np.isfinite(calls), scenes)]  # fmt: skip
+    none, sure = ~np.isfinite(calls), known & (said >= 0.9)
+    held = f'{(real & sure).sum()} of {sure.sum()}'
+    cells += [text, *wrong, f'{none.sum()} of {len(rows)}', held]
+    share = float((calls[failed] == 1).mean()) if failed.any() else nan
+    return Row(physics, judge, cells, auroc, share, float(none.mean()))
+
+
+def across(rows: Sequence[Row]) -> list[list[str]]:
+    """Returns a line a judge: the means over all shifted truths, and the worst."""
+    lines = []
+    for judge in dict.fromkeys(r.judge for r in rows):
+        of = [r for r in rows if r.judge == judge and r.physics != NOMINAL]
+        if not of:
+            continue
+        least = min(of, key=lambda r: r.auroc if isfinite(r.auroc) else 2.0)
+        most = max(of, key=lambda r: r.false_success if isfinite(r.false_success) else -1.0)
+        lines.append(
+            [judge, str(len(of)), f'{_mean([r.auroc for r in of]):.2f}',
+             f'{least.auroc:.2f} ({least.physics})',
+             f'{_mean([r.false_success for r in of]):.2f}',
+             f'{most.false_success:.2f} ({most.physics})',
+             f'{np.mean([r.unknown for r in of]):.2f}']
+        )  # fmt: skip
+    return lines
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Mean of those that are known; NaN = none is."""
+    known = [value for value in values if isfinite(value)]
+    return float(np.mean(known)) if known else nan
+
+
+def _share(hits: np.ndarray, among: np.ndarray, scenes: Sequence[tuple[str, int]]) -> str:
+    if not among.any():
+        return '–'
+    names = list(dict.fromkeys(scenes))
+    number = np.array([names.index(scene) for scene in scenes])
+    counts = [np.bincount(number[among & h], minlength=len(names)) for h in (hits, among)]
+    low, high = clustered_wilson(*(c[counts[1] > 0].astype(np.float64) for c in counts))
+    interval = f' [{low:.2f}, {high:.2f}]' if isfinite(low) else ''
+    return f'{int(counts[0].sum())} of {int(counts[1].sum())}{interval}'
+
+
+def rows_of(
+    options: argparse.Namespace, pipelines: dict[str, Pipeline], found: Sequence[dict[str, Any]]
+) -> list[Row]:
+    """Returns a row for each physics and judge."""
+    rows, scenes = [], Scenes(pipelines, options)
+    for physics in options.physics.split(','):
+        chosen = [r for r in found if r['job'][0] == physics]
+        if not chosen:
+            continue
+        for name, pipeline in pipelines.items():
+            for judge in scenes.wanted(physics):
+                said = [estimated(pipeline, judge, r['said'][name][judge]) for r in chosen]
+                title = judge if len(pipelines) == 1 else f'{judge}, {name}'
+                rows.append(row(physics, title, chosen, np.array(said)))
+        rule = [nan if r['rule']['value'] is None else r['rule']['value'] for r in chosen]
+        rows.append(row(physics, RULE, chosen, np.array(rule)))
+    return rows
+
+
+def flip_rows(
+    options: argparse.Namespace, found: Sequence[dict[str, Any]], names: Iterable[str]
+) -> list[list[str]]:
+    """Returns how many flips of contact each way of imagining shows, in each physics."""
+    rows, names = [], list(names)
+    for physics in options.physics.split(','):
+        chosen = [r for r in found if r['job'][0] == physics and 'ends' in r]
+        experts = {tuple(r['job'][1:3]): r for r in chosen if r['job'][4] == EXPERT}
+        pairs = [(r, experts.get(tuple(r['job'][1:3]))) for r in chosen]
+        flips = [(r, e) for r, e in pairs if e is not None and e['final'] != r['final']]
+        for name in names:
+            for judge in IMAGINED:
+                known = [(r, e) for r, e in flips if 'ends' in r['said'][name].get(judge, {})]
+                hits = np.array([is_flip(r, e, r['said'][name][judge]['ends']) for r, e in known])
+                scenes = [(r['job'][1], r['job'][2]) for r, _ in known]
+                if known:
+                    title = judge if len(names) == 1 else f'{judge}, {name}'
+                    share = _share(hits, np.ones(len(known), np.bool_), scenes)
+                    rows.append([physics, title, share])
+    return rows
+
+
+def is_flip(faulty: dict[str, Any], expert: dict[str, Any], imagined_ends: str) -> bool:
+    """Returns whether an imagined end is nearer to the faulty rollout's than to the expert's."""
+    own, other, imagined_end = map(unpacked, (faulty['ends'], expert['ends'], imagined_ends))
+    objects = (unpacked(faulty['objects']) > 127) | (unpacked(expert['objects']) > 127)
+    return is_nearer(imagined_end, own, other, np.asarray(objects.any(-1)))
+
+
+def watch_rows(
+    options: argparse.Namespace, found: Sequence[dict[str, Any]], names: Iterable[str]
+) -> list[list[str]]:
+    """Returns what the watch makes of executed chunks, in each physics."""
+    rows = []
+    for physics in options.physics.split(','):
+        for name in names:
+            for judge in (FORESEEN, FITTED):
+                said = [r['said'][name].get(judge, {}) for r in found if r['job'][0] == physics]
+                apart = [one['apart'] for one in said if 'apart' in one]
+                if any(np.isfinite(one).any() for one in apart):
+                    title = judge if len(list(names)) == 1 else f'{judge}, {name}'
+                    rows.append([physics, title, *watch_cells(apart)])
+    return rows
+
+
+def watch_cells(apart: Sequence[Sequence[float]]) -> list[str]:
+    """Returns the rest of a row, of how far the chunks of each rollout ended from all futures."""
+    told = np.concatenate([np.array(one) for one in apart])
+    told = told[np.isfinite(told)]
+    rng = np.random.default_rng(0)
+    counts = np.array([needed(apart, rng.permutation(len(apart))) for _ in range(_ORDERS)])
+    said = counts[counts > 0]
+    after = '–'
+    if len(said):
+        low, middle, high = np.percentile(said, (5, 50, 95))
+        after = f'{middle:.0f} [{low:.0f}, {high:.0f}]'
+    unlike = int((told > NEAR_M).sum())
+    return [f'{unlike} of {len(told)}', after, f'{(counts == 0).sum()} of {_ORDERS}']
+
+
+def needed(apart: Sequence[Sequence[float]], order: Iterable[int]) -> int:
+    """Returns after how many rollouts the watch says that the physics is another; 0 = never."""
+    watch = PhysicsWatch()
+    for count, number in enumerate(order, 1):
+        for away in apart[number]:
+            watch.take(away)
+        if watch.doubt:
+            return count
+    return 0
+
+
+def main() -> None:
+    """Prints a row for each physics and judge, and writes them as a page."""
+    options = parse_arguments(__doc__, 1, more)
+    names = options.checkpoints.split(',')
+    pipelines = {
+        name: load_pipeline(name, camera_check=not options.no_camera_check) for name in names
+    }
+    found = run(options, pipelines)
+    if not found:
+        raise MtvWorldError('no rollout was done; give more time (--until)')
+    rows = rows_of(options, pipelines, found)
+    asked = ('faults', 'size', 'physics', 'pictures', 'real', 'contact', 'tasks', 'scenes',
+             'policies', 'seed', 'checkpoints')  # fmt: skip
+    command = ' '.join(
+        f'--{key} {getattr(options, key)}' for key in asked if getattr(options, key)
+    )
+    publish(
+        'shifted_worlds',
+        'Verdicts where the truth is another physics',
+        f'python experiments/shifted_worlds.py {command}',
+        '\n\n'.join(
+            [
+                (__doc__ or '').split('\n' * 2)[-1].strip(),
+                f'{len(found)} rollouts.',
+                table(HEAD, [r.cells for r in rows]),
+                'Over all truths but the nominal one:',
+                table(ACROSS, across(rows)),
+                'Flips of contact:',
+                table(FLIPPED, flip_rows(options, found, list(pipelines))),
+                'Executed chunks against the futures:',
+                table(WATCHED, watch_rows(options, found, list(pipelines))),
+            ]
+        ),
+        options,
+        'one process',
+    )
+
+
+if __name__ == '__main__':
+    main()
