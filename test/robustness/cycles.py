@@ -38,7 +38,7 @@ class Cycles:
     def __init__(self, out: Path, *, bundled: bool) -> None:
         program = {'program': NODE} if bundled else {}
         self.out, self.rows = out, [dict[str, float]()][:0]
-        self.process = ros().start_node(out, 'pace:=burst', **program)
+        self.process = ros().start_node_process(out, 'pace:=burst', **program)
         self.client = ros().Client()
         self.client.wait(self.client.diagnostic_values, 'the node', PATIENCE_S)
         self.client.connect_inputs(ros().INPUTS)

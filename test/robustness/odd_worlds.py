@@ -37,7 +37,7 @@ class World:
         values = ('pace:=burst', *parameters, f'use_sim_time:={str(sim_time).lower()}')
         remaps = (f'__ns:=/{space}',) if space else ()
         out.mkdir(parents=True, exist_ok=True)
-        self.process = ros().start_node(out, *values, remaps=remaps)
+        self.process = ros().start_node_process(out, *values, remaps=remaps)
         self.client = ros().Client()
         report = f'/{space}/world_model/report' if space else '/world_model/report'
         if space:

@@ -88,7 +88,7 @@ class Rate:
         self.memory: list[tuple[int, float]] = []
         program = {'program': NODE} if bundled else {}
         values = ('pace:=burst', 'max_horizon_s:=60.0', 'max_trajectory_age_s:=60.0')
-        self.process = ros().start_node(out, *values, **program)
+        self.process = ros().start_node_process(out, *values, **program)
         self.client = ros().Client()
         self.client.wait(self.client.diagnostic_values, 'the node', PATIENCE_S)
         # a client that is not scheduled for a while would lose ends itself with the usual 100

@@ -90,7 +90,7 @@ class Soak:
         return summary
 
     def _start(self) -> None:
-        self._node = self._ros.start_node(self._out, 'pace:=burst')
+        self._node = self._ros.start_node_process(self._out, 'pace:=burst')
         self._client.connect_inputs(self._ros.INPUTS)
         self._client.send_scene()
 

@@ -33,9 +33,16 @@ from mtv_world_ros.ros.messages.conversions import (  # noqa: E402
     values_of,
 )
 from mtv_world_ros.ros.messages.image_messages import to_compressed, to_image  # noqa: E402
+from mtv_world_ros.ros.policy.node import PolicyNode  # noqa: E402
+from mtv_world_ros.ros.world_model.node import main, WorldModelNode  # noqa: E402
+from test.ros.fake_policy import load as load_fake_policy  # noqa: E402
+from test.ros.fake_world_model import load as load_fake  # noqa: E402
+from test.support.in_process import NodeInProcess, run_to_end  # noqa: E402
+from test.support.ros_domain import claim_domain  # noqa: E402
 
-os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
+os.environ['ROS_DOMAIN_ID'] = str(claim_domain())
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(share_path('config', 'fastdds_heartbeat.xml'))
 
 PACKAGES = filter(None, (str(Path(__file__).parents[2]), os.environ.get('PYTHONPATH')))
 ENVIRONMENT = {**os.environ, 'PYTHONPATH': os.pathsep.join(PACKAGES), 'OMP_NUM_THREADS': '1'}
@@ -358,106 +365,11 @@ def make_trajectory(*, stamp_ns=0, names=JOINTS, seconds=CHUNK_S, times=None, po
     return message
 
 
-class Forks:
-    """Starts nodes as forks of a process that has imported them: imports take most of a start.
-
-    Args:
-        code: defines `start(words) -> status`; modules of this folder can be imported.
-    """
-
-    def __init__(self, code):
-        environment = {**ENVIRONMENT, 'PYTHONPATH': f'{FAKE.parent}:{ENVIRONMENT["PYTHONPATH"]}'}
-        self._process = subprocess.Popen(
-            [sys.executable, '-c', f'print(flush=True)\n{code}{FORKING}'], env=environment,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        self._process.stdout.readline()  # from now on it has its own name in /proc
-
-    def ask(self, **asked):
-        self._process.stdin.write(json.dumps(asked) + '\n')
-        self._process.stdin.flush()
-        return json.loads(self._process.stdout.readline())
-
-    def start(self, words, log):
-        return Fork(self, self.ask(words=words, log=str(log), environment=ENVIRONMENT))
-
-    def run(self, folder, *words):
-        """Returns the exit status of a node that ends by itself, and all that it said."""
-        log = folder / f'{time.monotonic_ns()}.log'
-        return self.start(words, log).wait(120), log.read_text()
-
-    def close(self):
-        self._process.stdin.close()
-        assert self._process.wait(60) == 0
-        self._process.stdout.close()
-
-
-FORKING = """
-import json, os, sys
-for line in sys.stdin:
-    asked = json.loads(line)
-    if 'words' in asked:
-        answer = os.fork()
-        if not answer:
-            log = os.open(asked['log'], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-            os.dup2(log, 1)
-            os.dup2(log, 2)
-            os.environ.update(asked['environment'])
-            sys.exit(start(asked['words']))
-    else:
-        pid, status = os.waitpid(asked['pid'], os.WNOHANG)
-        answer = os.waitstatus_to_exitcode(status) if pid else None
-    print(json.dumps(answer), flush=True)
-"""
-
-
-class Fork:
-    """A forked node, with what tests use of `Popen`."""
-
-    def __init__(self, forks, pid):
-        self._forks, self.pid, self.returncode = forks, pid, None
-
-    def poll(self):
-        if self.returncode is None:
-            self.returncode = self._forks.ask(pid=self.pid)
-        return self.returncode
-
-    def wait(self, timeout):
-        end = time.monotonic() + timeout
-        while self.poll() is None:
-            if time.monotonic() > end:
-                raise subprocess.TimeoutExpired(f'node {self.pid}', timeout)
-            time.sleep(0.02)
-        return self.returncode
-
-    def send_signal(self, number):
-        if self.poll() is None:
-            os.kill(self.pid, number)
-
-    def kill(self):
-        self.send_signal(signal.SIGKILL)
-
-
-#: forks nodes with the fake world model while tests run
-FORKS = []
-
-
-@pytest.fixture(scope='session', autouse=True)
-def forks_of_the_fake():
-    FORKS.append(Forks('import fake_world_model as f\nstart = lambda w: f.main(w, load=f.load)\n'))
-    yield
-    FORKS.pop().close()
-
-
 class NodeProcess:
     """The node as its own process."""
 
     def __init__(self, command, log):
         self._log = log.open('w+')
-        if FORKS and command[1] == str(FAKE):
-            self.process = FORKS[0].start(command[1:], log)
-            return
         self.process = subprocess.Popen(
             command, stdout=self._log, stderr=subprocess.STDOUT, env=ENVIRONMENT
         )
@@ -473,8 +385,31 @@ class NodeProcess:
         return self._log.read()
 
 
-def start_node(folder, *parameters, program=(str(FAKE),), remaps=()):
-    """Starts the node with `name:=value` parameters and remappings."""
+def start_node(folder, *parameters, remaps=(), load=load_fake):
+    """Starts the node in this process, with `name:=value` parameters and remappings."""
+    words = ['--ros-args', *node_options(folder, *parameters)]
+    words += [part for rule in remaps for part in ('-r', rule)]
+
+    def make(context):
+        node = WorldModelNode(load, context)
+        try:
+            node.start()
+        except BaseException:
+            node.close()
+            raise
+        return node
+
+    return NodeInProcess(make, words)
+
+
+def run_node(folder, *parameters):
+    """Returns the exit status of a node that ends by itself, and what it said."""
+    words = ['world_model', '--ros-args', *node_options(folder, *parameters)]
+    return run_to_end(lambda: main(words, load_fake))
+
+
+def start_node_process(folder, *parameters, program=(str(FAKE),), remaps=()):
+    """Starts the node in a process of its own."""
     command = [sys.executable, *program, '--ros-args', *node_options(folder, *parameters)]
     command += [part for rule in remaps for part in ('-r', rule)]
     return NodeProcess(command, folder / 'node.log')
@@ -503,7 +438,7 @@ def make_checkpoint(folder):
     return folder
 
 
-def start_policy(folder, *parameters, remaps=()):
+def policy_options(folder, *parameters, remaps=()):
     values = (
         f'checkpoint:={folder / "checkpoint"}',
         f'calibration_file:={make_calibration(folder / "calibration.yaml")}',
@@ -511,9 +446,19 @@ def start_policy(folder, *parameters, remaps=()):
         *parameters,
     )
     options = [part for value in values for part in ('-p', value)]
-    options += [part for rule in remaps for part in ('-r', rule)]
-    command = [sys.executable, str(FAKE_POLICY), '--ros-args', *options]
-    return NodeProcess(command, folder / 'policy.log')
+    return ['--ros-args', *options, *(part for rule in remaps for part in ('-r', rule))]
+
+
+def start_policy(folder, *parameters, remaps=()):
+    """Starts the policy node in this process."""
+    words = policy_options(folder, *parameters, remaps=remaps)
+    return NodeInProcess(lambda context: PolicyNode(load_fake_policy, context), words)
+
+
+def start_policy_process(folder, *parameters, remaps=()):
+    """Starts the policy node in a process of its own, which some of its faults end."""
+    words = policy_options(folder, *parameters, remaps=remaps)
+    return NodeProcess([sys.executable, str(FAKE_POLICY), *words], folder / 'policy.log')
 
 
 INPUTS = {

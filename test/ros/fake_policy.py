@@ -57,5 +57,9 @@ JOINTS = tuple(
 )
 
 
+def load(settings):
+    return lambda origin: FakePolicy(origin.task)
+
+
 if __name__ == '__main__':
-    sys.exit(main(load=lambda settings: lambda origin: FakePolicy(origin.task)))
+    sys.exit(main(load=load))

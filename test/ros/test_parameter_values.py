@@ -1,33 +1,28 @@
 """Values of parameters that ROS reads otherwise than it is written, on the line and in files."""
 
 import pytest
+from rclpy.node import Node
 import yaml
 
-NODE = """
-from rclpy.node import Node
 from mtv_world_ros.ros import parameters
+from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.policy.loop import PolicySettings
 from mtv_world_ros.ros.run_node import run
+from test.support.in_process import run_to_end
+
+KINDS = {'world_model': Settings, 'policy': PolicySettings}
 
 
-def start(words):
-    kind = {'world_model': parameters.Settings, 'policy': PolicySettings}[words[0]]
+def run_with(name, *words):
+    """Returns the exit status of a node that only reads its parameters, and what it said."""
 
     def make():
-        node = Node(words[0])
-        parameters.declare(node, kind)
-        print(parameters.read(node, kind).model_dump_json())
+        node = Node(name)
+        parameters.declare(node, KINDS[name])
+        print(parameters.read(node, KINDS[name]).model_dump_json())
         return node
 
-    return run(make, words, spin=lambda node: None)
-"""
-
-
-@pytest.fixture(scope='module')
-def forks(ros):
-    forks = ros.Forks(NODE)
-    yield forks
-    forks.close()
+    return run_to_end(lambda: run(make, [name, *words], spin=lambda node: None))
 
 
 def lists(kind):
@@ -35,17 +30,14 @@ def lists(kind):
 
 
 @pytest.mark.parametrize('in_file', [False, True])
-def test_an_empty_list_is_an_empty_list(forks, tmp_path, in_file):
-    from mtv_world_ros.ros.parameters import Settings
-    from mtv_world_ros.ros.policy.loop import PolicySettings
-
+def test_an_empty_list_is_an_empty_list(tmp_path, in_file):
     asked = 0
-    for node, kind in (('world_model', Settings), ('policy', PolicySettings)):
+    for node, kind in KINDS.items():
         for name in lists(kind):
             file = tmp_path / f'{node}.yaml'
             file.write_text(yaml.safe_dump({node: {'ros__parameters': {name: []}}}))
             given = ['--params-file', str(file)] if in_file else ['-p', f'{name}:=[]']
-            status, out = forks.run(tmp_path, node, '--ros-args', *given)
+            status, out = run_with(node, '--ros-args', *given)
             assert status == 0 and f'"{name}":[]' in out, out
             asked += 1
     assert asked
@@ -64,8 +56,8 @@ def test_an_empty_list_is_an_empty_list(forks, tmp_path, in_file):
         ('seed:={a: 1}', 'expected -p NAME:=VALUE'),
     ],
 )
-def test_what_cannot_be_a_value_is_one_line_that_says_what_can(forks, tmp_path, given, said):
-    status, out = forks.run(tmp_path, 'world_model', '--ros-args', '-p', given)
+def test_what_cannot_be_a_value_is_one_line_that_says_what_can(given, said):
+    status, out = run_with('world_model', '--ros-args', '-p', given)
     assert status == 1
     assert said in out and 'Traceback' not in out
     assert out.splitlines()[-1].startswith('ConfigError: ')

@@ -9,6 +9,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
@@ -52,13 +53,14 @@ class PolicyNode(Node):
 
     Args:
         load: finds out from the parameters how the policy is made.
+        context: ROS context of the node; default: the process' own.
 
     Raises:
         MtvWorldError: a parameter or a file it names cannot be used.
     """
 
-    def __init__(self, load: Load = load_named_policy) -> None:
-        super().__init__('policy')
+    def __init__(self, load: Load = load_named_policy, context: Context | None = None) -> None:
+        super().__init__('policy', context=context)
         parameters.declare(self, PolicySettings)
         settings = self._settings()
         self._make_policy = load(settings)

@@ -9,6 +9,7 @@ from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
 from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from mtv_world_ros.core.errors import MtvWorldError
@@ -28,13 +29,14 @@ class WorldModelNode(LifecycleNode):
 
     Args:
         load: makes the pipeline from the parameters.
+        context: ROS context of the node; default: the process' own.
 
     Raises:
         MtvWorldError: a parameter cannot be used.
     """
 
-    def __init__(self, load: Load = load_named_pipeline) -> None:
-        super().__init__('world_model')
+    def __init__(self, load: Load = load_named_pipeline, context: Context | None = None) -> None:
+        super().__init__('world_model', context=context)
         parameters.declare(self, Settings)
         self._settings, self._load = parameters.read(self, Settings), load
         self.add_post_set_parameters_callback(self._on_parameters)

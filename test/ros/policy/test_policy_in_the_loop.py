@@ -65,8 +65,8 @@ class Stack:
 
     def start(self, out, ros, episodes, seed):
         if self.policy is not None:
-            self.policy.stop(signal.SIGINT)
-        self.policy = ros.start_policy(
+            self.policy.stop()
+        self.policy = ros.start_policy_process(
             self.folder, 'answer_timeout_s:=1.5', *ros.FROZEN, remaps=ros.JOINT_STATES
         )
         arguments = [self.folder / out, '--views', 'low', 'high', '--seed', seed, '--episodes']
@@ -93,7 +93,7 @@ class Stack:
 
     def stop(self):
         for process in (self.runner, self.policy, self.world):
-            process.stop(signal.SIGINT)
+            process.stop()
 
 
 @pytest.fixture(scope='module')

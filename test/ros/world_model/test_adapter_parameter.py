@@ -1,8 +1,5 @@
 """The running node exchanges LoRA adapters between rollouts, and refuses those that do not fit."""
 
-import signal
-import sys
-
 import numpy as np
 import pytest
 from sensor_msgs.msg import Image
@@ -13,6 +10,7 @@ from mtv_world_ros.model.checkpoint import Checkpoint, save_checkpoint
 from mtv_world_ros.model.parts import build_scheduler
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.ros.messages.image_messages import to_rgb
+from mtv_world_ros.ros.world_model.loading import load_named_pipeline
 from mtv_world_ros.training.adapter import add_adapter, save_adapter
 from mtv_world_ros.training.training_config import load_training_config
 
@@ -72,26 +70,22 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def node(folder, ros, client, tmp_path_factory):
-    calibration = ros.make_calibration(folder / 'calibration.yaml')
-    values = {
-        'checkpoint': folder / 'checkpoint',
-        'calibration_file': calibration,
-        'pace': 'burst',
-        'num_inference_steps': 1,
-        'diagnostics_period_s': 0.1,
-        'max_image_age_s': 30.0,
-        'max_joint_state_age_s': 30.0,
-    }
-    flags = [part for key, value in values.items() for part in ('-p', f'{key}:={value}')]
-    command = [sys.executable, '-m', 'mtv_world_ros.ros.world_model.node', '--ros-args', *flags]
-    process = ros.NodeProcess(command, folder / 'node.log')
+    values = (
+        f'checkpoint:={folder / "checkpoint"}',
+        'pace:=burst',
+        'num_inference_steps:=1',
+        'diagnostics_period_s:=0.1',
+        'max_image_age_s:=30.0',
+        'max_joint_state_age_s:=30.0',
+    )
+    process = ros.start_node(folder, *values, load=load_named_pipeline)
     for topic in TOPICS:
         client.wait(lambda t=topic: client.node.count_publishers(t), 'the node', 120)
     client.connect_outputs(TOPICS, depth=FRAMES * CHUNKS)
     client.connect_inputs(ros.INPUTS)
     client.send_scene()
     yield process
-    assert process.stop(signal.SIGINT) == 0, process.output()
+    assert process.stop() == 0, process.output()
 
 
 def imagined(client):

@@ -85,7 +85,7 @@ def started(bundled, ros, tmp_path):
     """The node with the bundled model, and a client that has shown it a scene."""
     values = ('pace:=burst', 'max_image_age_s:=600.0', 'max_joint_state_age_s:=600.0',
               'max_horizon_s:=600.0')  # fmt: skip
-    process = ros.start_node(tmp_path, *values, program=NODE)
+    process = ros.start_node_process(tmp_path, *values, program=NODE)
     client = ros.Client()
     client.wait(client.diagnostic_values, 'the node', START_S)
     client.connect_inputs(ros.INPUTS)

@@ -19,6 +19,7 @@ from mtv_world_ros.ros.messages.conversions import (
     to_trajectory_message,
 )
 from mtv_world_ros.ros.messages.image_messages import to_image
+from mtv_world_ros.ros.world_model.loading import load_named_pipeline
 from mtv_world_ros.success.doubts import SAYS
 
 #: of the bundled model; two of its chunks, in which the first block is picked up and set down
@@ -43,8 +44,8 @@ def node(ros, tmp_path_factory):
         'max_joint_state_age_s:=600.0',
         'num_inference_steps:=1',
     )
-    program = ('-m', 'mtv_world_ros.ros.world_model.node')
-    process = ros.start_node(tmp_path_factory.mktemp('node'), *values, program=program)
+    folder = tmp_path_factory.mktemp('node')
+    process = ros.start_node(folder, *values, load=load_named_pipeline)
     client = ros.Client()
     client.wait(client.diagnostic_values, 'the node', 120)
     yield client

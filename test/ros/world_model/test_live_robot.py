@@ -81,9 +81,9 @@ def test_descriptions_can_be_ignored(start, new_client, ros):
 
 @pytest.mark.skipif(find_spec('tf2_msgs') is not None, reason='tf2_msgs is installed')
 def test_poses_from_tf_need_tf2_msgs(tmp_path, ros):
-    node = ros.start_node(tmp_path, 'extrinsics:=tf')
-    assert node.process.wait(timeout=120) == 1
-    assert "'extrinsics' is 'tf'" in node.output() and 'tf2_msgs' in node.output()
+    status, said = ros.run_node(tmp_path, 'extrinsics:=tf')
+    assert status == 1
+    assert "'extrinsics' is 'tf'" in said and 'tf2_msgs' in said
 
 
 class Broadcaster:

@@ -14,6 +14,8 @@ from mtv_world_ros.ros.messages.conversions import NANO, to_ns, to_stamp
 
 PREDICTED = '/world_model/low/predicted/image_raw'
 FRAME_NS = 200_000_000
+#: seed at which the fake model goes on until it is told to stop
+BLOCKS = 1200
 
 
 @pytest.fixture
@@ -166,10 +168,9 @@ def test_qos_overrides_and_latched_instruction(start, new_client, ros):
         (f'qos_overrides.{PREDICTED}.publisher.reliability:=maybe', 'maybe'),
     ],
 )
-def test_wrong_parameter_at_start_is_one_clear_line(start, parameter, said):
-    process = start(parameter)
-    assert process.process.wait(timeout=120) == 1
-    output = process.output()
+def test_wrong_parameter_at_start_is_one_clear_line(ros, tmp_path, parameter, said):
+    status, output = ros.run_node(tmp_path, parameter)
+    assert status == 1
     assert said in output
     assert 'Traceback' not in output
 
@@ -208,9 +209,11 @@ def test_parameters_describe_themselves(start, new_client):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_ends_cleanly_in_the_middle_of_a_rollout(start, new_client, ros, number):
+def test_ends_cleanly_in_the_middle_of_a_rollout(tmp_path, new_client, ros, number):
     client = new_client
-    process = start('seed:=1200')  # the fake model goes on until it is told to stop
+    process = ros.start_node_process(
+        tmp_path, 'pace:=burst', 'seed:=1200'
+    )  # the fake model goes on until it is told to stop
     client.connect_inputs(ros.INPUTS)
     client.send_scene()
     client.send_trajectory_and_wait_until_it_runs()

@@ -1,0 +1,31 @@
+"""A ROS domain that no other test process of this machine uses."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from pathlib import Path
+import tempfile
+
+#: highest domain whose ports Linux gives to no other program by itself
+LAST_DOMAIN = 101
+#: holds the lock until this process ends
+_held: list[int] = []
+
+
+def claim_domain() -> int:
+    """Return a free domain, which stays this process' own until it ends."""
+    folder = Path(tempfile.gettempdir()) / f'mtv_world_domains_{os.getuid()}'
+    folder.mkdir(exist_ok=True)
+    first = os.getpid()  # a process that knows no locks may be at the low numbers
+    for number in range(LAST_DOMAIN):
+        domain = 1 + (first + number) % LAST_DOMAIN
+        file = os.open(folder / str(domain), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(file)
+            continue
+        _held.append(file)
+        return domain
+    raise RuntimeError(f'all {LAST_DOMAIN} ROS domains are in use by tests')
