@@ -9,7 +9,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
-from mtv_world_ros.geometry.robot.model import RobotModel
+from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.ros.parameters import Settings
 
 if TYPE_CHECKING:

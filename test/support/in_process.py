@@ -103,7 +103,8 @@ class NodeInProcess:
         except ExternalShutdownException:
             pass
         except BaseException as error:
-            self._error = error
+            # what fails after the shutdown says nothing, see `run`
+            self._error = error if self._context.ok() else None
         finally:
             executor.shutdown(timeout_sec=0)
             close = getattr(self.node, 'close', self.node.destroy_node)
