@@ -18,8 +18,8 @@ from mtv_world_ros import load_pipeline
 from mtv_world_ros.core.data_types import ByteArray, WorldModelSpec
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import commands_from, load_recording
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from mtv_world_ros import load_pipeline
 from mtv_world_ros.core.data_types import JointTrajectory, Observation
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.rollout.options import RolloutOptions
 
 NUM_CHUNKS = 3
 

@@ -16,7 +16,7 @@ import numpy as np
 from mtv_world_ros import load_pipeline
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import commands_from, load_recording
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.vision.jaccard import jaccard
 
 parser = argparse.ArgumentParser()

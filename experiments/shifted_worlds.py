@@ -61,9 +61,9 @@ from mtv_world_ros.ranking.no_picture_rule import judge_without_pictures
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.resample import resample
 from mtv_world_ros.rollout.assembly import load_pipeline
-from mtv_world_ros.rollout.imagined_episode import Rollout
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.rollout.rollout import Rollout
 from mtv_world_ros.simulation.collect.episode_jobs import episode_seed
 from mtv_world_ros.simulation.collect.record import carry_out, RecordConfig, Take
 from mtv_world_ros.simulation.expert.expert import Expert

@@ -25,8 +25,8 @@ from mtv_world_ros.data.recordings import commanded
 from mtv_world_ros.evaluation.imagined_stretches import predicted_frames, stretches
 from mtv_world_ros.evaluation.result_settings import fingerprint
 from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
 
 HEAD = ('named', 'objects', 'area left, mean', '95 % interval', 'least', 'at least 90 % left')
 _STILL_PX = 2.0

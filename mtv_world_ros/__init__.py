@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from mtv_world_ros.core.data_types import JointTrajectory, Observation
     from mtv_world_ros.data.episode_reader import read_episode
     from mtv_world_ros.rollout.assembly import load_pipeline
-    from mtv_world_ros.rollout.imagined_episode import Rollout
     from mtv_world_ros.rollout.offline import judge
+    from mtv_world_ros.rollout.options import RolloutOptions
     from mtv_world_ros.rollout.pipeline import Pipeline
-    from mtv_world_ros.rollout.rollout_options import RolloutOptions
+    from mtv_world_ros.rollout.rollout import Rollout
 
 __all__ = [
     'JointTrajectory',
@@ -46,8 +46,8 @@ _PLACES = {
     'Observation': 'core.data_types',
     'Pipeline': 'rollout.pipeline',
     'read_episode': 'data.episode_reader',
-    'Rollout': 'rollout.imagined_episode',
-    'RolloutOptions': 'rollout.rollout_options',
+    'Rollout': 'rollout.rollout',
+    'RolloutOptions': 'rollout.options',
 }
 #: names of version 0.1 -> public name that replaced them
 _RENAMED = {'ImaginedEpisode': 'Rollout'}

@@ -12,8 +12,8 @@ from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.rollout.assembly import assemble
-from mtv_world_ros.rollout.imagined_episode import SEED_STEP
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.rollout.options import RolloutOptions
+from mtv_world_ros.rollout.rollout import SEED_STEP
 from mtv_world_ros.success.calibration import HorizonCurve
 
 SPEC = WorldModelSpec(

@@ -158,7 +158,7 @@ def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Evalua
     from mtv_world_ros.evaluation.evaluate_episodes import evaluate
     from mtv_world_ros.evaluation.result_settings import fingerprint
     from mtv_world_ros.evaluation.settings import EvaluationConfig
-    from mtv_world_ros.rollout.imagined_episode import SEED_STEP
+    from mtv_world_ros.rollout.rollout import SEED_STEP
 
     pipeline, parallel = load_pipelines(arguments, arguments.checkpoint, calibrated=False)
     return [

@@ -17,10 +17,10 @@ from mtv_world_ros.core.data_types import (
 from mtv_world_ros.core.errors import ConfigError, EpisodeError
 from mtv_world_ros.data.recording import frame_indices, Recording
 from mtv_world_ros.data.recordings import commands_until
-from mtv_world_ros.rollout.imagined_episode import Rollout
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.prediction import Prediction
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.rollout.rollout import Rollout
 
 #: observe: every chunk from the real frames until its start; imagine: chunks chained from the
 #: episode's first frame

@@ -14,8 +14,8 @@ from mtv_world_ros.core.errors import RolloutPreempted
 from mtv_world_ros.core.images import resize_frames
 from mtv_world_ros.physics.foreseen_motions import foreseen_of, ForeseenMotions
 from mtv_world_ros.physics.object_motion import FoundObjects, ObjectMotionModel
-from mtv_world_ros.robot.chunk_plan import ChunkPlan
 from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.plan import ChunkPlan
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 #: says which futures (K,) end as most of them do, of the motions until then; None = they do not

@@ -11,8 +11,8 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.physics.object_motion import FoundObjects
-from mtv_world_ros.robot.chunk_plan import ChunkPlan
 from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.plan import ChunkPlan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,8 +16,8 @@ from mtv_world_ros.cameras.mask_geometry import block_size, centroids, locate
 from mtv_world_ros.core.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.core.errors import CannotTell
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.rollout.imagined_episode import Rollout
 from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.rollout.rollout import Rollout
 from mtv_world_ros.simulation.shapes import SHAPES
 from mtv_world_ros.success.relations import FLOOR_M
 from mtv_world_ros.success.situation import TruePoses

@@ -26,9 +26,9 @@ from mtv_world_ros.ranking.worlds import (
     SimulatedWorld,
     World,
 )
-from mtv_world_ros.rollout.imagined_episode import Rollout
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.rollout.rollout import Rollout
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
 from mtv_world_ros.simulation.simulator import SimEpisode

@@ -21,10 +21,10 @@ from mtv_world_ros.core.data_types import (
 from mtv_world_ros.core.images import resize_frames
 from mtv_world_ros.policies.policy import first_part, Policy
 from mtv_world_ros.ranking.rollout_jobs import StoredEstimate
-from mtv_world_ros.robot.chunk_plan import Plan
+from mtv_world_ros.robot.plan import Plan
 from mtv_world_ros.robot.resample import resample
-from mtv_world_ros.rollout.imagined_episode import Rollout
 from mtv_world_ros.rollout.prediction import Prediction
+from mtv_world_ros.rollout.rollout import Rollout
 from mtv_world_ros.simulation.collect.record import START_NS
 from mtv_world_ros.simulation.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
 from mtv_world_ros.success.task import ever_and_final

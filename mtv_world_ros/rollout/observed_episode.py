@@ -8,10 +8,10 @@ from threading import Lock
 import numpy as np
 
 from mtv_world_ros.core.data_types import Observation
-from mtv_world_ros.rollout.imagined_episode import Rollout
+from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
-from mtv_world_ros.rollout.rollout_options import DEFAULT_OPTIONS, RolloutOptions
-from mtv_world_ros.rollout.rollout_state import fit_observation
+from mtv_world_ros.rollout.rollout import Rollout
+from mtv_world_ros.rollout.state import fit_observation
 
 #: least time between two frames that are kept, as a share of the model's period
 _SEEN_SHARE = 0.9

@@ -16,13 +16,13 @@ from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import DEFAULT, frame_indices, Recording
-from mtv_world_ros.robot.chunk_plan import Plan
+from mtv_world_ros.robot.plan import Plan
 from mtv_world_ros.robot.resample import match_joints
 from mtv_world_ros.rollout.observed_episode import ObservedEpisode
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.prediction import Prediction
 from mtv_world_ros.rollout.prediction_writer import ERROR, OK, PredictionWriter
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
 
 #: beyond these a trajectory is rejected, as by the node: age of the newest frames and joint states
 #: at its start, and time between the views' frames [s]

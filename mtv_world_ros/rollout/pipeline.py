@@ -23,13 +23,13 @@ from mtv_world_ros.core.data_types import (
 from mtv_world_ros.physics.episode_objects import Majority, ObjectForesight
 from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
 from mtv_world_ros.physics.object_motion import ObjectMotionModel
-from mtv_world_ros.robot.chunk_plan import ChunkPlan
 from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.plan import ChunkPlan
 from mtv_world_ros.robot.shape import LinkShape
-from mtv_world_ros.rollout.imagined_episode import ObservedChunk, Rollout
+from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions
 from mtv_world_ros.rollout.prediction import Prediction, StageClock
-from mtv_world_ros.rollout.rollout_options import DEFAULT_OPTIONS, RolloutOptions
-from mtv_world_ros.rollout.rollout_state import RolloutState
+from mtv_world_ros.rollout.rollout import ObservedChunk, Rollout
+from mtv_world_ros.rollout.state import RolloutState
 from mtv_world_ros.success.calibration import Fits, HorizonCurve
 from mtv_world_ros.success.doubts import doubted, Grounds, widened
 from mtv_world_ros.success.estimator import JudgedChunk, SuccessEstimator

@@ -22,7 +22,7 @@ import yaml
 
 from mtv_world_ros.core.config import ListOf, Model, Schema
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
-from mtv_world_ros.robot.chunk_plan import PlanLimits
+from mtv_world_ros.robot.plan import PlanLimits
 
 Span = tuple[float, float]
 Mode = Literal['observe', 'imagine']

@@ -15,7 +15,7 @@ from mtv_world_ros.core.data_types import Observation
 from mtv_world_ros.core.errors import TrajectoryError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.joint_plans import read_plan
-from mtv_world_ros.robot.chunk_plan import Plan
+from mtv_world_ros.robot.plan import Plan
 
 HOME = np.array([0.0, 1.047, 1.047, 0.0, 0.0, 0.0, 0.03] * 2)
 NAN = float('nan')

@@ -7,7 +7,7 @@ from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.data.recordings import commands_until
 from mtv_world_ros.evaluation.imagined_stretches import imagine_stretch, stretches
 from mtv_world_ros.evaluation.references import check_actions, with_actions
-from mtv_world_ros.rollout.imagined_episode import Rollout
+from mtv_world_ros.rollout.rollout import Rollout
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from mtv_world_ros.evaluation.imagined_stretches import (
     predicted_frames,
     stretches,
 )
-from mtv_world_ros.rollout.imagined_episode import Rollout
+from mtv_world_ros.rollout.rollout import Rollout
 
 
 def test_observed_stretches_are_chunks_from_real_frames(recordings, make_pipeline):

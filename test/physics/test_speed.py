@@ -19,7 +19,7 @@ from mtv_world_ros.core.data_types import JointTrajectory
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.rollout.assembly import load_pipeline
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.rollout.options import RolloutOptions
 
 #: turns, of which the fastest counts: other work only ever makes one slower
 TURNS = 6

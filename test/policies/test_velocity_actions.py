@@ -13,8 +13,8 @@ from mtv_world_ros.core.data_types import CameraModel, Observation
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.policies.server_mapping import ActionOutput
-from mtv_world_ros.robot.chunk_plan import Plan
 from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.plan import Plan
 from mtv_world_ros.rollout.assembly import assemble_policy, robot_path
 
 FRANKA = load_robot(robot_path('franka'))

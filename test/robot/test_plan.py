@@ -9,8 +9,8 @@ import pytest
 
 from mtv_world_ros.core.data_types import JointTrajectory, Observation, WorldModelSpec
 from mtv_world_ros.core.errors import PlanError, PlanFault
-from mtv_world_ros.robot.chunk_plan import Plan, PlanLimits
 from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.plan import Plan, PlanLimits
 
 NANO = 10**9
 START_NS = 100 * NANO

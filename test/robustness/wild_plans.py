@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.core.files import share_path
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.rollout.options import RolloutOptions
 
 #: points of a plan
 NUM_POINTS = 12

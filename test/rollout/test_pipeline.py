@@ -37,8 +37,8 @@ from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.assembly import assemble
 from mtv_world_ros.rollout.observed_episode import ObservedEpisode
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
 from mtv_world_ros.success.calibration import Fits, load_fits
 from mtv_world_ros.success.doubts import Grounds
 from mtv_world_ros.vision.describers.describer import DescribedObject

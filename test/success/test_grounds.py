@@ -15,7 +15,7 @@ from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.physics.checkpoint_files import load_contact, save_contact
 from mtv_world_ros.physics.contact_settings import ContactOrigin
 from mtv_world_ros.rollout.assembly import load_pipeline
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.success.calibration import CALIBRATION
 from mtv_world_ros.success.doubts import Grounds
 

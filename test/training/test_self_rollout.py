@@ -16,8 +16,8 @@ from mtv_world_ros.data.recording import frame_indices, Recording
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
 from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.training import self_rollout
 from mtv_world_ros.training.batches import BatchSource

@@ -16,9 +16,9 @@ from std_msgs.msg import Float32MultiArray
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.core.images import resize_frames
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.rollout.imagined_episode import Rollout
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.rollout.rollout import Rollout
 from mtv_world_ros.ros.messages import image_messages
 from mtv_world_ros.ros.messages.conversions import NANO, to_multi_array, to_ns
 from mtv_world_ros.ros.messages.rejection import Rejection

@@ -18,8 +18,8 @@ from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
 from mtv_world_ros.core.bounded_input import check_limit
 from mtv_world_ros.core.data_types import FloatArray
-from mtv_world_ros.robot.chunk_plan import Plan
 from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.plan import Plan
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.ros.messages.conversions import to_ns, to_trajectory
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection

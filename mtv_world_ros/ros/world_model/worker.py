@@ -11,13 +11,13 @@ import traceback
 
 from mtv_world_ros.core.data_types import Observation
 from mtv_world_ros.core.errors import ModelMemoryError, MtvWorldError, PlanError, RolloutPreempted
-from mtv_world_ros.robot.chunk_plan import Plan
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.rollout.imagined_episode import Rollout
+from mtv_world_ros.robot.plan import Plan
 from mtv_world_ros.rollout.observed_episode import ObservedEpisode
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.prediction import Prediction
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.rollout.rollout import Rollout
 from mtv_world_ros.ros.messages.conversions import NANO
 from mtv_world_ros.ros.messages.rejection import Reason
 from mtv_world_ros.ros.parameters import Settings

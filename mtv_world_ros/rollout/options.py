@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from mtv_world_ros.core.errors import ConfigError
-from mtv_world_ros.robot.chunk_plan import PlanLimits
+from mtv_world_ros.robot.plan import PlanLimits
 
 
 def never() -> bool:

@@ -20,11 +20,11 @@ from mtv_world_ros.core.data_types import (
 )
 from mtv_world_ros.core.errors import RolloutPreempted
 from mtv_world_ros.core.images import resize_frames
-from mtv_world_ros.robot.chunk_plan import ChunkPlan, Plan
 from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.plan import ChunkPlan, Plan
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.prediction import mean_of_seeds, Prediction
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
-from mtv_world_ros.rollout.rollout_state import RolloutState
+from mtv_world_ros.rollout.state import RolloutState
 from mtv_world_ros.vision.camera_check import CameraCheck
 
 #: distance between the seeds of the rollouts of a plan, so that those of their chunks never meet
