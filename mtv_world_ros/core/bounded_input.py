@@ -82,7 +82,12 @@ class Limits:
         yaml_bytes: of a YAML text.
         yaml_nodes: values in it, once aliases and merges are written out.
         urdf_bytes: of a robot's URDF.
-        nesting: levels of lists and maps, in YAML, JSON and answers of policy servers.
+        urdf_links: links of a robot, or joints.
+        chain_links: links of a robot in a row, from its root; parsers recurse over them.
+        xml_elements: of a URDF or a COLLADA mesh.
+        mesh_bytes: of a mesh file.
+        nesting: levels of lists, maps and elements, in YAML, JSON, XML and answers of policy
+            servers.
         json_bytes: of a JSON file; tokenizers have tens of megabytes.
         image_bytes: of an image file in a message.
         image_pixels: of an image, before it is decoded.
@@ -99,6 +104,10 @@ class Limits:
     yaml_bytes: int = 4 * 2**20
     yaml_nodes: int = 200_000
     urdf_bytes: int = 16 * 2**20
+    urdf_links: int = 2_000
+    chain_links: int = 200
+    xml_elements: int = 200_000
+    mesh_bytes: int = 128 * 2**20
     nesting: int = 64
     json_bytes: int = 256 * 2**20
     image_bytes: int = 64 * 2**20

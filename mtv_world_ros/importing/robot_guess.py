@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +17,7 @@ from mtv_world_ros.core.transforms import quaternion
 from mtv_world_ros.robot.file import read_urdf
 from mtv_world_ros.robot.model import check_can_move, Mimic
 from mtv_world_ros.robot.shape import link_shapes
+from mtv_world_ros.robot.xml_file import parse_xml
 
 #: a tree with a fork at most this far from its ends is a gripper [joints]
 _FINGER_JOINTS = 6
@@ -364,7 +364,7 @@ def _slid_axes(
 
 def _finger_points(model: pin.Model, urdf: Path, arm: _Arm) -> dict[int, FloatArray]:
     """Points of the finger links' shapes in their joints' frames; empty where one has none."""
-    root = ElementTree.fromstring(read_text(urdf, 'urdf_bytes'))
+    root = parse_xml(read_text(urdf, 'urdf_bytes'))
     links = {link.get('name'): link for link in root.iter('link')}
     found = {}
     for joint in arm.fingers:

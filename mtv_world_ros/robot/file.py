@@ -32,6 +32,7 @@ from mtv_world_ros.robot.mesh_pieces import (
 )
 from mtv_world_ros.robot.model import Mimic, RobotModel, Tool
 from mtv_world_ros.robot.shape import grip_links, load_shape
+from mtv_world_ros.robot.xml_file import check_xml, NO_XML, parse_xml, root_link
 
 #: a calibrated robot differs from its nominal description by less than this [m], [rad]
 _LARGEST_OFFSET = 0.05
@@ -130,6 +131,8 @@ def _without_errors(text: bytes) -> bytes:
     return re.sub(rb'^Error: .+\n(?: +at line \d+ in .+\n)?', b'', text, flags=re.MULTILINE)
 
 
+#: names that an error lists
+_MOST_NAMED = 8
 #: expanded URDFs may keep xacro in comments, and `$(find ...)` in what is not of the robot
 _COMMENT = re.compile(r'<!--.*?-->', re.DOTALL)
 _EXPRESSION = re.compile(r'\$[{(]')
@@ -327,7 +330,7 @@ def save_robot(file: Path, folder: Path) -> SavedRobot:
 
 def _with_hulls(urdf: Path, folder: Path, grips: set[str], missing: list[str]) -> Any:
     """Return the URDF with stored hulls in place of meshes; add those that are missing."""
-    tree = ElementTree.parse(urdf)
+    tree = ElementTree.ElementTree(parse_xml(read_text(urdf, 'urdf_bytes')))
     stored: dict[Path, str] = {}
     made: list[str] = []
     for link in tree.iter('link'):
@@ -418,20 +421,20 @@ def parse_urdf(text: str, what: str) -> tuple[pin.Model, list[Mimic], str]:
     Raises:
         RobotError: the file is not a usable URDF.
     """
-    written = _COMMENT.sub('', text)
-    if '<xacro:' in written:
-        raise RobotError(f'{what} is unexpanded xacro{_EXPAND}')
+    written = text
     try:
+        check_xml(text)  # first: searches for comments without an end take forever
+        written = _COMMENT.sub('', text)
+        if '<xacro:' in written:
+            raise RobotError(f'{what} is unexpanded xacro{_EXPAND}')
         root = ElementTree.fromstring(text)
+        base = root_link(root)
         # Pinocchio must see mimic joints as ordinary ones: RobotModel moves them itself.
         mimics = [mimic for joint in root.iter('joint') for mimic in _take_mimics(joint)]
         model = _build(ElementTree.tostring(root, encoding='unicode'))
-    except (ElementTree.ParseError, ValueError, KeyError, RuntimeError) as error:
+    except (*NO_XML, ValueError, KeyError, RuntimeError) as error:
         xacro = f'; it has expressions of xacro{_EXPAND}' if _EXPRESSION.search(written) else ''
         raise RobotError(f'{what} cannot be used: {error}{xacro}') from error
-    children = {child.get('link') for child in root.iter('child')}
-    base = next(link.attrib['name'] for link in root.iter('link')
-                if link.get('name') not in children)  # fmt: skip
     return model, _resolved(mimics), base
 
 
@@ -456,22 +459,30 @@ def _resolved(mimics: Sequence[Mimic]) -> list[Mimic]:
         RobotError: joints follow each other in a circle.
     """
     leaders = {mimic.joint: mimic for mimic in mimics}
-    resolved = []
+    resolved: dict[str, Mimic] = {}
     for mimic in mimics:
-        seen = {mimic.joint}
-        while mimic.source in leaders:
-            if mimic.source in seen:
-                raise RobotError(f"joint '{mimic.joint}' follows itself, by way of {sorted(seen)}")
-            seen.add(mimic.source)
-            leader = leaders[mimic.source]
-            mimic = Mimic(
-                joint=mimic.joint,
-                source=leader.source,
-                multiplier=mimic.multiplier * leader.multiplier,
-                offset=mimic.multiplier * leader.offset + mimic.offset,
-            )
-        resolved.append(mimic)
-    return resolved
+        way, seen = [mimic], {mimic.joint}
+        while (leader := leaders.get(way[-1].source)) and leader.joint not in resolved:
+            if leader.joint in seen:
+                names = sorted(seen)[:_MOST_NAMED]
+                raise RobotError(f"joint '{leader.joint}' follows itself, by way of {names}")
+            way.append(leader)
+            seen.add(leader.joint)
+        for one in reversed(way):
+            resolved[one.joint] = _behind(one, resolved.get(one.source))
+    return [resolved[mimic.joint] for mimic in mimics]
+
+
+def _behind(mimic: Mimic, leader: Mimic | None) -> Mimic:
+    """Return a follower of what its source follows; None = that follows nothing."""
+    if leader is None:
+        return mimic
+    return Mimic(
+        joint=mimic.joint,
+        source=leader.source,
+        multiplier=mimic.multiplier * leader.multiplier,
+        offset=mimic.multiplier * leader.offset + mimic.offset,
+    )
 
 
 def _take_mimics(joint: ElementTree.Element) -> list[Mimic]:

@@ -16,6 +16,8 @@ from scipy.spatial import ConvexHull, QhullError
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import RobotError
 from mtv_world_ros.core.files import write_whole
+from mtv_world_ros.core.bounded_input import read_bytes
+from mtv_world_ros.robot.xml_file import check_xml, NO_XML
 
 #: directions in which a mesh's outermost points are kept
 _DIRECTIONS = 256
@@ -82,7 +84,7 @@ class Mesh:
 
 
 def load_mesh(path: Path) -> Mesh:
-    """Read a mesh (STL, DAE, OBJ); the `<unit meter>` of a DAE file is applied.
+    """Read a mesh (STL, DAE, OBJ, PLY); the `<unit meter>` of a DAE file is applied.
 
     Raises:
         MissingMeshError: the file cannot be read as a mesh, or nothing here reads meshes.
@@ -93,6 +95,7 @@ def load_mesh(path: Path) -> Mesh:
         raise MissingMeshError(f"'{path.name}' needs the module coal") from error
     if problem := _not_a_mesh(path):
         raise MissingMeshError(f"'{path}' {problem}")
+    unit = _collada_unit_m(path) if path.suffix.lower() == '.dae' else 1.0
     try:
         mesh = coal.MeshLoader().load(str(path), np.ones(3))
         vertices = np.asarray(mesh.vertices(), np.float64)
@@ -100,27 +103,43 @@ def load_mesh(path: Path) -> Mesh:
         raise MissingMeshError(f"'{path}' cannot be read: {_short_reason(error)}") from error
     if not mesh.num_tris or not vertices.size:
         raise MissingMeshError(f"'{path}' holds no triangles")
-    unit = _collada_unit_m(path) if path.suffix.lower() == '.dae' else 1.0
     return Mesh(vertices * unit, mesh)
 
 
+#: types of mesh files; Assimp knows forty more, whose readers nobody has looked at here
+MESH_SUFFIXES = ('.stl', '.dae', '.obj', '.ply')
+_SUFFIXES = ', '.join(MESH_SUFFIXES)
 #: beginning of a file that is enough to tell what it is [bytes]
 _HEAD_BYTES = 512
 
 
 def _not_a_mesh(path: Path) -> str:
     """Return what a file is that takes a mesh's place, and the remedy; empty if it may be one."""
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        return f"is of type '{suffix}', which is not read; convert it to one of {_SUFFIXES}"
     try:
-        with path.open('rb') as file:
-            head = file.read(_HEAD_BYTES).lstrip().lower()
+        content = read_bytes(path, 'mesh_bytes')
     except OSError as error:
         return f'cannot be read: {error.strerror or error}'
+    except ValueError as error:
+        return f'is too large: {error}'
+    head = content[:_HEAD_BYTES].lstrip().lower()
     if not head:
         return 'is empty'
     if head.startswith(b'version https://git-lfs.github.com/'):
         return "is a pointer of Git LFS, not the mesh: run 'git lfs pull' in its repository"
     if head.startswith((b'<!doctype html', b'<html')):
         return 'is an HTML page, not a mesh: its download failed; fetch the file itself'
+    return _unreadable_xml(content) if suffix == '.dae' else ''
+
+
+def _unreadable_xml(content: bytes) -> str:
+    """Return why the reader of COLLADA is not given a file; empty if it is."""
+    try:
+        check_xml(content)
+    except (*NO_XML, ValueError) as error:
+        return f'cannot be read: {error}'
     return ''
 
 

@@ -26,6 +26,7 @@ from mtv_world_ros.robot.mesh_pieces import (
     slices,
 )
 from mtv_world_ros.robot.model import RobotModel, Tool
+from mtv_world_ros.robot.xml_file import parse_xml
 
 #: corners of a round shape's rims
 _CORNERS = 16
@@ -98,7 +99,7 @@ def urdf_links(robot: RobotModel) -> tuple[Path, dict[str, ElementTree.Element]]
     path = urdf_path(robot)
     if path is None:
         return None
-    tree = ElementTree.fromstring(read_text(path, 'urdf_bytes'))
+    tree = parse_xml(read_text(path, 'urdf_bytes'))
     return path, {link.attrib['name']: link for link in tree.iter('link')}
 
 

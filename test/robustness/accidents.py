@@ -168,6 +168,58 @@ def cut_compressed() -> Any:
     return message
 
 
+def urdf_of(make: Callable[[], str]) -> bytes:
+    """A robot of a link and more."""
+    return f'<robot name="r"><link name="root"/>{make()}</robot>'.encode()
+
+
+def joint(parent: str, child: str, more: str = '', kind: str = 'fixed') -> str:
+    """A joint that is called as its child."""
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    limit = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
+    return f'<joint name="{child}" type="{kind}">{ends}{limit}{more}</joint>'
+
+
+LINKS = '<link name="b"/><link name="c"/>'
+
+
+def chain(count: int) -> str:
+    """Links that are each fixed to the one before."""
+    parents = ['root', *(f'l{n}' for n in range(count))]
+    return ''.join(f'<link name="l{n}"/>{joint(parents[n], f"l{n}")}' for n in range(count))
+
+
+def star(count: int, more: str = '', last: str = '') -> str:
+    """Links that all turn on the root; `{next}` in what joints hold is the next one's number."""
+    return ''.join(
+        f'<link name="l{n}"/>'
+        + joint('root', f'l{n}', last if n == count - 1 else more.format(next=n + 1), 'revolute')
+        for n in range(count)
+    )
+
+
+def diamonds(count: int) -> str:
+    """Links that each can be reached in two ways, so that the last can in 2^count."""
+    text, top = '', 'root'
+    for n in range(count):
+        text += f'<link name="b{n}"/><link name="c{n}"/><link name="d{n}"/>'
+        text += joint(top, f'b{n}') + joint(top, f'c{n}')
+        text += joint(f'b{n}', f'd{n}') + joint(f'c{n}', f'd{n}').replace('name="d', 'name="e', 1)
+        top = f'd{n}'
+    return text
+
+
+def nested(count: int) -> str:
+    """Elements in one another."""
+    return '<a>' * count + '</a>' * count
+
+
+def entity_bomb() -> bytes:
+    """Ten levels of ten entities."""
+    rows = ''.join(f'<!ENTITY a{n + 1} "{f"&a{n};" * 10}">' for n in range(10))
+    return f'<!DOCTYPE a [<!ENTITY a0 "ha">{rows}]><robot name="&a10;"/>'.encode()
+
+
 Make = Callable[[], Any]
 
 
@@ -186,6 +238,27 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
     **{f'mesh {case}': ('mesh', found('mesh', case)) for case in (267, 1157, 1889)},
     'distortion of letters': ('camera parameters', found('camera parameters', 778)),
     'image path of no text': ('LeRobot v2.1', found('LeRobot v2.1', 1496)),
+    **{
+        name: ('urdf', partial(urdf_of, make))
+        for name, make in {
+            'URDF of 200,000 elements in one another': lambda: nested(200_000),
+            'URDF of 4,000 links in a row': lambda: chain(4_000),
+            'URDF of 1,900 links in a row': lambda: chain(1_900),
+            'URDF of 20,000 links': lambda: star(20_000),
+            'URDF of 40 diamonds': lambda: diamonds(40),
+            'URDF that is a circle': lambda: joint('b', 'c') + joint('c', 'b') + LINKS,
+            'URDF of comments without end': lambda: '<!--' * 2_000_000,
+            'URDF that follows itself': lambda: star(
+                1_000, '<mimic joint="l{next}"/>', last='<mimic joint="l0"/>'
+            ),
+        }.items()
+    },
+    'URDF whose entities laugh': ('urdf', entity_bomb),
+    'COLLADA of elements in one another': (
+        'COLLADA',
+        lambda: b'<COLLADA>' + b'<node>' * 100_000 + b'</node>' * 100_000 + b'</COLLADA>',
+    ),
+    'COLLADA whose entities laugh': ('COLLADA', entity_bomb),
     'data path of 3 GB': (
         'LeRobot v2.1',
         lambda: altered('LeRobot v2.1', rb'\{episode_index:06d\}', b'{episode_index:>3000000000}'),

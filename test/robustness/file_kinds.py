@@ -287,6 +287,30 @@ def _read_urdf(data: bytes, folder: Path) -> Any:
     return load_robot(folder / 'yam_bimanual.yaml')
 
 
+def _colladas() -> list[bytes]:
+    """A triangle pyramid as COLLADA 1.4.1 has it."""
+    corners = '0 0 0 1 0 0 0 1 0 0 0 1'
+    faces = '0 1 2 0 1 3 1 2 3 0 2 3'
+    return [
+        f"""<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="0.01"/></asset><library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="12">{corners}</float_array><technique_common>
+<accessor source="#a" count="4" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices><triangles count="4">
+<input semantic="VERTEX" source="#v" offset="0"/><p>{faces}</p></triangles></mesh></geometry>
+</library_geometries><library_visual_scenes><visual_scene id="s"><node>
+<instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>""".encode()
+    ]
+
+
+def _read_collada(data: bytes, folder: Path) -> Any:
+    from mtv_world_ros.robot.mesh_pieces import load_mesh
+
+    return load_mesh(_file(folder / 'part.dae', data))
+
+
 def _read_dataset_mapping(data: bytes, folder: Path) -> Any:
     from mtv_world_ros.importing.mapping import load_mapping
 
@@ -421,6 +445,7 @@ KINDS = {
     'calibration': Kind(_config('cameras'), lambda d, f: load_calibration(_file(f / 'c.yaml', d))),
     'robot': Kind(_config('robots'), _read_robot),
     'urdf': Kind(_urdfs, _read_urdf),
+    'COLLADA': Kind(_colladas, _read_collada),
     'task': Kind(_config('tasks'), lambda d, f: load_task(_file(f / 'task.yaml', d))),
     'policy': Kind(_config('policies'), READS_POLICY),
     'policy list': Kind(

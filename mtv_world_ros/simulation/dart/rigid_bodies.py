@@ -31,6 +31,7 @@ from mtv_world_ros.physics.solids import Solid
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import urdf_path
 from mtv_world_ros.simulation.dart.finger_swing import FingerDrives
+from mtv_world_ros.robot.xml_file import parse_xml
 
 #: what is at least this wide, and wider than high by this factor, is hollow: a dish, a tray [m]
 _DISH_M, _DISH_RATIO = 0.06, 1.5
@@ -540,7 +541,7 @@ def _described(path: Path) -> ElementTree.Element:
     Raises:
         RobotError: it collides with meshes, of which the engine finds no contacts.
     """
-    tree = ElementTree.fromstring(read_text(path, 'urdf_bytes'))
+    tree = parse_xml(read_text(path, 'urdf_bytes'))
     for link in tree.iterfind('link'):
         for look in link.findall('visual'):
             link.remove(look)
