@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from mtv_world_ros.core.bounded_input import read_bytes
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import RobotError
 from mtv_world_ros.core.files import write_whole
-from mtv_world_ros.core.bounded_input import read_bytes
 from mtv_world_ros.robot.xml_file import check_xml, NO_XML
 
 #: directions in which a mesh's outermost points are kept

@@ -16,7 +16,7 @@ from mtv_world_ros.core.errors import RobotError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.robot.file import parse_urdf
 from mtv_world_ros.robot.mesh_pieces import load_mesh, MissingMeshError
-from mtv_world_ros.geometry.robot.xml_file import check_xml, parse_xml, root_link
+from mtv_world_ros.robot.xml_file import check_xml, parse_xml, root_link
 
 MOST_S, MOST_MB = 1.0, 100
 

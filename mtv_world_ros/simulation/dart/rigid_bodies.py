@@ -30,8 +30,8 @@ from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.physics.solids import Solid
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import urdf_path
-from mtv_world_ros.simulation.dart.finger_swing import FingerDrives
 from mtv_world_ros.robot.xml_file import parse_xml
+from mtv_world_ros.simulation.dart.finger_swing import FingerDrives
 
 #: what is at least this wide, and wider than high by this factor, is hollow: a dish, a tray [m]
 _DISH_M, _DISH_RATIO = 0.06, 1.5
