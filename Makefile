@@ -57,6 +57,8 @@ soak: $(STAMP)  ## 10,000 rollouts with faults (an hour); memory, threads, laten
 attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, open ports, hostile paths (three hours)
 	@mkdir -p out
 	$(BIN)/python test/robustness/rate.py
+	$(BIN)/python test/robustness/default_client.py
+	$(BIN)/python test/robustness/default_client.py --cameras 3 --transports UDPv4
 	$(BIN)/python test/robustness/cycles.py --bundled
 	$(BIN)/python test/robustness/odd_worlds.py
 	$(BIN)/python test/robustness/policy_servers.py --json out/servers.json

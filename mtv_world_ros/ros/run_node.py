@@ -18,8 +18,8 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from mtv_world_ros.core.errors import MtvWorldError
-from mtv_world_ros.core.files import share_path
 from mtv_world_ros.core.processes import end_on_signals, PARENT_VARIABLE
+from mtv_world_ros.ros.receive_paths import receive_paths, resolved_topics
 
 _PR_SET_PDEATHSIG = 1
 AnyNode = TypeVar('AnyNode', bound=Node)
@@ -52,6 +52,8 @@ def run(
     spin: Callable[[AnyNode], None] = spin_forever,
     signals: SignalHandlerOptions = SignalHandlerOptions.ALL,
     help_text: str = '',
+    name: str = '',
+    own_paths: Sequence[Sequence[str]] = (),
 ) -> int:
     """Makes a node and spins it until it is done, or until SIGINT or SIGTERM.
 
@@ -63,6 +65,9 @@ def run(
         spin: runs the node's callbacks until shutdown.
         signals: signals that rclpy handles; NO = the node has handlers of its own.
         help_text: printed instead if the command line has `--help`.
+        name: of the node, before remapping; needed for `own_paths`.
+        own_paths: topics that do not share their receive buffers with images, in groups that share
+            a port (see `receive_paths`).
 
     Returns:
         The exit status: 1 after an error of the user's or of the disk, whose text goes to stderr,
@@ -74,8 +79,6 @@ def run(
     end_with_parent()
     starting = end_on_signals('mtv_world_ros')
     _find_log_folder()
-    heartbeat = share_path('config', 'fastdds_heartbeat.xml')
-    os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(heartbeat))
     try:
         rclpy.init(args=None if args is None else list(args), signal_handler_options=signals)
     except RuntimeError as error:  # rclpy's own classes for this are private
@@ -84,7 +87,12 @@ def run(
     node: AnyNode | None = None
     failure = ''
     try:
-        node = make()
+        words = sys.argv if args is None else args
+        groups = [resolved_topics(words, name, topics) for topics in own_paths]
+        with receive_paths(groups) as paths:
+            node = make()
+        for note in paths.notes:
+            node.get_logger().info(note)
         starting.is_over = True  # from now on rclpy's handler, or the node's own, ends it
         spin(node)
     except ExternalShutdownException:

@@ -28,6 +28,7 @@ from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.policy.loop import PolicyLoop, PolicySettings, PredictedFrames
 from mtv_world_ros.ros.policy.policy_thread import Actor
 from mtv_world_ros.ros.qos_profiles import LATCHED
+from mtv_world_ros.ros.receive_paths import SERVICES
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 from mtv_world_ros.ros.sensing.subscriptions import subscribe_observations
@@ -231,7 +232,13 @@ class PolicyNode(Node):
 def main(args: Sequence[str] | None = None, load: Load = load_named_policy) -> int:
     """Runs the node; returns the exit status."""
     help_text = parameters.help_text('python -m mtv_world_ros.ros.policy.node', PolicySettings)
-    return run(lambda: PolicyNode(load), args, help_text=help_text)
+    return run(
+        lambda: PolicyNode(load),
+        args,
+        help_text=help_text,
+        name='policy',
+        own_paths=(('joint_states', SERVICES),),
+    )
 
 
 if __name__ == '__main__':

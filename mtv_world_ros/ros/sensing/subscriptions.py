@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -19,6 +19,7 @@ from mtv_world_ros.cameras.camera_info import RECTIFIED
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.node_events import NodeEvents
+from mtv_world_ros.ros.receive_paths import PATHS, SERVICES
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 
 Handler = Callable[[Any], None]
@@ -27,6 +28,8 @@ _RELIABILITIES = ('match', 'reliable', 'best_effort')
 _LOWEST = (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
 #: plans that wait while the node is busy: one that is dropped would get no end
 PLANS_KEPT = 1000
+#: small, urgent topics that have ports of their own; joint states may come at 1 kHz
+OWN_PATHS = (('joint_trajectory', 'instruction', SERVICES), ('joint_states',))
 _HIGHEST = (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -39,6 +42,9 @@ class Inputs:
         compressed: whether images come as JPEG or PNG.
         buffer: gets images, camera infos and joint states.
         events: takes instructions and plans.
+
+    Raises:
+        ConfigError: a QoS override is invalid, or a port was taken by another program.
     """
 
     def __init__(
@@ -66,6 +72,8 @@ class Inputs:
             default='reliable',
         )
         self._all.append(self._plans)
+        urgent = [node.resolve_topic_name(topic) for topic in ('joint_trajectory', 'joint_states')]
+        self._paths = {f'receive_path.{topic}': PATHS.of(topic) for topic in urgent}
 
     def refresh(self) -> None:
         """Looks at the publishers again; to be called now and then."""
@@ -80,6 +88,10 @@ class Inputs:
     def plan_topic(self) -> str:
         """Where trajectories come in."""
         return self._plans.topic
+
+    def receive_paths(self) -> Mapping[str, str]:
+        """Where plans and joint states come in, as `receive_path.<topic>`."""
+        return self._paths
 
     def publisher_counts(self) -> dict[str, int]:
         """Publishers by topic, as `publishers.<topic>`, and `policies`: those of trajectories."""

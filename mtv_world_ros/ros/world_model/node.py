@@ -17,6 +17,7 @@ from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.run_node import run
+from mtv_world_ros.ros.sensing.subscriptions import OWN_PATHS
 from mtv_world_ros.ros.world_model.loading import load_named_pipeline
 from mtv_world_ros.ros.world_model.reporter import Reporter
 from mtv_world_ros.ros.world_model.rollouts import Rollouts
@@ -178,7 +179,13 @@ def main(args: Sequence[str] | None = None, load: Load = load_named_pipeline) ->
         node.start()
         return node
 
-    return run(make, args, help_text=parameters.help_text('world_model', Settings))
+    return run(
+        make,
+        args,
+        help_text=parameters.help_text('world_model', Settings),
+        name='world_model',
+        own_paths=OWN_PATHS,
+    )
 
 
 if __name__ == '__main__':

@@ -291,6 +291,7 @@ class Rollouts:
             **self._extrinsics.values(),
             **self._fidelity.values(),
             **self._inputs.publisher_counts(),
+            **self._inputs.receive_paths(),
             **self._publisher.subscriber_counts(),
             **self._buffer.ages(self._node.get_clock().now().nanoseconds),
             **({'camera_notes': '; '.join(notes)} if (notes := self._buffer.notes) else {}),
