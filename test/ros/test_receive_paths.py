@@ -39,6 +39,7 @@ def test_names_are_resolved_before_the_node_exists(rules):
     assert resolved_topics(words, 'world_model', NAMES) == [*RULES[rules], SERVICES]
 
 
+@pytest.mark.slow
 def test_names_are_those_that_rclpy_resolves(ros):
     """Independent source: a real node with the same command lines, all in one process."""
     code = (
