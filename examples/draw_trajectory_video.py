@@ -23,8 +23,8 @@ parser = argparse.ArgumentParser()
 parser.add_argument('--out', type=Path, default=Path('out/examples'))
 options = parser.parse_args()
 
-robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-cameras = load_calibration(share_path('config', 'cameras', 'yam_bimanual.yaml'))
+robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
+cameras = load_calibration(share_path('config', 'robots', 'yam_bimanual', 'cameras.yaml'))
 
 # both arms swing about their bases while the grippers open and close
 times = np.arange(40) / 10.0

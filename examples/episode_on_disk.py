@@ -24,8 +24,8 @@ parser.add_argument('--out', type=Path, default=Path('out/examples/episode'))
 parser.add_argument('--overwrite', action='store_true', help='replace what is there')
 options = parser.parse_args()
 
-robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-cameras = load_calibration(share_path('config', 'cameras', 'yam_bimanual.yaml'))
+robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
+cameras = load_calibration(share_path('config', 'robots', 'yam_bimanual', 'cameras.yaml'))
 home = np.tile([0.0, 1.05, 1.05, 0.0, 0.0, 0.0, 0.02], 2)
 trajectory = JointTrajectory(
     joint_names=robot.joint_names,

@@ -21,7 +21,7 @@ from mtv_world_ros.robot.file import load_robot
 
 parser = argparse.ArgumentParser()
 parser.add_argument(
-    'urdf', type=Path, nargs='?', default=share_path('config', 'robots', 'franka.urdf')
+    'urdf', type=Path, nargs='?', default=share_path('config', 'robots', 'franka', 'franka.urdf')
 )
 parser.add_argument('--out', type=Path, default=Path('out/examples/robot'))
 parser.add_argument('--overwrite', action='store_true', help='replace what is there')

@@ -127,7 +127,7 @@ def _recordings(paths: Sequence[Path], size: tuple[int, int]) -> list[Recording]
     spec = WorldModelSpec(
         views=VIEWS, fps=5, num_frames=16, width=size[0], height=size[1], robot='yam_bimanual'
     )
-    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
     return [load_recording(path, spec, robot) for path in paths]
 
 

@@ -119,7 +119,7 @@ def main() -> None:
     """Measures both and prints the table."""
     options = parse_arguments(__doc__, repeats=15)
     cv2.setNumThreads(1)
-    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
     config, rows = TrajectoryVideoConfig(), []
     for name, frames, width, height, fps in CASES:
         cameras, masks = make_cameras(width, height), make_masks(width, height)

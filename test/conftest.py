@@ -75,12 +75,12 @@ SLOW = [
 @pytest.fixture(scope='session')
 def robot() -> RobotModel:
     """The bundled robot with two arms."""
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    return load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
 
 
 @pytest.fixture(scope='session')
 def yam() -> RobotModel:
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    return load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
 
 
 @pytest.fixture(scope='session')

@@ -19,7 +19,7 @@ from mtv_world_ros.success.calibration import HorizonCurve
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=4, width=64, height=48, robot='yam_bimanual'
 )
-YAM = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+YAM = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
 CARD = read_card(share_path('resource', 'checkpoint')).replace(rendering={})
 
 

@@ -129,8 +129,9 @@ def recorded_robot(episode: Path, name: str) -> Path:
     Raises:
         ConfigError: there is no file of that name.
     """
+    from mtv_world_ros.core.files import ROBOT_YAML
     from mtv_world_ros.model.card import ROBOT_FOLDER
-    from mtv_world_ros.robot.file import load_robot, ROBOT_YAML
+    from mtv_world_ros.robot.file import load_robot
     from mtv_world_ros.rollout.assembly import robot_path
 
     for folder in (episode, *list(episode.resolve().parents)[:2]):

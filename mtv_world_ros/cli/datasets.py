@@ -210,7 +210,7 @@ def _import_bag(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
     import yaml
 
-    from mtv_world_ros.core.files import write_whole
+    from mtv_world_ros.core.files import ROBOT_YAML, write_whole
     from mtv_world_ros.data.bag_mapping import BagMapping, load_bag_mapping
     from mtv_world_ros.data.episode_reader import read_episode
     from mtv_world_ros.importing.bags import (
@@ -220,7 +220,6 @@ def _import_bag(arguments: argparse.Namespace) -> int:
         summary_line,
         with_guessed_views,
     )
-    from mtv_world_ros.robot.file import ROBOT_YAML
 
     mapping = BagMapping() if arguments.topics is None else load_bag_mapping(arguments.topics)
     if arguments.action:
@@ -315,6 +314,7 @@ def _add_import_videos(commands: argparse._SubParsersAction) -> None:
 def _import_videos(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
+    from mtv_world_ros.core.files import ROBOT_YAML
     from mtv_world_ros.importing.bags import summary_line
     from mtv_world_ros.importing.videos import (
         find_recordings,
@@ -322,7 +322,6 @@ def _import_videos(arguments: argparse.Namespace) -> int:
         load_video_mapping,
         read_recording,
     )
-    from mtv_world_ros.robot.file import ROBOT_YAML
 
     mapping = load_video_mapping(arguments.mapping)
     found = {one.name: one for one in find_recordings(arguments.folder, mapping)}
@@ -374,10 +373,10 @@ def _add_import_dataset(commands: argparse._SubParsersAction) -> None:
 def _import_dataset(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
+    from mtv_world_ros.core.files import ROBOT_YAML
     from mtv_world_ros.importing.convert import episode_name, import_dataset, read_frames
     from mtv_world_ros.importing.lerobot import LeRobotDataset
     from mtv_world_ros.importing.mapping import load_mapping
-    from mtv_world_ros.robot.file import ROBOT_YAML
 
     file = arguments.mapping or _guessed_mapping(arguments)
     source, mapping = LeRobotDataset(arguments.dataset), load_mapping(file)
@@ -471,7 +470,7 @@ def _export(arguments: argparse.Namespace) -> int:
     if arguments.fps < 1:
         raise ConfigError(f'--fps is {arguments.fps}; it must be at least 1')
     path = bundled('robots', arguments.robot, '--robot')
-    named = arguments.robot if path.stem == arguments.robot else str(path.resolve())
+    named = arguments.robot if path.parent.name == arguments.robot else str(path.resolve())
     count = export_dataset(
         [path for folder in arguments.episodes for path in list_episodes(folder)],
         arguments.out,

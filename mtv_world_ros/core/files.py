@@ -19,6 +19,8 @@ from typing import Any
 from mtv_world_ros.core.errors import ConfigError, nearest
 
 PACKAGE = 'mtv_world_ros'
+#: file of a robot in a folder of its own
+ROBOT_YAML = 'robot.yaml'
 
 
 def _candidates() -> list[Path]:
@@ -52,7 +54,9 @@ def share_path(*parts: str) -> Path:
 
 
 def bundled(kind: str, name: str | Path, setting: str) -> Path:
-    """Returns the YAML file of `config/<kind>` with this name, or `name` if it is a YAML path.
+    """Return the YAML file of `config/<kind>` with this name, or `name` if it is a YAML path.
+
+    A robot is a folder that holds `robot.yaml`: by name in `config/robots`, or any path.
 
     Raises:
         ConfigError: there is no such file; names the nearest known one and `setting`.
@@ -60,14 +64,18 @@ def bundled(kind: str, name: str | Path, setting: str) -> Path:
     path = Path(name)
     if path.suffix in ('.yaml', '.yml'):
         return path
+    if kind == 'robots' and (path / ROBOT_YAML).is_file():
+        return path / ROBOT_YAML
     folder = share_path('config', kind)
-    known = sorted(file.stem for file in folder.glob('*.yaml'))
+    files = {file.stem: file for file in folder.glob('*.yaml')}
+    files |= {file.parent.name: file for file in folder.glob(f'*/{ROBOT_YAML}')}
+    known = sorted(files)
     if str(name) not in known:
         raise ConfigError(
             f"'{name}' is not in config/{kind}{nearest(str(name), known)}; set '{setting}' to a "
             f'YAML file or to one of {", ".join(known)}'
         )
-    return folder / f'{name}.yaml'
+    return files[str(name)]
 
 
 def content_digest(folder: Path, without: Collection[str] = ()) -> str:

@@ -14,6 +14,7 @@ import yaml
 from mtv_world_ros.cameras.camera import camera_poses
 from mtv_world_ros.core.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, RobotError, TrajectoryError
+from mtv_world_ros.core.files import ROBOT_YAML
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag_mapping import BagMapping
@@ -24,7 +25,7 @@ from mtv_world_ros.importing.convert import import_each, ImportSummary, jumps, M
 from mtv_world_ros.importing.mapping import digest_of
 from mtv_world_ros.importing.robot_guess import guess_robot
 from mtv_world_ros.importing.stored_objects import AS_RECORDED, MaskWriter, ObjectStage
-from mtv_world_ros.robot.file import load_robot, ROBOT_YAML, save_robot
+from mtv_world_ros.robot.file import load_robot, save_robot
 from mtv_world_ros.robot.model import check_positions, RobotModel
 from mtv_world_ros.robot.resample import match_joints
 

@@ -21,7 +21,7 @@ from mtv_world_ros.core.bounded_input import read_text
 from mtv_world_ros.core.config import ListOf, Metres, Quaternion, read_yaml, Schema, validated
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import ConfigError, RobotError
-from mtv_world_ros.core.files import whole_folder
+from mtv_world_ros.core.files import ROBOT_YAML, whole_folder
 from mtv_world_ros.core.transforms import denavit_hartenberg, pose
 from mtv_world_ros.robot.mesh_pieces import (
     convex_pieces,
@@ -281,7 +281,7 @@ def _movable(model: pin.Model, followers: set[str]) -> list[str]:
 
 
 #: names in a folder that holds a copy of a robot
-ROBOT_YAML, _URDF, _MESHES, _PIECES = 'robot.yaml', 'robot.urdf', 'meshes', 'pieces'
+_URDF, _MESHES, _PIECES = 'robot.urdf', 'meshes', 'pieces'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

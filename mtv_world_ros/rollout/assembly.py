@@ -17,7 +17,7 @@ from mtv_world_ros.core.errors import (
     nearest,
     PolicyError,
 )
-from mtv_world_ros.core.files import bundled, content_digest, share_path
+from mtv_world_ros.core.files import bundled, content_digest, ROBOT_YAML, share_path
 from mtv_world_ros.core.processes import threads_each
 from mtv_world_ros.model.card import CAMERAS, CheckpointCard, read_card, ROBOT_FOLDER
 from mtv_world_ros.physics.object_motion import ObjectMotionModel
@@ -30,7 +30,7 @@ from mtv_world_ros.policies.policy import (
     RecordedPolicySettings,
     ScriptedPolicySettings,
 )
-from mtv_world_ros.robot.file import load_robot, ROBOT_YAML
+from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.pipeline import Pipeline, WorldModel
@@ -286,7 +286,7 @@ def checkpoint_cameras(checkpoint: str | Path) -> Path:
         return carried
     robot = read_card(folder).robot
     try:
-        return share_path('config', 'cameras', f'{robot}.yaml')
+        return share_path('config', 'robots', robot, 'cameras.yaml')
     except ConfigError as error:
         raise CalibrationError(
             f"checkpoint '{checkpoint}' has no default calibration (its episodes were recorded "

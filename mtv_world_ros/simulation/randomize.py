@@ -144,7 +144,7 @@ def draw_scene(
         raise SimulatorError(
             f"no feasible placement for task '{task.name}' in {MAX_DRAWS} draws; widen x_range "
             'and y_range of its roles (config/scenes.yaml) or lower the clearance '
-            '(config/workcells)'
+            '(workcell.yaml)'
         )
     cameras = tuple(
         camera_model(

@@ -17,6 +17,9 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.cameras import AnyCameraSpec, CameraSpec, WristCameraSpec
 
+#: file of a robot's folder: where its arms and cameras stand in the simulator
+WORKCELL_YAML = 'workcell.yaml'
+
 Number = Annotated[int | float, Field(ge=-1000, le=1000)]
 Vector = ListOf[Number]
 
@@ -93,16 +96,16 @@ class Workcell:
 
 @lru_cache(maxsize=8)
 def workcell_of(robot: RobotModel) -> Workcell:
-    """Returns the workcell of a robot, `config/workcells/<its name>.yaml`.
+    """Returns the workcell of a robot, `config/robots/<its name>/workcell.yaml`.
 
     Raises:
         SimulatorError: there is none for this robot, or it is for other arms.
         ConfigError: its file has unknown, missing or wrong values.
     """
-    folder = share_path('config', 'workcells')
-    path = folder / f'{robot.name}.yaml'
+    folder = share_path('config', 'robots')
+    path = folder / robot.name / WORKCELL_YAML
     if not path.is_file():
-        known = ', '.join(sorted(file.stem for file in folder.glob('*.yaml')))
+        known = ', '.join(sorted(file.parent.name for file in folder.glob(f'*/{WORKCELL_YAML}')))
         raise SimulatorError(
             f"robot '{robot.name}' has no workcell in the simulator; there are some for {known}"
         )

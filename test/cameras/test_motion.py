@@ -17,7 +17,7 @@ from mtv_world_ros.robot.model import RobotModel
 @pytest.fixture
 def cameras(yam: RobotModel) -> tuple[CameraModel, ...]:
     """The bundled fixed cameras, and one on the wrist."""
-    fixed = load_calibration(share_path('config', 'cameras', 'yam_bimanual.yaml'))
+    fixed = load_calibration(share_path('config', 'robots', 'yam_bimanual', 'cameras.yaml'))
     T = np.eye(4)
     T[:3, 3] = (0.02, 0.0, -0.05)
     values = {field: getattr(fixed['low'], field) for field in ('width', 'height', 'K')}

@@ -25,7 +25,7 @@ HOME = np.array([0, -0.4, 0, -2.2, 0, 1.9, 0.785, 0.03])
 
 @pytest.fixture(scope='module')
 def franka() -> RobotModel:
-    return load_robot(share_path('config', 'robots', 'franka.yaml'))
+    return load_robot(share_path('config', 'robots', 'franka', 'robot.yaml'))
 
 
 def motion(seconds: float = 4.0) -> tuple[np.ndarray, np.ndarray]:

@@ -126,7 +126,7 @@ def test_yaml_in_the_pages_can_be_used(block, tmp_path):
         (tmp_path / 'my_robot.urdf').write_text(URDF)
         load_robot(file)
     elif 'kind' in values:
-        robot = load_robot(ROOT / 'config' / 'robots' / 'yam_bimanual.yaml')
+        robot = load_robot(ROOT / 'config' / 'robots' / 'yam_bimanual' / 'robot.yaml')
         load_policy_config(file, robot)
     elif 'joint_states' in values:
         assert load_source(file, None).mapping is not None
@@ -135,7 +135,7 @@ def test_yaml_in_the_pages_can_be_used(block, tmp_path):
     elif 'policies' in values:  # beside those of the same page
         mine = tmp_path / 'my_policy.yaml'
         mine.write_text('kind: scripted\nvariant: expert\n')
-        robot = load_robot(ROOT / 'config' / 'robots' / 'yam_bimanual.yaml')
+        robot = load_robot(ROOT / 'config' / 'robots' / 'yam_bimanual' / 'robot.yaml')
         assert len(load_policy_list(file, robot)) == len(values['policies'])
     else:
         assert 'qos_overrides' in values or has_boxes(file, values)

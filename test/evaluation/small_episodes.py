@@ -208,5 +208,5 @@ def blurred_oracle(recordings) -> OracleWorldModel:
 def persistence(spec: WorldModelSpec) -> Pipeline:
     """A pipeline whose world model holds the first frame; a worker process can make it, too."""
     card = read_card(share_path('resource', 'checkpoint')).replace(rendering={})
-    yam = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    yam = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
     return assemble(card, PersistenceWorldModel(spec), robot=yam)

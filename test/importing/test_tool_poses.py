@@ -19,7 +19,7 @@ GRIPPER = {'panda_finger_joint1': {'column': 'grip', 'closed': 0, 'open': 1}}
 
 @pytest.fixture(scope='module')
 def robot():
-    return load_robot(share_path('config', 'robots', 'franka.yaml'))
+    return load_robot(share_path('config', 'robots', 'franka', 'robot.yaml'))
 
 
 @pytest.fixture(scope='module')

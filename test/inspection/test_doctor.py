@@ -36,7 +36,7 @@ def episode():
 
 @pytest.fixture(scope='module')
 def inspector():
-    return load_inspector(share_path('config', 'robots', 'yam_bimanual.yaml'), QUICK)
+    return load_inspector(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'), QUICK)
 
 
 def changed(episode, view, **changes):

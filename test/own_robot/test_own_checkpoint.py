@@ -82,5 +82,5 @@ def test_older_checkpoints_find_their_robot_by_name_or_path(trained, tmp_path):
     (older / 'world_model.json').write_text(json.dumps(card))
     with pytest.raises(ConfigError, match=r'gone.yaml.* does not exist'):
         checkpoint_robot(older)
-    yam = share_path('config', 'robots', 'yam_bimanual.yaml')
+    yam = share_path('config', 'robots', 'yam_bimanual', 'robot.yaml')
     assert checkpoint_robot(older, yam).name == 'yam_bimanual'

@@ -41,8 +41,10 @@ def test_a_urdf_becomes_a_robot_file_with_a_picture(crane, tmp_path, capsys):
 
 
 def test_the_guess_for_two_arms_agrees_with_the_bundled_file():
-    yam = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
-    values = guess_robot(share_path('config', 'robots', 'yam_bimanual.urdf')).values
+    yam = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
+    values = guess_robot(
+        share_path('config', 'robots', 'yam_bimanual', 'yam_bimanual.urdf')
+    ).values
     assert tuple(values['joints']) == yam.joint_names and values['base_link'] == yam.base_link
     for guess, tool in zip(values['tools'], yam.tools, strict=True):
         assert (guess['arm'], guess['link']) == (tool.arm, tool.link)

@@ -27,7 +27,7 @@ DEMO = share_path('resource', 'demo_episode')
 
 
 def robot_of(name: str):
-    return load_robot(share_path('config', 'robots', f'{name}.yaml'))
+    return load_robot(share_path('config', 'robots', name, 'robot.yaml'))
 
 
 def response_of(robot, compliance: float) -> ArmResponse:

@@ -124,7 +124,7 @@ def test_a_mesh_that_is_missing_is_named(tmp_path):
 
 @pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
 def test_bundled_robots_stay_where_they_are_told_to_be(name):
-    robot = load_robot(share_path('config', 'robots', f'{name}.yaml'))
+    robot = load_robot(share_path('config', 'robots', name, 'robot.yaml'))
     away = Solid(centre=np.array([1.5, 1.5, 0.02]), size=np.full(3, 0.04))
     batch = batch_of(robot, away)
     middle = np.where(np.isfinite(robot.lower + robot.upper), robot.lower + robot.upper, 0) / 2
@@ -147,13 +147,13 @@ def test_fingers_that_follow_one_joint_are_kept_together_unless_they_swing(lift,
 
 
 def test_a_gripper_whose_joint_moves_nothing_is_named(tmp_path):
-    robot = share_path('config', 'robots', 'franka.urdf').read_text()
+    robot = share_path('config', 'robots', 'franka', 'franka.urdf').read_text()
     bare = robot
     for link in ('panda_leftfinger', 'panda_rightfinger'):
         first = bare.index(f'<link name="{link}">')
         bare = f'{bare[:first]}<link name="{link}"/>{bare[bare.index("</link>", first) + 7 :]}'
     (tmp_path / 'franka.urdf').write_text(bare)
-    text = share_path('config', 'robots', 'franka.yaml').read_text()
+    text = share_path('config', 'robots', 'franka', 'robot.yaml').read_text()
     (tmp_path / 'franka.yaml').write_text(text)
     with pytest.raises(
         RobotError, match="'panda' .* no part that its joint 'panda_finger_joint1'"

@@ -11,7 +11,7 @@ from mtv_world_ros.rollout.assembly import robot_path
 
 FILE = robot_path('yam_bimanual')
 YAM = load_robot(FILE)
-URDF = FILE.with_suffix('.urdf').read_text()
+URDF = (FILE.parent / 'yam_bimanual.urdf').read_text()
 
 
 def with_joint(name, pattern, text):

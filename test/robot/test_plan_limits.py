@@ -17,7 +17,7 @@ SHOULDER, WRIST = 5.4, 20.0
 
 @pytest.fixture(scope='module')
 def yam():
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    return load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
 
 
 def plan_of(
@@ -54,9 +54,9 @@ def test_twice_the_speed_of_the_description_is_accepted_and_no_more(yam, joint, 
 
 
 def test_a_joint_without_a_speed_has_the_default_and_a_gripper_any(yam, tmp_path):
-    text = share_path('config', 'robots', 'yam_bimanual.urdf').read_text()
+    text = share_path('config', 'robots', 'yam_bimanual', 'yam_bimanual.urdf').read_text()
     (tmp_path / 'yam_bimanual.urdf').write_text(text.replace('velocity="5.4"', 'velocity="0"'))
-    yaml = share_path('config', 'robots', 'yam_bimanual.yaml').read_text()
+    yaml = share_path('config', 'robots', 'yam_bimanual', 'robot.yaml').read_text()
     (tmp_path / 'r.yaml').write_text(yaml)
     limits = dict(zip(yam.joint_names, speed_limits(load_robot(tmp_path / 'r.yaml')), strict=True))
     assert limits['left_joint1'] == 20.0

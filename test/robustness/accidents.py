@@ -27,7 +27,7 @@ from mtv_world_ros.core.files import share_path
 
 def calibration(text: str, instead: str) -> bytes:
     """The bundled cameras with one thing replaced."""
-    whole = share_path('config', 'cameras', 'yam_bimanual.yaml').read_text()
+    whole = share_path('config', 'robots', 'yam_bimanual', 'cameras.yaml').read_text()
     assert text in whole
     return whole.replace(text, instead, 1).encode()
 

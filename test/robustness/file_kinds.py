@@ -106,7 +106,7 @@ def _file(path: Path, data: bytes) -> Path:
 
 @cache
 def _yam() -> Any:
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    return load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
 
 
 def _reads(name: str, function: str, *more: Callable[[], Any]) -> Callable[[bytes, Path], Any]:
@@ -121,14 +121,14 @@ def _reads(name: str, function: str, *more: Callable[[], Any]) -> Callable[[byte
 
 
 def _config(folder: str) -> Callable[[], list[bytes]]:
-    return lambda: [file.read_bytes() for file in share_path('config', folder).glob('*.yaml')]
+    return lambda: [file.read_bytes() for file in share_path('config').glob(f'{folder}.yaml')]
 
 
 def _read_robot(data: bytes, folder: Path) -> Any:
     """Beside the files that the bundled robots name."""
-    if not (folder / 'robots').exists():
-        shutil.copytree(share_path('config', 'robots'), folder / 'robots')
-    return load_robot(_file(folder / 'robots' / 'mutated.yaml', data))
+    for urdf in share_path('config', 'robots').glob('*/*.urdf'):
+        shutil.copy(urdf, folder)
+    return load_robot(_file(folder / 'mutated.yaml', data))
 
 
 def _images() -> list[bytes]:
@@ -277,14 +277,14 @@ def _recorded_sqlite() -> list[bytes]:
 
 
 def _urdfs() -> list[bytes]:
-    return [share_path('config', 'robots', 'yam_bimanual.urdf').read_bytes()]
+    return [share_path('config', 'robots', 'yam_bimanual', 'yam_bimanual.urdf').read_bytes()]
 
 
 def _read_urdf(data: bytes, folder: Path) -> Any:
     """By the bundled robot's YAML, which names it."""
-    shutil.copy(share_path('config', 'robots', 'yam_bimanual.yaml'), folder)
+    shutil.copy(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'), folder)
     _file(folder / 'yam_bimanual.urdf', data)
-    return load_robot(folder / 'yam_bimanual.yaml')
+    return load_robot(folder / 'robot.yaml')
 
 
 def _colladas() -> list[bytes]:
@@ -314,8 +314,9 @@ def _read_collada(data: bytes, folder: Path) -> Any:
 def _read_dataset_mapping(data: bytes, folder: Path) -> Any:
     from mtv_world_ros.importing.mapping import load_mapping
 
-    (folder / 'cameras').mkdir(exist_ok=True)
-    shutil.copy(share_path('config', 'cameras', 'yam_bimanual.yaml'), folder / 'cameras')
+    robot = folder / 'robots' / 'yam_bimanual'
+    robot.mkdir(exist_ok=True, parents=True)
+    shutil.copy(share_path('config', 'robots', 'yam_bimanual', 'cameras.yaml'), robot)
     (folder / 'datasets').mkdir(exist_ok=True)
     return load_mapping(_file(folder / 'datasets' / 'mapping.yaml', data))
 
@@ -442,16 +443,17 @@ KINDS = {
     'scene file, numbers': Kind(
         _scene_files, judged(READS_SCENE, wild_numbers.plausible_scene),
         damage=with_wild_number),
-    'calibration': Kind(_config('cameras'), lambda d, f: load_calibration(_file(f / 'c.yaml', d))),
-    'robot': Kind(_config('robots'), _read_robot),
+    'calibration': Kind(
+        _config('robots/*/cameras'), lambda d, f: load_calibration(_file(f / 'c.yaml', d))),
+    'robot': Kind(_config('robots/*/robot'), _read_robot),
     'urdf': Kind(_urdfs, _read_urdf),
     'COLLADA': Kind(_colladas, _read_collada),
-    'task': Kind(_config('tasks'), lambda d, f: load_task(_file(f / 'task.yaml', d))),
-    'policy': Kind(_config('policies'), READS_POLICY),
+    'task': Kind(_config('tasks/*'), lambda d, f: load_task(_file(f / 'task.yaml', d))),
+    'policy': Kind(_config('policies/*'), READS_POLICY),
     'policy list': Kind(
-        _config('rankings'),
+        _config('rankings/*'),
         _reads('policies.yaml', 'ranking.policy_list.load_policy_list', _yam)),
-    'preset': Kind(_config('models'), READS_PRESET),
+    'preset': Kind(_config('models/*'), READS_PRESET),
     'bag mapping': Kind(lambda: [share_path('config', 'datasets', 'bag.yaml').read_bytes()],
                         _reads('mapping.yaml', 'data.bag_mapping.load_bag_mapping')),
     'dataset mapping': Kind(
@@ -487,20 +489,20 @@ KINDS = {
         _responses, judged(_read_response, wild_numbers.plausible_response),
         damage=with_wild_number),
     'robot, numbers': Kind(
-        _config('robots'), judged(_read_robot, wild_numbers.plausible_robot),
+        _config('robots/*/robot'), judged(_read_robot, wild_numbers.plausible_robot),
         damage=with_wild_number),
     'calibration, numbers': Kind(
-        _config('cameras'),
+        _config('robots/*/cameras'),
         judged(lambda d, f: load_calibration(_file(f / 'c.yaml', d)),
                wild_numbers.plausible_cameras),
         damage=with_wild_number),
     'checkpoint, numbers': Kind(
         CHECKPOINT_PARTS, judged(LOADS_CHECKPOINT, wild_numbers.plausible_checkpoint), 20.0,
         with_wild_number, 0.1),
-    'task, numbers': Kind(_config('tasks'), lambda d, f: load_task(_file(f / 'task.yaml', d)),
+    'task, numbers': Kind(_config('tasks/*'), lambda d, f: load_task(_file(f / 'task.yaml', d)),
                           damage=with_wild_number),
-    'policy, numbers': Kind(_config('policies'), READS_POLICY, damage=with_wild_number),
-    'preset, numbers': Kind(_config('models'), READS_PRESET, damage=with_wild_number),
+    'policy, numbers': Kind(_config('policies/*'), READS_POLICY, damage=with_wild_number),
+    'preset, numbers': Kind(_config('models/*'), READS_PRESET, damage=with_wild_number),
     'weights, numbers': Kind(
         _weights, wild_numbers.no_survivors(_read_weights, wild_numbers.are_finite),
         damage=wild_numbers.weights),

@@ -88,7 +88,7 @@ def make_episode(folder: Path) -> None:
     """A short recorded episode, neither compressed nor with checksums: all of it is looked at."""
     from mtv_world_ros.data.episode_writer import EpisodeWriter
 
-    cameras = load_calibration(share_path('config', 'cameras', 'yam_bimanual.yaml'))
+    cameras = load_calibration(share_path('config', 'robots', 'yam_bimanual', 'cameras.yaml'))
     robot = _yam()
     pixels = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
     with EpisodeWriter(
@@ -137,7 +137,7 @@ def _read_episode(folder: Path) -> Any:
 
 @cache
 def _yam() -> Any:
-    return load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    return load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
 
 
 def make_card(folder: Path) -> None:

@@ -205,7 +205,7 @@ def _fixed() -> Any:
 
     with tempfile.TemporaryDirectory() as folder:
         cameras = load_calibration(ros().make_calibration(Path(folder) / 'calibration.yaml'))
-    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
     return robot, tuple(cameras.values()), Settings()
 
 

@@ -21,7 +21,7 @@ from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
 from mtv_world_ros.inspection.motion_residual import ResidualSearch
 
 EPISODE = share_path('resource', 'demo_episode')
-URDF = share_path('config', 'robots', 'yam_bimanual.urdf')
+URDF = share_path('config', 'robots', 'yam_bimanual', 'yam_bimanual.urdf')
 QUICK = ResidualSearch(max_pairs=5, lags_s=(0.0,), rolls_deg=(), zooms=())
 SETTINGS = settings(2)
 

@@ -80,15 +80,15 @@ def test_a_whole_camera_is_read(tmp_path):
 
 
 def test_tools_and_joints_out_of_all_reach_are_refused(tmp_path):
-    for name in ('yam_bimanual.yaml', 'yam_bimanual.urdf'):
-        shutil.copy(share_path('config', 'robots', name), tmp_path)
-    file = tmp_path / 'yam_bimanual.yaml'
+    for name in ('robot.yaml', 'yam_bimanual.urdf'):
+        shutil.copy(share_path('config', 'robots', 'yam_bimanual', name), tmp_path)
+    file = tmp_path / 'robot.yaml'
     values = yaml.safe_load(file.read_text())
     values['tools'][0]['position'] = [0.0, 0.0, 1e308]
     file.write_text(yaml.safe_dump(values))
     with pytest.raises(ConfigError, match=r'position.* must be at most 100'):
         load_robot(file)
-    shutil.copy(share_path('config', 'robots', 'yam_bimanual.yaml'), tmp_path)
+    shutil.copy(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'), tmp_path)
     urdf = tmp_path / 'yam_bimanual.urdf'
     tree = ElementTree.parse(urdf)
     origins = (origin for joint in tree.iter('joint') for origin in joint.iter('origin'))

@@ -46,7 +46,7 @@ from mtv_world_ros.vision.describers.describer import DescribedObject
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=8, width=64, height=48, robot='yam_bimanual'
 )
-YAM = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+YAM = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
 CARD = read_card(share_path('resource', 'checkpoint')).replace(rendering={})
 
 
@@ -574,7 +574,7 @@ def test_without_object_masks_the_control_is_dark_but_for_the_trails(world_model
 
 
 def test_a_larger_observation_is_brought_to_the_models_size(pipeline, recording):
-    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
     large = load_recording(
         share_path('resource', 'demo_episode'), replace(SPEC, width=384, height=288), robot
     )

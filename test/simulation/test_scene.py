@@ -36,7 +36,7 @@ def put(model, data, robot, row):
 @pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
 def test_simulated_arms_stand_where_pinocchio_puts_them(name):
     mujoco = load_mujoco(rendering=False)
-    robot = load_robot(share_path('config', 'robots', f'{name}.yaml'))
+    robot = load_robot(share_path('config', 'robots', name, 'robot.yaml'))
     drawn = draw_scene(TASKS['stack_blocks_two'], np.random.default_rng(1), workcell_of(robot))
     model = mujoco.MjModel.from_xml_string(scene_xml(drawn, robot))
     data = mujoco.MjData(model)
@@ -62,7 +62,7 @@ def test_simulated_arms_stand_where_pinocchio_puts_them(name):
 @pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
 def test_the_urdf_is_drawn_where_the_simulator_draws_the_robot(name, opengl):
     mujoco = load_mujoco()
-    robot = load_robot(share_path('config', 'robots', f'{name}.yaml'))
+    robot = load_robot(share_path('config', 'robots', name, 'robot.yaml'))
     drawn = draw_scene(TASKS['stack_blocks_two'], np.random.default_rng(1), workcell_of(robot))
     fixed = [c for c in drawn.cameras if c.mount_link == robot.base_link]
     model = mujoco.MjModel.from_xml_string(scene_xml(replace(drawn, objects=()), robot))

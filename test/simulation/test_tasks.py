@@ -14,7 +14,7 @@ from mtv_world_ros.simulation.workcell import workcell_of
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from mtv_world_ros.vision.segmenters.colour import PALETTE
 
-WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual.yaml')))
+WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml')))
 
 
 def test_unknown_task_names_the_nearest():

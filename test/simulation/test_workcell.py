@@ -22,7 +22,7 @@ OTHERS = ROBOTS[1:]
 
 
 def bundled(name):
-    return load_robot(share_path('config', 'robots', f'{name}.yaml'))
+    return load_robot(share_path('config', 'robots', name, 'robot.yaml'))
 
 
 def test_franka_flange_is_where_the_published_parameters_put_it():
@@ -78,7 +78,7 @@ def test_a_redundant_arm_comes_back_to_where_it_rests():
 @pytest.mark.parametrize('name', ROBOTS)
 def test_default_calibration_is_that_of_the_workcell(name):
     robot = bundled(name)
-    stored = load_calibration(share_path('config', 'cameras', f'{name}.yaml'))
+    stored = load_calibration(share_path('config', 'robots', name, 'cameras.yaml'))
     workcell = workcell_of(robot)
     assert list(stored) == [spec.view for spec in workcell.cameras]
     for spec in workcell.cameras:

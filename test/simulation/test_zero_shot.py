@@ -19,7 +19,7 @@ from mtv_world_ros.simulation.tasks import task_named, TASKS, tasks_named
 from mtv_world_ros.simulation.workcell import workcell_of
 from mtv_world_ros.simulation.zero_shot import kinds_named, tasks_of, UNSEEN_SHAPES, variant
 
-WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual.yaml')))
+WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml')))
 CAMERAS = WORKCELL.cameras
 PLAIN, CONFIG = RandomizationConfig().of(WORKCELL), CameraMoves()
 ALL = tasks_named('all')

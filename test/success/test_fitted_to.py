@@ -82,7 +82,7 @@ def test_another_foresight_counts_where_motions_are_foreseen():
 
 
 def test_another_robot_and_a_longer_arm_are_other_robots():
-    franka = load_robot(share_path('config', 'robots', 'franka.yaml'))
+    franka = load_robot(share_path('config', 'robots', 'franka', 'robot.yaml'))
     assert "'franka'" in FITTED.objection(Setting.of(franka), CAMERAS, is_foreseen=False)
     for metres, is_other in ((0.01, False), (0.05, True)):
         tools = np.array(HERE.tools) + [metres, 0, 0]

@@ -104,7 +104,7 @@ def motion(share=None):
     ],
 )
 def test_grippers_open_as_foreseen_and_else_as_commanded(shares, expected):
-    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
     tool = robot.tools[1]
     positions = np.tile((robot.lower + robot.upper) / 2, (3, 1))
     half = (tool.gripper_closed + tool.gripper_open) / 2

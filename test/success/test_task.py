@@ -13,7 +13,7 @@ from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 
-WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual.yaml')))
+WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml')))
 LEFT = """
 name: left
 instruction: place the {a} to the left of the {b}

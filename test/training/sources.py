@@ -81,7 +81,7 @@ def run_training(out: Path, episodes: Path, preset: Path, **options: Any) -> Non
     """Trains the bundled robot's model on one thread of this process."""
     torch.set_num_threads(1)
     run = TrainingRun(config=load_training_config(preset), dataset=episodes, out=out, **options)
-    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
     train(run, robot=robot, segmenter=ColourSegmenter())
 
 

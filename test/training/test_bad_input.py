@@ -99,7 +99,7 @@ def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
     rewrite(episode, tmp_path / 'only' / 'bad', without('/joint_states'))
     with pytest.raises(TrainingError, match='no usable episode: 1 x .*joint_states'):
         train(run.replace(dataset=tmp_path / 'only'), robot=robot, segmenter=ColourSegmenter())
-    franka = load_robot(share_path('config', 'robots', 'franka.yaml'))
+    franka = load_robot(share_path('config', 'robots', 'franka', 'robot.yaml'))
     said = "of robot 'yam_bimanual', and video.robot is 'franka'; give --set video.robot="
     with pytest.raises(TrainingError, match=said):
         load_recordings([episode], tiny.spec, franka, tmp_path / 'cache')

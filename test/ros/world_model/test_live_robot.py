@@ -21,7 +21,7 @@ needs_tf2 = pytest.mark.skipif(
     find_spec('tf2_msgs') is None,
     reason='tf2_msgs is not among the wheels: run this in a native ROS, or build its definition',
 )
-URDF = robot_path('yam_bimanual').with_suffix('.urdf').read_text()
+URDF = (robot_path('yam_bimanual').parent / 'yam_bimanual.urdf').read_text()
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LOW, HIGH = 'low_optical_frame', 'high_optical_frame'
 

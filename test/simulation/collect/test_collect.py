@@ -373,7 +373,7 @@ def test_81_frames_at_16_fps_and_288x384_can_be_cut(tmp_path, data_set):
     assert main([*words, '--seed', '3', '--out', str(tmp_path)]) == 0
     (path,) = (folder for folder in tmp_path.iterdir() if (folder / 'metadata.yaml').is_file())
     spec = load_training_config('wan-1.3b').spec
-    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
     recording = load_recording(path, spec, robot)
     assert recording.frames.shape[2:] == (288, 384, 3)
     ideal = np.arange(len(recording.times)) / 16

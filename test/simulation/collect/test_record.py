@@ -22,7 +22,7 @@ TASK, SEED = 'stack_blocks_two', 3
 @pytest.mark.skipif(bool(missing_opengl()), reason=missing_opengl() or '')
 @pytest.mark.parametrize('name', ['expert', 'expert-fast-1.5', 'expert-choppy-0.6'])
 def test_recorded_episodes_and_ranked_policies_are_carried_out_alike(name):
-    robot = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
     expert = Expert(robot)
     sim = SimEpisode(robot, expert.home, rendering=False)
     policy = scripted_policy(name, TASK, SEED, expert)

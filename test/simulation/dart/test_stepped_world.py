@@ -355,20 +355,20 @@ def test_what_is_wide_and_low_is_hollow(robot, response, is_round):
 
 
 def test_a_robot_without_a_urdf_is_named(robot, response):
-    bare = load_robot(share_path('config', 'robots', 'yam_bimanual.yaml'))
+    bare = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
     bare.file = None
     with pytest.raises(RobotError, match='has no URDF'):
         bodies_of(bare, response, still(robot, 0.0)[0])
 
 
 def test_meshes_are_refused_by_name(response, tmp_path):
-    source = share_path('config', 'robots')
-    for name in ('yam_bimanual.yaml', 'yam_bimanual.urdf'):
+    source = share_path('config', 'robots', 'yam_bimanual')
+    for name in ('robot.yaml', 'yam_bimanual.urdf'):
         shutil.copy(source / name, tmp_path)
     urdf = tmp_path / 'yam_bimanual.urdf'
     before, rest = urdf.read_text().split('<collision>', 1)
     shape = '<geometry><mesh filename="base.stl"/></geometry></collision>'
     urdf.write_text(f'{before}<collision>{shape}{rest.split("</collision>", 1)[1]}')
-    robot = load_robot(tmp_path / 'yam_bimanual.yaml')
+    robot = load_robot(tmp_path / 'robot.yaml')
     with pytest.raises(RobotError, match="'base.stl' is a mesh"):
         bodies_of(robot, response, still(robot, 0.0)[0])

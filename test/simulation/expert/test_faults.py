@@ -107,7 +107,7 @@ def arm_columns(expert) -> list[int]:
 
 def test_faults_of_two_arms_are_refused_of_one(expert):
     given = plan(expert, 'expert')
-    franka = load_robot(share_path('config', 'robots', 'franka.yaml'))
+    franka = load_robot(share_path('config', 'robots', 'franka', 'robot.yaml'))
     one = JointTrajectory(
         joint_names=franka.joint_names,
         times=np.arange(len(given)) * 0.02,
