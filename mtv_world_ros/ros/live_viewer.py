@@ -11,7 +11,6 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
-from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.data.bag.reader import BagMessage
 from mtv_world_ros.ros.messages.conversions import has_header, message_class, read_stamp
 from mtv_world_ros.ros.qos_profiles import best_offer
@@ -71,7 +70,7 @@ class LiveViewer(Node):
         def show(data: bytes) -> None:
             try:
                 self._show(topic, msgtype, data)
-            except MtvWorldError as error:
+            except Exception as error:  # the viewer never ends of a message
                 self._num_refused += 1
                 text = f'{self._num_refused} messages cannot be shown; the last, of {topic}: '
                 self.get_logger().warning(f'{text}{error}', throttle_duration_sec=5.0)

@@ -232,9 +232,19 @@ def declare(node: Node, kind: type[Schema]) -> None:
     for name, field in kind.model_fields.items():
         _declare(node, name, field)
     node.add_on_set_parameters_callback(refusing(partial(_check, node, kind)))
+    guard_parameter_services(node)
+
+
+def guard_parameter_services(node: Node) -> None:
+    """Let the node's parameter services refuse requests that rclpy fails on.
+
+    Without it a value of an unknown type ends the executor, and with it the node. A second call
+    changes nothing.
+    """
     for service in node.services:
-        if service.srv_name.rpartition('/')[2] in _SET_SERVICES:
-            service.callback = partial(_answered, service.callback)
+        name = service.srv_name.rpartition('/')[2]
+        if name in _SET_SERVICES and not isinstance(service.callback, _Answered):
+            service.callback = _Answered(service.callback)
 
 
 def refusing(
@@ -254,18 +264,28 @@ def refusing(
     return called
 
 
-def _answered(serve: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
-    """Answers requests that rclpy fails on, such as a value of an unknown type."""
-    try:
-        return serve(request, response)
-    except Exception as error:
-        refused = SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
-        if hasattr(response, 'results'):
-            done = len(response.results)
-            response.results += [refused] * (len(request.parameters) - done)
-        else:
-            response.result = refused
-        return response
+class _Answered:
+    """Callback of a parameter service that always answers.
+
+    Args:
+        serve: rclpy's callback.
+    """
+
+    def __init__(self, serve: Callable[[Any, Any], Any]) -> None:
+        self._serve = serve
+
+    def __call__(self, request: Any, response: Any) -> Any:
+        try:
+            return self._serve(request, response)
+        except Exception as error:
+            reason = f'{type(error).__name__}: {error}'
+            refused = SetParametersResult(successful=False, reason=reason)
+            if hasattr(response, 'results'):
+                done = len(response.results)
+                response.results += [refused] * (len(request.parameters) - done)
+            else:
+                response.result = refused
+            return response
 
 
 def declare_one(

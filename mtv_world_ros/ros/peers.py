@@ -60,7 +60,7 @@ class Peers:
 
         def has_too_few(topic: str) -> bool:
             counts = (state.get(f'subscribers.{topic}') for state in states)
-            return any(count is not None and int(count) < least for count in counts)
+            return any(count is not None and _is_below(count, least) for count in counts)
 
         return [topic for topic in topics if has_too_few(topic)]
 
@@ -127,3 +127,8 @@ class Peers:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             self._newest[status.name] = (time.monotonic(), values_of(status))
+
+
+def _is_below(count: str, least: int) -> bool:
+    """True if a count of another node's diagnostics is below `least`; others say nothing."""
+    return count.isascii() and count.isdecimal() and len(count) < 10 and int(count) < least

@@ -19,6 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.core.processes import end_on_signals, PARENT_VARIABLE
+from mtv_world_ros.ros.parameters import guard_parameter_services
 from mtv_world_ros.ros.receive_paths import receive_paths, resolved_topics
 
 _PR_SET_PDEATHSIG = 1
@@ -91,6 +92,7 @@ def run(
         groups = [resolved_topics(words, name, topics) for topics in own_paths]
         with receive_paths(groups) as paths:
             node = make()
+        guard_parameter_services(node)
         for note in paths.notes:
             node.get_logger().info(note)
         starting.is_over = True  # from now on rclpy's handler, or the node's own, ends it

@@ -137,6 +137,13 @@ def altered(kind: str, pattern: bytes, instead: bytes) -> bytes:
     return next(sample for sample, count in samples if count)
 
 
+def altered_checkpoint(pattern: bytes, instead: bytes) -> bytes:
+    """A part of a checkpoint, altered; torch, which is large, is imported before it is read."""
+    import mtv_world_ros.model.checkpoint as _  # noqa: F401
+
+    return altered('checkpoint', pattern, instead)
+
+
 def joints(**changes: Any) -> Any:
     """A joint state with some fields of its own."""
     message = whole('joints')
@@ -271,8 +278,7 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
         f'checkpoint of {field} {value}': (
             'checkpoint',
             partial(
-                altered,
-                'checkpoint',
+                altered_checkpoint,
                 rf'"{field}": \[?[\d, \n]+\]?'.encode(),
                 f'"{field}": {value}'.encode(),
             ),
