@@ -27,9 +27,9 @@ mapping = with_guessed_views(BagMapping(), options.bag)
 for view, topics in mapping.views.items():
     print(f'view {view}: {mapping.topic(topics.image)}')
 summary = import_bags([options.bag], options.out, mapping, robot_path(options.robot))
-for bag, reason in summary.failed.items():
-    print(f'{bag}: {reason}')
-for bag in (*summary.made, *summary.kept):
-    episode = read_episode(options.out / bag.name)
+for part, reason in summary.failed.items():
+    print(f'{part}: {reason}')
+for part in (*summary.made, *summary.kept):
+    episode = read_episode(options.out / part.name)
     frames = {view: len(track.stamps_ns) for view, track in episode.images.items()}
-    print(f'{options.out / bag.name}: {frames} frames, instruction "{episode.info.instruction}"')
+    print(f'{options.out / part.name}: {frames} frames, instruction "{episode.info.instruction}"')

@@ -249,8 +249,8 @@ def _import_bag(arguments: argparse.Namespace) -> int:
     write_whole(arguments.out / 'mapping.yaml', yaml.safe_dump(values, sort_keys=False))
     for view, row in mapping.views.items():
         print(f'view {view}: {mapping.topic(row.image)}')
-    for bag in summary.made:
-        place = arguments.out / episode_name(bag)
+    for part in summary.made:
+        place = arguments.out / part.name
         print(summary_line(place, objects=bool(arguments.segmenter or arguments.objects)))
     status = _import_status(summary, str)
     print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')

@@ -81,6 +81,11 @@ class BagMapping(Written):
         description='commanded poses of the tools of arms, in place of their joints; `action` '
         'then has the other joints',
     )
+    received_times: ListOf[str] = Field(
+        default=(),
+        description='views and streams (`joint_states`, `action`, arms of `tools`) whose receive '
+        "times are taken in place of their headers' stamps",
+    )
     robot_description: str = 'robot_description'
     tf_prefix: str = Field(default='', description='of frame names in TF, removed')
     instruction_topic: str = 'instruction'

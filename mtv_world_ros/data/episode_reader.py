@@ -10,6 +10,7 @@ import re
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.cameras.camera import unknown_camera
@@ -47,6 +48,17 @@ from mtv_world_ros.data.episode import (
 )
 from mtv_world_ros.data.joint_plans import complete_plans, following, join_streams, read_plan
 from mtv_world_ros.data.measured_joints import merge_joint_states
+from mtv_world_ros.data.stream_clocks import (
+    arrival_times,
+    ClockBreakError,
+    CLOCKS,
+    settle_clocks,
+    StampedStream,
+    Window,
+)
+from mtv_world_ros.data.stream_clocks import (
+    WHOLE as WHOLE_BAG,
+)
 from mtv_world_ros.data.tool_targets import joints_of_tools, ToolTrack
 from mtv_world_ros.data.transform_tree import Mount, pose_track, read_tree, TransformTree
 from mtv_world_ros.robot.model import RobotModel
@@ -63,7 +75,11 @@ STREAMS = {
     'instruction': INSTRUCTION,
     'object_poses': OBJECT_POSES,
 }
-TF_TOPICS = ('/tf', '/tf_static')
+STATIC_TF = '/tf_static'
+TF_TOPICS = ('/tf', STATIC_TF)
+#: frames further away from all joint states share no moment with them [s]
+MAX_FRAME_AWAY_S = 0.5
+NANO = 1_000_000_000
 _PLAIN_VIEW = re.compile(r'/([^/]+)/image_raw(?:/compressed|/ffmpeg)?')
 Item = TypeVar('Item')
 
@@ -79,6 +95,7 @@ def read_episode(
     mapping: BagMapping | None = None,
     robot: RobotModel | None = None,
     unknown_mount: str = '',
+    window: Window = WHOLE_BAG,
 ) -> Episode:
     """Reads an episode; frames are decoded later, when asked for.
 
@@ -100,12 +117,15 @@ def read_episode(
         unknown_mount: link that carries cameras whose pose is not known; they get a placeholder
             (without a CameraInfo, for the intrinsics too) and are named in `Episode.unknown`;
             empty = they are an error.
+        window: the part of the recording that is wanted, by receive times.
 
     Raises:
-        EpisodeError: no bag, a view is missing, or none of its images can be used.
+        ClockBreakError: all clocks change at once; its windows are the parts.
+        EpisodeError: no bag, a view is missing, or none of its images can be used; streams are
+            not of one clock, or share no moment.
         CalibrationError: a view's calibration is missing or does not fit its CameraInfo.
     """
-    reader = _EpisodeReader(Path(path), views, topics or {}, with_masks, mapping, robot)
+    reader = _EpisodeReader(Path(path), views, topics or {}, with_masks, mapping, robot, window)
     return reader.read(calibration, with_cameras, unknown_mount)
 
 
@@ -148,8 +168,9 @@ class _EpisodeReader:
         with_masks: bool,
         mapping: BagMapping | None,
         robot: RobotModel | None,
+        window: Window,
     ) -> None:
-        self.path, self.robot = path, robot
+        self.path, self.robot, self.window = path, robot, window
         self.mapping = mapping or BagMapping()
         streams = mapping.streams() if mapping else {}
         asked = {k: t for k, t in streams.items() if views is None or k in (*STREAMS, *views)}
@@ -166,6 +187,7 @@ class _EpisodeReader:
             raise
         self.with_masks = with_masks
         self.received: dict[str, Stamped] = {}
+        self.arrived: dict[str, NDArray[np.int64]] = {}
         self.refused: dict[str, list[str]] = {}
         self.tracks: dict[str, FloatArray] = {}
         self.unknown: dict[str, str] = {}
@@ -182,6 +204,7 @@ class _EpisodeReader:
         masks = {view: self._masks(names) for view, names in topics.views.items()}
         instructions = [(s, m.data) for s, m in self._take(topics.instruction, messages.STRING)]
         states = self._states()
+        self._check_shared(images, states)
         cameras = self._cameras(calibration, images, unknown_mount) if with_cameras else {}
         episode_info = _info(self.bag, instructions)
         return Episode(
@@ -204,17 +227,110 @@ class _EpisodeReader:
         wanted = self.topics.names(with_masks=self.with_masks) | set(TF_TOPICS)
         wanted |= {self._camera_info(view) for view in self.topics.views}
         wanted |= {self.mapping.topic(tool.topic) for tool in self.mapping.tools.values()}
-        for message in self.bag.messages(wanted):
+        logged: dict[str, list[tuple[int, int]]] = {}
+        for index, message in enumerate(self.bag.messages(wanted)):
             try:
                 parsed = messages.deserialize(message.msgtype, message.data)
             except EpisodeError as error:
                 self._refuse(message.topic, error)
                 continue
             stamp = messages.header_stamp(parsed) if hasattr(parsed, 'header') else 0
-            entry = (stamp or message.stamp_ns, (message.msgtype, parsed))
-            self.received.setdefault(message.topic, []).append(entry)
-            if not stamp and hasattr(parsed, 'header'):
-                self._warn_once(f"'{message.topic}': headers without stamp; log times are used")
+            self.received.setdefault(message.topic, []).append((stamp, (message.msgtype, parsed)))
+            logged.setdefault(message.topic, []).append((index, message.stamp_ns))
+        places = {topic: np.array(rows, np.int64).T for topic, rows in logged.items()}
+        self.arrived = arrival_times(
+            {topic: each[1] for topic, each in places.items()},
+            {topic: each[0] for topic, each in places.items()},
+        )
+        self._cut_window()
+        self._settle_clocks()
+
+    def _cut_window(self) -> None:
+        """Leave out what is not in the window; what holds for good stays."""
+        if self.window == WHOLE_BAG:
+            return
+        infos = {self._camera_info(view) for view in self.topics.views}
+        for topic, arrived in self.arrived.items():
+            rows = [k for k, ns in enumerate(arrived.tolist()) if self.window.has(ns)]
+            if topic == self.topics.instruction:  # the last one before it still holds
+                earlier = np.flatnonzero(arrived < self.window.begin_ns)
+                rows = [*earlier[-1:].tolist(), *rows]
+            if topic == STATIC_TF or topic in infos and not rows:
+                continue
+            self.received[topic] = [self.received[topic][k] for k in rows]
+            self.arrived[topic] = arrived[rows]
+
+    def _settle_clocks(self) -> None:
+        """Bring stamps of images, joint states and commands onto one clock."""
+        rows = self._senders()
+        streams = [stream for stream, _ in rows]
+        try:
+            settled = settle_clocks(streams)
+        except ClockBreakError as error:
+            raise ClockBreakError(f"'{self.path}': {error}", error.windows) from error
+        except EpisodeError as error:
+            raise EpisodeError(f"'{self.path}': {error}") from error
+        self.warnings += dict.fromkeys(settled.notes)
+        stamps = {topic: self._other_stamps(topic, settled.offset_s) for topic in self.received}
+        for (_, places), mended, kept in zip(
+            rows, settled.stamps_ns, settled.is_kept, strict=True
+        ):
+            for topic, at in places.items():
+                stamps[topic][at] = np.where(kept, mended, -1)
+        for topic, items in self.received.items():
+            pairs = zip(stamps[topic].tolist(), items, strict=True)
+            self.received[topic] = [(stamp, item) for stamp, (_, item) in pairs if stamp >= 0]
+
+    def _other_stamps(self, topic: str, offset_s: float) -> NDArray[np.int64]:
+        """Stamps of a topic as they are; receive times on the clock of the others where 0."""
+        stamps = np.array([stamp for stamp, _ in self.received[topic]], np.int64)
+        is_far = not -CLOCKS.refused_behind_s < offset_s < CLOCKS.refused_ahead_s
+        shift = round(offset_s * 1e9) if is_far else 0
+        return np.where(stamps == 0, np.maximum(self.arrived[topic] + shift, 1), stamps)
+
+    def _senders(self) -> list[tuple[StampedStream, dict[str, NDArray[np.intp]]]]:
+        """Streams whose clocks are compared, and the rows of their topic that they are."""
+        keys = {names.image: view for view, names in self.topics.views.items()}
+        keys |= {self.topics.joint_states: 'joint_states'}
+        if self.mapping.action != STATE:
+            keys |= {self.topics.joint_trajectory: 'action'}
+        keys |= {self.mapping.topic(tool.topic): arm for arm, tool in self.mapping.tools.items()}
+        found = []
+        for topic, key in keys.items():
+            items = self.received.get(topic, [])
+            senders: dict[tuple[str, ...], list[int]] = {}
+            for row, (_, (kind, message)) in enumerate(items):
+                names = tuple(message.name) if kind == messages.JOINT_STATE else ()
+                senders.setdefault(names, []).append(row)
+            for names, rows in senders.items():
+                at = np.array(rows, np.intp)
+                spans = [_span(items[row][1]) for row in rows]
+                stream = StampedStream(
+                    name=topic if len(senders) == 1 else f'{topic} of {names[0]}',
+                    key=key,
+                    stamps_ns=np.array([items[row][0] for row in rows], np.int64),
+                    received_ns=self.arrived[topic][at],
+                    spans_ns=None if None in spans else np.array(spans, np.int64),
+                    use_received=key in self.mapping.received_times,
+                )
+                found.append((stream, {topic: at}))
+        return found
+
+    def _check_shared(self, images: Mapping[str, Track], states: JointStates | None) -> None:
+        """Refuse frames that share no moment with the joint states."""
+        if states is None:
+            return
+        low, high = int(states.stamps_ns[0]), int(states.stamps_ns[-1])
+        slack = round(MAX_FRAME_AWAY_S * NANO)
+        for view, track in images.items():
+            stamps = track.stamps_ns
+            if not ((stamps >= low - slack) & (stamps <= high + slack)).any():
+                raise EpisodeError(
+                    f"'{self.path}': no frame of view '{view}' has joint states: its frames are "
+                    f'from {stamps[0] / NANO:.3f} to {stamps[-1] / NANO:.3f} s, '
+                    f"'{self.topics.joint_states}' from {low / NANO:.3f} to {high / NANO:.3f} s. "
+                    'Are both stamped by one clock, and were both recorded all the time?'
+                )
 
     def _images(self, view: str, names: ViewTopics) -> Track:
         track = self._track(names.image, to_rgb)
@@ -615,6 +731,15 @@ class _EpisodeReader:
             for topic, reasons in self.refused.items()
         ]
         return (*cut, *self.bag.problems, *self.warnings, *refused)
+
+
+def _span(item: tuple[str, Any]) -> int | None:
+    """Length of a plan [ns]; None = the message is none."""
+    kind, message = item
+    if kind != messages.JOINT_TRAJECTORY:
+        return None
+    after = message.points[-1].time_from_start if len(message.points) else None
+    return 0 if after is None else after.sec * NANO + after.nanosec
 
 
 def _framed_pose(message: Any) -> tuple[str, FloatArray]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 import math
 from typing import Any, NamedTuple
 
@@ -138,8 +137,9 @@ def find_unreachable(
 ) -> Unreachable:
     """Return the samples that no joint can have moved to: glitches, or a second publisher.
 
-    Samples are sorted into sources within which every step is possible. Short and rare ones are
-    glitches. Of two that last, the one that moves is the robot.
+    Samples are sorted into sources within which every step is possible. Short and rare stretches
+    are glitches. Of sources that take turns, the one that moves is the robot. A jump after which
+    the joint stays is named, and all samples are kept.
 
     Args:
         topic: for texts.
@@ -161,16 +161,35 @@ def find_unreachable(
         f'{times[row]:.4g} s, which no joint can'
     )
     sources = _sources(times, positions, reach)
-    kept = _robot_source(topic, times, positions, sources, step, reach.settings)
-    is_out = np.ones(len(times), bool)
-    is_out[kept] = False
-    if not is_out.any():
-        return Unreachable(is_out, '')
-    text = (
-        f"'{topic}': {int(is_out.sum())} of {len(times)} messages are out of reach of the others "
-        f'and were left out: {step} (glitches of a sensor, or a second publisher)'
+    settings = reach.settings
+    is_short = _short_runs(times, sources, settings)
+    if is_short.mean() <= settings.glitch_ratio:
+        lasting = set(sources[~is_short].tolist())
+        what = 'glitches of a sensor, or a second publisher'
+        if len(lasting) > 1:
+            what = 'an encoder whose zero changed, or a time in which nothing was recorded'
+        kept = ~is_short
+    else:
+        kept = sources == _robot_source(topic, times, positions, sources, step, settings)
+        what = 'a second publisher that stands still'
+    count = int((~kept).sum())
+    handled = (
+        f'{count} of {len(times)} messages are out of reach of the others and were left out'
+        if count
+        else 'all messages are kept; cut the recording there where its images do not fit'
     )
-    return Unreachable(is_out, text)
+    return Unreachable(~kept, f"'{topic}': {step} ({what}); {handled}")
+
+
+def _short_runs(
+    times: FloatArray, sources: NDArray[np.intp], settings: ReachSettings
+) -> BoolArray:
+    """(N,) samples of runs of one source that are too short for a robot."""
+    edges = np.flatnonzero(np.diff(sources)) + 1
+    is_short = np.zeros(len(times), bool)
+    for first, last in zip([0, *edges], [*edges, len(times)], strict=True):
+        is_short[first:last] = times[last - 1] - times[first] <= settings.glitch_s
+    return is_short | (sources < 0)
 
 
 def _first_jump(
@@ -188,11 +207,9 @@ def _first_jump(
     return min(found, default=None)
 
 
-def _sources(
-    times: FloatArray, positions: FloatArray, reach: JointReach
-) -> list[NDArray[np.intp]]:
-    """Return the rows of each source; a sample goes to the nearest of those that reach it."""
-    rows: list[list[int]] = []
+def _sources(times: FloatArray, positions: FloatArray, reach: JointReach) -> NDArray[np.intp]:
+    """(N,) number of the source of each sample: the nearest of those that reach it; -1 = none."""
+    found = np.full(len(times), -1, np.intp)
     last = np.full((0, positions.shape[1]), np.nan)
     last_s = np.zeros_like(last)
     for row, (seconds, values) in enumerate(zip(times, positions, strict=True)):
@@ -202,49 +219,41 @@ def _sources(
         fits = (moved <= allowed).all(axis=1)
         if fits.any():
             away = np.where(fits, (moved / reach.noise[given]).max(axis=1, initial=0.0), np.inf)
-            best = int(away.argmin())
-        elif len(rows) < reach.settings.num_publishers:
-            best = len(rows)
-            rows.append([])
+            found[row] = away.argmin()
+        elif len(last) < reach.settings.num_publishers:
+            found[row] = len(last)
             last = np.vstack([last, np.full_like(values, np.nan)])
             last_s = np.vstack([last_s, np.full_like(values, seconds)])
         else:
             continue
-        last[best, given], last_s[best, given] = values[given], seconds
-        rows[best].append(row)
-    return [np.array(each, np.intp) for each in rows]
+        last[found[row], given], last_s[found[row], given] = values[given], seconds
+    return found
 
 
 def _robot_source(
     topic: str,
     times: FloatArray,
     positions: FloatArray,
-    sources: Sequence[NDArray[np.intp]],
+    sources: NDArray[np.intp],
     step: str,
     settings: ReachSettings,
-) -> NDArray[np.intp]:
-    """Return the rows of the source that is the robot.
+) -> int:
+    """Return the source that is the robot: of those that last, the only one that moves.
 
     Raises:
-        EpisodeError: several may be.
+        EpisodeError: none moves, or several do.
     """
-    ordered = sorted(sources, key=len, reverse=True)
-    lasting = [rows for rows in ordered if len(rows) > settings.glitch_ratio * len(times)]
-    moving = [rows for rows in lasting if _moves(positions[rows], settings)]
-    kept = moving[0] if len(lasting) > 1 and len(moving) == 1 else ordered[0]
-    if len(lasting) > 1 and len(moving) != 1:
-        counts = ' and '.join(str(len(rows)) for rows in lasting[:4])
+    numbers, counts = np.unique(sources[sources >= 0], return_counts=True)
+    lasting = numbers[counts > settings.glitch_ratio * len(times)]
+    moving = [int(n) for n in lasting if _moves(positions[sources == n], settings)]
+    if len(moving) != 1:
+        each = ' and '.join(str(count) for count in sorted(counts, reverse=True)[:4])
         raise EpisodeError(
-            f"'{topic}': {step}; {counts} of {len(times)} messages belong together: two "
-            'publishers, or an encoder whose zero changed. Leave one publisher out (give the '
-            "robot's own topic as 'joint_states' in the mapping), or cut the recording there"
+            f"'{topic}': {step}; {each} of {len(times)} messages belong together, and it cannot "
+            'be told which are the robot: two publishers? Leave one out: give the topic of the '
+            "robot's own as 'joint_states' in the mapping (--topics), or record again"
         )
-    if not _is_interleaved(times, kept, settings):
-        raise EpisodeError(
-            f"'{topic}': {step}, and it stays there for more than {settings.glitch_s:g} s: an "
-            'encoder whose zero changed, or another robot. Cut the recording there'
-        )
-    return kept
+    return moving[0]
 
 
 def _moves(positions: FloatArray, settings: ReachSettings) -> bool:
@@ -252,18 +261,6 @@ def _moves(positions: FloatArray, settings: ReachSettings) -> bool:
     with np.errstate(invalid='ignore'):
         away = np.nan_to_num(np.abs(positions - np.nanmedian(positions, axis=0)))
     return bool(np.quantile(away.max(axis=1), 0.9) > settings.still)
-
-
-def _is_interleaved(times: FloatArray, rows: NDArray[np.intp], settings: ReachSettings) -> bool:
-    """Whether the samples that are not among `rows` are short stretches."""
-    is_out = np.ones(len(times), bool)
-    is_out[rows] = False
-    runs = [[row for row, _ in run] for out, run in groupby(enumerate(is_out), _second) if out]
-    return all(times[run[-1]] - times[run[0]] <= settings.glitch_s for run in runs)
-
-
-def _second(item: tuple[int, bool]) -> bool:
-    return item[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,7 +365,9 @@ def _table(
             why = 'named twice with different positions' if column in doubled else 'not finite'
             share = f'{unusable[column]} of {num_given[column]}'
             text = f"'{topic}': joint '{names[column]}' is {why} in {share} messages"
-            warnings.append(_unusable(text, names[column], unusable[column] < num_given[column]))
+            if unusable[column] == num_given[column]:
+                raise EpisodeError(_without_positions(text, names[column], column in doubled))
+            warnings.append(f'{text}; the positions before and after stand in')
     return names, table
 
 
@@ -389,15 +388,10 @@ def _own_columns(
     return tuple(np.array(names, object)[used]), table[:, used]
 
 
-def _unusable(text: str, joint: str, has_others: bool) -> str:
-    """Return what is done about positions that cannot be used.
-
-    Raises:
-        EpisodeError: the joint has no others.
-    """
-    if has_others:
-        return f'{text}; the positions before and after stand in'
-    raise EpisodeError(
+def _without_positions(text: str, joint: str, is_doubled: bool) -> str:
+    if is_doubled:
+        return f'{text}: it cannot be told which of them is measured; publish the joint once'
+    return (
         f'{text}, so that it has no position at all. Where it is not measured, give its position '
         f"in the mapping (--topics): 'constants: {{{joint}: 0.0}}'"
     )

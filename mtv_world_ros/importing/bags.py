@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import replace
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 import tempfile
 from typing import Any
@@ -21,6 +22,7 @@ from mtv_world_ros.data.bag_mapping import BagMapping
 from mtv_world_ros.data.episode import Episode, MASKS_BY, UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
+from mtv_world_ros.data.stream_clocks import ClockBreakError, WHOLE, Window
 from mtv_world_ros.importing.convert import import_each, ImportSummary, jumps, MAPPING_KEY
 from mtv_world_ros.importing.mapping import digest_of
 from mtv_world_ros.importing.robot_guess import guess_robot
@@ -34,6 +36,30 @@ _NOT_A_VIEW = {'image', 'image_raw', 'image_rect', 'image_color', 'image_rect_co
                'rgb', 'compressed', 'ffmpeg', 'camera', 'image_rect_raw'}  # fmt: skip
 #: no pictures of the scene
 _NO_COLOURS = ('depth', 'infra', 'mask', 'confidence', 'disparity')
+
+
+@dataclass(frozen=True, slots=True)
+class BagPart:
+    """A bag, or a part of one whose clocks jump.
+
+    Attributes:
+        bag: rosbag2 folder or file.
+        number: of the part, from 1 on; 0 = the whole bag.
+        window: the part, by receive times.
+    """
+
+    bag: Path
+    number: int = 0
+    window: Window = WHOLE
+
+    @property
+    def name(self) -> str:
+        """Name of the folder that its episode gets."""
+        name = episode_name(self.bag)
+        return f'{name}_part{self.number}' if self.number else name
+
+    def __str__(self) -> str:
+        return f'{self.bag} (part {self.number})' if self.number else str(self.bag)
 
 
 def find_bags(paths: Sequence[Path]) -> list[Path]:
@@ -163,8 +189,10 @@ def import_bags(
     calibration: Path | None = None,
     stage: ObjectStage = AS_RECORDED,
     progress: Callable[[Iterable[Path]], Iterable[Path]] = iter,
-) -> ImportSummary[Path]:
+) -> ImportSummary[BagPart]:
     """Converts bags into episodes `out/<name of the bag>`, with `out/robot/` beside them.
+
+    A bag in which all clocks jump at once is divided there: `out/<name>_part1` and so on.
 
     Args:
         bags: rosbag2 folders or files.
@@ -184,10 +212,25 @@ def import_bags(
         notes = save_robot(robot_file, inside).notes
     key = digest_of(robot_file, calibration, start=stage.key + mapping.model_dump_json().encode())
 
-    def convert(bag: Path, path: Path) -> tuple[str, ...]:
-        return convert_bag(bag, path, mapping, robot, calibration, key, stage)
+    parts: deque[BagPart] = deque()
 
-    summary = import_each(progress(bags), key, lambda bag: out / episode_name(bag), convert)
+    def items() -> Iterator[BagPart]:
+        for bag in progress(bags):
+            yield BagPart(bag)
+            while parts:
+                yield parts.popleft()
+
+    def convert(part: BagPart, path: Path) -> tuple[str, ...]:
+        try:
+            return convert_bag(part, path, mapping, robot, calibration, key, stage)
+        except ClockBreakError as error:
+            if part.number:
+                raise
+            windows = enumerate(error.windows, start=1)
+            parts.extend(BagPart(part.bag, number, window) for number, window in windows)
+            return (f'{error} ({", ".join(one.name for one in parts)})',)
+
+    summary = import_each(items(), key, lambda part: out / part.name, convert)
     summary.robot_notes = notes
     return summary
 
@@ -222,7 +265,7 @@ def summary_line(path: Path, objects: bool = False) -> str:
 
 
 def convert_bag(
-    bag: Path,
+    part: BagPart,
     out: Path,
     mapping: BagMapping,
     robot: RobotModel,
@@ -230,16 +273,23 @@ def convert_bag(
     key: str = '',
     stage: ObjectStage = AS_RECORDED,
 ) -> tuple[str, ...]:
-    """Writes a bag as an episode; see `write_imported`."""
+    """Writes a bag as an episode; see `write_imported`.
+
+    A part has no outcome: that of the recording is of the whole.
+    """
     episode = read_episode(
-        bag,
+        part.bag,
         views=list(mapping.views),
         calibration=calibration,
         mapping=mapping,
         robot=robot,
         unknown_mount=robot.base_link,
+        window=part.window,
     )
-    return write_imported(episode, bag.name, out, mapping, robot, key, stage)
+    if part.number:
+        mapping = mapping.replace(outcome='unknown')
+        episode = replace(episode, info=replace(episode.info, outcome='unknown'))
+    return write_imported(episode, part.bag.name, out, mapping, robot, key, stage)
 
 
 def write_imported(

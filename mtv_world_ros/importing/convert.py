@@ -61,7 +61,8 @@ def import_each(
         items: e.g. numbers of a data set's episodes.
         key: digest of mapping, robot and calibration; an episode made with others is an error.
         place: gives the folder of an item's episode.
-        convert: writes the folder; returns what was odd and how it was handled.
+        convert: writes the folder, unless it divides the item into further ones of `items`;
+            returns what was odd and how it was handled.
     """
     summary = ImportSummary[Item]()
     for item in items:
@@ -69,7 +70,8 @@ def import_each(
         try:
             if not path.exists():
                 summary.warnings[item] = convert(item, path)
-                summary.made.append(item)
+                if path.exists():  # else it was divided
+                    summary.made.append(item)
             elif read_info(path).metadata.get(MAPPING_KEY, '') == key:
                 summary.kept.append(item)
             else:

@@ -14,7 +14,7 @@ from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag_mapping import BagMapping
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.importing.bags import convert_bag
+from mtv_world_ros.importing.bags import BagPart, convert_bag
 from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer, SensedScene
@@ -140,7 +140,7 @@ def converted(folder, robot, scene, plans):
     bag = record(folder / 'bag', robot, cameras, positions, frames=frames, prefix='', more=write)
     views = {view: f'/cell/{view}/color/image_raw' for view in cameras}
     mapping = BagMapping.model_validate({'namespace': 'cell', 'views': views})
-    return convert_bag(bag, folder / 'episode', mapping, robot, None)
+    return convert_bag(BagPart(bag), folder / 'episode', mapping, robot, None)
 
 
 def ask_importer(case, robot, scene, folder):
