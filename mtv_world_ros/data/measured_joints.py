@@ -38,6 +38,8 @@ class ReachSettings:
     glitch_s: float = 0.5
     #: fraction of the samples up to which those out of reach are glitches
     glitch_ratio: float = 0.05
+    #: fraction of the samples of the largest source up to which all is taken as of a wrong unit
+    scattered_ratio: float = 0.3
     #: a publisher whose joints vary by less stands still [rad or m]
     still: float = 1e-3
     #: publishers that are told apart at most
@@ -162,6 +164,9 @@ def find_unreachable(
     )
     sources = _sources(times, positions, reach)
     settings = reach.settings
+    if np.bincount(sources[sources >= 0]).max() <= settings.scattered_ratio * len(times):
+        text = f"'{topic}': {step}; nearly every step does (degrees instead of radians?)"
+        return Unreachable(np.zeros(len(times), bool), text)
     is_short = _short_runs(times, sources, settings)
     if is_short.mean() <= settings.glitch_ratio:
         lasting = set(sources[~is_short].tolist())

@@ -230,3 +230,12 @@ def test_a_gripper_in_messages_of_its_own_does_not_repeat_a_stamp(franka):
     states, warnings = merged(franka, items)
     assert warnings == []
     np.testing.assert_array_equal(states.positions, rows)
+
+
+def test_joints_in_degrees_are_named_as_that(franka):
+    """Every step is too large; the check of limits refuses them."""
+    stamps, rows = motion()
+    rows = np.rad2deg(rows + np.cumsum(np.full_like(rows, 0.02), axis=0))
+    states, warnings = merged(franka, recorded(franka, stamps, rows))
+    assert len(states.stamps_ns) == len(rows)
+    assert 'nearly every step does (degrees instead of radians?)' in warnings[0]
