@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from mtv_world_ros.data_types import BoolArray, FloatArray
-from mtv_world_ros.errors import EpisodeError
+from mtv_world_ros.core.data_types import BoolArray, FloatArray
+from mtv_world_ros.core.errors import EpisodeError
 
 Stamps = NDArray[np.int64]
 NANO = 1_000_000_000

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.stream_clocks import (
     arrival_times,
     check_row_times,
@@ -13,7 +14,6 @@ from mtv_world_ros.data.stream_clocks import (
     settle_clocks,
     StampedStream,
 )
-from mtv_world_ros.errors import EpisodeError
 
 NANO = 1_000_000_000
 START = 1_750_000_000 * NANO
