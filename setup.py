@@ -53,7 +53,6 @@ setup(
         'diffusers>=0.42,<0.43',
         'lz4>=4.3',
         'mcap>=1.6',
-        'mcap-ros2-support>=0.6',
         'mujoco>=4.0,<5',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
@@ -69,6 +68,8 @@ setup(
     ],
     extras_require={
         'train': ['accelerate>=1.15', 'tensorboard>=2.21'],
+        # Control fast_tokens: byte-pair encoding of actions, one of the paper's baselines.
+        'fast_tokens': ['tokenizers>=0.22'],
         # Vision-language models that name objects: behind a server, or here.
         'describe': ['httpx2>=2.16', 'openai>=3.52,<4'],
         # Segmenters with public weights: MM-Grounding-DINO with SAM 2, SAM 3.
@@ -99,7 +100,7 @@ setup(
             )
         ],
         # `colcon test` looks for pytest under this name
-        'test': ['pytest>=7.4', 'pytest-xdist>=3.5'],
+        'test': ['mcap-ros2-support>=0.6', 'pytest>=7.4', 'pytest-xdist>=3.5'],
         'lint': ['import-linter>=2.16', 'pyright[nodejs]', 'ruff>=0.17'],
         # `make docs`
         'docs': ['mkdocs>=1.6,<2', 'mkdocs-material>=9.6,<10'],

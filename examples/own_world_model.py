@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from mtv_world_ros import load_pipeline
+from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.data_types import ByteArray, WorldModelSpec
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import commands_from, load_recording
@@ -29,10 +30,10 @@ class HeldFrame:
     spec: WorldModelSpec
 
     def predict(
-        self, start_frame: ByteArray, trajectory_frames: ByteArray, **options: object
+        self, start_frame: ByteArray, control: ControlInputs, **options: object
     ) -> ByteArray:
         """Returns (V, T, H, W, 3) uint8 RGB frames: the (V, H, W, 3) start frame, T times."""
-        del trajectory_frames, options  # positions, seed, steps, ...: see `WorldModel`
+        del control, options  # positions, seed, steps, ...: see `WorldModel`
         return np.repeat(start_frame[:, None], self.spec.num_frames, axis=1)
 
 

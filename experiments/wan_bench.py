@@ -17,6 +17,7 @@ from mtv_world_ros.model.autoencoders import TinyAutoencoder
 from mtv_world_ros.model.conditioning import (
     condition,
     Conditioning,
+    ControlBatch,
     decode_frames,
     with_anchor,
     with_history,
@@ -97,7 +98,9 @@ class Bench:
 
     def encode(self) -> Conditioning:
         """Start images, trajectory videos and history to latents; text and image at hand."""
-        latents = condition(self.autoencoder, self.frames[:, :, 0], self.frames)
+        latents = condition(
+            self.autoencoder, self.frames[:, :, 0], ControlBatch.drawn(self.frames)
+        )
         history = self.config.history
         if history.anchored:
             latents = with_anchor(self.autoencoder, latents, self.frames[:, :, 0])

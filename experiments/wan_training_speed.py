@@ -27,6 +27,7 @@ from wan_bench import Bench
 
 from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.model.conditioning import ControlBatch
 from mtv_world_ros.model.serving import ServingOptions
 from mtv_world_ros.training.adapter import add_adapter
 from mtv_world_ros.training.base_checkpoint import Base
@@ -53,7 +54,7 @@ def random_clip(bench: Bench) -> ClipBatch:
     return ClipBatch(
         frames=frames,
         start_frame=start,
-        trajectory=frames,
+        inputs=ControlBatch.drawn(frames),
         object_ids=None,
         anchor=start if settings.anchored else None,
         history=frames[:, :, :count] if count else None,

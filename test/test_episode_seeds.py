@@ -30,9 +30,9 @@ class SeededWorldModel(PersistenceWorldModel):
         super().__init__(spec)
         self.asked = []
 
-    def predict(self, start_frame, trajectory_frames, *, seed, **options):
+    def predict(self, start_frame, control, *, seed, **options):
         self.asked.append((seed, int(start_frame[0, 0, 0, 0])))
-        held = super().predict(start_frame, trajectory_frames, seed=seed, **options)
+        held = super().predict(start_frame, control, seed=seed, **options)
         return held + np.uint8(seed >= SEED_STEP)
 
 

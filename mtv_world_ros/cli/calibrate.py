@@ -88,7 +88,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     if arguments.store:
         fitted_to = _fitted_to(arguments, selection)
         stored = found.calibration.replace(fitted_to=fitted_to)
-        of_pictures = _is_of_pictures(arguments, folder)
+        of_pictures = _is_of_pictures(arguments)
         if horizon is not None:  # first: with the calibration the checkpoint counts as calibrated
             print(f'stored: {save_fit(folder, horizon, of_pictures=of_pictures)}')
         print(f'stored: {save_fit(folder, stored, of_pictures=of_pictures)}')
@@ -142,15 +142,15 @@ def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
             f"'{arguments.checkpoint}' is part of the installed package, into which nothing is "
             f"written; copy it with 'cp -r {folder} DIR' and calibrate DIR, or give --no-store"
         )
-    file = fit_path(folder, Calibration, of_pictures=_is_of_pictures(arguments, folder))
+    file = fit_path(folder, Calibration, of_pictures=_is_of_pictures(arguments))
     check_free(file, arguments.overwrite, 'checkpoint')
 
 
-def _is_of_pictures(arguments: argparse.Namespace, folder: Path) -> bool:
+def _is_of_pictures(arguments: argparse.Namespace) -> bool:
     """Whether the fit is to rollouts without the object motion that the checkpoint foresees."""
     from mtv_world_ros.rollout.assembly import can_foresee
 
-    return not arguments.foresight and can_foresee(folder)
+    return not arguments.foresight and can_foresee(arguments.checkpoint, arguments.robot)
 
 
 def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[EvaluationSummary]:

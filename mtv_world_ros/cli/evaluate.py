@@ -139,11 +139,10 @@ def _label(path: str) -> str:
 
 def _row(entry: Entry, pipeline: Pipeline) -> str:
     """Name of the row; an ablation of the paper says so."""
-    kinds = []
+    kinds: list[str] = []
     if len(pipeline.spec.views) == 1:
         kinds.append('Single-View')
-    if not pipeline.object_mask:
-        kinds.append('w/o Mask')
+    kinds += pipeline.control.ablations
     if entry.is_named or not kinds:
         return entry.label
     return f'{entry.label} ({", ".join(kinds)})'

@@ -279,12 +279,17 @@ def set_overrides(items: list[str]) -> dict[str, Any]:
 
 
 def _dry_run(config: TrainingConfig, arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.control.registry import create_control
     from mtv_world_ros.model.runtime import choose_dtype
+    from mtv_world_ros.robot.file import load_robot
+    from mtv_world_ros.rollout.assembly import robot_path
     from mtv_world_ros.training.dry_run import step_cost
 
     dtype = choose_dtype(arguments.dtype, arguments.device)
     video = config.video
-    cost = step_cost(config, dtype=dtype)
+    robot = load_robot(robot_path(video.robot))
+    control = create_control(video.control, config.control_options(robot))
+    cost = step_cost(config, control.layout, dtype=dtype)
     print(
         f'{len(video.views)} views of {1 + video.num_frames} frames of '
         f'{video.width}x{video.height}, batch {config.optimizer.batch_size}, {dtype}'

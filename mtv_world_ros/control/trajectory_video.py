@@ -1,4 +1,4 @@
-"""Trajectory videos: tool points projected into each view, drawn as fading glowing trails.
+"""Control `trajectory_video`: tool points projected into each view, as fading glowing trails.
 
 Paper, Trajectory Representation. A arms, V views, T frames, N trail points, O objects, H W pixels.
 """
@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 import colorsys
 from dataclasses import dataclass
 from itertools import islice
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import cv2
 import numpy as np
@@ -17,6 +17,14 @@ from pydantic import Field
 
 from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.cameras.motion import Motion
+from mtv_world_ros.control.arm_pictures import arm_pictures
+from mtv_world_ros.control.control import (
+    Control,
+    ControlInputs,
+    ControlOptions,
+    ControlScene,
+    InputLayout,
+)
 from mtv_world_ros.control.glow import (
     Box,
     FAINTEST,
@@ -39,7 +47,10 @@ from mtv_world_ros.core.data_types import (
     MultiViewVideo,
 )
 from mtv_world_ros.core.errors import ObservationError, TrajectoryError
+from mtv_world_ros.robot.shape import LinkShape, load_shape
 
+#: grey level of the canvas by which a model of both kinds tells that nothing is foreseen
+UNFORESEEN_GREY = 24
 #: drawn length of a finger [m]
 _FINGER_LENGTH_M = 0.03
 #: most trail points from one frame to the next
@@ -106,10 +117,17 @@ class TrajectoryVideoConfig(Schema):
         'first frame are drawn, as in the paper',
     )
 
+    foreseen_ratio: Share = Field(
+        default=1.0,
+        description='with `object_motion`: share of training clips that show objects where they '
+        'are expected to be; the others show the masks of the first frame on a grey canvas, so '
+        'that one model knows both',
+    )
+
     @property
     def draws_masks(self) -> bool:
         """Whether a model of this rendering was trained with the masks of the first frame."""
-        return not self.object_motion
+        return not self.object_motion or self.foreseen_ratio < 1
 
 
 #: the core that shows a closed gripper, as a share of the glow's standard deviation
@@ -158,11 +176,13 @@ def render_trajectory_video(
     tools = tool_motion(motion, times, config.points_per_frame, config.max_gap_m)
     lines = () if config.link_width_m is None else motion.arm_points
     shape = (len(cameras), len(times), cameras[0].height, cameras[0].width, 3)
-    frames = np.zeros(shape, np.uint8)
+    is_marked = objects is None and config.object_motion and config.draws_masks
+    canvas = UNFORESEEN_GREY if is_marked else 0
+    frames = np.full(shape, canvas, np.uint8)
     has_fills = objects is None and config.draws_masks
     for view, camera in enumerate(cameras):
         masks = object_masks[view] if has_fills and object_masks is not None else ()
-        fills = _fills(camera, masks, config)
+        fills = _fills(camera, masks, config.object_fill, canvas)
         poses = motion.camera_poses[view]
         links = ArmLinks(camera, poses, lines, config.link_width_m)
         over = [None if pictures is None else pictures[view] for pictures in (arms, objects)]
@@ -201,13 +221,13 @@ def _check(motion: Motion, times: FloatArray, masks: BoolArray | None) -> None:
 
 
 def _fills(
-    camera: CameraModel, masks: Sequence[BoolArray] | BoolArray, config: TrajectoryVideoConfig
+    camera: CameraModel, masks: Sequence[BoolArray] | BoolArray, fill: float, grey: int
 ) -> tuple[Box, ByteArray]:
-    """Returns the box of all objects in a view and its (h, w, 3) fills on black."""
-    canvas = np.zeros((camera.height, camera.width, 3), np.uint8)
+    """Returns the box of all objects in a view and its (h, w, 3) fills on a grey level."""
+    canvas = np.full((camera.height, camera.width, 3), grey, np.uint8)
     box = NO_BOX
     for index, mask in enumerate(masks):
-        canvas[mask] = np.rint(255 * object_colour(index, config.object_fill))
+        canvas[mask] = np.rint(255 * object_colour(index, fill))
         left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
         box = union(box, (top, top + height, left, left + width))
     return box, region(canvas, box)
@@ -224,7 +244,7 @@ def _draw_view(
     arms: ByteArray | None,
     objects: ByteArray | None,
 ) -> None:
-    """Draws one view onto black (T, H, W, 3) frames."""
+    """Draws one view onto (T, H, W, 3) frames of one grey level."""
     num_arms = len(motion.points)
     heads, depths = project(camera, poses, motion.points[:, motion.shown_at])
     core_sigmas = np.maximum(_CORE_SHARE * _sigmas(camera, depths, config), _LEAST_CORE_PX)
@@ -241,9 +261,10 @@ def _draw_view(
     white = _Paint(_WHITE)
     # far arms first; one that is behind the camera cannot hide another
     orders = np.argsort(-np.where(depths > 0, depths, np.inf), axis=0, kind='stable').T.tolist()
+    is_black = not frames[0, 0, 0].any()
     for image in frames:
         region(image, fills[0])[...] = fills[1]
-    is_bare = config.link_width_m is None and arms is None
+    is_bare = is_black and config.link_width_m is None and arms is None
     painted = fills[0] if is_bare else (0, camera.height, 0, camera.width)
     for k, (image, order, glows) in enumerate(
         zip(frames, orders, zip(*trails, strict=True), strict=True)
@@ -474,3 +495,75 @@ def _in_pieces(points: FloatArray) -> FloatArray:
     shares = np.arange(_PIECES)[None, :, None, None] / _PIECES
     between = points[:-1, None] * (1 - shares) + points[1:, None] * shares
     return np.concatenate([between.reshape(-1, *points.shape[1:]), points[-1:]])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrajectoryVideo(Control):
+    """Trails of the tool points and the objects' first masks, as video latents by channel.
+
+    Options of `config` also draw the links, the fingers, the arm's own pixels, and the objects
+    where they are expected to be.
+
+    Attributes:
+        config: widths, colours and fading; a model is served with what it was trained with.
+        object_mask: whether objects are drawn.
+        parts: shapes of the robot's links, for `config.arm_pictures`; empty = not drawn.
+    """
+
+    config: TrajectoryVideoConfig
+    object_mask: bool = True
+    parts: tuple[LinkShape, ...] = ()
+
+    @classmethod
+    def create(cls, options: ControlOptions) -> Self:
+        """Return the control of the sections `rendering` and `video` of a preset."""
+        config = TrajectoryVideoConfig(**options.rendering)
+        return cls(
+            config=config,
+            object_mask=options.object_mask,
+            parts=load_shape(options.robot).parts if config.arm_pictures else (),
+        )
+
+    @property
+    def layout(self) -> InputLayout:
+        """A video."""
+        return InputLayout(video=True)
+
+    @property
+    def links(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Names of the links that are drawn."""
+        return tuple(dict.fromkeys(part.link for part in self.parts))
+
+    @property
+    def uses_masks(self) -> bool:  # type: ignore[override]
+        """Whether masks of the start frame are drawn."""
+        return self.object_mask
+
+    @property
+    def shows_objects(self) -> bool:  # type: ignore[override]
+        """Whether the model is trained to see objects where they are expected to be."""
+        return self.object_mask and self.config.object_motion
+
+    @property
+    def ablations(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Row of the paper's ablation without object masks."""
+        return () if self.object_mask else ('w/o Mask',)
+
+    def make(self, scene: ControlScene) -> ControlInputs:
+        """Return the drawn frames (V, 1 + T, H, W, 3), at the cameras' size."""
+        video = render_trajectory_video(
+            motion=scene.motion,
+            times=scene.times,
+            object_masks=scene.masks if self.object_mask else None,
+            objects=scene.objects if self.shows_objects else None,
+            arms=arm_pictures(self.parts, scene.motion, scene.start_frames),
+            config=self.config,
+        )
+        return ControlInputs.drawn(video.frames)
+
+    def cache_key(self) -> dict[str, Any]:
+        """Return how the plan is drawn."""
+        return {
+            **{f'rendering.{name}': value for name, value in self.config.model_dump().items()},
+            'video.object_mask': self.object_mask,
+        }

@@ -9,6 +9,8 @@ from mtv_world_ros.core.errors import ConfigError
 
 #: groups of entry points; each names a module, see docs/architecture.md
 COMMANDS, POLICIES, ROLLOUTS = 'mtv_world.commands', 'mtv_world.policies', 'mtv_world.rollouts'
+#: group of controls: each entry point names a class, see `control/control.py`
+CONTROLS = 'mtv_world.controls'
 
 
 def registered(group: str) -> dict[str, metadata.EntryPoint]:

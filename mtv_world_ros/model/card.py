@@ -8,14 +8,13 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
+from mtv_world_ros.control.registry import check_control_name
 from mtv_world_ros.core.bounded_input import check_limit, read_json
 from mtv_world_ros.core.config import expected, ListOf, Schema, validated
 from mtv_world_ros.core.data_types import WorldModelSpec
-from mtv_world_ros.core.errors import CheckpointError
+from mtv_world_ros.core.errors import CheckpointError, ConfigError
 
 CARD = 'world_model.json'
-#: how actions enter every model: drawn into its views
-TRAJECTORY_VIDEO = 'trajectory_video'
 #: the robot that a checkpoint was trained on (see `robot.file.save_robot`), and its cameras
 ROBOT_FOLDER, CAMERAS = 'robot', 'cameras.yaml'
 
@@ -58,13 +57,11 @@ class HistorySettings(Schema):
         return {'history': self.model_dump(include=names)} if self.on else {}
 
 
-def _drawn(control: str) -> str:
-    if control != TRAJECTORY_VIDEO:
-        raise ValueError(
-            f"'{control}' is not {TRAJECTORY_VIDEO}; policy2vec, ee_mlp and fast_tokens are in "
-            'version 0.1.0 alone'
-        )
-    return control
+def _known_control(name: str) -> str:
+    try:
+        return check_control_name(name)
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
 
 
 def _some_steps(count: int) -> int:
@@ -82,7 +79,7 @@ class CheckpointCard(Schema):
     width: int = Field(ge=1, le=16_384, description='of a view [px]')
     height: int = Field(ge=1, le=16_384, description='of a view [px]')
     robot: str
-    control: Annotated[str, AfterValidator(_drawn)]
+    control: Annotated[str, AfterValidator(_known_control)]
     object_mask: bool
     rendering: dict[str, Any]
     trained_on: dict[str, Any]

@@ -10,6 +10,8 @@ from typing import Any, cast
 
 import torch
 
+from mtv_world_ros.control.control import Control
+from mtv_world_ros.control.registry import save_control
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.errors import CheckpointError, MtvWorldError
 from mtv_world_ros.core.files import whole_folder
@@ -43,6 +45,8 @@ class Checkpoint:
         adapter: folder of a LoRA adapter for the transformer.
         object_motion: folder of the contact settings and the arms' response, for foresight.
         robot: folder of the robot that the model was trained on, and of the default calibration.
+        control: how plans enter the model, to be saved; loaded with a robot, see
+            `control.registry.load_control`.
     """
 
     transformer: MultiViewWanTransformer
@@ -54,6 +58,7 @@ class Checkpoint:
     adapter: Path | None = None
     object_motion: Path | None = None
     robot: Path | None = None
+    control: Control | None = None
 
 
 def save_checkpoint(
@@ -73,6 +78,8 @@ def save_checkpoint(
         for name, part in _folders(checkpoint).items():
             shutil.copytree(part, partial / name)
         checkpoint.card.write(partial)
+        if checkpoint.control is not None:
+            save_control(checkpoint.control, checkpoint.card.control, partial)
 
 
 def _folders(checkpoint: Checkpoint) -> dict[str, Path]:

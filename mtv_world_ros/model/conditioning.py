@@ -1,21 +1,25 @@
 """What the transformer is conditioned on, in latents: control, start image, reference.
 
 Shape letters: B batch, V views, T frames, H W pixels, C latent channels, F latent frames,
-h w = latent size.
+h w = latent size, L context tokens of a control.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 import torch
 from torch import Tensor
 
+from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.card import HistorySettings
 from mtv_world_ros.model.parts import Autoencoder
+from mtv_world_ros.model.transformer.control_tokens import PADDING
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,7 +27,8 @@ class Conditioning:
     """Latents a chunk is denoised under.
 
     Attributes:
-        control: (B, V, C, F, h, w) of the trajectory video, in step with the denoised latents.
+        control: (B, V, C, F, h, w) of the control's video, in step with the denoised latents;
+            zero where the control feeds none.
         start_control: (B, V, C, h, w) of its frame 0.
         start: (B, V, C, F, h, w) the start image's channel slot.
         reference: (B, V, C, h, w) of the start image.
@@ -33,6 +38,9 @@ class Conditioning:
         anchor: (B, V, C, h, w) of the rollout's first frame, where reference tokens show that.
         history: (B, V, C, P, h, w) of what was seen before, in models that take it.
         history_sigmas: (B,) noise levels of the history, 1 = there is none.
+        context: (B, L) indices or (B, L, size) vectors of the control, where it feeds them.
+        frame: (B, 1 + T, size) vectors of the control, where it feeds them.
+        control_kept: (B,) bool, False = a sample without these two; None = all have them.
     """
 
     control: Tensor
@@ -45,6 +53,9 @@ class Conditioning:
     anchor: Tensor | None = None
     history: Tensor | None = None
     history_sigmas: Tensor | None = None
+    context: Tensor | None = None
+    frame: Tensor | None = None
+    control_kept: Tensor | None = None
 
     def with_noisy_history(self, noise: Tensor) -> Conditioning:
         """Returns the same with noise (B, V, C, P, h, w) mixed into the clean history."""
@@ -71,6 +82,11 @@ class Conditioning:
         # encoded twice, the same picture differs by rounding
         same = (difference <= 0.01 * largest).reshape(-1, 1, 1, 1, 1)
         return replace(self, start=self.start * same.unsqueeze(3), anchor=shown * ~same)
+
+    @property
+    def has_control_tokens(self) -> bool:
+        """Whether the control feeds tokens of the cross-attention."""
+        return self.context is not None or self.frame is not None
 
     def part(self, samples: slice) -> Conditioning:
         """Returns that of some samples."""
@@ -107,23 +123,96 @@ def decode_frames(autoencoder: Autoencoder, latents: Tensor) -> Tensor:
     return pixels.to(torch.uint8).movedim(2, -1)
 
 
-def condition(
-    autoencoder: Autoencoder, start_frame: Tensor, trajectory_frames: Tensor
-) -> Conditioning:
-    """Returns the latents to denoise under.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlBatch:
+    """Inputs of a control for B chunks; see `control.ControlInputs`.
+
+    Attributes:
+        num_frames: T.
+        video: (B, V, 1 + T, H, W, 3) uint8 RGB.
+        context: (B, L) int64, `PADDING` = no token, or (B, L, size) float32, NaN = none.
+        frame: (B, 1 + T, size) float32.
+    """
+
+    num_frames: int
+    video: Tensor | None = None
+    context: Tensor | None = None
+    frame: Tensor | None = None
+
+    @classmethod
+    def of(cls, inputs: Sequence[ControlInputs]) -> ControlBatch:
+        """Return the batch of chunks of one control and one length."""
+        first = inputs[0]
+        return cls(
+            num_frames=first.num_frames,
+            video=_stacked([one.video for one in inputs]),
+            context=None
+            if first.context is None
+            else pad_rows([torch.from_numpy(i.context) for i in inputs if i.context is not None]),
+            frame=_stacked([one.frame for one in inputs]),
+        )
+
+    @classmethod
+    def drawn(cls, video: Tensor) -> ControlBatch:
+        """Return the inputs of plans that are drawn: (B, V, 1 + T, H, W, 3) uint8 RGB."""
+        return cls(num_frames=video.shape[2] - 1, video=video)
+
+    def _tensors(self) -> dict[str, Tensor]:
+        held = {name: getattr(self, name) for name in ('video', 'context', 'frame')}
+        return {name: tensor for name, tensor in held.items() if tensor is not None}
+
+    def to(self, device: torch.device) -> ControlBatch:
+        """Return the batch on a device."""
+        return replace(self, **{n: v.to(device) for n, v in self._tensors().items()})
+
+    def __getitem__(self, samples: slice) -> ControlBatch:
+        return replace(self, **{n: v[samples] for n, v in self._tensors().items()})
+
+    def with_chunk(self, index: int, chunk: ControlBatch) -> ControlBatch:
+        """Return the batch with another chunk (B = 1) at an index."""
+        changes = {}
+        for name, tensor in self._tensors().items():
+            other = getattr(chunk, name)[0]
+            rows = [tensor[k] if k != index else other for k in range(len(tensor))]
+            changes[name] = pad_rows(rows) if name == 'context' else torch.stack(rows)
+        return replace(self, **changes)
+
+
+def _stacked(arrays: Sequence[NDArray[Any] | None]) -> Tensor | None:
+    known = [array for array in arrays if array is not None]
+    return torch.from_numpy(np.stack(known)) if known else None
+
+
+def pad_rows(rows: Sequence[Tensor]) -> Tensor:
+    """Return token rows (L, ...) of unequal lengths as one tensor (B, longest L, ...)."""
+    filler = float('nan') if rows[0].is_floating_point() else PADDING
+    return torch.nn.utils.rnn.pad_sequence(list(rows), batch_first=True, padding_value=filler)
+
+
+def condition(autoencoder: Autoencoder, start_frame: Tensor, inputs: ControlBatch) -> Conditioning:
+    """Returns the latents and tokens to denoise under.
+
+    Where the control feeds no video its latents are zero, so that the transformer keeps its shape,
+    and with it public weights.
 
     Args:
         autoencoder: of the preset.
         start_frame: (B, V, H, W, 3) uint8 RGB.
-        trajectory_frames: (B, V, 1 + T, H, W, 3) uint8 RGB; frame k shows the state after
-            command k.
+        inputs: of the control, on the device of the autoencoder.
     """
-    control = encode_frames(autoencoder, trajectory_frames)
-    first = control[:, :, :, 0]
-    if not autoencoder.includes_start:
-        control = control[:, :, :, 1:]
     reference = encode_frames(autoencoder, start_frame.unsqueeze(2))[:, :, :, 0]
+    if inputs.video is None:
+        count = autoencoder.num_latent_frames(inputs.num_frames)
+        first = torch.zeros_like(reference)
+        control = first.unsqueeze(3).repeat(1, 1, 1, count, 1, 1)
+    else:
+        control = encode_frames(autoencoder, inputs.video)
+        first = control[:, :, :, 0]
+        if not autoencoder.includes_start:
+            control = control[:, :, :, 1:]
     return Conditioning(
+        context=inputs.context,
+        frame=inputs.frame,
         control=control,
         start_control=first,
         start=start_slot(reference, control.shape[3], autoencoder.includes_start),

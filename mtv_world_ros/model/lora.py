@@ -19,8 +19,9 @@ from mtv_world_ros.model.lora_file import Factors, PEFT_CONFIG, read_lora
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 ADAPTER = 'pytorch_lora_weights.safetensors'
-#: weights that are trained whole and saved beside the adapter: phi, views, the way in
-BESIDE = ('ref_conv.', 'view_embedding', 'patch_embedding.')
+#: weights that are trained whole and saved beside the adapter: phi, views, the stem, the
+#: embeddings of controls that are not drawn
+BESIDE = ('ref_conv.', 'view_embedding', 'patch_embedding.', 'control_tokens.')
 BESIDE_FILE = 'beside.safetensors'
 BASE_FILE = 'base.json'
 #: peft's name for an adapter's file

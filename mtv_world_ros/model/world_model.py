@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.data_types import ByteArray, FloatArray, History
 from mtv_world_ros.core.errors import CheckpointError, ModelMemoryError, RolloutPreempted
 from mtv_world_ros.model.card import check_same_model
@@ -20,6 +21,7 @@ from mtv_world_ros.model.conditioning import (
     check_history,
     condition,
     Conditioning,
+    ControlBatch,
     decode_frames,
     with_anchor,
     with_history,
@@ -147,6 +149,9 @@ def denoise(
         anchor=conditioning.anchor,
         history=conditioning.history,
         history_timestep=conditioning.history_timestep,
+        control_context=conditioning.context,
+        control_frame=conditioning.frame,
+        control_kept=conditioning.control_kept,
     ).float()
 
 
@@ -156,7 +161,7 @@ _NO_MEMORY = ("can't allocate memory", 'out of memory', 'ALLOC_FAILED', 'ALLOCAT
 
 
 class DiffusionWorldModel:
-    """Denoises one chunk of multi-view video under a trajectory video.
+    """Denoises one chunk of multi-view video under the inputs of a control.
 
     Args:
         checkpoint: the trained parts.
@@ -212,9 +217,20 @@ class DiffusionWorldModel:
         """Runs one prediction and discards it, so that the first real one does not wait."""
         spec = self.spec
         shape = (len(spec.views), 1 + spec.num_frames, spec.height, spec.width, 3)
+        config: Any = self.transformer.config
+        context, frame = config['context_input'], config['frame_input']
+        vectors = None
+        if context is not None:
+            size = context['vector_size']
+            vectors = np.zeros((1, size), np.float32) if size else np.zeros(1, np.int64)
         self.predict(
             np.zeros((shape[0], *shape[2:]), np.uint8),
-            np.zeros(shape, np.uint8),
+            ControlInputs(
+                num_frames=spec.num_frames,
+                video=np.zeros(shape, np.uint8),
+                context=vectors,
+                frame=frame and np.zeros((shape[1], frame['vector_size']), np.float32),
+            ),
             positions=np.zeros((shape[1], 0)),
             seed=0,
             num_inference_steps=1,
@@ -249,7 +265,7 @@ class DiffusionWorldModel:
     def predict(
         self,
         start_frame: ByteArray,
-        trajectory_frames: ByteArray,
+        control: ControlInputs,
         *,
         positions: FloatArray,
         seed: int,
@@ -258,10 +274,11 @@ class DiffusionWorldModel:
         history: History | None = None,
     ) -> ByteArray:
         """Returns (V, T, H, W, 3) uint8 RGB frames; see `pipeline.WorldModel.predict`."""
-        self._check_size(trajectory_frames)
+        del positions  # this model knows the plan by its control alone
+        self._check_size(len(start_frame), control.num_frames)
         try:
             with torch.inference_mode():
-                conditioning = self._condition(start_frame, trajectory_frames)
+                conditioning = self._condition(start_frame, control)
                 conditioning = self._with_history(
                     conditioning, history or History.begin(start_frame)
                 )
@@ -277,15 +294,14 @@ class DiffusionWorldModel:
                 frames = decode_frames(self._decoder, latents.to(self._decoder.dtype))
                 return frames[0].cpu().numpy()
         except (torch.OutOfMemoryError, MemoryError) as error:
-            raise self._out_of_memory(trajectory_frames, error) from error
+            raise self._out_of_memory(start_frame, control.num_frames, error) from error
         except RuntimeError as error:
             if not any(text in str(error) for text in _NO_MEMORY):
                 raise
-            raise self._out_of_memory(trajectory_frames, error) from error
+            raise self._out_of_memory(start_frame, control.num_frames, error) from error
 
-    def _check_size(self, frames: ByteArray) -> None:
+    def _check_size(self, views: int, count: int) -> None:
         spec = self.spec
-        views, count = len(frames), frames.shape[1] - 1
         if views > len(spec.views) or count > spec.num_frames:
             raise CheckpointError(
                 f'{views} views of {count} frames given, the model was trained on '
@@ -293,9 +309,9 @@ class DiffusionWorldModel:
                 'video.views and video.num_frames set to what you need'
             )
 
-    def _condition(self, start_frame: ByteArray, trajectory_frames: ByteArray) -> Conditioning:
+    def _condition(self, start_frame: ByteArray, control: ControlInputs) -> Conditioning:
         start = self._tensor(start_frame)
-        latents = condition(self.autoencoder, start, self._tensor(trajectory_frames))
+        latents = condition(self.autoencoder, start, ControlBatch.of([control]).to(self.device))
         return self._with_context(latents, start)
 
     def _with_history(self, latents: Conditioning, history: History) -> Conditioning:
@@ -329,8 +345,10 @@ class DiffusionWorldModel:
     def _tensor(self, frames: ByteArray) -> torch.Tensor:
         return torch.from_numpy(np.array(frames))[None].to(self.device)
 
-    def _out_of_memory(self, frames: ByteArray, error: Exception) -> ModelMemoryError:
-        views, count, height, width, _ = frames.shape
+    def _out_of_memory(
+        self, start_frame: ByteArray, count: int, error: Exception
+    ) -> ModelMemoryError:
+        views, height, width, _ = start_frame.shape
         if self.device.type == 'cuda':
             torch.cuda.empty_cache()
         return ModelMemoryError(

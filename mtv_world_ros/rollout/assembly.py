@@ -8,7 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.control.control import Control, ControlOptions
+from mtv_world_ros.control.registry import create_control, load_control
 from mtv_world_ros.core.entry_points import policy_kind
 from mtv_world_ros.core.errors import (
     CalibrationError,
@@ -150,7 +151,8 @@ def load_pipeline(
         loaded = replace(loaded, adapter=adapter)
     model = checkpoint_robot(checkpoint, robot)
     folder, motion = checkpoint_path(checkpoint), None
-    foresees = can_foresee(folder)
+    control = load_control(loaded.card.control, control_options(loaded.card, model), folder)
+    foresees = control.shows_objects and loaded.object_motion is not None
     if foresight and foresees and loaded.object_motion is not None:
         motion = load_foresight(loaded.object_motion, model, num_threads or threads_each(1))
     fits = load_fits(folder, of_pictures=foresees and not foresight)
@@ -165,6 +167,7 @@ def load_pipeline(
         loaded.card,
         world_model,
         robot=model,
+        control=control,
         objects=objects,
         task=task,
         segmenter=choose_segmenter(segmenter, device=device),
@@ -185,12 +188,31 @@ def load_pipeline(
     )
 
 
-def can_foresee(folder: Path) -> bool:
-    """Return whether a checkpoint foresees object motion and was trained to see it."""
+def control_options(card: CheckpointCard, robot: RobotModel) -> ControlOptions:
+    """Return what the control of a checkpoint is created for."""
+    return ControlOptions(
+        robot=robot,
+        rendering=card.rendering,
+        object_mask=card.object_mask,
+        num_frames=card.num_frames,
+    )
+
+
+def can_foresee(checkpoint: str | Path, robot: str | Path | None = None) -> bool:
+    """Return whether a checkpoint foresees object motion and was trained to see it.
+
+    Args:
+        checkpoint: folder, or `bundled`.
+        robot: as in `checkpoint_robot`.
+    """
     from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
 
-    rendering = TrajectoryVideoConfig(**read_card(folder).rendering)
-    return rendering.object_motion and (folder / OBJECT_MOTION_FOLDER).is_dir()
+    folder = checkpoint_path(checkpoint)
+    if not (folder / OBJECT_MOTION_FOLDER).is_dir():
+        return False
+    card = read_card(folder)
+    options = control_options(card, checkpoint_robot(checkpoint, robot))
+    return load_control(card.control, options, folder).shows_objects
 
 
 def fitting_setting(checkpoint: str | Path, robot: RobotModel) -> Setting:
@@ -206,6 +228,7 @@ def assemble(
     world_model: WorldModel,
     *,
     robot: RobotModel,
+    control: Control | None = None,
     objects: tuple[str, ...] = (),
     task: str | None = None,
     segmenter: Segmenter | None = None,
@@ -216,9 +239,13 @@ def assemble(
     camera_checker: CameraChecker | None = None,
     setting: Setting | None = None,
 ) -> Pipeline:
-    """Puts the main path around a world model trained as the card says."""
+    """Puts the main path around a world model trained as the card says.
+
+    The control is that of the card; one that is fitted to a training set has to be given.
+    """
     segmenter = segmenter or choose_segmenter()
-    rendering = TrajectoryVideoConfig(**card.rendering)
+    if control is None:
+        control = create_control(card.control, control_options(card, robot))
     return Pipeline(
         robot=robot,
         world_model=world_model,
@@ -229,14 +256,12 @@ def assemble(
             segmenter=segmenter,
             setting=setting,
         ),
-        rendering=rendering,
-        object_mask=card.object_mask,
+        control=control,
         objects=objects,
         describer=describer,
         horizon=horizon,
         object_motion=object_motion,
         camera_checker=camera_checker,
-        parts=load_shape(robot).parts if rendering.arm_pictures else (),
     )
 
 

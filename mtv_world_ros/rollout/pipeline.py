@@ -8,8 +8,8 @@ from types import MappingProxyType
 from typing import Protocol
 
 from mtv_world_ros.cameras.motion import Motion
-from mtv_world_ros.control.arm_pictures import arm_pictures
-from mtv_world_ros.control.trajectory_video import render_trajectory_video, TrajectoryVideoConfig
+from mtv_world_ros.control.control import Control, ControlInputs, ControlScene
+from mtv_world_ros.control.trajectory_video import TrajectoryVideo, TrajectoryVideoConfig
 from mtv_world_ros.core.data_types import (
     BoolArray,
     ByteArray,
@@ -25,7 +25,6 @@ from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
 from mtv_world_ros.physics.object_motion import ObjectMotionModel
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import ChunkPlan
-from mtv_world_ros.robot.shape import LinkShape
 from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions
 from mtv_world_ros.rollout.prediction import Prediction, StageClock
 from mtv_world_ros.rollout.rollout import ObservedChunk, Rollout
@@ -38,7 +37,7 @@ from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
-#: of an estimate for which the model was shown no motion
+#: reason against an estimate if the plan is drawn outside of all views
 _UNSEEN = 'no view shows a tool at any time'
 
 
@@ -53,7 +52,7 @@ class WorldModel(Protocol):
     def predict(
         self,
         start_frame: ByteArray,
-        trajectory_frames: ByteArray,
+        control: ControlInputs,
         *,
         positions: FloatArray,
         seed: int,
@@ -65,10 +64,9 @@ class WorldModel(Protocol):
 
         Args:
             start_frame: (V, H, W, 3) uint8 RGB, the frame the chunk starts from.
-            trajectory_frames: (V, 1 + T, H, W, 3) uint8 RGB; frame k shows the state after
-                command k, frame 0 the start.
-            positions: (1 + T, J) what was drawn: row 0 where the robot stands, row k command k
-                [rad or m]; for models that take actions as numbers.
+            control: the plan as the model takes it, T commands.
+            positions: (1 + T, J) the plan itself: row 0 where the robot stands, row k command k
+                [rad or m].
             seed: seed of the noise.
             num_inference_steps: denoising steps.
             should_stop: asked between steps.
@@ -90,16 +88,15 @@ class Pipeline:
         world_model: predicts chunks.
         segmenter: finds the objects' masks.
         estimator: judges the outcome.
-        rendering: how trajectory videos look; must be what the model was trained with.
-        object_mask: whether trajectory videos carry the object masks.
+        control: how the plan enters the model; must be what the model was trained with.
         objects: names of the objects; empty = the describer's.
         describer: names the objects of an episode's first frame; None = the instruction's words.
         horizon: measured J by horizon; None = not measured.
-        object_motion: foresees object motions, for models whose trajectory videos show them;
-            None = objects are drawn where they were.
+        object_motion: foresees object motions, for controls that show them; None = the imagined
+            frames alone decide.
         camera_checker: compares the first frames with the arm's outline; None = no check.
         grounds: what estimates that are not calibrated may rest on.
-        parts: shapes of the robot's links, for `rendering.arm_pictures`; empty = none are drawn.
+        drawing: draws the plan for people where the control itself is no video.
         picture_fits: fits to rollouts without foreseen object motion, for `without_foresight`;
             None = the estimate stays as it is, e.g. bare.
     """
@@ -108,15 +105,14 @@ class Pipeline:
     world_model: WorldModel
     segmenter: Segmenter
     estimator: SuccessEstimator
-    rendering: TrajectoryVideoConfig
-    object_mask: bool = True
+    control: Control
     objects: tuple[str, ...] = ()
     describer: Describer | None = None
     horizon: HorizonCurve | None = None
     object_motion: ObjectMotionModel | None = None
     camera_checker: CameraChecker | None = None
     grounds: Grounds = Grounds()
-    parts: tuple[LinkShape, ...] = ()
+    drawing: TrajectoryVideo = TrajectoryVideo(config=TrajectoryVideoConfig())
     picture_fits: Fits | None = None
 
     @property
@@ -194,8 +190,7 @@ class Pipeline:
         """Returns one chunk of one rollout, stage by stage, and the rollout's state after it."""
         start, clock = state.observation, StageClock()
         num_steps = options.num_inference_steps or self.spec.num_inference_steps
-        links = {part.link for part in self.parts}
-        motion = Motion.of(self.robot, start.cameras, plan.positions, links)
+        motion = Motion.of(self.robot, start.cameras, plan.positions, self.control.links)
         in_view = motion.tools_in_view()
         start_masks = self.find(state, options)
         clock.lap('start masks')
@@ -208,14 +203,24 @@ class Pipeline:
             state.is_begun,
             options.should_stop,
         )
-        pictures = objects.pictures(plan, motion)
+        scene = ControlScene(
+            motion=motion,
+            times=plan.times,
+            start_frames=start.frames,
+            masks=start_masks.masks[:, :, 0],
+            objects=objects.pictures(plan, motion),
+        )
         clock.lap('object motion')
-        arms = arm_pictures(self.parts, motion, start.frames)
-        control = self.draw(motion, plan.times, start_masks, pictures, arms)
+        control = self.control.make(scene)
+        self.control.layout.check(control, type(self.control).__name__)
+        drawn = control.video
+        if drawn is None:
+            drawn = self.drawing.make(scene).video
+        assert drawn is not None
         clock.lap('trajectory video')
         frames = self.world_model.predict(
             start.frames,
-            control.frames,
+            control,
             positions=plan.positions,
             seed=options.seed,
             num_inference_steps=num_steps,
@@ -228,7 +233,7 @@ class Pipeline:
         motion = motion.first(plan.num_frames + 1)
         foreseen = objects.motions(plan, state.is_begun)
         success, memory = self.judge(state, motion, start_masks, masks, options, foreseen)
-        unseen = () if in_view.any() else (_UNSEEN,)
+        unseen = () if control.video is None or in_view.any() else (_UNSEEN,)
         success = doubted(success, (*objects.reasons, *unseen))
         success = doubted(success, refusal=objects.refusal)
         clock.lap('success')
@@ -242,7 +247,7 @@ class Pipeline:
             video=MultiViewVideo(views=start.views, times=times, frames=frames),
             seed=options.seed,
             positions=motion.positions[1:],
-            trajectory_video=control,
+            trajectory_video=MultiViewVideo(views=start.views, times=plan.times, frames=drawn),
             start_masks=start_masks,
             masks=masks,
             success=success,
@@ -287,32 +292,6 @@ class Pipeline:
     def find(self, state: RolloutState, options: RolloutOptions) -> ObjectMasks:
         """Returns masks of the frame that a chunk starts from (T = 1)."""
         return self.segmenter.segment(state.observation.frames[:, None], options.objects)
-
-    def draw(
-        self,
-        motion: Motion,
-        times: FloatArray,
-        start_masks: ObjectMasks,
-        objects: ByteArray | None = None,
-        arms: ByteArray | None = None,
-    ) -> MultiViewVideo:
-        """Returns the 1 + T frames of the trajectory video, at the cameras' size.
-
-        Args:
-            motion: 1 + T states of the robot, seen by V cameras.
-            times: (1 + T,) [s].
-            start_masks: of the start frame.
-            objects: (V, 1 + T, H, W, 4) of `moved_pictures`, in place of the masks.
-            arms: (V, 1 + T, H, W, 4) of `arm_pictures`.
-        """
-        return render_trajectory_video(
-            motion=motion,
-            times=times,
-            object_masks=start_masks.masks[:, :, 0] if self.object_mask else None,
-            objects=objects,
-            arms=arms,
-            config=self.rendering,
-        )
 
     def follow(
         self,
@@ -363,7 +342,7 @@ class Pipeline:
     def _objects_in(self, observation: Observation) -> ObjectForesight:
         """The objects of an episode that begins at an observation."""
         return ObjectForesight(
-            model=self.object_motion if self.rendering.object_motion else None,
+            model=self.object_motion if self.control.shows_objects else None,
             segmenter=self.segmenter,
             robot=self.robot,
             first=observation,

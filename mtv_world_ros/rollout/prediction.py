@@ -47,7 +47,8 @@ class Prediction:
         video: the T predicted frames, frame k after command k; its times count from `stamp_ns`.
         seed: of the noise.
         positions: (T, J) commanded at these times [rad or m].
-        trajectory_video: 1 + T control frames, frame 0 at the chunk's start.
+        trajectory_video: 1 + T frames of the drawn plan, frame 0 at the chunk's start; the model's
+            control input where that is a video.
         start_masks: object masks of the chunk's start frame (T = 1).
         masks: object masks of the predicted frames.
         success: the estimate at the end of this chunk.

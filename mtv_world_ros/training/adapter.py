@@ -11,6 +11,8 @@ from typing import Any
 from safetensors.torch import save_file
 from torch import Tensor
 
+from mtv_world_ros.control.control import Control
+from mtv_world_ros.control.registry import save_control
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import whole_folder
 from mtv_world_ros.model.card import CheckpointCard
@@ -55,6 +57,7 @@ def save_adapter(
     *,
     weights: Mapping[str, Tensor] | None = None,
     card: CheckpointCard | None = None,
+    control: Control | None = None,
 ) -> None:
     """Writes the adapter's folder; it appears under its name only when it is whole.
 
@@ -65,6 +68,7 @@ def save_adapter(
         folder: to write.
         weights: in place of the transformer's, by name; such as averaged ones.
         card: base model and training data, as in a checkpoint.
+        control: how plans enter the model.
     """
     from peft.utils import get_peft_model_state_dict
 
@@ -77,6 +81,8 @@ def save_adapter(
         (partial / BASE_FILE).write_text(json.dumps(base_of(transformer), indent=2) + '\n')
         if card is not None:
             card.write(partial)
+            if control is not None:
+                save_control(control, card.control, partial)
 
 
 def _save(tensors: dict[str, Tensor], file: Path, config: str = '') -> None:

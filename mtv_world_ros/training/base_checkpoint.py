@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from mtv_world_ros.control.control import InputLayout, VIDEO_ONLY
 from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.model.card import CheckpointCard, SHARED_KEYS
@@ -51,6 +52,7 @@ def load_base(
     dtype: torch.dtype,
     *,
     seed: int,
+    layout: InputLayout = VIDEO_ONLY,
 ) -> Base:
     """Loads a checkpoint and adds a new adapter, drawn by the seed, where the preset trains one.
 
@@ -67,7 +69,7 @@ def load_base(
             "'mtv-world import-weights' makes of public weights"
         )
     loaded = load_checkpoint(folder, dtype=dtype)
-    _check_transformer(config, loaded.transformer, folder)
+    _check_transformer(config, layout, loaded.transformer, folder)
     _check_card(config, loaded.card, folder)
     autoencoder = place(loaded.autoencoder, device, dtype).eval().requires_grad_(False)
     check_video(autoencoder, loaded.transformer.config, loaded.card.spec)
@@ -88,10 +90,14 @@ def load_base(
 
 
 def _check_transformer(
-    config: TrainingConfig, transformer: MultiViewWanTransformer, folder: Path
+    config: TrainingConfig,
+    layout: InputLayout,
+    transformer: MultiViewWanTransformer,
+    folder: Path,
 ) -> None:
     held: Any = transformer.config
-    for name, wanted in config.transformer.items():
+    inputs = {'context_input': None, 'frame_input': None, **layout.transformer_arguments()}
+    for name, wanted in {**config.transformer, **inputs}.items():
         value = held.get(name)
         if _plain(value) != _plain(wanted):
             raise TrainingError(

@@ -17,13 +17,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mtv_world_ros.control.control import Control, ControlInputs
+from mtv_world_ros.control.registry import create_control
 from mtv_world_ros.core.data_types import ByteArray
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.core.worker_pool import run_job, WorkerPool
 from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.data.recordings import clip_starts, cut_clip
+from mtv_world_ros.model.conditioning import ControlBatch
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.training.clip_controls import (
     ControlMaker,
     draw_lead_in,
@@ -38,12 +40,12 @@ from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClipBatch:
-    """Clips with their trajectory videos.
+    """Clips with the inputs of their control.
 
     Attributes:
         frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
         start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model sees it (maybe disturbed).
-        trajectory: (B, V, 1 + T, H, W, 3) uint8 RGB.
+        inputs: of the control.
         object_ids: (B, V, 1 + T, H, W) uint8, zero in clips without; None where no clip has them.
         anchor: (B, V, H, W, 3) uint8 RGB, the first frame of the clip's rollout, in models with a
             history; see `draw_past`.
@@ -58,7 +60,7 @@ class ClipBatch:
 
     frames: Tensor
     start_frame: Tensor
-    trajectory: Tensor
+    inputs: ControlBatch
     object_ids: Tensor | None
     anchor: Tensor | None = None
     history: Tensor | None = None
@@ -82,7 +84,7 @@ class _Sample(NamedTuple):
 
     frames: ByteArray
     start_frame: ByteArray
-    trajectory: ByteArray
+    inputs: ControlInputs
     object_ids: ByteArray | None
     past: Past | None
     lead_in: LeadIn | None
@@ -96,6 +98,7 @@ class BatchSource:
         config: views and times of clips, how they are drawn and disturbed, clips per step.
         robot: kinematics of the recorded robot.
         segmenter: finds the objects of the first frames.
+        control: fitted to the recordings; None = that of the configuration, which needs no fit.
         seed: of choice and disturbances.
         numbers: the clips of a step that this process makes; None: all.
         workers: processes that make them; 0 = a thread of this one.
@@ -108,6 +111,7 @@ class BatchSource:
         *,
         robot: RobotModel,
         segmenter: Segmenter,
+        control: Control | None = None,
         seed: int,
         numbers: Sequence[int] | None = None,
         workers: int = 0,
@@ -125,10 +129,9 @@ class BatchSource:
         self.controls = ControlMaker(
             robot=robot,
             segmenter=segmenter,
-            rendering=config.rendering,
-            object_mask=config.video.object_mask,
-            parts=load_shape(robot).parts if config.rendering.arm_pictures else (),
+            control=control or create_control(config.video.control, config.control_options(robot)),
         )
+        self._foreseen_ratio = config.rendering.foreseen_ratio
         self._spec, self._augment, self._seed = spec, config.augment, seed
         self._history, self._self_rollout = config.history, config.self_rollout
         self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
@@ -171,7 +174,7 @@ class BatchSource:
             numbers=self._numbers,
             frames=torch.from_numpy(np.stack([s.frames for s in samples])),
             start_frame=torch.from_numpy(np.stack([s.start_frame for s in samples])),
-            trajectory=torch.from_numpy(np.stack([s.trajectory for s in samples])),
+            inputs=ControlBatch.of([s.inputs for s in samples]),
             object_ids=_stacked([s.object_ids for s in samples]),
             lead_ins=tuple(s.lead_in for s in samples),
             **pasts([s.past for s in samples]),
@@ -190,7 +193,10 @@ class BatchSource:
         names = recording.names
         if rng.random() < self._augment.name_dropout:
             names = tuple(name for name in names if rng.random() < 0.5)
-        trajectory = self.controls.make(clip, names)
+        foresees, ratio = True, self._foreseen_ratio
+        if 0 < ratio < 1:  # nothing is drawn otherwise: such runs keep their clips
+            foresees = bool(rng.random() < ratio)
+        inputs = self.controls.make(clip, names, foresees=foresees)
         frames = clip.frames
         if rng.random() < self._augment.colour_permutation:
             colours = rng.permutation(3)
@@ -201,8 +207,8 @@ class BatchSource:
         if rng.random() < self._augment.start_noise:
             start = _disturb(start, self._augment.start_noise_std, rng)
         whole = np.ascontiguousarray(frames)
-        lead_in = lead_in and replace(lead_in, names=names)
-        return _Sample(whole, start.copy(), trajectory, clip.object_ids, past, lead_in)
+        lead_in = lead_in and replace(lead_in, names=names, foresees=foresees)
+        return _Sample(whole, start.copy(), inputs, clip.object_ids, past, lead_in)
 
     def _past(
         self, recording: Recording, start: int, lead_in: LeadIn | None, rng: np.random.Generator

@@ -9,14 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from mtv_world_ros.cameras.motion import Motion
-from mtv_world_ros.control.arm_pictures import arm_pictures
-from mtv_world_ros.control.trajectory_video import render_trajectory_video, TrajectoryVideoConfig
+from mtv_world_ros.control.control import Control, ControlInputs, ControlScene
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, History, WorldModelSpec
 from mtv_world_ros.data.recording import frame_indices, Recording
 from mtv_world_ros.data.recordings import Clip, cut_clip
 from mtv_world_ros.physics.object_motion import cut_outs, moved_pictures, ObjectMotion
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.robot.shape import LinkShape
 from mtv_world_ros.training.training_config import HistoryConfig, SelfRolloutConfig
 from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, Segmenter
 
@@ -80,12 +78,14 @@ class LeadIn:
         num_chunks: chunks to imagine.
         names: of the objects.
         colours: order of the colour channels of the clip that is trained on.
+        foresees: whether the objects' motion counts as foreseen.
     """
 
     clip: Clip
     num_chunks: int
     names: tuple[str, ...] = ()
     colours: tuple[int, ...] = (0, 1, 2)
+    foresees: bool = True
 
     @property
     def num_frames(self) -> int:
@@ -151,23 +151,24 @@ class ControlMaker:
     Attributes:
         robot: of the episodes.
         segmenter: finds the objects of the start frame.
-        rendering: widths, colours and fading of trajectory videos.
-        object_mask: whether they carry the objects' masks.
-        parts: shapes of the robot's links, for `rendering.arm_pictures`; empty = none are drawn.
+        control: how plans enter the model.
     """
 
     robot: RobotModel
     segmenter: Segmenter
-    rendering: TrajectoryVideoConfig
-    object_mask: bool
-    parts: tuple[LinkShape, ...] = ()
+    control: Control
     # batches are prepared in one thread while the model's rollouts are drawn in another
     _lock: Lock = field(default_factory=Lock)
 
     def make(
-        self, clip: Clip, names: tuple[str, ...], start: ByteArray | None = None
-    ) -> ByteArray:
-        """Returns the trajectory video (V, 1 + T, H, W, 3) uint8 RGB of a clip.
+        self,
+        clip: Clip,
+        names: tuple[str, ...],
+        start: ByteArray | None = None,
+        *,
+        foresees: bool = True,
+    ) -> ControlInputs:
+        """Returns the control's inputs of a clip.
 
         Objects are searched in its first frame, unless this segmenter made the masks that are
         stored with the episode.
@@ -176,19 +177,21 @@ class ControlMaker:
             clip: the chunk.
             names: of the objects.
             start: (V, H, W, 3) uint8 RGB imagined frame in place of the clip's first one.
+            foresees: whether the objects' motion counts as foreseen in this clip.
         """
-        first = clip.frames[:, 0] if start is None else start
-        links = {part.link for part in self.parts}
-        motion = Motion.of(self.robot, clip.cameras, clip.positions, links)
-        video = render_trajectory_video(
+        control = self.control
+        motion = Motion.of(self.robot, clip.cameras, clip.positions, control.links)
+        shows_objects = foresees and control.shows_objects
+        scene = ControlScene(
             motion=motion,
             times=clip.times,
-            object_masks=self._start_masks(clip, names, start) if self.object_mask else None,
-            objects=self._objects(clip, motion, names) if self.object_mask else None,
-            arms=arm_pictures(self.parts, motion, first),
-            config=self.rendering,
+            start_frames=clip.frames[:, 0] if start is None else start,
+            masks=self._start_masks(clip, names, start) if control.uses_masks else None,
+            objects=self._objects(clip, motion, names) if shows_objects else None,
         )
-        return video.frames
+        inputs = control.make(scene)
+        control.layout.check(inputs, type(control).__name__)
+        return inputs
 
     def _start_masks(
         self, clip: Clip, names: tuple[str, ...], start: ByteArray | None
@@ -221,7 +224,7 @@ class ControlMaker:
         They are those of the episode's first frame, as in a rollout of chained chunks.
         """
         origin, poses = clip.origin, clip.object_poses
-        if not self.rendering.object_motion or origin is None or poses is None:
+        if origin is None or poses is None:
             return None
         if any(name not in clip.objects for name in names):
             return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 import time
@@ -13,6 +13,7 @@ from torch import nn, Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
+from mtv_world_ros.control.control import InputLayout, VIDEO_ONLY
 from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
@@ -23,6 +24,8 @@ from mtv_world_ros.training.training_config import TrainingConfig
 _FLOAT = 4
 #: CLIP tokens of an image
 _IMAGE_TOKENS = 257
+#: indices a frame that a control is counted with; byte-pair encoding leaves fewer
+_TOKENS_A_FRAME = 14
 _GIB = 2**30
 #: rows and columns of the matrices that are multiplied
 _SIZE = {'cpu': 1024, 'cuda': 8192}
@@ -74,19 +77,27 @@ class StepCost:
         ]
 
 
-def step_cost(config: TrainingConfig, *, dtype: torch.dtype, fake: bool = True) -> StepCost:
+def step_cost(
+    config: TrainingConfig,
+    layout: InputLayout = VIDEO_ONLY,
+    *,
+    dtype: torch.dtype,
+    fake: bool = True,
+) -> StepCost:
     """Counts operations and bytes of a step on shapes only; `fake=False` computes it on a CPU."""
     # fake tensors have shapes and no numbers; said to be on the CPU, they take the attention that
     # keeps no attention matrix, as a GPU does (on `meta` they would take the one that does)
     with torch.device('meta' if fake else 'cpu'):
-        transformer = MultiViewWanTransformer(**config.transformer)
+        transformer = MultiViewWanTransformer(
+            **config.transformer, **layout.transformer_arguments()
+        )
     if config.lora.rank:
         add_adapter(transformer, rank=config.lora.rank, alpha=config.lora.alpha)
     if config.optimizer.gradient_checkpointing:
         transformer.enable_gradient_checkpointing()
     with FakeTensorMode() if fake else nullcontext():
         fill(transformer, dtype)
-        inputs = _inputs(config, transformer, dtype)
+        inputs = _inputs(config, layout, transformer, dtype)
         parameters = list(transformer.parameters())
         with FlopCounterMode(display=False, custom_mapping=attention_operations()) as counter:
             with _kept(parameters) as sizes:
@@ -150,6 +161,7 @@ def _storage(tensor: Tensor) -> int:
 
 def _inputs(
     config: TrainingConfig,
+    layout: InputLayout,
     transformer: MultiViewWanTransformer,
     dtype: torch.dtype,
 ) -> dict[str, Tensor]:
@@ -181,6 +193,19 @@ def _inputs(
     if config.transformer.get('image_dim'):
         width = config.transformer['image_dim']
         values['encoder_hidden_states_image'] = zeros(views * _IMAGE_TOKENS, width)
+    return values | _control_inputs(layout, video.num_frames, zeros)
+
+
+def _control_inputs(
+    layout: InputLayout, num_frames: int, zeros: Callable[..., Tensor]
+) -> dict[str, Tensor]:
+    values, context = {}, layout.context
+    if layout.frame is not None:
+        values['control_frame'] = zeros(1 + num_frames, layout.frame.vector_size)
+    if context is not None and context.vector_size:
+        values['control_context'] = zeros(1, context.vector_size)
+    elif context is not None:
+        values['control_context'] = zeros(_TOKENS_A_FRAME * num_frames, kind=torch.int64)
     return values
 
 
@@ -214,7 +239,9 @@ def measured_peak(device: torch.device, dtype: torch.dtype) -> float:
     return together * 2 * size**3 / fastest
 
 
-def ideal_seconds(config: TrainingConfig, dtype: torch.dtype, flops: float) -> float:
+def ideal_seconds(
+    config: TrainingConfig, dtype: torch.dtype, flops: float, layout: InputLayout = VIDEO_ONLY
+) -> float:
     """Returns the time of a step whose forward and backward run at a peak of operations a second.
 
     The transformer's alone: encoding, and what gradient checkpointing computes again, is not the
@@ -222,4 +249,4 @@ def ideal_seconds(config: TrainingConfig, dtype: torch.dtype, flops: float) -> f
     """
     optimizer = config.optimizer.replace(gradient_checkpointing=False)
     config = config.replace(optimizer=optimizer)
-    return step_cost(config, dtype=dtype).step_flop / flops
+    return step_cost(config, layout, dtype=dtype).step_flop / flops

@@ -99,7 +99,7 @@ def encode_batch(
 def condition_batch(encoders: Encoders, batch: ClipBatch, device: torch.device) -> Conditioning:
     """Returns the conditioning of a batch."""
     autoencoder, start = encoders.autoencoder, batch.start_frame.to(device)
-    latents = condition(autoencoder, start, batch.trajectory.to(device))
+    latents = condition(autoencoder, start, batch.inputs.to(device))
     latents = _with_past(encoders, latents, batch, device)
     if encoders.text is None or encoders.image is None:
         return latents
@@ -131,24 +131,35 @@ def _weights(weights: Tensor, autoencoder: Autoencoder, clean: Tensor) -> Tensor
 
 
 def drop_conditions(
-    conditioning: Conditioning, augment: AugmentConfig, draws: NoiseDraws
+    conditioning: Conditioning,
+    augment: AugmentConfig,
+    draws: NoiseDraws,
+    control_dropout: float = 0.0,
 ) -> Conditioning:
     """Drops control, reference, start slot or CLIP tokens in random samples, each independently.
 
-    Dropped inputs are zero. VideoX-Fun drops one in ten samples; classifier-free guidance needs
-    a model trained without its condition.
+    Dropped latents are zero, dropped tokens of a control are left out. VideoX-Fun drops one in ten
+    samples; classifier-free guidance needs a model trained without its condition.
+
+    Args:
+        conditioning: of a batch.
+        augment: probabilities.
+        draws: random numbers of the batch.
+        control_dropout: the control's own, where it is higher than `augment.control_dropout`.
     """
     dropped = {
-        ('control', 'start_control'): augment.control_dropout,
+        ('control', 'start_control'): max(augment.control_dropout, control_dropout),
         ('reference', 'anchor'): augment.reference_dropout,
         ('start',): augment.start_dropout,
         ('image',): augment.image_dropout,
     }
-    changes = {}
+    changes: dict[str, Tensor] = {}
     for names, probability in dropped.items():
         if probability == 0:  # nothing is drawn: runs without dropout keep their noise
             continue
         kept = draws.uniform() >= probability
+        if 'control' in names and conditioning.has_control_tokens:
+            changes['control_kept'] = kept.to(conditioning.control.device)
         for name in names:
             value = getattr(conditioning, name)
             if value is not None:

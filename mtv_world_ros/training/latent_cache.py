@@ -27,7 +27,7 @@ from mtv_world_ros.core.errors import ConfigError, TrainingError
 from mtv_world_ros.core.files import content_digest, write_whole
 from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.data.recordings import cut_clip
-from mtv_world_ros.model.conditioning import Conditioning, start_slot
+from mtv_world_ros.model.conditioning import Conditioning, ControlBatch, pad_rows, start_slot
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.training.base_checkpoint import Base
 from mtv_world_ros.training.batches import BatchSource, ClipBatch, pasts
@@ -171,7 +171,9 @@ def _other_settings(root: Path, mine: Mapping[str, Any]) -> list[str]:
 
 
 #: to be increased when the stored data or their computation change
-_VERSION = 1
+_VERSION = 2
+#: tokens of a control; clips have unequal numbers of them
+CONTEXT = 'context'
 #: kinds of pixels with extra weight, in the order of a cache's `shares`
 WEIGHTS = ('change_weight', 'object_weight', 'moved_weight')
 _NO_WEIGHTS = ObjectiveConfig(change_weight=0.0, object_weight=0.0, moved_weight=0.0)
@@ -200,13 +202,14 @@ class CachedClip:
 
 
 def settings_of(
-    config: TrainingConfig, base: Path, robot: RobotModel, segmenter: str, dtype: torch.dtype
+    config: TrainingConfig, base: Path, controls: ControlMaker, dtype: torch.dtype
 ) -> dict[str, Any]:
     """Returns everything that the latents of all clips depend on, as plain values.
 
-    That is the preset, the encoders of the base checkpoint, the robot's kinematics, the segmenter,
-    and the number format of the encoders and of what is kept.
+    That is the preset, the encoders of the base checkpoint, the control, the robot's kinematics,
+    the segmenter, and the number format of the encoders and of what is kept.
     """
+    control = controls.control
     video = config.video.model_dump()
     names = ('views', 'fps', 'num_frames', 'width', 'height')
     settings = {
@@ -215,11 +218,10 @@ def settings_of(
         'autoencoder': content_digest(base / 'autoencoder')[:16],
         'dtype': str(dtype),
         **{f'history.{k}': v for k, v in config.history.model_dump().items()},
-        'trajectory_video': True,
-        **{f'rendering.{k}': v for k, v in config.rendering.model_dump().items()},
-        'robot': _robot_digest(robot),
-        'video.object_mask': video['object_mask'],
-        'segmenter': segmenter if video['object_mask'] else None,
+        'video.control': video['control'],
+        **control.cache_key(),
+        'robot': _robot_digest(controls.robot),
+        'segmenter': controls.segmenter.name if control.uses_masks else None,
     }
     if (base / 'image_encoder').is_dir():
         settings['image_encoder'] = content_digest(base / 'image_encoder')[:16]
@@ -257,7 +259,7 @@ def read_clip(
     Its anchor and history are drawn once, by its start.
     """
     cut = cut_clip(clip.recording, clip.start, spec)
-    trajectory = controls.make(cut, clip.recording.names)
+    inputs = controls.make(cut, clip.recording.names)
     past = None
     if history.on:
         rng = np.random.default_rng((_VERSION, clip.start))
@@ -266,7 +268,7 @@ def read_clip(
     return ClipBatch(
         frames=_alone(cut.frames),
         start_frame=_alone(cut.frames[:, 0]),
-        trajectory=_alone(trajectory),
+        inputs=ControlBatch.of([inputs]),
         object_ids=None if cut.object_ids is None else _alone(cut.object_ids),
         **pasts([past]),  # type: ignore[arg-type]
     )
@@ -322,8 +324,11 @@ def _encode(
     encoded = encode_batch(encoders, batch, ObjectiveConfig(), device)
     cond = encoded.conditioning
     tensors = {'clean': encoded.clean, 'reference': cond.reference, 'image': cond.image}
-    tensors |= {'anchor': cond.anchor, 'history': cond.history, 'control': cond.control}
+    tensors |= {'anchor': cond.anchor, 'history': cond.history}
+    tensors['control'] = cond.control if batch.inputs.video is not None else None
     held = {name: value[0].to(dtype) for name, value in tensors.items() if value is not None}
+    tokens = {CONTEXT: cond.context, 'frame': cond.frame}
+    held |= {name: value[0] for name, value in tokens.items() if value is not None}
     if cond.history_sigmas is not None:
         held['history_sigma'] = cond.history_sigmas[0].float()
     return held | {'shares': _shares(batch, encoded.clean.shape)[0]}
@@ -361,7 +366,7 @@ def cached(
     assert base is not None
     source.close()
     controls, spec = source.controls, config.spec
-    settings = settings_of(config, base.folder, controls.robot, controls.segmenter.name, dtype)
+    settings = settings_of(config, base.folder, controls, dtype)
     cache = LatentCache(root, settings)
     clips = list_clips(source.starts)
     for note in [*cache.notes, *_changed(cache, clips)]:
@@ -404,6 +409,7 @@ def _check(config: TrainingConfig) -> None:
         'augment.colour_permutation': augment.colour_permutation,
         'augment.failure_share': augment.failure_share,
         'self_rollout.share': config.self_rollout.share,
+        '1 - rendering.foreseen_ratio': 1 - config.rendering.foreseen_ratio,
     }
     for name, value in disturbed.items():
         if value:
@@ -462,10 +468,13 @@ class CachedSource:
         """Returns the batch of a step."""
         clips = [self._clip(step, number) for number in self._numbers]
         rows = [self._cache.read(clip.key) for clip in clips]
-        held = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+        held = {
+            name: (pad_rows if name == CONTEXT else torch.stack)([row[name] for row in rows])
+            for name in rows[0]
+        }
         held = {name: tensor.to(self._device) for name, tensor in held.items()}
         clean, reference = held['clean'], held['reference']
-        control = held['control']
+        control = held.get('control', torch.zeros_like(clean))
         cond = Conditioning(
             control=control,
             start_control=control[:, :, :, 0],
@@ -476,6 +485,8 @@ class CachedSource:
             anchor=held.get('anchor'),
             history=held.get('history'),
             history_sigmas=held.get('history_sigma'),
+            context=held.get(CONTEXT),
+            frame=held.get('frame'),
         )
         return EncodedBatch(
             step=step,

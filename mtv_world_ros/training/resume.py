@@ -16,7 +16,6 @@ from torch import Tensor
 from mtv_world_ros.core.bounded_input import check_finite, read_json
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.core.files import recover_folder, whole_folder
-from mtv_world_ros.model.card import TRAJECTORY_VIDEO
 from mtv_world_ros.training.averaged_weights import AveragedWeights
 from mtv_world_ros.training.training_config import TrainingConfig
 
@@ -90,7 +89,6 @@ def architecture(config: TrainingConfig) -> dict[str, Any]:
         **{f'autoencoder.{name}': value for name, value in config.autoencoder.items()},
         **{f'video.{n}': v for n, v in config.video.model_dump(exclude={'clip_stride_s'}).items()},
         'lora.rank': config.lora.rank,
-        'video.control': TRAJECTORY_VIDEO,
     }
     return json.loads(json.dumps(values))
 

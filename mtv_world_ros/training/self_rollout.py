@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from mtv_world_ros.core.data_types import ByteArray, History
-from mtv_world_ros.model.conditioning import decode_frames
+from mtv_world_ros.model.conditioning import ControlBatch, decode_frames
 from mtv_world_ros.model.parts import Scheduler
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.world_model import sample_latents
@@ -31,7 +31,7 @@ class SelfRollout:
     """Replaces the start frames of clips that have a lead-in.
 
     Args:
-        controls: makes the trajectory videos of what was imagined.
+        controls: makes the inputs of what was imagined.
         encoders: on the device that trains.
         scheduler: noise levels and step rule of serving.
         num_inference_steps: denoising steps of a chunk.
@@ -59,7 +59,7 @@ class SelfRollout:
             batch: clips of a step.
             transformer: imagines; best with averaged weights, which are those that will serve.
         """
-        start_frame, trajectory = batch.start_frame.clone(), batch.trajectory.clone()
+        start_frame, made_inputs = batch.start_frame.clone(), batch.inputs
         history = None if batch.history is None else batch.history.clone()
         for index, lead_in in enumerate(batch.lead_ins):
             if lead_in is None:
@@ -69,10 +69,10 @@ class SelfRollout:
             # the rollout was made in true colours, which segmenters expect
             colours = list(lead_in.colours)
             start_frame[index] = made.start_frame[0][..., colours]
-            trajectory[index] = made.trajectory[0]
+            made_inputs = made_inputs.with_chunk(index, made.inputs)
             if history is not None and made.history is not None:
                 history[index] = made.history[0][..., colours]
-        return replace(batch, start_frame=start_frame, trajectory=trajectory, history=history)
+        return replace(batch, start_frame=start_frame, inputs=made_inputs, history=history)
 
     def _last_chunk(
         self, lead_in: LeadIn, noise: tuple[int, int, int], transformer: MultiViewWanTransformer
@@ -91,11 +91,11 @@ class SelfRollout:
     def _chunk(self, lead_in: LeadIn, index: int, start: ByteArray, past: History) -> ClipBatch:
         """One chunk from a given start frame, as a batch of one clip."""
         clip = lead_in.chunk(index)
-        control = self._controls.make(clip, lead_in.names, start)
+        inputs = self._controls.make(clip, lead_in.names, start, foresees=lead_in.foresees)
         return ClipBatch(
             frames=torch.from_numpy(np.array(clip.frames))[None],
             start_frame=torch.from_numpy(np.array(start))[None],
-            trajectory=torch.from_numpy(np.array(control))[None],
+            inputs=ControlBatch.of([inputs]),
             object_ids=None,
             **self._past(past),
         )

@@ -13,6 +13,9 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from mtv_world_ros.control.control import Control
+from mtv_world_ros.control.registry import control_class
+from mtv_world_ros.control.trajectory_video import TrajectoryVideo
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.model.card import OPTIONAL_KEYS, ROBOT_FOLDER
 from mtv_world_ros.model.checkpoint import (
@@ -102,6 +105,7 @@ class Trainer:
         trained_on: entry of the checkpoint's card.
         processes: that train together; None: those that the launcher started.
         base: checkpoint to train on top of; None: all weights are new.
+        control: how plans enter the model; None = the paper's.
 
     Raises:
         TrainingError: fewer clips per step than processes times accumulated parts.
@@ -118,8 +122,11 @@ class Trainer:
         trained_on: dict[str, object],
         processes: Processes | None = None,
         base: Base | None = None,
+        control: Control | None = None,
     ) -> None:
         torch.manual_seed(seed)
+        drawn = TrajectoryVideo(config=config.rendering, object_mask=config.video.object_mask)
+        self.control = control or drawn
         settings = config.optimizer
         self.processes = processes or Processes(device)
         self.clips = self._clips(settings)
@@ -129,7 +136,9 @@ class Trainer:
         if base is None:
             autoencoder = place(build_autoencoder(config.autoencoder), self.device, torch.float32)
             self.encoders = Encoders(autoencoder=autoencoder, history=config.history)
-            transformer = MultiViewWanTransformer(**config.transformer)
+            transformer = MultiViewWanTransformer(
+                **config.transformer, **self.control.layout.transformer_arguments()
+            )
         else:
             self.encoders, transformer = base.encoders, base.checkpoint.transformer
         check_history(config.history, self.encoders.autoencoder, transformer.config)
@@ -169,7 +178,7 @@ class Trainer:
         """
         loaded = load_checkpoint(folder)
         theirs, video = loaded.card, self.config.video
-        if not self.config.rendering.object_motion:
+        if not self.control.shows_objects:
             self._object_motion = None  # its trajectory videos will not show what is foreseen
         elif (theirs.robot, len(theirs.spec.views)) == (video.robot, len(video.views)):
             self._object_motion = loaded.object_motion
@@ -350,7 +359,9 @@ class Trainer:
         card = card.replace(**{name: theirs[name] for name in OPTIONAL_KEYS if name in theirs})
         if self.config.lora.rank:
             averages = self.weights.averages()
-            return save_adapter(self.weights.worker, folder, weights=averages, card=card)
+            return save_adapter(
+                self.weights.worker, folder, weights=averages, card=card, control=self.control
+            )
         # what `fit-contact` put there stays
         mine = folder / OBJECT_MOTION_FOLDER
         parts = Checkpoint(
@@ -360,6 +371,7 @@ class Trainer:
             card=card,
             object_motion=mine if mine.is_dir() else self._object_motion,
             robot=self.robot,
+            control=self.control,
             text_encoder=base and base.checkpoint.text_encoder,
             image_encoder=base and base.checkpoint.image_encoder,
         )
@@ -395,7 +407,8 @@ def batch_loss(
     cond = batch.conditioning
     if transformer.start_image == 'either':
         cond = cond.with_one_start()
-    cond = drop_conditions(cond, config.augment, draws)
+    dropout = control_class(config.video.control).dropout
+    cond = drop_conditions(cond, config.augment, draws, dropout)
     if cond.history is not None:
         cond = cond.with_noisy_history(draws.normal(*cond.history.shape[1:]).to(device))
     cond = cond.in_dtype(dtype)
@@ -411,6 +424,9 @@ def batch_loss(
         anchor=cond.anchor,
         history=cond.history,
         history_timestep=cond.history_timestep,
+        control_context=cond.context,
+        control_frame=cond.frame,
+        control_kept=cond.control_kept,
     )
     target = clean if transformer.prediction == 'sample' else noise - clean
     by_sigma = sigma_weights(sigmas, objective).to(device)

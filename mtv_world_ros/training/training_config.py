@@ -7,8 +7,10 @@ from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from mtv_world_ros.control.control import ControlOptions
+from mtv_world_ros.control.registry import check_control_name, TRAJECTORY_VIDEO
 from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.core.config import (
     Count,
@@ -25,7 +27,8 @@ from mtv_world_ros.core.data_types import WorldModelSpec
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import bundled
 from mtv_world_ros.data.bag_mapping import EpisodeSource
-from mtv_world_ros.model.card import CheckpointCard, HistorySettings, TRAJECTORY_VIDEO
+from mtv_world_ros.model.card import CheckpointCard, HistorySettings
+from mtv_world_ros.robot.model import RobotModel
 
 #: in a loss
 Weight = Annotated[float, Field(ge=0, le=1000)]
@@ -42,6 +45,11 @@ class VideoConfig(Schema):
     width: Count = Field(default=96, description='[px]')
     height: Count = Field(default=72, description='[px]')
     robot: str = 'yam_bimanual'
+    control: Annotated[str, AfterValidator(check_control_name)] = Field(
+        default=TRAJECTORY_VIDEO,
+        description='how a plan enters the model: trajectory_video (the paper), policy2vec, '
+        'ee_mlp, fast_tokens, the name of an entry point of mtv_world.controls, or module:Class',
+    )
     object_mask: bool = Field(
         default=True, description="the trajectory video carries the objects' masks"
     )
@@ -260,6 +268,15 @@ class TrainingConfig(Schema):
         """What a model of this configuration takes and gives."""
         return self.card({}).spec
 
+    def control_options(self, robot: RobotModel) -> ControlOptions:
+        """Returns what the control is created for."""
+        return ControlOptions(
+            robot=robot,
+            rendering=self.rendering.model_dump(),
+            object_mask=self.video.object_mask,
+            num_frames=self.video.num_frames,
+        )
+
     def with_steps(self, num_clips: int) -> TrainingConfig:
         """Returns a copy with `epochs` converted to steps, if it counts in epochs."""
         optimizer = self.optimizer
@@ -272,7 +289,6 @@ class TrainingConfig(Schema):
         """Returns the checkpoint's card; `trained_on` says where weights come from."""
         return CheckpointCard(
             **self.video.model_dump(mode='json', exclude={'clip_stride_s'}),
-            control=TRAJECTORY_VIDEO,
             rendering=self.rendering.model_dump(),
             **self.history.as_card(),
             num_inference_steps=self.sampling.num_inference_steps,

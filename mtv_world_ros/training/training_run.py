@@ -43,6 +43,7 @@ from mtv_world_ros.training.base_checkpoint import load_base, needs_base
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
+from mtv_world_ros.training.fit_control import fitted_control
 from mtv_world_ros.training.latent_cache import cached, CachedSource
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
@@ -235,18 +236,23 @@ def train(
             run.broken,
         )
     _save_robot(robot, recordings, out / ROBOT_FOLDER, processes)
+    with processes.main_first():
+        control = fitted_control(out, config, recordings, robot, initial=run.initial)
     source: BatchSource | CachedSource = BatchSource(
         recordings,
         config,
         robot=robot,
         segmenter=segmenter,
+        control=control,
         seed=run.seed,
         workers=run.data_workers,
         numbers=processes.share(config.optimizer.batch_size),
     )
     base = None
     if needs_base(config):
-        base = load_base(config, run.initial, processes.device, dtype, seed=run.seed)
+        base = load_base(
+            config, run.initial, processes.device, dtype, seed=run.seed, layout=control.layout
+        )
     if run.latent_cache is not None:
         with processes.main_first():
             source = cached(
@@ -272,6 +278,7 @@ def train(
         },
         processes=processes,
         base=base,
+        control=control,
     )
     with processes.main_first():
         resumed = trainer.load_state()
@@ -294,7 +301,7 @@ def train(
     ideal = None
     if run.peak_tflops is not None and processes.is_main:
         peak = 1e12 * run.peak_tflops or measured_peak(processes.device, dtype)
-        ideal = ideal_seconds(config, dtype, peak * processes.count)
+        ideal = ideal_seconds(config, dtype, peak * processes.count, control.layout)
     try:
         with disk_errors_named(out):
             _loop(trainer, source, run, held_out, ideal)

@@ -36,8 +36,8 @@ class PersistenceWorldModel:
     def __init__(self, spec):
         self.spec = spec
 
-    def predict(self, start_frame, trajectory_frames, **_):
-        return np.repeat(start_frame[:, None], trajectory_frames.shape[1] - 1, axis=1)
+    def predict(self, start_frame, control, **_):
+        return np.repeat(start_frame[:, None], control.num_frames, axis=1)
 
 
 def camera(view: str) -> CameraModel:
@@ -173,11 +173,11 @@ class OracleWorldModel:
         self._blur = blur
         self._true: dict[bytes, bytes] = {}
 
-    def predict(self, start_frame, trajectory_frames, **_):
+    def predict(self, start_frame, control, **_):
         """See `pipeline.WorldModel.predict`."""
         self.num_calls += 1
-        key, control = start_frame.tobytes(), trajectory_frames.tobytes()
-        if self._true.setdefault(key, control) != control:
+        key, drawn = start_frame.tobytes(), control.video.tobytes()
+        if self._true.setdefault(key, drawn) != drawn:
             return np.repeat(start_frame[:, None], SPEC.num_frames, axis=1)
         frames = self._after(start_frame)
         if not self._blur:

@@ -113,7 +113,7 @@ def test_object_that_the_model_loses_scores_0_and_says_so(make_pipeline, episode
     class Eraser:
         spec = make_pipeline().spec
 
-        def predict(self, start_frame, trajectory_frames, **_):
+        def predict(self, start_frame, control, **_):
             frames = np.repeat(start_frame[:, None], 4, axis=1)
             frames[..., :] = 170
             return frames

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder, TinyAutoencoder
-from mtv_world_ros.model.conditioning import condition, decode_frames, encode_frames
+from mtv_world_ros.model.conditioning import condition, ControlBatch, decode_frames, encode_frames
 
 Weights = dict[str, Tensor]
 
@@ -200,7 +200,7 @@ def test_control_frame_k_stands_at_predicted_frame_k():
     trajectory = torch.zeros(1, 1, 5, 4, 4, 3, dtype=torch.uint8)
     trajectory[:, :, 3] = 255
     autoencoder = SpaceToDepthAutoencoder()
-    cond = condition(autoencoder, trajectory[:, :, 0], trajectory)
+    cond = condition(autoencoder, trajectory[:, :, 0], ControlBatch.drawn(trajectory))
     bright = cond.control.amax(dim=(0, 1, 2, 4, 5)) > 0
     assert bright.tolist() == [False, False, True, False]
     assert cond.control.shape[3] == 4

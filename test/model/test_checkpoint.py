@@ -11,6 +11,7 @@ import pytest
 from small_transformer import build, CARD, inputs, SMALL
 import torch
 
+from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.errors import CheckpointError, ModelMemoryError, RolloutPreempted
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.card import CheckpointCard
@@ -60,7 +61,7 @@ def predict(model: DiffusionWorldModel, seed: int = 0, should_stop=lambda: False
     generator = np.random.default_rng(0)
     return model.predict(
         generator.integers(0, 255, (2, 32, 32, 3), np.uint8),
-        generator.integers(0, 255, (2, 5, 32, 32, 3), np.uint8),
+        ControlInputs.drawn(generator.integers(0, 255, (2, 5, 32, 32, 3), np.uint8)),
         positions=np.zeros((5, 14)),
         seed=seed,
         num_inference_steps=2,

@@ -12,6 +12,7 @@ from small_transformer import build, CARD, inputs, PATCH, SMALL
 import torch
 from torch import Tensor
 
+from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.data_types import History
 from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
@@ -193,7 +194,7 @@ def frames(*shape: int, seed: int = 0) -> np.ndarray:
 def predict(model: DiffusionWorldModel, history: History | None):
     return model.predict(
         frames(2),
-        frames(2, 5, seed=1),
+        ControlInputs.drawn(frames(2, 5, seed=1)),
         positions=np.zeros((5, 14)),
         seed=0,
         num_inference_steps=1,

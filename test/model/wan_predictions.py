@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from wan_files import AUTOENCODER, CARD, SCHEDULER, TRANSFORMER, write_videox
 
+from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.model.wan_weights import import_weights
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 
@@ -35,7 +36,7 @@ def frames(*shape: int, seed: int = 0) -> np.ndarray:
 def predict(model: DiffusionWorldModel, *, seed: int = 0, steps: int = 2, **changes: Any):
     arguments = {
         'start_frame': frames(VIEWS),
-        'trajectory_frames': frames(VIEWS, 1 + T, seed=1),
+        'control': ControlInputs.drawn(frames(VIEWS, 1 + T, seed=1)),
         'positions': np.zeros((1 + T, 14)),
         'seed': seed,
         'num_inference_steps': steps,

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.control.trajectory_video import TrajectoryVideo, TrajectoryVideoConfig
 from mtv_world_ros.core.data_types import WorldModelSpec
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.episode_reader import read_episode
@@ -101,9 +101,11 @@ def test_later_stages_read_the_names_and_training_the_masks(bag, ask, robot):
 
     def control(segmenter, clip):
         maker = ControlMaker(
-            robot=robot, segmenter=segmenter, rendering=TrajectoryVideoConfig(), object_mask=True
+            robot=robot,
+            segmenter=segmenter,
+            control=TrajectoryVideo(config=TrajectoryVideoConfig()),
         )
-        return maker.make(clip, recording.names)[0]
+        return maker.make(clip, recording.names).video[0]
 
     clip = cut_clip(recording, 5, SPEC)
     stored, found = control(Asked(), clip), control(ColourSegmenter(), replace(clip, masks_by=''))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.control.trajectory_video import TrajectoryVideo, TrajectoryVideoConfig
 from mtv_world_ros.core.data_types import WorldModelSpec
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.core.images import resize_frames
@@ -34,8 +34,8 @@ class PerfectWorldModel:
     def begin(self, seed, task):
         self._sim.reset(seed, task)
 
-    def predict(self, start_frame, trajectory_frames, *, positions, **options):
-        del start_frame, trajectory_frames, options
+    def predict(self, start_frame, control, *, positions, **options):
+        del start_frame, control, options
         seen = [self._sim.step(row, 1 / SPEC.fps) for row in positions[1:]]
         frames = np.stack([[found.images[view] for found in seen] for view in SPEC.views])
         return np.stack([resize_frames(view, SPEC.width, SPEC.height) for view in frames])
@@ -58,7 +58,7 @@ def runner(robot, expert):
         world_model=world_model,
         segmenter=ColourSegmenter(),
         estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks'))),
-        rendering=TrajectoryVideoConfig(),
+        control=TrajectoryVideo(config=TrajectoryVideoConfig()),
     )
 
     def make_policy(name, task, seed, expert):

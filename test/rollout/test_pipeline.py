@@ -12,7 +12,14 @@ from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.cameras.mask_geometry import centroids, locate
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.control.arm_pictures import arm_pictures
-from mtv_world_ros.core.data_types import History, JointTrajectory, Observation, WorldModelSpec
+from mtv_world_ros.control.control import ControlScene
+from mtv_world_ros.core.data_types import (
+    History,
+    JointTrajectory,
+    ObjectMasks,
+    Observation,
+    WorldModelSpec,
+)
 from mtv_world_ros.core.errors import (
     CalibrationError,
     ObservationError,
@@ -60,12 +67,12 @@ class CountingWorldModel(PersistenceWorldModel):
         self.num_steps: list[int] = []
         self.histories: list[History] = []
 
-    def predict(self, start_frame, trajectory_frames, *, seed, history, **options):
+    def predict(self, start_frame, control, *, seed, history, **options):
         self.histories.append(history)
-        self.trajectories.append(trajectory_frames)
+        self.trajectories.append(control.video)
         self.seeds.append(seed)
         self.num_steps.append(options['num_inference_steps'])
-        held = super().predict(start_frame, trajectory_frames, seed=seed, **options)
+        held = super().predict(start_frame, control, seed=seed, **options)
         steps = np.arange(1, held.shape[1] + 1)[None, :, None, None, None]
         return np.minimum(held.astype(int) + steps, 255).astype(np.uint8)
 
@@ -100,6 +107,16 @@ def commands(recording: Recording, seconds: float) -> JointTrajectory:
     return JointTrajectory(
         joint_names=whole.joint_names, times=whole.times[kept], positions=whole.positions[kept]
     )
+
+
+def draw(pipeline: Pipeline, motion: Motion, times: np.ndarray, masks: ObjectMasks) -> np.ndarray:
+    scene = ControlScene(
+        motion=motion,
+        times=times,
+        start_frames=np.zeros((len(motion.cameras), SPEC.height, SPEC.width, 3), np.uint8),
+        masks=masks.masks[:, :, 0],
+    )
+    return pipeline.control.make(scene).video
 
 
 def with_motion(world_model: CountingWorldModel, object_motion) -> Pipeline:
@@ -257,8 +274,8 @@ def test_a_stop_between_chunks_keeps_those_that_are_done(pipeline, recording):
 class NoisyWorldModel(CountingWorldModel):
     """Draws its frames from the seed alone."""
 
-    def predict(self, start_frame, trajectory_frames, *, seed, **options):
-        held = super().predict(start_frame, trajectory_frames, seed=seed, **options)
+    def predict(self, start_frame, control, *, seed, **options):
+        held = super().predict(start_frame, control, seed=seed, **options)
         return np.random.default_rng(seed).integers(0, 256, held.shape, np.uint8)
 
 
@@ -337,7 +354,7 @@ def test_the_last_chunk_alone_is_imagined_from_what_was_seen(pipeline, world_mod
     masks = pipeline.segmenter.segment(stretch.frames[:, :1], ())
     motions = [Motion.of(YAM, recording.cameras, row[None]) for row in stretch.positions]
     away = [
-        np.abs(pipeline.draw(motion, np.zeros(1), masks).frames[:, 0] - drawn).mean()
+        np.abs(draw(pipeline, motion, np.zeros(1), masks)[:, 0] - drawn).mean()
         for motion in motions
     ]
     assert np.argmin(away) == stretch.num_frames - SPEC.num_frames
@@ -540,8 +557,8 @@ def test_control_frame_zero_shows_the_observed_state(pipeline, world_model, reco
     (chunk,) = imagine(pipeline, recording, 1.6)
     rows = np.stack([recording.positions[0], chunk.positions[0]])
     motion = Motion.of(YAM, recording.cameras, rows)
-    drawn = pipeline.draw(motion, np.array([0.0, 0.2]), chunk.start_masks)
-    assert np.array_equal(world_model.trajectories[0][:, :2], drawn.frames)
+    drawn = draw(pipeline, motion, np.array([0.0, 0.2]), chunk.start_masks)
+    assert np.array_equal(world_model.trajectories[0][:, :2], drawn)
 
 
 def test_arms_are_drawn_as_the_frame_that_each_chunk_starts_from_shows_them(

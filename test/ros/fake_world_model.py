@@ -42,7 +42,7 @@ class FakeWorldModel:
     def predict(
         self,
         start_frame,
-        trajectory_frames,
+        control,
         *,
         positions,
         seed,
@@ -50,7 +50,7 @@ class FakeWorldModel:
         should_stop,
         history=None,
     ):
-        assert trajectory_frames.shape == (2, 1 + NUM_FRAMES, HEIGHT, WIDTH, 3)
+        assert control.video.shape == (2, 1 + NUM_FRAMES, HEIGHT, WIDTH, 3)
         assert positions.shape == (1 + NUM_FRAMES, 14)
         if seed // 100 == OUT_OF_MEMORY // 100:
             raise ModelMemoryError('the device ran out of memory (fake)')

@@ -50,8 +50,8 @@ def test_object_masks_off_leaves_them_out_of_the_trajectory_video(recording, tin
         source = make_source([recording], drawn, robot)
         batch = source.batch(0)
         source.close()
-        assert batch.trajectory is not None
-        return int((batch.trajectory > 0).sum())
+        assert batch.inputs.video is not None
+        return int((batch.inputs.video > 0).sum())
 
     assert drawn_pixels(True) > drawn_pixels(False)
 

@@ -130,7 +130,7 @@ def test_the_same_step_gives_the_same_batch(source):
     first, again, other = source.batch(3), source.batch(3), source.batch(4)
     assert torch.equal(first.frames, again.frames)
     assert torch.equal(first.start_frame, again.start_frame)
-    assert torch.equal(first.trajectory, again.trajectory)
+    assert torch.equal(first.inputs.video, again.inputs.video)
     assert not torch.equal(first.frames, other.frames)
 
 

@@ -14,6 +14,7 @@ import torch
 from wan_base import make_base, tiny_preset
 
 from mtv_world_ros.cli import main
+from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.errors import CheckpointError, TrainingError
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.model.checkpoint import load_checkpoint
@@ -67,7 +68,7 @@ def make(config: TrainingConfig, folder: Path, base: Path, device: str = 'cpu') 
 def predict(model: DiffusionWorldModel, clip: np.ndarray) -> np.ndarray:
     return model.predict(
         clip[:, 0],
-        clip,
+        ControlInputs.drawn(clip),
         positions=np.zeros((5, 14)),
         seed=0,
         num_inference_steps=2,

@@ -21,6 +21,7 @@ from mtv_world_ros.model.transformer.block import (
     hold_levels_by_run,
     without_cross_attention,
 )
+from mtv_world_ros.model.transformer.control_tokens import ContextAttnProcessor, ControlTokens
 from mtv_world_ros.model.transformer.stem import ConvStem, ReferenceDecoder, ReferenceStem
 from mtv_world_ros.model.transformer.tokens import (
     arrange,
@@ -59,6 +60,13 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             slot, or in `either` (see `Conditioning.with_one_start`).
         copies_control: the convolutional decoder may also copy from the trajectory video, where
             that shows the objects themselves (`rendering.object_motion`).
+        context_input: fields of `control.ContextInput`, tokens of a control that all tokens see;
+            None = no such input. With it or the next one, blocks have cross-attention also where
+            `context` is `none`.
+        frame_input: fields of `control.FrameInput`, vectors of a control that their own frames
+            see; None = no such input.
+        num_prompt_tokens: learned tokens in place of the text where `context` is `none` and there
+            is a `context_input`.
     """
 
     _repeated_blocks = ['WanTransformerBlock', 'RunwiseBlock']
@@ -95,6 +103,9 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         prediction: str = 'flow',
         start_image: str = 'both',
         copies_control: bool = False,
+        context_input: dict[str, Any] | None = None,
+        frame_input: dict[str, Any] | None = None,
+        num_prompt_tokens: int = 8,
     ) -> None:
         sizes = {'num_layers': num_layers, 'num_views': num_views, 'patch_size': patch_size}
         sizes |= {'num_attention_heads': num_attention_heads, 'ffn_dim': ffn_dim}
@@ -140,7 +151,19 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             self.ref_conv = nn.Conv2d(latent_channels, dim, patch_size[1:], stride=patch_size[1:])  # type: ignore[arg-type]
         hold_levels_by_run(self.blocks)
         self.with_text = context != 'none'
-        if not self.with_text:
+        # last, so that a seed gives all controls the same weights of what they share
+        self.control_tokens: ControlTokens | None = None
+        if context_input is not None or frame_input is not None:
+            self.control_tokens = ControlTokens(
+                context=context_input,
+                frame=frame_input,
+                dim=dim,
+                frames_per_token=frames_per_token,
+                num_prompt_tokens=0 if self.with_text else num_prompt_tokens,
+            )
+            for block in self.blocks:
+                block.attn2.set_processor(ContextAttnProcessor())
+        elif not self.with_text:
             without_cross_attention(self.blocks)
 
     def _build_conv_stem(
@@ -171,6 +194,9 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         anchor: Tensor | None = None,
         history: Tensor | None = None,
         history_timestep: Tensor | None = None,
+        control_context: Tensor | None = None,
+        control_frame: Tensor | None = None,
+        control_kept: Tensor | None = None,
     ) -> Tensor:
         """Returns (B, V, C, F, H, W): flow or clean latents, as `config.prediction` says.
 
@@ -188,10 +214,14 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             history: (B, V, C, P, H, W) latents of what was seen before the chunk, as noisy as
                 `history_timestep` says; None = no such tokens.
             history_timestep: (B,) in [0, 1000]; 1000 = nothing is known of it.
+            control_context: (B, L) indices or (B, L, size) vectors of the control, in models with
+                `context_input`.
+            control_frame: (B, 1 + T, size) vectors of the control, in models with `frame_input`.
+            control_kept: (B,) bool, False = a sample without these two; None = all have them.
 
         Raises:
-            CheckpointError: more views than the model has embeddings for, or text or image tokens
-                that are missing or of another number.
+            CheckpointError: more views than the model has embeddings for, or text, image or
+                control tokens that are missing or of another number.
         """
         num_views = hidden_states.shape[1]
         if num_views > self.view_embedding.shape[0]:
@@ -218,7 +248,17 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             None if history is None else embed_history(self, history, start, temb[:, -1]),
         )
         sequence = grid.tokens + self.view_embedding[:num_views, None, None, None]
-        context = text if image is None else torch.cat([image, text], dim=1)
+        context: Any = text if image is None else torch.cat([image, text], dim=1)
+        if self.control_tokens is not None:
+            context = self.control_tokens(
+                control_context,
+                control_frame,
+                control_kept,
+                text if self.with_text else None,
+                image,
+                num_slots=grid.tokens.shape[2] - grid.num_history,
+                num_views=num_views,
+            ).with_history(grid.num_history)
         sequence = self._run_blocks(
             sequence.flatten(1, 4),
             context,
@@ -252,7 +292,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         return temb, proj.unflatten(2, (6, -1)), text, image
 
     def _run_blocks(
-        self, sequence: Tensor, context: Tensor, time_proj: Tensor, rotary: tuple[Tensor, Tensor]
+        self, sequence: Tensor, context: Any, time_proj: Tensor, rotary: tuple[Tensor, Tensor]
     ) -> Tensor:
         for block in self.blocks:
             if torch.is_grad_enabled() and self.gradient_checkpointing:

@@ -255,6 +255,7 @@ _STARVED = """
 import resource
 import numpy as np
 from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.errors import ModelMemoryError
 model = load_pipeline(num_threads=1, dtype='float32').world_model
 spec = model.spec
@@ -263,8 +264,8 @@ def predict(scale):
     views, frames, height, width, _ = shape
     video = np.zeros((views, frames, scale * height, scale * width, 3), np.uint8)
     return model.predict(
-        video[:, 0], video, positions=np.zeros((frames, 14)), seed=0, num_inference_steps=1,
-        should_stop=lambda: False)
+        video[:, 0], ControlInputs.drawn(video), positions=np.zeros((frames, 14)), seed=0,
+        num_inference_steps=1, should_stop=lambda: False)
 used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()
 hard = resource.getrlimit(resource.RLIMIT_AS)[1]
 resource.setrlimit(resource.RLIMIT_AS, (used + 300 * 2**20, hard))

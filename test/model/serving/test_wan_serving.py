@@ -17,11 +17,12 @@ from wan_encoder_reference import clip_tokens, umt5_encode
 from wan_files import CARD, clip_weights, umt5_weights, vae_model
 from wan_predictions import frames, imported, predict, T, VIEWS
 
+from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.data_types import History
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.autoencoders import WanAutoencoder
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
-from mtv_world_ros.model.conditioning import condition, decode_frames, encode_chunk
+from mtv_world_ros.model.conditioning import condition, ControlBatch, decode_frames, encode_chunk
 from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.serving import compile_norms
 from mtv_world_ros.model.world_model import DiffusionWorldModel
@@ -53,7 +54,7 @@ def test_more_views_or_frames_than_trained_are_refused(
     told = rf'{views} views of {count} frames given, .* 2 views of 4; .*video\.num_frames'
     more = {
         'start_frame': frames(views),
-        'trajectory_frames': frames(views, 1 + count),
+        'control': ControlInputs.drawn(frames(views, 1 + count)),
         'positions': np.zeros((1 + count, 14)),
     }
     with pytest.raises(CheckpointError, match=told):
@@ -199,7 +200,7 @@ def test_compiled_norms_change_nothing_beyond_rounding(autoencoder: WanAutoencod
 def test_conditioning_is_laid_out_as_wan_control_was_trained(autoencoder: WanAutoencoder) -> None:
     trajectory = video(1 + 8)
     start = video(1, seed=5)[:, :, 0]
-    cond = condition(autoencoder, start, trajectory)
+    cond = condition(autoencoder, start, ControlBatch.drawn(trajectory))
     clean = encode_chunk(autoencoder, trajectory)
     # 1 + 8 frames are 1 + 2 latent ones: the first alone, then four each
     assert cond.control.shape == cond.start.shape == clean.shape == (1, VIEWS, 16, 3, 4, 4)
@@ -226,7 +227,7 @@ def test_control_frame_k_drives_predicted_frame_k(folder: Path, k: int) -> None:
     changed = trajectory.copy()
     changed[:, k] = 255 - changed[:, k]
     one, other = (
-        predict(model, trajectory_frames=t, positions=np.zeros((9, 14)))
+        predict(model, control=ControlInputs.drawn(t), positions=np.zeros((9, 14)))
         for t in (trajectory, changed)
     )
     differs = (one != other).any(axis=(0, 2, 3, 4))  # predicted frames 1 .. 8

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from mtv_world_ros.cameras.silhouettes import draw_silhouettes
+from mtv_world_ros.control.trajectory_video import TrajectoryVideo
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import load_recording
@@ -33,9 +34,9 @@ def test_objects_are_cut_out_of_the_recordings_first_frame(episode, robot):
     source = BatchSource([still], config, robot=robot, segmenter=segmenter, seed=0)
     batch = source.batch(0)
     source.close()
-    assert batch.trajectory is not None
+    assert batch.inputs.video is not None
     same = []
-    for frames, drawn in zip(batch.frames.numpy(), batch.trajectory.numpy(), strict=True):
+    for frames, drawn in zip(batch.frames.numpy(), batch.inputs.video.numpy(), strict=True):
         seen = segmenter.segment(frames[:, :1], recording.names).masks[:, :, 0].any(1)
         same.append(bool((drawn[:, 0][seen] == frames[:, 0][seen]).all()))
     assert not any(same)
@@ -69,9 +70,9 @@ def test_masks_that_came_with_the_episode_cut_objects_out(robot):
         name = 'boxes'
 
     maker = ControlMaker(
-        robot=robot, segmenter=Boxes(), rendering=config.rendering, object_mask=True
+        robot=robot, segmenter=Boxes(), control=TrajectoryVideo(config=config.rendering)
     )
-    video = maker.make(cut_clip(recording, 0, config.spec), recording.names)
+    video = maker.make(cut_clip(recording, 0, config.spec), recording.names).video
     assert recording.object_ids is not None
     shown = np.isin(recording.object_ids[:, 0], [1 + recording.objects.index(name)
                                                  for name in recording.names])  # fmt: skip
@@ -92,7 +93,7 @@ def test_arms_are_those_of_the_frame_that_a_clip_starts_from(robot):
     source = BatchSource([recording], config, robot=robot, segmenter=ColourSegmenter(), seed=0)
     batch = source.batch(0)
     source.close()
-    frames, drawn = batch.frames.numpy(), batch.trajectory.numpy()
+    frames, drawn = batch.frames.numpy(), batch.inputs.video.numpy()
     outlines = np.stack(
         [
             draw_silhouettes(load_shape(robot).parts, camera, robot, recording.positions) > 0

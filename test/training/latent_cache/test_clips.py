@@ -15,7 +15,7 @@ from wan_base import make_base, tiny_preset
 from mtv_world_ros.core.errors import ConfigError, TrainingError
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data.recordings import cut_clip
-from mtv_world_ros.model.conditioning import condition, encode_chunk
+from mtv_world_ros.model.conditioning import condition, ControlBatch, encode_chunk
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.training.base_checkpoint import Base, load_base
 from mtv_world_ros.training.batches import BatchSource
@@ -87,7 +87,7 @@ def test_a_batch_is_what_encoding_the_recorded_clips_gives(source, root, config,
     autoencoder = base.encoders.autoencoder
     with torch.no_grad():
         clean = encode_chunk(autoencoder, frames)
-        expected = condition(autoencoder, frames[:, :, 0], torch.from_numpy(np.array(video))[None])
+        expected = condition(autoencoder, frames[:, :, 0], ControlBatch.of([video]))
     torch.testing.assert_close(batch.clean[1:], clean)
     for name in ('control', 'start_control', 'start', 'reference'):
         torch.testing.assert_close(

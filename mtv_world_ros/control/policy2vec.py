@@ -1,0 +1,70 @@
+"""Control `policy2vec`: one vector for all actions of a chunk, added to every text token.
+
+World-Eval: the mean of the chunk's actions passes through an MLP (linear, GELU, linear) and is
+added to the embedded text with a learned scale, in both branches of guidance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+
+from mtv_world_ros.cameras.motion import Motion
+from mtv_world_ros.control.action_scaling import ActionScaling, joint_features
+from mtv_world_ros.control.control import (
+    ContextInput,
+    Control,
+    ControlInputs,
+    ControlOptions,
+    ControlScene,
+    InputLayout,
+)
+
+#: the range of a joint that rarely moves is next to nothing, so that scaled numbers need a bound
+CLIP = 1.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Policy2Vec(Control):
+    """Mean of the scaled joint commands of a chunk, as one context vector.
+
+    Attributes:
+        scaling: percentiles of the joint positions in the training set.
+    """
+
+    scaling: ActionScaling
+
+    @classmethod
+    def create(cls, options: ControlOptions) -> Self:
+        """Return the control of a robot, with joints not yet scaled."""
+        return cls(scaling=ActionScaling.unfitted(options.robot.joint_names, CLIP))
+
+    @property
+    def layout(self) -> InputLayout:
+        """One vector that is added to every text token."""
+        size = len(self.scaling.names)
+        return InputLayout(context=ContextInput(vector_size=size, joins='add'))
+
+    def make(self, scene: ControlScene) -> ControlInputs:
+        """Return the mean of the chunk's commands, (1, J)."""
+        self.scaling.check(scene.motion.robot.joint_names)
+        scaled = self.scaling.apply(joint_features(scene.motion)[1:])
+        return ControlInputs(
+            num_frames=len(scaled), context=scaled.mean(0, keepdims=True).astype(np.float32)
+        )
+
+    def fitted(self, motions: Sequence[Motion]) -> Self:
+        """Return the control scaled by the commands of the training set's chunks."""
+        found = [joint_features(motion)[1:] for motion in motions]
+        return replace(self, scaling=self.scaling.fitted(found))
+
+    def state(self) -> dict[str, Any]:
+        """Return the percentiles."""
+        return self.scaling.state()
+
+    def restored(self, state: Mapping[str, Any]) -> Self:
+        """Return the control with stored percentiles."""
+        return replace(self, scaling=self.scaling.restored(state))

@@ -1,0 +1,75 @@
+"""Statistics of the training set's chunks for controls that need them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mtv_world_ros.cameras.motion import Motion
+from mtv_world_ros.control.control import Control
+from mtv_world_ros.control.registry import CONTROL_FILE, create_control, load_control, save_control
+from mtv_world_ros.core.errors import TrainingError
+from mtv_world_ros.data.recording import Recording
+from mtv_world_ros.data.recordings import clip_starts, cut_clip
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.training.training_config import TrainingConfig
+
+#: largest number of clips that a control is fitted to, spread evenly
+MAX_CLIPS = 4096
+
+
+def fitted_control(
+    folder: Path,
+    config: TrainingConfig,
+    recordings: Sequence[Recording],
+    robot: RobotModel,
+    *,
+    initial: Path | None = None,
+) -> Control:
+    """Return the control of a training; what it was fitted to is stored in the folder.
+
+    A training that is resumed keeps what it was fitted to. One that starts from the weights of a
+    checkpoint takes over the checkpoint's, whose numbers these weights know.
+
+    Args:
+        folder: of the training.
+        config: the preset.
+        recordings: episodes that are trained on.
+        robot: of the episodes.
+        initial: checkpoint that weights are taken from; None = weights are new.
+
+    Raises:
+        CheckpointError: what is stored is of another control or cannot be used.
+        TrainingError: no episode is long enough for a clip.
+    """
+    name, options = config.video.control, config.control_options(robot)
+    control = create_control(name, options)
+    for known in (folder, initial):
+        if known is not None and (known / CONTROL_FILE).is_file():
+            control = load_control(name, options, known)
+            break
+    else:
+        if control.state():
+            control = control.fitted(_motions(config, recordings, robot))
+    if control.state():
+        folder.mkdir(parents=True, exist_ok=True)
+        save_control(control, name, folder)
+    return control
+
+
+def _motions(
+    config: TrainingConfig, recordings: Sequence[Recording], robot: RobotModel
+) -> list[Motion]:
+    """Motions of clips that are spread evenly over the recordings."""
+    spec = config.spec
+    clips = [(one, int(start)) for one in recordings for start in clip_starts(one, spec)]
+    if not clips:
+        raise TrainingError(
+            f'none of {len(recordings)} episodes is long enough for a clip of {spec.num_frames} '
+            f'frames at {spec.fps} Hz; record longer ones or lower video.num_frames'
+        )
+    chosen = np.linspace(0, len(clips) - 1, min(len(clips), MAX_CLIPS)).round().astype(int)
+    cut = [cut_clip(*clips[index], spec) for index in chosen]
+    return [Motion.of(robot, clip.cameras, clip.positions) for clip in cut]

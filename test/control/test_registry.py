@@ -1,0 +1,176 @@
+"""Controls by name; a fourth one from a file outside the package trains and predicts."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+import json
+from pathlib import Path
+import shutil
+import sys
+
+import numpy as np
+import pytest
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.control import registry
+from mtv_world_ros.control.control import ControlInputs, ControlOptions, InputLayout
+from mtv_world_ros.control.registry import (
+    check_control_name,
+    control_class,
+    control_names,
+    CONTROLS,
+    create_control,
+)
+from mtv_world_ros.core.data_types import JointTrajectory
+from mtv_world_ros.core.errors import CheckpointError, ConfigError
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.data.recording import load_recording
+from mtv_world_ros.model.card import read_card
+from mtv_world_ros.rollout.assembly import checkpoint_path, load_pipeline
+from mtv_world_ros.training.training_config import load_training_config
+
+TINY = {
+    'transformer.num_attention_heads': 2,
+    'transformer.attention_head_dim': 12,
+    'transformer.ffn_dim': 32,
+    'transformer.num_layers': 1,
+    'transformer.stem_widths': [8, 16, 16],
+    'transformer.freq_dim': 16,
+    'video.width': 48,
+    'video.height': 40,
+    'optimizer.batch_size': 1,
+    'optimizer.steps': 1,
+}
+
+
+@pytest.fixture
+def outside(tmp_path, monkeypatch):
+    """A folder on the path that has the module of a control."""
+    folder = tmp_path / 'elsewhere'
+    folder.mkdir()
+    shutil.copy(Path(__file__).with_name('own_control.py'), folder / 'somebodys_control.py')
+    monkeypatch.syspath_prepend(folder)
+    yield folder
+    sys.modules.pop('somebodys_control', None)
+
+
+def options(robot) -> ControlOptions:
+    return ControlOptions(robot=robot, rendering={}, object_mask=True, num_frames=16)
+
+
+def test_the_papers_control_and_its_three_baselines_are_registered():
+    assert list(CONTROLS) == ['trajectory_video', 'policy2vec', 'ee_mlp', 'fast_tokens']
+    assert control_names()[:4] == list(CONTROLS)
+    for name in CONTROLS:
+        assert control_class(name).__module__.startswith('mtv_world_ros.')
+
+
+def test_a_name_that_is_not_registered_names_the_nearest(robot):
+    with pytest.raises(ConfigError, match=r"'ee_mpl' is not registered.*did you mean 'ee_mlp'"):
+        check_control_name('ee_mpl')
+    with pytest.raises(ConfigError, match=r"'fast_token'.*'fast_tokens'.*video.control"):
+        load_training_config('small', {'video.control': 'fast_token'})
+
+
+def test_a_checkpoint_of_an_unknown_control_is_refused(tmp_path):
+    shutil.copytree(checkpoint_path('bundled'), tmp_path / 'own')
+    card = tmp_path / 'own' / 'world_model.json'
+    card.write_text(card.read_text().replace('trajectory_video', 'telepathy'))
+    with pytest.raises(CheckpointError, match="'telepathy' is not registered"):
+        read_card(tmp_path / 'own')
+
+
+@pytest.mark.parametrize(
+    ('target', 'said'),
+    [
+        ('nowhere_at_all:Control', r"No module named 'nowhere_at_all'; install the package"),
+        ('somebodys_control:Nothing', "has no attribute 'Nothing'"),
+        ('json:JSONDecoder', 'lacks create, make, layout'),
+    ],
+)
+def test_a_class_that_cannot_be_used_is_refused_with_the_reason(outside, target, said):
+    assert check_control_name(target) == target
+    with pytest.raises(ConfigError, match=said):
+        control_class(target)
+
+
+def test_a_control_whose_package_is_missing_names_the_extra(monkeypatch, robot, tmp_path):
+    monkeypatch.setitem(sys.modules, 'tokenizers', None)
+    monkeypatch.delitem(sys.modules, 'mtv_world_ros.control.fast_tokens', raising=False)
+    with pytest.raises(ConfigError, match=r"pip install 'mtv_world_ros\[fast_tokens\]'"):
+        control_class('fast_tokens')
+    with pytest.raises(CheckpointError, match=r'mtv_world_ros\[fast_tokens\]'):
+        registry.load_control('fast_tokens', options(robot), tmp_path)
+
+
+def test_a_class_that_fails_is_named(monkeypatch, robot):
+    class Failing:
+        layout = InputLayout(video=True)
+
+        @classmethod
+        def create(cls, options):
+            raise ZeroDivisionError('of somebody else')
+
+        def make(self, scene): ...
+
+    monkeypatch.setattr(registry, 'control_class', lambda name: Failing)
+    with pytest.raises(ConfigError, match='cannot be created.*ZeroDivisionError: of somebody'):
+        create_control('own:Failing', options(robot))
+
+
+@pytest.mark.parametrize(
+    ('inputs', 'said'),
+    [
+        (ControlInputs(num_frames=4), "did not make the input 'video'"),
+        (
+            ControlInputs(
+                num_frames=4,
+                video=np.zeros((1, 5, 4, 4, 3), np.uint8),
+                frame=np.zeros((5, 3), np.float32),
+            ),
+            "made the input 'frame'",
+        ),
+    ],
+)
+def test_inputs_that_the_layout_does_not_declare_are_refused(inputs, said):
+    with pytest.raises(CheckpointError, match=said):
+        InputLayout(video=True).check(inputs, 'own')
+
+
+def test_an_entry_point_registers_a_control(outside, monkeypatch, robot):
+    entry = EntryPoint('tool_pixels', 'somebodys_control:ToolPixels', registry.GROUP)
+    monkeypatch.setattr(registry, 'registered', lambda group: {entry.name: entry})
+    assert control_names()[-1] == 'tool_pixels'
+    assert control_class('tool_pixels').__name__ == 'ToolPixels'
+    assert create_control('tool_pixels', options(robot)).layout.names == ('frame',)
+
+
+@pytest.mark.parametrize('control', ['somebodys_control:ToolPixels', *list(CONTROLS)[1:]])
+def test_any_control_trains_and_predicts(control, outside, tmp_path, robot):
+    """By the command, on the bundled episode; other plans give other frames."""
+    run = tmp_path / 'run'
+    episodes = tmp_path / 'episodes'
+    episodes.mkdir()
+    (episodes / 'demo').symlink_to(share_path('resource', 'demo_episode'))
+    values = {**TINY, 'video.control': control}
+    command = ['train', str(episodes), '--out', str(run), '--threads', '1', '--dtype', 'float32']
+    assert main([*command, *(f'--set={key}={value}' for key, value in values.items())]) == 0
+    card = json.loads((run / 'checkpoint' / 'world_model.json').read_text())
+    assert card['control'] == control
+    pipeline = load_pipeline(run / 'checkpoint', dtype='float32', num_threads=1)
+    assert pipeline.object_motion is None
+    recording = load_recording(episodes / 'demo', pipeline.spec, robot)
+    rest = recording.positions[0]
+    frames = []
+    for way in (0.0, 0.02):
+        plan = JointTrajectory(
+            joint_names=robot.joint_names,
+            times=np.arange(1, 17) / 5,
+            positions=rest + way * np.arange(1, 17)[:, None] * np.eye(len(rest))[0],
+        )
+        episode = pipeline.begin(recording.observation(0), instruction=recording.instruction)
+        (chunk,) = episode.extend(plan)
+        assert chunk.trajectory_video.frames.any()  # drawn for people all the same
+        frames.append(chunk.video.frames)
+    assert frames[0].shape == (2, 16, 40, 48, 3)
+    assert not np.array_equal(*frames)
