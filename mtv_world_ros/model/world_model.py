@@ -352,7 +352,7 @@ class DiffusionWorldModel:
         if self.device.type == 'cuda':
             torch.cuda.empty_cache()
         return ModelMemoryError(
-            f'out of memory on {self.device} with {views} views of {count} frames of '
+            f'out of memory on {self.device} with {views} views of {1 + count} frames of '
             f"{width}x{height}; set offload=true in 'serving', use a smaller "
             'preset or another device, or free memory there '
             f'({str(error).splitlines()[0]})'

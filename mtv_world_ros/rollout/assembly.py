@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from mtv_world_ros.control.control import Control, ControlOptions
 from mtv_world_ros.control.registry import create_control, load_control
@@ -152,6 +152,7 @@ def load_pipeline(
     model = checkpoint_robot(checkpoint, robot)
     folder, motion = checkpoint_path(checkpoint), None
     control = load_control(loaded.card.control, control_options(loaded.card, model), folder)
+    _check_inputs(loaded.card.control, control, loaded.transformer.config)
     foresees = control.shows_objects and loaded.object_motion is not None
     if foresight and foresees and loaded.object_motion is not None:
         motion = load_foresight(loaded.object_motion, model, num_threads or threads_each(1))
@@ -186,6 +187,21 @@ def load_pipeline(
         grounds=Grounds.of(doubt, calibration is not None),
         picture_fits=load_fits(folder, of_pictures=True) if motion else None,
     )
+
+
+def _check_inputs(name: str, control: Control, transformer: Mapping[str, Any]) -> None:
+    """Raises if the transformer was not built for the inputs that a control feeds."""
+    wanted = control.layout.transformer_arguments()
+    for kind in ('context', 'frame'):
+        key = f'{kind}_input'
+        given, held = wanted.get(key), transformer.get(key)
+        if given != (None if held is None else dict(held)):
+            fed = f"feeds '{kind}' of {given}" if given else f"does not feed '{kind}'"
+            taken = f'takes {dict(held)}' if held else 'takes none'
+            raise CheckpointError(
+                f"control '{name}' {fed}, the checkpoint's transformer {taken}; the control that "
+                'it was trained with stands in world_model.json, as `control`'
+            )
 
 
 def control_options(card: CheckpointCard, robot: RobotModel) -> ControlOptions:

@@ -27,6 +27,7 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.rollout.assembly import checkpoint_path, load_pipeline
+from mtv_world_ros.rollout.rollout_options import RolloutOptions
 from mtv_world_ros.training.training_config import load_training_config
 
 TINY = {
@@ -168,7 +169,8 @@ def test_any_control_trains_and_predicts(control, outside, tmp_path, robot):
             times=np.arange(1, 17) / 5,
             positions=rest + way * np.arange(1, 17)[:, None] * np.eye(len(rest))[0],
         )
-        episode = pipeline.begin(recording.observation(0), instruction=recording.instruction)
+        options = RolloutOptions(instruction=recording.instruction)
+        episode = pipeline.begin(recording.observation(0), options)
         (chunk,) = episode.extend(plan)
         assert chunk.trajectory_video.frames.any()  # drawn for people all the same
         frames.append(chunk.video.frames)

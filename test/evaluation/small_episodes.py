@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.control.trajectory_video import TrajectoryVideo, TrajectoryVideoConfig
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, JointTrajectory, WorldModelSpec
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode_writer import EpisodeWriter
@@ -153,7 +153,7 @@ def make_pipeline(robot) -> Callable[..., Pipeline]:
             world_model=world_model or PersistenceWorldModel(SPEC),
             segmenter=ColourSegmenter(),
             estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks'))),
-            rendering=TrajectoryVideoConfig(),
+            control=TrajectoryVideo(config=TrajectoryVideoConfig()),
             **options,  # type: ignore[arg-type]
         )
 
