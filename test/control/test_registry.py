@@ -27,7 +27,7 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.rollout.assembly import checkpoint_path, load_pipeline
-from mtv_world_ros.rollout.rollout_options import RolloutOptions
+from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.training.training_config import load_training_config
 
 TINY = {
