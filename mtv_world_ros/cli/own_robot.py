@@ -82,6 +82,7 @@ def _robot(arguments: argparse.Namespace) -> int:
     print(describe(robot))
     print(f'shapes: {shape.source}')
     print(*(f'missing: {name}\n' for name in shape.missing), sep='', end='')
+    print(*(f'{text}\n' for text in shape.replaced), sep='', end='')
     print(*(f'suspicious: {text}\n' for text in shape.doubts), sep='', end='')
     picture = arguments.picture or Path('out/robot') / f'{robot.name}.png'
     _draw_robot(robot, picture)

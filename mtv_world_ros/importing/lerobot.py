@@ -25,7 +25,7 @@ from mtv_world_ros.core.bounded_input import (
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest, ObservationError
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
-from mtv_world_ros.importing.video_frames import frames_at, video_note
+from mtv_world_ros.importing.video_frames import frames_at, video_note, video_offset
 
 VERSIONS = ('v2.0', 'v2.1', 'v3.0')
 _PICTURES = ('video', 'image')
@@ -83,6 +83,7 @@ class LeRobotDataset:
         pyarrow_modules()
         self.root = root
         self._video_notes: dict[Path, str] = {}
+        self._offsets: dict[tuple[int, str], float] = {}
         info = self._info()
         self.version = str(info.get('codebase_version', ''))
         if self.version not in VERSIONS:
@@ -139,14 +140,13 @@ class LeRobotDataset:
     def column_names(self, feature: str) -> list[str]:
         """Names of a feature's columns, empty where it has none.
 
-        They are a list, a list in a list, or a list under one key (`motors`).
+        They are a list, a list in a list, lists under keys (`motors`), which follow each other, or
+        numbers of columns by name.
         """
         names = self.feature(feature).get('names')
-        if isinstance(names, Mapping):
-            names = next(iter(names.values()), None)
-        if isinstance(names, list) and len(names) == 1 and isinstance(names[0], list):
-            names = names[0]
-        return [str(name) for name in names] if isinstance(names, list) else []
+        if isinstance(names, Mapping) and _are_numbers(list(names.values())):
+            names = sorted(names, key=names.__getitem__)
+        return _flat_names(names)
 
     def joined_names(self, sizes: Mapping[str, int]) -> list[str]:
         """Return one name a column of several features side by side.
@@ -176,7 +176,9 @@ class LeRobotDataset:
         return found
 
     def video_note(self, entry: EpisodeEntry, feature: str) -> str:
-        """Return what is done to the frames of a video feature and why; empty if nothing is.
+        """Return what was done to the frames of a video feature and why; empty if nothing was.
+
+        Call it when the frames have been read.
 
         Raises:
             EpisodeError: the video is missing or damaged.
@@ -186,7 +188,13 @@ class LeRobotDataset:
         file = entry.videos[feature].file
         if file not in self._video_notes:
             self._video_notes[file] = video_note(file)
-        return self._video_notes[file]
+        notes = [self._video_notes[file]]
+        if offset_s := self._offsets.get((entry.index, feature)):
+            notes.append(
+                f'its frames are {1000 * offset_s:+.1f} ms from the times of the rows, all alike; '
+                'they were shifted onto the rows'
+            )
+        return '; '.join(filter(None, notes))
 
     def rows(self, entry: EpisodeEntry, features: Sequence[str]) -> dict[str, FloatArray]:
         """Numbers of an episode by feature, (T, ...) each, in order.
@@ -224,8 +232,12 @@ class LeRobotDataset:
             return
         part = entry.videos[feature]
         tolerance = _TIME_TOLERANCE / self.fps
+        times = timestamps + part.start_s
         try:
-            yield from frames_at(part.file, timestamps + part.start_s, tolerance)
+            offset_s = video_offset(part.file, times, tolerance, is_alone=self.version != 'v3.0')
+            if offset_s:
+                self._offsets[entry.index, feature] = offset_s
+            yield from frames_at(part.file, times + offset_s, tolerance)
         except EpisodeError as error:
             raise EpisodeError(f'{error}{self._stale_video(feature)}') from error
 
@@ -441,6 +453,23 @@ class LeRobotDataset:
             raise EpisodeError(
                 f"'{entry.data_file}': an image of '{feature}' is damaged: {error}"
             ) from error
+
+
+def _are_numbers(values: list[Any]) -> bool:
+    """Whether values are the numbers from 0 on, in any order."""
+    is_whole = all(isinstance(value, int) for value in values)
+    return bool(values) and is_whole and sorted(values) == list(range(len(values)))
+
+
+def _flat_names(names: Any) -> list[str]:
+    """Return the texts of nested lists and keys, in order; empty where there are none."""
+    if isinstance(names, Mapping):
+        names = list(names.values())
+    if not isinstance(names, list):
+        return []
+    if any(isinstance(name, list | Mapping) for name in names):
+        return [text for part in names for text in _flat_names(part)]
+    return [str(name) for name in names]
 
 
 def _is_file(path: Path) -> bool:

@@ -36,6 +36,8 @@ _SAME_TIME = 0.1
 _SAME_SPAN, _SAME_SPAN_PERIODS = 0.05, 2.0
 #: difference of two rates that still counts as one rate, as a share
 _SAME_RATE = 0.1
+#: packets are stored in the order of decoding: at most this much before others [s]
+_REORDER_S = 2.0
 #: units of time that are mistaken for seconds [1 / s]
 _TIME_UNITS = {'ms': 1e3, 'us': 1e6, 'ns': 1e9}
 #: deviation of a ratio of spans from a unit of time, as a share
@@ -157,6 +159,24 @@ class VideoStream:
         base = self._stream.time_base
         if base is not None:
             self._container.seek(int(seconds / base), stream=self._stream, backward=True)
+
+    def packet_times(self, start_s: float, end_s: float) -> FloatArray:
+        """Return the increasing times of frames in a part of the file, without decoding them."""
+        base = self._stream.time_base
+        if base is None:
+            return np.zeros(0)
+        if start_s > 0:
+            self.seek(start_s)
+        found = []
+        for packet in self._container.demux(self._stream):
+            if packet.pts is None:
+                continue
+            seconds = float(packet.pts * base)
+            if seconds > end_s + _REORDER_S:
+                break
+            if start_s <= seconds <= end_s:
+                found.append(seconds)
+        return np.unique(found)
 
     def frames(self) -> Iterator[av.VideoFrame]:
         """Yield frames as they are stored."""
@@ -421,6 +441,43 @@ def _by_time(shown: FloatArray, row_times: FloatArray) -> FrameMatch:
     if left_out:
         note += f'; {left_out} frames after the last row are left out'
     return FrameMatch(numbers=numbers, times=shown[numbers], note=note)
+
+
+def video_offset(path: Path, times: FloatArray, tolerance_s: float, *, is_alone: bool) -> float:
+    """Return how much later the frames of a video are than (T,) times of rows, all alike [s].
+
+    0 where the first row has a frame, or where no offset explains all rows: then `frames_at`
+    names the first row without a frame.
+
+    Args:
+        path: video file.
+        times: increasing times of the rows in the file [s].
+        tolerance_s: a frame may be this far from its row [s].
+        is_alone: whether the file holds these rows and no others. As many frames as rows then
+            belong to each other, however late they begin; else an offset is at most half a
+            period, because the frames next to these are of another episode.
+
+    Raises:
+        EpisodeError: see `open_video`.
+    """
+    if len(times) < 2:
+        return 0.0
+    period_s = float(np.median(np.diff(times)))
+    part = (-np.inf, np.inf) if is_alone else (times[0] - 2 * period_s, times[-1] + 2 * period_s)
+    with open_video(path) as video:
+        found = video.packet_times(*part)
+    if not len(found) or np.abs(found - times[0]).min() <= tolerance_s:
+        return 0.0
+    offset_s, most_s = found[np.abs(found - times[0]).argmin()] - times[0], period_s / 2
+    if is_alone and len(found) == len(times):
+        offset_s, most_s = found[0] - times[0], np.inf
+    if abs(offset_s) > most_s:
+        return 0.0
+    at = np.clip(np.searchsorted(found, times + offset_s), 1, len(found) - 1)
+    distances = np.minimum(
+        np.abs(found[at] - times - offset_s), np.abs(found[at - 1] - times - offset_s)
+    )
+    return float(offset_s) if distances.max() <= tolerance_s else 0.0
 
 
 def frames_at(path: Path, times: FloatArray, tolerance_s: float) -> Iterator[ByteArray]:

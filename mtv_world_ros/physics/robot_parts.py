@@ -24,6 +24,7 @@ from mtv_world_ros.robot.shape import (
     grip_links,
     LinkShape,
     moving_links,
+    replaced_meshes,
     rods,
     shape_origin,
     urdf_links,
@@ -97,7 +98,8 @@ def load_parts(robot: RobotModel) -> RobotParts:
         f'{len(drawn)} links have no collision shapes ({", ".join(drawn[:2])}, ...): what is '
         'drawn of them can be touched'
     )
-    return RobotParts(parts=tuple(parts), notes=(note,) if drawn else ())
+    notes = (*replaced_meshes(links.values(), path), *((note,) if drawn else ()))
+    return RobotParts(parts=tuple(parts), notes=notes)
 
 
 def with_inertias(robot: RobotModel, parts: Sequence[Part]) -> tuple[RobotModel, tuple[str, ...]]:

@@ -186,6 +186,8 @@ class ActionOutput(JointTable):
             values = np.atleast_2d(np.asarray(actions, np.float64))
         except (TypeError, ValueError) as error:
             raise PolicyError(f'the actions are no table of numbers: {error}') from error
+        if values.ndim == 3 and len(values) == 1:  # a batch of one answer
+            values = values[0]
         if values.ndim != 2 or not values.size:
             raise PolicyError(f'the actions have shape {values.shape}; expected (time, column)')
         try:

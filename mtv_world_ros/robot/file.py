@@ -31,7 +31,7 @@ from mtv_world_ros.robot.mesh_pieces import (
     write_convex_hull,
 )
 from mtv_world_ros.robot.model import Mimic, RobotModel, Tool
-from mtv_world_ros.robot.shape import grip_links, load_shape
+from mtv_world_ros.robot.shape import grip_links, load_shape, mesh_scale, replaced_meshes
 from mtv_world_ros.robot.xml_file import check_xml, NO_XML, parse_xml, root_link
 
 #: a calibrated robot differs from its nominal description by less than this [m], [rad]
@@ -315,17 +315,33 @@ def save_robot(file: Path, folder: Path) -> SavedRobot:
     values = read_yaml(file, 'robot file', 'robot_file')
     values['base_link'] = robot.base_link
     missing: list[str] = []
+    replaced: tuple[str, ...] = ()
     with whole_folder(folder) as partial:
         if values.get('urdf'):
             urdf = file.parent / values['urdf']
+            links = parse_xml(read_text(urdf, 'urdf_bytes')).iter('link')
+            replaced = replaced_meshes(links, urdf)
             tree = _with_hulls(urdf, partial, grip_links(robot), missing)
             tree.write(partial / _URDF, encoding='utf-8', xml_declaration=True)
             values['urdf'] = _URDF
         text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, allow_unicode=True)
         (partial / ROBOT_YAML).write_text(text, encoding='utf-8')
-    copy = folder / ROBOT_YAML
-    doubts = load_shape(load_robot(copy)).doubts
-    return SavedRobot(file=copy, notes=(*(f'mesh {text}' for text in missing), *doubts))
+        doubts = _size_doubts(partial, file)
+    notes = (*(f'mesh {text}' for text in missing), *replaced, *doubts)
+    return SavedRobot(file=folder / ROBOT_YAML, notes=notes)
+
+
+def _size_doubts(copy: Path, file: Path) -> tuple[str, ...]:
+    """Return the links of a copied robot whose size is doubtful.
+
+    Raises:
+        RobotError: a shape cannot be read; names the file that was copied.
+    """
+    try:
+        return load_shape(load_robot(copy / ROBOT_YAML)).doubts
+    except RobotError as error:
+        text = str(error).replace(f"'{copy / _URDF}'", f"the URDF of '{file}'")
+        raise RobotError(text) from error
 
 
 def _with_hulls(urdf: Path, folder: Path, grips: set[str], missing: list[str]) -> Any:
@@ -379,11 +395,9 @@ def _split_collisions(link: Any, urdf: Path, folder: Path, first: int) -> list[s
             continue
         try:
             file = _present_mesh(mesh.get('filename', ''), urdf)
-            loaded = load_mesh(file)
+            pieces = _scaled_pieces(mesh, file, f"'{urdf}': a mesh of link '{link.get('name')}'")
         except MissingMeshError:  # the caller names it, as its name stays
             continue
-        scale = np.array(mesh.get('scale', '1 1 1').split(), float)
-        pieces = convex_pieces(loaded.vertices * scale, loaded.edges())
         link.remove(element)
         for points in pieces:
             made.append(name := f'{_PIECES}/{first + len(made)}_{file.stem}.stl')
@@ -395,6 +409,21 @@ def _split_collisions(link: Any, urdf: Path, folder: Path, first: int) -> list[s
                 ElementTree.SubElement(piece, 'geometry'), 'mesh', filename=name
             )
     return made
+
+
+def _scaled_pieces(mesh: ElementTree.Element, file: Path, what: str) -> list[FloatArray]:
+    """Return convex pieces (N, 3) of a mesh, with the scale of the URDF [m].
+
+    Raises:
+        MissingMeshError: the file cannot be read.
+        RobotError: the scale cannot be read; begins with `what`.
+    """
+    loaded = load_mesh(file)
+    try:
+        scale = mesh_scale(mesh)
+    except ValueError as error:
+        raise RobotError(f'{what}: {error}') from error
+    return convex_pieces(loaded.vertices * scale, loaded.edges())
 
 
 def read_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import os
 from pathlib import Path
 import struct
 from typing import Any
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
@@ -32,12 +34,29 @@ _THINNEST = 1e-4
 _MOST_PIECES, _LEAST_GAIN, _CUTS, _SEGMENTS, _CUT_DIRECTIONS = 10, 0.03, 7, 1000, 32
 
 
+#: folders above a URDF in which a mesh is looked for by the end of its path
+_NUM_FOLDERS = 4
+
+
 def find_mesh(name: str, urdf: Path) -> Path | None:
     """Returns where a mesh lies, or None.
 
     `package://<name>/...` is looked for above the URDF, then in the ROS packages that are
-    installed (`AMENT_PREFIX_PATH`).
+    installed (`AMENT_PREFIX_PATH`). A mesh that is not there is looked for by the end of its path
+    in the URDF's folder and those above, whatever the case of letters: paths may be of another
+    machine, or of Windows. `mesh_note` tells that.
     """
+    return _named_mesh(name, urdf) or _mesh_by_end(name, urdf)
+
+
+def mesh_note(name: str, urdf: Path) -> str:
+    """Return that a mesh was found by the end of its path; empty if it is where its name says."""
+    file = None if _named_mesh(name, urdf) else _mesh_by_end(name, urdf)
+    return f"mesh '{name}' is not there; '{file}' was taken, which is called alike" if file else ''
+
+
+def _named_mesh(name: str, urdf: Path) -> Path | None:
+    """Return the mesh at the place that its name states."""
     plain = name.removeprefix('file://')
     if not plain.startswith('package://'):
         candidates = [urdf.parent / plain]
@@ -49,6 +68,49 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
         installed = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
         candidates += [Path(prefix) / 'share' / package / inside for prefix in installed]
     return next((candidate for candidate in candidates if _is_file(candidate)), None)
+
+
+def _mesh_by_end(name: str, urdf: Path) -> Path | None:
+    """Return the mesh near the URDF whose path ends as the name does; the longest end counts.
+
+    A file name alone counts beside the URDF only.
+    """
+    _, separator, path = name.rpartition('://')
+    text = unquote(path) if separator else path
+    parts = [part for part in text.replace('\\', '/').split('/') if part not in ('', '.')]
+    if not parts or '..' in parts:
+        return None
+    folders = urdf.resolve().parents[:_NUM_FOLDERS]
+    for start in range(len(parts)):
+        end = parts[start:]
+        for folder in folders if len(end) > 1 else folders[:1]:
+            if found := _whatever_case(folder, end):
+                return found
+    return None
+
+
+def _whatever_case(folder: Path, parts: Sequence[str]) -> Path | None:
+    """Return the file of a relative path, whatever the case of letters; None if there is none."""
+    at = folder
+    for part in parts:
+        if _exists(at / part):
+            at = at / part
+            continue
+        try:
+            alike = sorted(p.name for p in at.iterdir() if p.name.lower() == part.lower())
+        except OSError:
+            return None
+        if not alike:
+            return None
+        at = at / alike[0]
+    return at if _is_file(at) else None
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name that no system has
+        return False
 
 
 def _is_file(path: Path) -> bool:

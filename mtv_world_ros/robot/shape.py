@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -21,6 +21,7 @@ from mtv_world_ros.robot.mesh_pieces import (
     even_directions,
     find_mesh,
     load_mesh,
+    mesh_note,
     MissingMeshError,
     outermost,
     slices,
@@ -76,6 +77,7 @@ class RobotShape:
         source: origin of the shapes, for reports.
         is_known: False where rods stand for the links.
         missing: meshes that are not there or cannot be read, and why.
+        replaced: meshes that are not where the URDF says, and the files that were taken.
         doubts: links whose size does not fit the arm.
     """
 
@@ -83,6 +85,7 @@ class RobotShape:
     source: str
     is_known: bool = True
     missing: tuple[str, ...] = ()
+    replaced: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
 
 
@@ -135,8 +138,16 @@ def load_shape(robot: RobotModel) -> RobotShape:
         parts=parts,
         source=f"the shapes of '{path.name}'",
         missing=missing,
+        replaced=replaced_meshes(links.values(), path),
         doubts=size_doubts(robot, parts),
     )
+
+
+def replaced_meshes(links: Iterable[ElementTree.Element], urdf: Path) -> tuple[str, ...]:
+    """Return the meshes that are not where the URDF says, and the files that were taken."""
+    names = (mesh.get('filename', '') for link in links for mesh in link.iter('mesh'))
+    notes = (mesh_note(name, urdf) for name in names)
+    return tuple(dict.fromkeys(note for note in notes if note))
 
 
 def size_doubts(robot: RobotModel, parts: Sequence[LinkShape]) -> tuple[str, ...]:
@@ -292,11 +303,13 @@ def element_shapes(
         return
     try:
         pieces = _pieces(geometry[0], urdf, cut)
+        pose = shape_origin(element.find('origin'))
     except KeyError as error:
         raise RobotError(
             f"'{urdf}': a {geometry[0].tag} of link '{link}' lacks {error}"
         ) from error
-    pose = shape_origin(element.find('origin'))
+    except ValueError as error:
+        raise RobotError(f"'{urdf}': a {geometry[0].tag} of link '{link}': {error}") from error
     for points in pieces:
         yield LinkShape(link=link, points=_moved(pose, points))
 
@@ -309,7 +322,7 @@ def _pieces(
     """Convex parts (N, 3) of a shape, of a mesh as it is cut."""
     if shape.tag != 'mesh':
         return [_points(shape, urdf)]
-    scale = np.array(shape.attrib.get('scale', '1 1 1').split(), float)
+    scale = mesh_scale(shape)
     file = find_mesh(shape.attrib['filename'], urdf)
     if file is None:
         raise MissingMeshError(f"'{shape.attrib['filename']}' is not there")
@@ -324,14 +337,13 @@ def _pieces(
 
 
 def _points(shape: ElementTree.Element, urdf: Path) -> FloatArray:
-    values = shape.attrib
     if shape.tag == 'box':
         corners = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
-        return corners * np.array(values['size'].split(), float) / 2
+        return corners * numbers_of(shape, 'size', 3) / 2
     if shape.tag in ('cylinder', 'capsule'):
-        return _cylinder(float(values['radius']), float(values['length']))
+        return _cylinder(*(float(numbers_of(shape, key, 1)[0]) for key in ('radius', 'length')))
     if shape.tag == 'sphere':
-        return float(values['radius']) * even_directions(64)
+        return numbers_of(shape, 'radius', 1) * even_directions(64)
     raise RobotError(
         f"'{urdf}' has a shape '{shape.tag}'; known are box, capsule, cylinder, mesh, sphere"
     )
@@ -344,12 +356,46 @@ def _cylinder(radius: float, length: float) -> FloatArray:
     return np.concatenate(ends)
 
 
+def numbers_of(
+    element: ElementTree.Element, attribute: str, count: int, default: str | None = None
+) -> FloatArray:
+    """Return the (count,) numbers of an attribute.
+
+    Raises:
+        KeyError: the element lacks the attribute, and there is no default.
+        ValueError: the text is not that many numbers.
+    """
+    text = element.attrib[attribute] if default is None else element.get(attribute, default)
+    try:
+        values = np.array(text.split(), float)
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count or not np.isfinite(values).all():
+        many = 'a number' if count == 1 else f'{count} numbers separated by spaces'
+        raise ValueError(f"'{attribute}' is '{text}', must be {many}")
+    return values
+
+
+def mesh_scale(mesh: ElementTree.Element) -> FloatArray:
+    """Return the (3,) scale of a `<mesh>`; one number scales all axes, as Drake has it.
+
+    Raises:
+        ValueError: the scale is neither one number nor three.
+    """
+    count = 1 if len(mesh.get('scale', '1 1 1').split()) == 1 else 3
+    return np.broadcast_to(numbers_of(mesh, 'scale', count, '1 1 1'), 3)
+
+
 def shape_origin(element: ElementTree.Element | None) -> FloatArray:
-    """Returns the (4, 4) pose of an `<origin>`."""
+    """Return the (4, 4) pose of an `<origin>`.
+
+    Raises:
+        ValueError: its numbers cannot be read.
+    """
     T = np.eye(4)
     if element is not None:
-        T[:3, 3] = np.array(element.get('xyz', '0 0 0').split(), float)
-        T[:3, :3] = pin.rpy.rpyToMatrix(np.array(element.get('rpy', '0 0 0').split(), float))
+        T[:3, 3] = numbers_of(element, 'xyz', 3, '0 0 0')
+        T[:3, :3] = pin.rpy.rpyToMatrix(numbers_of(element, 'rpy', 3, '0 0 0'))
     return T
 
 

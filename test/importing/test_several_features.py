@@ -230,3 +230,26 @@ def test_an_image_that_is_nowhere_is_named(datasets, make_mapping, tmp_path, cel
     assert set(summary.failed) == {0, 1}
     with pytest.raises(AssertionError, match=said):
         raise AssertionError(summary.failed[0])
+
+
+@pytest.mark.parametrize(
+    'names',
+    [
+        {'shoulder.pos': 0, 'elbow.pos': 1, 'gripper.pos': 2, 'force': 3},
+        {'elbow.pos': 1, 'force': 3, 'gripper.pos': 2, 'shoulder.pos': 0},
+        {'arm': ['shoulder.pos', 'elbow.pos'], 'hand': ['gripper.pos', 'force']},
+        {'motors': [['shoulder.pos', 'elbow.pos'], ['gripper.pos', 'force']]},
+        {'motors': {'arm': ['shoulder.pos', 'elbow.pos'], 'hand': ['gripper.pos', 'force']}},
+    ],
+    ids=['numbers', 'numbers_in_another_order', 'parts', 'nested_lists', 'nested_keys'],
+)
+def test_columns_have_names_however_a_data_set_writes_them(copy, make_mapping, tmp_path, names):
+    root = copy()
+    info = json.loads((root / 'meta/info.json').read_text())
+    for key in ('observation.state', 'action'):
+        info['features'][key]['names'] = names
+    (root / 'meta/info.json').write_text(json.dumps(info))
+    summary = import_dataset(root, make_mapping(), tmp_path / 'out')
+    assert summary.made == [0, 1] and not summary.failed
+    states = read_episode(tmp_path / 'out/episode_000000', with_cameras=False).joint_states
+    assert states.positions[3] == pytest.approx([np.radians(9.0), 0.4, 0.0004 * 15], abs=1e-6)

@@ -16,6 +16,7 @@ from mtv_world_ros.importing.video_frames import (
     frames_at,
     match_frames,
     Presentation,
+    video_offset,
     VideoFileFrames,
 )
 
@@ -204,3 +205,50 @@ def test_a_video_at_another_rate_than_its_rows_is_named(tmp_path):
     path = write(tmp_path / 'b.mp4', [picture()] * 12)
     with pytest.raises(EpisodeError, match=r'frames are 0.100 s apart and rows 0.033 s'):
         list(frames_at(path, np.arange(36) / 30, 0.008))
+
+
+@pytest.mark.parametrize(
+    ('shift_s', 'is_alone', 'found_s'),
+    [
+        (0.0, True, 0.0),
+        (0.02, True, 0.0),  # within a quarter of a period
+        (0.04, True, 0.04),
+        (-0.04, False, -0.04),  # a drifting index of a file with several episodes
+        (1.5, True, 1.5),  # the file begins late, and has a frame for each row
+        (1.5, False, 0.0),  # the frames may be those of another episode
+    ],
+)
+def test_a_constant_distance_of_frames_from_rows_is_found(tmp_path, shift_s, is_alone, found_s):
+    rows = np.arange(12) / FPS + (1.0 if not is_alone else 0.0)
+    frames = rows + shift_s
+    if not is_alone:  # others before and behind, unless they begin late
+        frames = np.arange(-5 if shift_s < 1 else 0, 20) / FPS + rows[0] + shift_s
+    path = write(tmp_path / 'a.mkv', [picture()] * len(frames), times=frames - min(0, frames[0]))
+    offset = video_offset(path, rows - min(0, frames[0]), 0.25 / FPS, is_alone=is_alone)
+    assert offset == pytest.approx(found_s, abs=2e-3)
+
+
+def test_frames_that_drift_apart_from_rows_have_no_constant_distance(tmp_path):
+    path = write(tmp_path / 'a.mp4', [picture()] * 40, times=0.04 + np.arange(40) / 9.7)
+    assert video_offset(path, np.arange(40) / FPS, 0.25 / FPS, is_alone=True) == 0.0
+
+
+@pytest.mark.parametrize(('kind', 'late_s'), [('v2.1', 0.3), ('v2.1', 0.04), ('v3.0', 0.04)])
+def test_a_video_that_is_off_its_rows_is_shifted_and_named(
+    datasets, make_mapping, tmp_path, kind, late_s
+):
+    root = shutil.copytree(datasets(kind), tmp_path / 'set')
+    for video in (root / 'videos').rglob('*.mp4'):
+        if 'front' not in str(video):
+            continue
+        with av.open(str(video)) as container:
+            frames = [f.to_ndarray(format='rgb24') for f in container.decode(video=0)]
+        write(video, frames, times=late_s + np.arange(len(frames)) / FPS)
+    summary = import_dataset(root, make_mapping(), tmp_path / 'out')
+    assert summary.made == [0, 1] and not summary.failed
+    for number, count in enumerate((12, 9)):
+        said = f"view 'front': its frames are {1000 * late_s:+.1f} ms from the times of the rows"
+        assert sum(said in line for line in summary.warnings[number]) == 1
+        track = read_episode(tmp_path / f'out/episode_{number:06d}', with_cameras=False)
+        shown = [float(np.asarray(frame).mean()) for frame in track.images['front'].frames]
+        np.testing.assert_allclose(shown, 20 + 16 * np.arange(count) + 3 * number, atol=3)

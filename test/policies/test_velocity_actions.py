@@ -10,7 +10,7 @@ pytest.importorskip('msgpack', reason='msgpack is not installed (pip install .[p
 pytest.importorskip('websockets', reason='websockets is not installed (pip install .[policies])')
 
 from mtv_world_ros.core.data_types import CameraModel, Observation
-from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.errors import ConfigError, PolicyError
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.policies.server_mapping import ActionOutput
 from mtv_world_ros.robot.file import load_robot
@@ -101,6 +101,15 @@ def test_units_signs_and_joints_that_the_policy_does_not_move():
 def test_a_gripper_is_driven_by_velocities_where_it_is_no_position():
     answer = make(positions=[]).trajectory(chunk([0.0] * 7, -0.01, 10), observe())
     np.testing.assert_allclose(answer.positions[[0, 9], 7], [0.029, 0.02])
+
+
+def test_a_batch_of_one_answer_is_that_answer_and_larger_ones_are_refused():
+    velocities = chunk([0.3, 0, 0, 0, 0, 0, 0])
+    alone = make().trajectory(velocities, observe())
+    batch = make().trajectory(velocities[None], observe())
+    np.testing.assert_array_equal(batch.positions, alone.positions)
+    with pytest.raises(PolicyError, match=r'have shape \(2, 15, 8\); expected \(time, column\)'):
+        make().trajectory(np.stack([velocities, velocities]), observe())
 
 
 @pytest.mark.parametrize(

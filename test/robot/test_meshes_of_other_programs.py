@@ -176,3 +176,67 @@ def test_bundled_robots_have_no_doubtful_links(name):
     from mtv_world_ros.rollout.assembly import robot_path
 
     assert load_shape(load_robot(robot_path(name))).doubts == ()
+
+
+@pytest.mark.parametrize(
+    ('shape', 'said'),
+    [
+        (mesh('arm.stl', 'scale="0.001,0.001,0.001"'), "'scale' is '0.001,0.001,0.001', must be"),
+        (mesh('arm.stl', 'scale="1 1"'), "'scale' is '1 1', must be 3 numbers"),
+        (mesh('arm.stl', 'scale=""'), "'scale' is '', must be 3 numbers"),
+        ('<geometry><box size="0.1 0.1"/></geometry>', "'size' is '0.1 0.1', must be 3 numbers"),
+        ('<geometry><box size="0,1 0,1 0,1"/></geometry>', "'size' is '0,1 0,1 0,1'"),
+        ('<geometry><cylinder radius="" length="1"/></geometry>', "'radius' is '', must be a"),
+        ('<geometry><sphere radius="nan"/></geometry>', "'radius' is 'nan', must be a number"),
+    ],
+    ids=['commas', 'two', 'none', 'box', 'decimal_commas', 'empty', 'nan'],
+)
+def test_numbers_of_shapes_that_cannot_be_read_are_named_everywhere(tmp_path, shape, said):
+    (tmp_path / 'arm.stl').write_bytes(stl(SIZE))
+    made = robot(tmp_path, upper=shape)
+    for read in (load_shape, load_parts, lambda it: save_robot(it.file, tmp_path / 'copy')):
+        with pytest.raises(RobotError, match=f"link 'upper': {said}"):
+            read(made)
+    assert not (tmp_path / 'copy').exists()
+
+
+def test_one_number_scales_all_axes(tmp_path):
+    (tmp_path / 'arm.stl').write_bytes(stl(SIZE / 2))
+    made = robot(tmp_path, upper=mesh('arm.stl', 'scale="2"'))
+    np.testing.assert_allclose(extent(load_shape(made).parts), SIZE, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    'name',
+    [
+        '/home/someone/ws/src/r_description/meshes/my arm.stl',
+        'file:///home/someone/ws/src/r_description/meshes/my%20arm.stl',
+        'file://$(find r_description)/meshes/my arm.stl',
+        'package://r_description\\meshes\\my arm.stl',
+        'C:\\Users\\someone\\r\\meshes\\my arm.stl',
+        'meshes/MY ARM.STL',
+    ],
+    ids=['absolute', 'uri', 'find', 'backslashes', 'windows', 'case'],
+)
+def test_a_mesh_with_a_path_of_another_machine_is_found_by_its_end_and_named(tmp_path, name):
+    folder = tmp_path / 'r' / 'urdf'
+    (tmp_path / 'r' / 'meshes').mkdir(parents=True)
+    folder.mkdir()
+    (tmp_path / 'r' / 'meshes' / 'my arm.stl').write_bytes(stl(SIZE))
+    made = robot(folder, upper=mesh(name))
+    shape = load_shape(made)
+    assert shape.is_known and not shape.missing
+    np.testing.assert_allclose(extent(shape.parts), SIZE, atol=1e-6)
+    assert len(shape.replaced) == 1 and "my arm.stl' was taken" in shape.replaced[0]
+    assert save_robot(made.file, tmp_path / 'copy').notes == shape.replaced
+    assert shape.replaced[0] in load_parts(made).notes
+
+
+@pytest.mark.parametrize('name', ['/elsewhere/other.stl', '/elsewhere/arm.stl', '../../arm.stl'])
+def test_a_mesh_that_only_has_a_known_file_name_is_not_taken(tmp_path, name):
+    folder = tmp_path / 'a' / 'b' / 'urdf'
+    folder.mkdir(parents=True)
+    (tmp_path / 'a' / 'arm.stl').write_bytes(stl(SIZE))
+    shape = load_shape(robot(folder, upper=mesh(name)))
+    taken = name == '../../arm.stl'  # it is there
+    assert shape.is_known == taken and not shape.replaced
