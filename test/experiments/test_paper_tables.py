@@ -1,0 +1,268 @@
+"""The paper's tables by one command: rows, resuming, other data, and what cannot be done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import errno
+import json
+from pathlib import Path
+import shutil
+from types import ModuleType
+
+import pytest
+from safetensors.torch import save_file
+from sources import set_options, TINY_MODEL
+import torch
+
+from mtv_world_ros.cli import main as mtv_world
+from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.files import share_path
+
+ROOT = Path(__file__).resolve().parents[2]
+TASK = 'stack_blocks_two'
+#: what the tests of the whole run train
+ROWS = 'mtv_world,single_view_low'
+
+
+@pytest.fixture(scope='module')
+def tables() -> ModuleType:
+    """The experiment as a module."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / 'experiments'))
+        return __import__('paper_tables')
+
+
+@pytest.fixture(scope='module')
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four episodes of one task, two to train on and two to test."""
+    folder = tmp_path_factory.mktemp('data')
+    names = [f'{TASK}_{index:05d}' for index in range(4)]
+    for name in names:
+        shutil.copytree(share_path('resource', 'demo_episode'), folder / name)
+    write_card(folder, dict.fromkeys(names, TASK))
+    return folder
+
+
+def write_card(folder: Path, tasks: dict[str, str]) -> None:
+    """Writes the card of a data set, as far as it is read here."""
+    names = list(tasks)
+    card = {
+        'splits': {'train': names[::2], 'test': names[1::2]},
+        'episodes': [{'name': name, 'task': task} for name, task in tasks.items()],
+    }
+    (folder / 'dataset.json').write_text(json.dumps(card))
+
+
+def words_of(out: Path, data: Path, rows: str = ROWS, *more: str) -> list[str]:
+    """A command line with a tiny budget."""
+    return [
+        '--out', str(out), '--data', str(data), '--tasks', TASK, '--clips', '1', '--rows', rows,
+        '--zero-shot-episodes', '0', '--no-lite-features', *set_options(TINY_MODEL), *more,
+    ]  # fmt: skip
+
+
+class Recorder:
+    """Runs commands, or fails instead, and remembers them."""
+
+    def __init__(self, run: Callable[[list[str]], int] = mtv_world) -> None:
+        self.commands: list[list[str]] = []
+        self._run = run
+
+    def __call__(self, words: list[str]) -> int:
+        self.commands.append(words)
+        return self._run(words)
+
+
+@pytest.fixture(scope='module')
+def finished(tables: ModuleType, data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of two rows."""
+    out = tmp_path_factory.mktemp('tables') / 'out'
+    assert tables.main(words_of(out, data), Recorder()) == 0
+    return out
+
+
+@pytest.fixture
+def run_folder(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the finished run in another place."""
+    return Path(shutil.copytree(finished, tmp_path / 'out', symlinks=True))
+
+
+@pytest.mark.slow
+def test_rows_are_trained_and_tested_and_their_cells_are_filled(finished: Path):
+    text = (finished / 'tables.md').read_text()
+    for heading in ('Table 1', 'react to their actions', 'Table 3: J x 100', 'Clips and time'):
+        assert f'## {heading}' in text or heading in text
+    assert 'no weights' in text  # of FID and FVD
+    lines = [line for line in text.splitlines() if line.startswith('| MTV-World')]
+    numbers = [cell for line in lines for cell in line.split('|')[2:-1] if '0.' in cell]
+    assert len(numbers) >= 4
+    single = next(line for line in text.splitlines() if line.startswith('| Single-View '))
+    assert '–' in single or '.' in single
+    trained = json.loads(
+        (finished / 'rows/single_view_low/seed_0/training/checkpoint/world_model.json').read_text()
+    )
+    assert trained['views'] == ['low'] and trained['trained_on']['steps'] == 1
+    assert trained['rendering']['link_width_m'] is None  # the paper draws trails alone
+
+
+@pytest.mark.slow
+def test_a_finished_run_runs_nothing_again(tables: ModuleType, run_folder: Path, data: Path):
+    again = Recorder(lambda words: 1)
+    assert tables.main(words_of(run_folder, data), again) == 0
+    assert again.commands == []
+
+
+@pytest.mark.slow
+def test_a_row_is_added_later_without_touching_the_others(
+    tables: ModuleType, run_folder: Path, data: Path
+):
+    later = Recorder()
+    assert tables.main(words_of(run_folder, data, f'{ROWS},without_mask'), later) == 0
+    assert [words[0] for words in later.commands] == ['train', 'evaluate']
+    assert all('without_mask' in ' '.join(words) for words in later.commands)
+    assert '| w/o Mask' in (run_folder / 'tables.md').read_text()
+
+
+@pytest.mark.slow
+def test_distances_asked_for_later_are_measured_alone(
+    tables: ModuleType, run_folder: Path, data: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(tables, 'frame_features', lambda path: None)
+    asked = Recorder(lambda words: 1)
+    assert tables.main(words_of(run_folder, data, ROWS, '--fid-weights', 'fid.pth'), asked) == 1
+    (words,) = asked.commands
+    assert words[0] == 'evaluate' and words[words.index('--fid-weights') + 1] == 'fid.pth'
+    assert '--overwrite' in words
+
+
+def test_a_command_that_is_stopped_says_how_to_go_on(
+    tables: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    stopped = Recorder(lambda words: 130)
+    assert tables.main(words_of(tmp_path / 'out', data), stopped) == 130
+    told = capsys.readouterr().err
+    assert 'single_view_low, seed 0: training' in told and 'ended with status 130' in told
+    assert 'run the same command again to go on' in told
+    again = Recorder(lambda words: 130)
+    tables.main(words_of(tmp_path / 'out', data), again)
+    assert again.commands == stopped.commands  # it begins where it was stopped
+
+
+def test_a_full_disk_is_told_and_nothing_half_written_stays(
+    tables: ModuleType,
+    data: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, 'No space left on device')
+
+    monkeypatch.setattr(tables, 'write_json', full)
+    assert tables.main(words_of(tmp_path / 'out', data), Recorder(lambda words: 0)) == 1
+    told = capsys.readouterr().err
+    assert 'No space left on device' in told and 'once there is room' in told
+    assert not (tmp_path / 'out' / 'settings.json').exists()
+
+
+def test_a_folder_with_other_tasks_is_refused_with_their_names(
+    tables: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    other = Path(shutil.copytree(data, tmp_path / 'data'))
+    names = sorted(path.name for path in other.iterdir() if path.is_dir())
+    write_card(other, dict(zip(names, [TASK, TASK, TASK, 'fold_towel'], strict=True)))
+    nothing = Recorder(lambda words: 1)
+    assert tables.main(words_of(tmp_path / 'out', other), nothing) == 1
+    assert 'not asked for are fold_towel' in capsys.readouterr().err
+    assert nothing.commands == []
+    fifteen = [w for w in words_of(tmp_path / 'all', data) if w not in ('--tasks', TASK)]
+    assert tables.main(fifteen, nothing) == 1
+    assert 'missing are bussing_table, collect_food' in capsys.readouterr().err
+
+
+def test_a_folder_that_is_no_data_set_is_refused(
+    tables: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    assert tables.main(words_of(tmp_path / 'out', tmp_path), Recorder(lambda words: 1)) == 1
+    assert 'has no readable dataset.json' in capsys.readouterr().err
+
+
+def test_a_run_of_other_settings_is_not_mixed_with_this_one(
+    tables: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    nothing, out = Recorder(lambda words: 1), tmp_path / 'out'
+    tables.main(words_of(out, data), nothing)
+    capsys.readouterr()
+    assert tables.main([*words_of(out, data), '--clips', '5'], nothing) == 1
+    assert 'clips is 1 there, 5 now' in capsys.readouterr().err
+
+
+def test_two_processes_do_not_work_in_one_folder(
+    tables: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    (tmp_path / 'out').mkdir()
+    with tables.locked(tmp_path / 'out'):
+        assert tables.main(words_of(tmp_path / 'out', data), Recorder(lambda words: 1)) == 1
+    assert 'another process works in' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('rows', 'message'),
+    [
+        ('mtv_wrld', r"no row \(did you mean 'mtv_world'\?\)"),
+        ('real_mtv_world', 'give --real FOLDER and --real-view'),
+    ],
+)
+def test_rows_that_cannot_be_trained_are_refused(tables: ModuleType, rows: str, message: str):
+    with pytest.raises(ConfigError, match=message):
+        tables.chosen_rows([rows], has_real=False)
+
+
+def test_weights_of_another_network_are_refused_before_anything_is_trained(
+    tables: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    weights, nothing = tmp_path / 'other.safetensors', Recorder(lambda words: 1)
+    save_file({'conv.weight': torch.zeros(3)}, weights)
+    for option in ('--fid-weights', '--fvd-weights'):
+        words = words_of(tmp_path / 'out', data, ROWS, option, str(weights))
+        assert tables.main(words, nothing) == 1
+        assert str(weights) in capsys.readouterr().err
+    assert nothing.commands == []
+
+
+def test_all_rows_have_the_same_budget_and_differ_in_what_they_are_named_after(
+    tables: ModuleType, data: Path, tmp_path: Path
+):
+    """The words of every training: clips over the batch's size, control, views and mask."""
+    options = tables.parser().parse_args(
+        ['--out', str(tmp_path), '--data', str(data), '--clips', '8000', '--real', str(data),
+         '--real-view', 'ext1']
+    )  # fmt: skip
+    run = tables.PaperTables(options, Recorder(lambda words: 1))
+    found = {row.name: ' '.join(run._training(row, 0)) for row in run.rows}
+    assert len(found) == len(tables.ROWS)
+    assert all('optimizer.steps=4000' in words for words in found.values())
+    for control in ('policy2vec', 'ee_mlp', 'fast_tokens'):
+        assert [n for n, words in found.items() if f'video.control={control}' in words] == [
+            row.name for row in tables.ROWS if row.control == control
+        ]
+    assert 'video.views=[high] ' in found['policy2vec']
+    assert 'video.views=[low] ' in found['single_view_low']
+    assert [n for n, words in found.items() if 'object_mask=false' in words] == ['without_mask']
+    real = found['real_mtv_world']
+    assert 'video.views=[ext1] ' in real and 'robot/robot.yaml' in real
+
+
+def test_real_recordings_are_split_three_to_one(
+    tables: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for index in range(8):
+        folder = tmp_path / 'lab' / f'{index:04d}'
+        folder.mkdir(parents=True)
+        (folder / 'metadata.yaml').write_text('{}')
+    options = tables.parser().parse_args(
+        ['--out', str(tmp_path / 'out'), '--real', str(tmp_path / 'lab'), '--real-view', 'ext1']
+    )
+    tables.PaperTables(options)._split_real()
+    counts = [len(list((tmp_path / 'out' / n).iterdir())) for n in ('real_train', 'real_test')]
+    assert counts == [6, 2]
