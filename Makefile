@@ -46,25 +46,25 @@ tests: $(STAMP)
 
 fuzz: $(STAMP)  ## damage everything that is read from outside (minutes); prints seed and table
 	@mkdir -p out
-	$(BIN)/python test/robustness/fuzz.py --json out/fuzz.json
+	$(BIN)/python -m test.robustness.fuzz --json out/fuzz.json
 
 kills: $(STAMP)  ## kill nodes, recorder and player at random moments (an hour); prints a table
-	$(BIN)/python test/robustness/kills.py
+	$(BIN)/python -m test.robustness.kills
 
 soak: $(STAMP)  ## 10,000 rollouts with faults (an hour); memory, threads, latency under out/soak/
-	$(BIN)/python test/robustness/soak.py
+	$(BIN)/python -m test.robustness.soak
 
 attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, open ports, hostile paths (three hours)
 	@mkdir -p out
-	$(BIN)/python test/robustness/rate.py
-	$(BIN)/python test/robustness/default_client.py
-	$(BIN)/python test/robustness/default_client.py --cameras 3 --transports UDPv4
-	$(BIN)/python test/robustness/cycles.py --bundled
-	$(BIN)/python test/robustness/odd_worlds.py
-	$(BIN)/python test/robustness/policy_servers.py --json out/servers.json
-	$(BIN)/python test/robustness/children.py
-	$(BIN)/python test/robustness/interrupts.py
-	$(BIN)/python test/robustness/listeners.py
+	$(BIN)/python -m test.robustness.rate
+	$(BIN)/python -m test.robustness.default_client
+	$(BIN)/python -m test.robustness.default_client --cameras 3 --transports UDPv4
+	$(BIN)/python -m test.robustness.cycles --bundled
+	$(BIN)/python -m test.robustness.odd_worlds
+	$(BIN)/python -m test.robustness.policy_servers --json out/servers.json
+	$(BIN)/python -m test.robustness.children
+	$(BIN)/python -m test.robustness.interrupts
+	$(BIN)/python -m test.robustness.listeners
 	MTV_WORLD_ATTACKS=all $(BIN)/python -m pytest -q test/robustness/test_commands.py test/robustness/test_examples.py
 
 upstream:  ## show what libraries do otherwise than documented, and which work-around of ours each guards (minutes)

@@ -26,8 +26,8 @@ import time
 import cv2
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / 'test' / 'viewing'))
-from browser import Browser  # noqa: E402
+sys.path.insert(0, str(ROOT))
+from test.support.browser import Browser  # noqa: E402
 
 WIDTH = 900
 #: colours of a picture: it is to be small

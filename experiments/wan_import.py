@@ -28,9 +28,11 @@ from page import parse_arguments, publish, ROOT, table
 import torch
 import yaml
 
-sys.path.insert(0, str(ROOT / 'test' / 'model'))
+sys.path.insert(0, str(ROOT))
 from diffusers import AutoencoderKLWan
-from wan_files import (
+
+from mtv_world_ros.training.training_config import load_training_config
+from test.support.wan_files import (
     clip_shapes,
     clip_text_shapes,
     Shapes,
@@ -38,9 +40,7 @@ from wan_files import (
     vae_original_name,
     write_tokenizer,
 )
-from wan_reference import video_tensors
-
-from mtv_world_ros.training.training_config import load_training_config
+from test.support.wan_reference import video_tensors
 
 _BYTES = {'BF16': 2, 'F16': 2, 'F32': 4}
 _GIB = 2**30

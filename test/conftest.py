@@ -11,7 +11,6 @@ import shutil
 import sys
 import warnings
 
-from left_behind import left, restore, state
 import pytest
 
 from mtv_world_ros.core.files import share_path
@@ -22,6 +21,7 @@ from mtv_world_ros.rollout.assembly import checkpoint_path
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.opengl import missing_opengl
 from mtv_world_ros.simulation.workcell import workcell_of
+from test.support.left_behind import left, restore, state
 
 
 def _no_gpu() -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_episodes import PersistenceWorldModel
 
 from mtv_world_ros.core.data_types import JointTrajectory, Observation, WorldModelSpec
 from mtv_world_ros.core.files import share_path
@@ -15,6 +14,7 @@ from mtv_world_ros.rollout.assembly import assemble
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.rollout import SEED_STEP
 from mtv_world_ros.success.calibration import HorizonCurve
+from test.support.small_episodes import PersistenceWorldModel
 
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=4, width=64, height=48, robot='yam_bimanual'

@@ -9,12 +9,12 @@ import threading
 import time
 
 import pytest
-from worker_jobs import LongJobs, make_held_back, make_stopping
 
 from mtv_world_ros.core.errors import MtvWorldError, TrainingError
 from mtv_world_ros.core.processes import stop_process, STOPPED_S, StoppedProcesses
 from mtv_world_ros.core.worker_pool import run_all, run_job, WorkerPool
 from mtv_world_ros.training.batches import ClipWorkers
+from test.robustness.worker_jobs import LongJobs, make_held_back, make_stopping
 
 
 @pytest.fixture

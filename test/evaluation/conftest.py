@@ -1,6 +1,6 @@
 """The small episodes, for every test of the evaluation."""
 
-from small_episodes import (
+from test.support.small_episodes import (
     blurred_oracle,
     episodes,
     make_episode,

@@ -1,6 +1,5 @@
 """J of the arm on a drawn robot: whole, half painted over, not there, held."""
 
-from crane import FPS, load, make_cameras, make_positions, write_episode
 import numpy as np
 import pytest
 
@@ -9,6 +8,7 @@ from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.evaluation.imagined_stretches import stretches
 from mtv_world_ros.evaluation.metrics.arm_masks import arm_scenes
 from mtv_world_ros.robot.shape import load_shape
+from test.support.crane import FPS, load, make_cameras, make_positions, write_episode
 
 
 @pytest.fixture(scope='module')

@@ -5,7 +5,6 @@ import re
 import shutil
 from urllib.parse import unquote
 
-from browser import Browser
 import numpy as np
 import pytest
 import yaml
@@ -17,6 +16,7 @@ from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.rollout.assembly import robot_path
 from mtv_world_ros.viewing.video import encode_video
 from mtv_world_ros.vision.jaccard import jaccard
+from test.support.browser import Browser
 
 FPS, ROWS = 5, 10
 MUG, SIZE = (120, 75, 45), (24, 20)

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-from crane import write_cuboid
 import cv2
 import numpy as np
 import pytest
@@ -22,6 +21,7 @@ from mtv_world_ros.inspection.motion_residual import (
     ResidualSearch,
 )
 from mtv_world_ros.robot.shape import load_shape, rods
+from test.support.crane import write_cuboid
 
 QUICK = ResidualSearch(max_pairs=25, lags_s=(0.0,), rolls_deg=(), zooms=())
 

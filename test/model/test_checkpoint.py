@@ -8,7 +8,6 @@ from pathlib import Path
 from diffusers import FlowMatchEulerDiscreteScheduler
 import numpy as np
 import pytest
-from small_transformer import build, CARD, inputs, SMALL
 import torch
 
 from mtv_world_ros.control.control import ControlInputs
@@ -17,6 +16,7 @@ from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mtv_world_ros.model.world_model import DiffusionWorldModel
+from test.support.small_transformer import build, CARD, inputs, SMALL
 
 
 @pytest.fixture

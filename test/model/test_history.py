@@ -8,7 +8,6 @@ from typing import Any
 from diffusers import FlowMatchEulerDiscreteScheduler
 import numpy as np
 import pytest
-from small_transformer import build, CARD, inputs, PATCH, SMALL
 import torch
 from torch import Tensor
 
@@ -20,6 +19,7 @@ from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.transformer.tokens import MultiViewRotaryPosEmbed
 from mtv_world_ros.model.world_model import DiffusionWorldModel
+from test.support.small_transformer import build, CARD, inputs, PATCH, SMALL
 
 CONFIGS = {'conv': (SMALL, 0), 'patch': (PATCH, 16)}
 

@@ -14,13 +14,13 @@ import pytest
 from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
-from wan_files import DIM, FFN, LAYERS
-from wan_lora import build, RANK, run
 
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.lora import Adapters
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.adapter import TARGETS
+from test.support.wan_files import DIM, FFN, LAYERS
+from test.support.wan_lora import build, RANK, run
 
 Pairs = dict[str, tuple[Tensor, Tensor]]
 LORA = 'pytorch_lora_weights.safetensors'

@@ -9,7 +9,13 @@ import shutil
 import pytest
 from safetensors.torch import load_file, save_file
 import torch
-from wan_files import (
+import yaml
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.core.errors import CheckpointError
+from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from mtv_world_ros.model.wan_weights import import_weights, PartReport
+from test.support.wan_files import (
     AUTOENCODER,
     CARD,
     clip_weights,
@@ -22,12 +28,6 @@ from wan_files import (
     write_tokenizer,
     write_videox,
 )
-import yaml
-
-from mtv_world_ros.cli import main
-from mtv_world_ros.core.errors import CheckpointError
-from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from mtv_world_ros.model.wan_weights import import_weights, PartReport
 
 WEIGHTS = 'diffusion_pytorch_model.safetensors'
 

@@ -11,8 +11,6 @@ import hashlib
 from diffusers import AutoencoderKLWan
 import pytest
 import torch
-from wan_files import clip_shapes, clip_text_shapes, Shapes, umt5_shapes, vae_original_name
-from wan_reference import video_tensors
 
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.wan_keys import (
@@ -24,6 +22,14 @@ from mtv_world_ros.model.wan_keys import (
 )
 from mtv_world_ros.model.wan_weights import NEW
 from mtv_world_ros.training.training_config import load_training_config
+from test.support.wan_files import (
+    clip_shapes,
+    clip_text_shapes,
+    Shapes,
+    umt5_shapes,
+    vae_original_name,
+)
+from test.support.wan_reference import video_tensors
 
 
 def hash_of(shapes: Shapes) -> str:

@@ -8,14 +8,14 @@ import pytest
 from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
-from wan_files import DIM
-from wan_lora import build, RANK, run
 
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.lora import ADAPTER, Adapters
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.adapter import add_adapter, save_adapter
 from mtv_world_ros.training.training_config import load_training_config
+from test.support.wan_files import DIM
+from test.support.wan_lora import build, RANK, run
 
 
 def trained(folder: Path, alpha: float = 8.0, seed: int = 5) -> Tensor:

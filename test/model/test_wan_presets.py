@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
-from wan_reference import video_tensors
 
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.training_config import load_training_config
+from test.support.wan_reference import video_tensors
 
 #: the published configurations of Wan2.1-Fun-V1.1-Control: width, ffn, blocks, heads
 PUBLISHED = {'wan-1.3b': (1536, 8960, 30, 12), 'wan-14b': (5120, 13824, 40, 40)}

@@ -1,7 +1,8 @@
 """The robot that `config/` knows nothing of, for the tests of its recordings."""
 
-from crane import load
 import pytest
+
+from test.support.crane import load
 
 
 @pytest.fixture(scope='module')

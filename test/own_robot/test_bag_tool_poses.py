@@ -1,7 +1,5 @@
 """`mtv-world import-bag` of recordings whose commands are poses of the tool."""
 
-from bags import Bag, bag_cameras, grey_frames, MAPPING, record
-from crane import FPS, make_positions, START_NS
 import numpy as np
 import pytest
 import yaml
@@ -10,6 +8,8 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.core.transforms import quaternion
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.episode_reader import read_episode
+from test.support.bags import Bag, bag_cameras, grey_frames, MAPPING, record
+from test.support.crane import FPS, make_positions, START_NS
 
 NUM = 20
 

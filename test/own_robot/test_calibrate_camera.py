@@ -3,7 +3,6 @@
 from dataclasses import replace
 import shutil
 
-from crane import load, make_cameras, make_positions, write_episode
 import cv2
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
 from mtv_world_ros.inspection.cameras.wrist_camera import follow_scene, WristCamera
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.robot.shape import load_shape
+from test.support.crane import load, make_cameras, make_positions, write_episode
 
 
 def test_a_fixed_camera_is_found_from_a_guess_in_a_part_of_the_recording(tmp_path, capsys):

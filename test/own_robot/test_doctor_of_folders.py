@@ -4,16 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 import shutil
 
-from crane import (
-    FPS,
-    load,
-    looking_at,
-    make_cameras,
-    make_positions,
-    render,
-    START_NS,
-    write_robot,
-)
 import numpy as np
 import pytest
 
@@ -37,6 +27,16 @@ from mtv_world_ros.inspection.stored_masks import check_masks
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.training.training_run import check_recording
+from test.support.crane import (
+    FPS,
+    load,
+    looking_at,
+    make_cameras,
+    make_positions,
+    render,
+    START_NS,
+    write_robot,
+)
 
 SECONDS = 3.0
 QUICK = ResidualSearch(lags_s=(0.0,), rolls_deg=(), zooms=())

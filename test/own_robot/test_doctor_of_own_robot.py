@@ -3,7 +3,6 @@
 from dataclasses import replace
 import shutil
 
-from crane import load, make_cameras, make_positions, tilted, write_episode
 import numpy as np
 import pytest
 
@@ -12,6 +11,7 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.inspection.inspect import Inspector
 from mtv_world_ros.inspection.motion_residual import ResidualSearch
 from mtv_world_ros.robot.shape import load_shape, moving_links
+from test.support.crane import load, make_cameras, make_positions, tilted, write_episode
 
 SEARCH = ResidualSearch(max_pairs=20, lags_s=(0.0,))
 

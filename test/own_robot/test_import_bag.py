@@ -4,8 +4,6 @@ from dataclasses import replace
 import re
 import shlex
 
-from bags import bag_cameras, MAPPING, record
-from crane import FPS, make_positions, render, START_NS, URDF
 import numpy as np
 import pytest
 import yaml
@@ -16,6 +14,8 @@ from mtv_world_ros.data.bag_mapping import load_bag_mapping
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.importing.bags import guess_views
 from mtv_world_ros.robot.file import load_robot
+from test.support.bags import bag_cameras, MAPPING, record
+from test.support.crane import FPS, make_positions, render, START_NS, URDF
 
 NUM = 25
 

@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 
-from bags import bag_cameras, grey_frames, MAPPING, record
-from crane import FPS, JOINTS, make_cameras, make_positions, URDF, write_episode, write_robot
 import numpy as np
 import pytest
 import yaml
@@ -20,6 +18,16 @@ from mtv_world_ros.inspection.motion_residual import ResidualSearch
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.offline import observe
+from test.support.bags import bag_cameras, grey_frames, MAPPING, record
+from test.support.crane import (
+    FPS,
+    JOINTS,
+    make_cameras,
+    make_positions,
+    URDF,
+    write_episode,
+    write_robot,
+)
 
 NUM = 30
 SEARCH = ResidualSearch(max_pairs=4, lags_s=(0.0,))

@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-from bags import bag_cameras, grey_frames, record
-from crane import FPS, JOINTS, make_positions, render, START_NS
 import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message
@@ -19,6 +17,8 @@ from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer, SensedScene
 from mtv_world_ros.ros.world_model.rollouts import RequestMaker
+from test.support.bags import bag_cameras, grey_frames, record
+from test.support.crane import FPS, JOINTS, make_positions, render, START_NS
 
 NUM = 25
 TOPIC = '/cell/joint_trajectory'

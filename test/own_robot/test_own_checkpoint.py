@@ -3,9 +3,7 @@
 import json
 import shutil
 
-from crane import load, make_cameras, make_positions, write_episode
 import pytest
-from sources import set_options, TINY_MODEL
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.cli import main
@@ -13,6 +11,8 @@ from mtv_world_ros.core.errors import CalibrationError, CheckpointError, ConfigE
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.assembly import checkpoint_cameras, checkpoint_robot
+from test.support.crane import load, make_cameras, make_positions, write_episode
+from test.support.sources import set_options, TINY_MODEL
 
 TINY = set_options(
     {

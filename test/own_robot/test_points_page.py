@@ -3,13 +3,13 @@
 import json
 from urllib.parse import unquote
 
-from browser import Browser
-from crane import load, make_cameras, make_positions, write_episode
 import numpy as np
 import pytest
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.inspection.cameras.shared_camera import load_points
+from test.support.browser import Browser
+from test.support.crane import load, make_cameras, make_positions, write_episode
 
 #: of frame f, number k of all, `at` clicks a pixel of the recorded image (320 px wide)
 CLICK = (

@@ -2,7 +2,6 @@
 
 from xml.etree import ElementTree
 
-from crane import load, URDF, write_robot
 import cv2
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from mtv_world_ros.core.errors import RobotError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.importing.robot_guess import guess_robot
 from mtv_world_ros.robot.file import load_robot
+from test.support.crane import load, URDF, write_robot
 
 
 @pytest.fixture

@@ -3,14 +3,6 @@
 from dataclasses import replace
 import re
 
-from crane import (
-    load,
-    looking_at,
-    make_cameras,
-    make_positions,
-    tool_pixels,
-    write_episode,
-)
 import numpy as np
 import pytest
 import yaml
@@ -23,6 +15,14 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.inspection.camera_pose import moved
 from mtv_world_ros.inspection.cameras import joint_camera
 from mtv_world_ros.inspection.places import background, find_places, turn_between
+from test.support.crane import (
+    load,
+    looking_at,
+    make_cameras,
+    make_positions,
+    tool_pixels,
+    write_episode,
+)
 
 SECONDS = 5.0
 

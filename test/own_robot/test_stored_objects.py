@@ -3,9 +3,6 @@
 from dataclasses import replace
 import json
 
-from bags import bag_cameras, MAPPING, record
-from chat_server import ChatServer, completion
-from crane import FPS, make_positions, render
 import numpy as np
 import pytest
 import yaml
@@ -20,6 +17,9 @@ from mtv_world_ros.data.recordings import cut_clip, described_objects
 from mtv_world_ros.rollout.assembly import assemble_describer
 from mtv_world_ros.training.clip_controls import ControlMaker
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from test.support.bags import bag_cameras, MAPPING, record
+from test.support.chat_server import ChatServer, completion
+from test.support.crane import FPS, make_positions, render
 
 pytest.importorskip('openai')
 NUM = 40

@@ -1,16 +1,16 @@
 """Recordings of which nothing is known but images and joints, and mappings with more views."""
 
-from bags import bag_cameras, MAPPING, record
-from crane import FPS, make_positions, render
 import numpy as np
 import pytest
-from test_import_bag import run
 import yaml
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import CalibrationError
 from mtv_world_ros.data.bag_mapping import load_bag_mapping
 from mtv_world_ros.data.episode_reader import read_episode
+from test.own_robot.test_import_bag import run
+from test.support.bags import bag_cameras, MAPPING, record
+from test.support.crane import FPS, make_positions, render
 
 
 @pytest.fixture

@@ -14,12 +14,9 @@ import signal
 import subprocess
 import sys
 
-from bags import MAPPING, record
-from crane import FPS, load, make_cameras, make_positions, render, tool_pixels
 import cv2
 import numpy as np
 import pytest
-from test_own_checkpoint import TINY
 import yaml
 
 from mtv_world_ros.cameras.camera import project
@@ -29,6 +26,9 @@ from mtv_world_ros.inspection.cameras import joint_camera
 from mtv_world_ros.physics.fitting import contact_fit
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.viewing.video import encode_video
+from test.own_robot.test_own_checkpoint import TINY
+from test.support.bags import MAPPING, record
+from test.support.crane import FPS, load, make_cameras, make_positions, render, tool_pixels
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'your_robot.md'
 #: names on the page, and those of the test's robot

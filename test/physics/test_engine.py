@@ -7,7 +7,6 @@ import time
 
 import numpy as np
 import pytest
-import small_scene
 
 from mtv_world_ros.core.errors import RolloutPreempted
 from mtv_world_ros.physics import engine as engine_module
@@ -18,6 +17,7 @@ from mtv_world_ros.physics.engine import Engine
 from mtv_world_ros.physics.futures import draw_futures
 from mtv_world_ros.physics.solid_foresight import SolidForesight, TrackedSolids
 from mtv_world_ros.physics.solids import Solid
+from test.support import small_scene
 
 SETTINGS = small_scene.SETTINGS.model_copy(update={'num_motions': 4})
 BLOCK = Solid(centre=np.array([0.0, 0.0, 0.02]), size=np.array([0.02, 0.03, 0.04]))

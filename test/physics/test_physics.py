@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_scene import batch_of, SETTINGS
 
 from mtv_world_ros.physics.solids import Solid
+from test.support.small_scene import batch_of, SETTINGS
 
 G = 9.81
 #: away from the hand

@@ -8,7 +8,6 @@ import struct
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, Delaunay
-from small_scene import batch_of, SETTINGS
 
 from mtv_world_ros.core.errors import RobotError
 from mtv_world_ros.core.files import share_path
@@ -18,6 +17,7 @@ from mtv_world_ros.physics.futures import draw_futures
 from mtv_world_ros.physics.robot_parts import load_parts
 from mtv_world_ros.physics.solids import Solid
 from mtv_world_ros.robot.file import load_robot, save_robot
+from test.support.small_scene import batch_of, SETTINGS
 
 MESH = """<robot name="mesh"><link name="base"/>
   <link name="arm"><collision><geometry><mesh filename="{file}" scale="2 2 2"/></geometry>

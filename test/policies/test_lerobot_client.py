@@ -3,8 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from policy_servers import HOME, make_policy, observe, policy_values, ROBOT, running
 import pytest
+
+from test.support.policy_servers import HOME, make_policy, observe, policy_values, ROBOT, running
 
 pytest.importorskip('grpc', reason='grpcio is not installed (pip install .[policies])')
 pytest.importorskip('google.protobuf', reason='protobuf is not installed')

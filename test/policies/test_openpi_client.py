@@ -4,8 +4,9 @@ import socket
 import time
 
 import numpy as np
-from policy_servers import HOME, make_policy, observe, policy_values, ROBOT, running
 import pytest
+
+from test.support.policy_servers import HOME, make_policy, observe, policy_values, ROBOT, running
 
 pytest.importorskip('msgpack', reason='msgpack is not installed (pip install .[policies])')
 pytest.importorskip('websockets', reason='websockets is not installed (pip install .[policies])')

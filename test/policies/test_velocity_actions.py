@@ -1,10 +1,11 @@
 """Policies that answer joint velocities, as openpi's DROID checkpoints do."""
 
 import numpy as np
-from openpi_server import DROID_VELOCITIES
-from policy_servers import policy_values, running
 import pytest
 import yaml
+
+from test.support.openpi_server import DROID_VELOCITIES
+from test.support.policy_servers import policy_values, running
 
 pytest.importorskip('msgpack', reason='msgpack is not installed (pip install .[policies])')
 pytest.importorskip('websockets', reason='websockets is not installed (pip install .[policies])')

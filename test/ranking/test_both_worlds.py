@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 
-from browser import Browser
 import numpy as np
 import pytest
 
@@ -15,6 +14,7 @@ from mtv_world_ros.reports.ranking_report import write_ranking
 from mtv_world_ros.reports.rollout_cards import curves, verdict, when_they_part, worst_first
 from mtv_world_ros.viewing.stored_rollout import load_rollout
 from mtv_world_ros.viewing.video import decode_video
+from test.support.browser import Browser
 
 NAN = float('nan')
 TASK = 'place_block_a2b_left'

@@ -7,9 +7,10 @@ import sys
 import time
 
 import numpy as np
-from policy_servers import HOME, observe
 import pytest
 import yaml
+
+from test.support.policy_servers import HOME, observe
 
 pytest.importorskip('msgpack', reason='msgpack is not installed (pip install .[policies])')
 pytest.importorskip('websockets', reason='websockets is not installed (pip install .[policies])')
@@ -26,7 +27,7 @@ from mtv_world_ros.ranking.policy_list import (
 )
 
 #: a websocket server of openpi's protocol whose prompt says what goes wrong
-SERVER = Path(__file__).parents[1] / 'policies' / 'openpi_server.py'
+SERVER = Path(__file__).parents[1] / 'support' / 'openpi_server.py'
 OPENPI = {
     'name': 'served', 'policy': 'openpi', 'change': {'timeout_s': 1.0},
     'command': [sys.executable, str(SERVER), '--port', '{port}'], 'start_timeout_s': 60.0,

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from small_episodes import PersistenceWorldModel
 
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate
 from mtv_world_ros.reports.comparison import (
@@ -15,6 +14,7 @@ from mtv_world_ros.reports.comparison import (
     task_tables,
     write_comparison,
 )
+from test.support.small_episodes import PersistenceWorldModel
 
 QUIET = {'show_progress': False}
 

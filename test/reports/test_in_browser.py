@@ -1,10 +1,10 @@
 """The report of an evaluation in a real browser: filters without a script, videos that play."""
 
-from browser import Browser
 import pytest
 
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate
 from mtv_world_ros.reports.evaluation_page import write_report
+from test.support.browser import Browser
 
 
 @pytest.fixture(scope='module')

@@ -9,7 +9,6 @@ import time
 import tracemalloc
 from xml.etree import ElementTree
 
-from accidents import chain, diamonds, entity_bomb, joint, nested, star, urdf_of
 import pytest
 
 from mtv_world_ros.core.errors import RobotError
@@ -17,6 +16,7 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.robot.file import parse_urdf
 from mtv_world_ros.robot.mesh_pieces import load_mesh, MissingMeshError
 from mtv_world_ros.robot.xml_file import check_xml, parse_xml, root_link
+from test.robustness.accidents import chain, diamonds, entity_bomb, joint, nested, star, urdf_of
 
 MOST_S, MOST_MB = 1.0, 100
 

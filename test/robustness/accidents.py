@@ -15,14 +15,14 @@ import tempfile
 from typing import Any
 
 import cv2
-from file_kinds import KINDS, timed_actions
 from mcap.writer import CompressionType, Writer
 import msgpack
-from node_messages import ros, whole
 import numpy as np
 import zstandard
 
 from mtv_world_ros.core.files import share_path
+from test.robustness.file_kinds import KINDS, timed_actions
+from test.robustness.node_messages import ros, whole
 
 
 def calibration(text: str, instead: str) -> bytes:

@@ -24,15 +24,15 @@ import time
 import traceback
 from typing import Any
 
-from node_messages import commit, ROOT, ros
 import numpy as np
-from policy_servers import _observation, fine, TIMEOUT_S
-from usage import descendants
 import yaml
 
 from mtv_world_ros.core.data_types import JointTrajectory
 from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.policies.openpi_client import pack
+from test.robustness.node_messages import commit, ROOT, ros
+from test.robustness.policy_servers import _observation, fine, TIMEOUT_S
+from test.robustness.usage import descendants
 
 #: an end that comes later than this after the signal is late; a case that takes longer froze [s]
 LATE_S, FROZEN_S = 20.0, 90

@@ -24,12 +24,12 @@ import time
 from typing import Any
 
 import cv2
-from node_messages import commit, ROOT
 import numpy as np
 
 from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.bag.reader import BagReader
+from test.robustness.node_messages import commit, ROOT
 
 #: an end that comes later than this after the signal is late; what is not over then is killed [s]
 LATE_S, FROZEN_S = 15.0, 120.0

@@ -25,17 +25,15 @@ import sys
 import time
 from typing import Any, NamedTuple
 
-from children import make_episode
-from node_messages import commit, ROOT, ros
 import numpy as np
 from rosbags.highlevel import AnyReader
-from usage import starved_s
 
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.importing.recover import find_damaged, recover
 from mtv_world_ros.ros.messages.conversions import read_stamp
-
-sys.path.insert(0, str(ROOT / 'test' / 'ros'))
+from test.robustness.children import make_episode
+from test.robustness.node_messages import commit, ROOT, ros
+from test.robustness.usage import starved_s
 
 #: a busy machine takes long to start a node
 START_S = 180.0
@@ -48,12 +46,13 @@ STARTING = 0.3
 
 def imported() -> dict[str, Callable[[], int]]:
     """What is run, by name; importing it takes seconds, which the fork server spends once."""
-    import fake_policy  # type: ignore[import-not-found]
-    import fake_world_model  # type: ignore[import-not-found]
-
     from mtv_world_ros.ros.bags import player, recorder
     from mtv_world_ros.ros.policy import node as policy
     from mtv_world_ros.ros.world_model import node
+    from test.support import (
+        fake_policy,  # type: ignore[import-not-found]
+        fake_world_model,  # type: ignore[import-not-found]
+    )
 
     def policy_main() -> int:
         return policy.main(load=lambda _: lambda task, scene_seed: fake_policy.FakePolicy(task))
@@ -128,10 +127,9 @@ class Kills:
     def __init__(self, out: Path, seed: int, longest_s: float) -> None:
         self._out, self._longest_s = out, longest_s
         self._seed = seed
-        here = Path(__file__).parent  # the fork server looks for its modules there
-        os.environ['PYTHONPATH'] = os.pathsep.join([str(here), str(ROOT)])
+        os.environ['PYTHONPATH'] = str(ROOT)  # the fork server looks for its modules there
         self._context = multiprocessing.get_context('forkserver')
-        self._context.set_forkserver_preload(['kills_preload'])
+        self._context.set_forkserver_preload(['test.robustness.kills_preload'])
         self._sent: list[int] = []
         self._heard = 0
         #: longest that a thread of the process waited for a processor, while it was at work

@@ -1,6 +1,6 @@
 """Sockets that processes listen on: none is reachable from another machine unless asked for.
 
-    python test/robustness/listeners.py
+    python -m test.robustness.listeners
 
 starts every command that opens a TCP port, prints where it listens, and fails on an address that
 is not the machine's own.

@@ -10,10 +10,9 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable
 from functools import cache
-import importlib.util
+import importlib
 from pathlib import Path
 import subprocess
-import sys
 from typing import Any
 
 import cv2
@@ -36,12 +35,7 @@ NOW_NS = 1_000_000_000_000
 @cache
 def ros() -> Any:
     """The messages and sizes of the tests over ROS."""
-    if 'ros_client' not in sys.modules:
-        spec = importlib.util.spec_from_file_location('ros_client', ROOT / 'test/ros/conftest.py')
-        assert spec is not None and spec.loader is not None
-        sys.modules['ros_client'] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules['ros_client'])
-    return sys.modules['ros_client']
+    return importlib.import_module('test.support.ros_nodes')
 
 
 def commit() -> str:

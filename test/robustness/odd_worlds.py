@@ -19,9 +19,10 @@ import sys
 import time
 from typing import Any
 
-from children import make_episode
-from node_messages import commit, ROOT, ros
 import numpy as np
+
+from test.robustness.children import make_episode
+from test.robustness.node_messages import commit, ROOT, ros
 
 #: this seed's chunks take 0.3 s
 SLOW = 1400

@@ -10,10 +10,11 @@ from functools import cache
 import os
 from typing import Any
 
-from folder_kinds import clean_up, new_folder
-from node_messages import FLOATS, WORDS
 import numpy as np
-import wild_plans
+
+from test.robustness import wild_plans
+from test.robustness.folder_kinds import clean_up, new_folder
+from test.robustness.node_messages import FLOATS, WORDS
 
 #: beyond those of tests that start nodes as processes of their own (1 to 100)
 _DOMAIN = 101

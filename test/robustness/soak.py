@@ -17,9 +17,10 @@ from pathlib import Path
 import time
 from typing import Any
 
-from node_messages import commit, ROOT, ros
 import numpy as np
-from usage import LABELS, plot, slope, usage
+
+from test.robustness.node_messages import commit, ROOT, ros
+from test.robustness.usage import LABELS, plot, slope, usage
 
 ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
 OUT_OF_MEMORY, CRASHES = 1100, 1300

@@ -11,9 +11,9 @@ from pathlib import Path
 import runpy
 
 import pytest
-from test_commands import PLACES
 
 from mtv_world_ros.core.errors import MtvWorldError
+from test.robustness.test_commands import PLACES
 
 EXAMPLES = Path(__file__).parents[2] / 'examples'
 #: scripts whose first argument is a path that is read

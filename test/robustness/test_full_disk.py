@@ -8,9 +8,7 @@ import os
 from pathlib import Path
 import subprocess
 
-from interrupts import ONE_STEP, settings
 import pytest
-from wan_files import AUTOENCODER, SCHEDULER, TRANSFORMER, write_videox
 import yaml
 
 from mtv_world_ros.cli import main
@@ -19,6 +17,8 @@ from mtv_world_ros.inspection import inspect
 from mtv_world_ros.inspection.camera_pose import CameraEstimate
 from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
 from mtv_world_ros.inspection.motion_residual import ResidualSearch
+from test.robustness.interrupts import ONE_STEP, settings
+from test.support.wan_files import AUTOENCODER, SCHEDULER, TRANSFORMER, write_videox
 
 EPISODE = share_path('resource', 'demo_episode')
 URDF = share_path('config', 'robots', 'yam_bimanual', 'yam_bimanual.urdf')

@@ -9,15 +9,13 @@ import resource
 import tempfile
 import tracemalloc
 
-from accidents import ACCIDENTS
-from file_kinds import Kind, KINDS
-import fuzz
-import node_messages
 import numpy as np
-import parameter_calls
 import pytest
 
 from mtv_world_ros.core.errors import MtvWorldError
+from test.robustness import fuzz, node_messages, parameter_calls
+from test.robustness.accidents import ACCIDENTS
+from test.robustness.file_kinds import Kind, KINDS
 
 SEED = 20261122
 COUNT = 40

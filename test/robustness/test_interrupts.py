@@ -6,10 +6,10 @@ from pathlib import Path
 import shutil
 import signal
 
-from interrupts import Attack, halves, WAYS
 import pytest
 
 from mtv_world_ros.core.files import share_path
+from test.robustness.interrupts import Attack, halves, WAYS
 
 
 @pytest.fixture(scope='module')

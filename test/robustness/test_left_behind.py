@@ -10,8 +10,9 @@ import subprocess
 import sys
 import threading
 
-from left_behind import left, state
 import pytest
+
+from test.support.left_behind import left, state
 
 SLEEP = 'import time; time.sleep({})'
 
@@ -27,7 +28,7 @@ def test_a_module_that_tidies_up_leaves_nothing() -> None:
 
 
 def test_every_trace_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('left_behind._PATIENCE_S', 0.0)
+    monkeypatch.setattr('test.support.left_behind._PATIENCE_S', 0.0)
     before, handler = state(), logging.NullHandler()
     old = signal.signal(signal.SIGALRM, lambda *_: None)
     logging.getLogger().addHandler(handler)

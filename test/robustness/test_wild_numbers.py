@@ -6,11 +6,9 @@ import json
 import shutil
 from xml.etree import ElementTree
 
-from folder_kinds import FOLDERS
 import pytest
 from safetensors.torch import load_file, save_file
 import torch
-from wan_files import AUTOENCODER, SCHEDULER, TRANSFORMER, write_videox
 import yaml
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
@@ -21,6 +19,8 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.model.checkpoint import load_checkpoint
 from mtv_world_ros.physics.checkpoint_files import load_contact
 from mtv_world_ros.robot.file import load_robot
+from test.robustness.folder_kinds import FOLDERS
+from test.support.wan_files import AUTOENCODER, SCHEDULER, TRANSFORMER, write_videox
 
 
 @pytest.mark.parametrize('value', [float('nan'), float('inf'), -float('inf')])

@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import wild_plans
+
+from test.robustness import wild_plans
 
 #: time that is foreseen, and how long it may take [s of the processor]
 SECONDS, MOST_S = 2.0, 12.0

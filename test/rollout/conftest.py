@@ -1,6 +1,6 @@
 """The small episodes, for every test of the replay."""
 
-from small_episodes import episodes, make_episode, make_pipeline, oracle, recordings
+from test.support.small_episodes import episodes, make_episode, make_pipeline, oracle, recordings
 
 __all__ = [
     'episodes',

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_episodes import PersistenceWorldModel
 
 from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.cameras.mask_geometry import centroids, locate
@@ -49,6 +48,7 @@ from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.success.calibration import Fits, load_fits
 from mtv_world_ros.success.doubts import Grounds
 from mtv_world_ros.vision.describers.describer import DescribedObject
+from test.support.small_episodes import PersistenceWorldModel
 
 SPEC = WorldModelSpec(
     views=('low', 'high'), fps=5.0, num_frames=8, width=64, height=48, robot='yam_bimanual'

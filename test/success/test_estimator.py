@@ -1,4 +1,3 @@
-from drawn_blocks import BLUE, CAMERAS, footage, LEFT, masks, NAMES, path, POSES, RED, STACK
 import numpy as np
 import pytest
 
@@ -9,6 +8,18 @@ from mtv_world_ros.success.calibration import Calibration, Weights
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.success.fitted_to import FittedTo, Setting
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from test.support.drawn_blocks import (
+    BLUE,
+    CAMERAS,
+    footage,
+    LEFT,
+    masks,
+    NAMES,
+    path,
+    POSES,
+    RED,
+    STACK,
+)
 
 
 def judge(shown, instruction=LEFT, task=None):

@@ -1,7 +1,6 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-from drawn_blocks import BLUE, footage, LEFT, masks, NAMES, path, RED
 import numpy as np
 import pytest
 
@@ -12,6 +11,7 @@ from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.success.foreseen import foreseen_ends, foreseen_feature
 from mtv_world_ros.success.task import match_task
+from test.support.drawn_blocks import BLUE, footage, LEFT, masks, NAMES, path, RED
 
 TASKS = load_tasks(share_path('config', 'tasks'))
 GOAL = (BLUE[0] - 0.13, BLUE[1], 0.025)

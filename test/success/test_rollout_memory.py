@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-from drawn_blocks import BLUE, CAMERAS, footage, LEFT, masks, path, POSES, RED, STACK
 import numpy as np
 import pytest
 
@@ -10,6 +9,7 @@ from mtv_world_ros.cameras.mask_geometry import count_reversals
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.success.rollout_memory import MAX_FRAMES, remember
+from test.support.drawn_blocks import BLUE, CAMERAS, footage, LEFT, masks, path, POSES, RED, STACK
 
 HOME = np.array([0.25, 0.15, 0.15])
 GOAL = (BLUE[0] - 0.13, BLUE[1], 0.025)

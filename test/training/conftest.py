@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from sources import make_source, TINY_MODEL
 
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
+from test.support.sources import make_source, TINY_MODEL
 
 TINY = TINY_MODEL | {
     'transformer.frames_per_token': 2,

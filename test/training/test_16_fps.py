@@ -4,10 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
-from sources import set_options, TINY_MODEL
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.simulation.opengl import missing_opengl
+from test.support.sources import set_options, TINY_MODEL
 
 #: everything small but time: 80 frames at 16 fps after the observed one, 5 s
 MINIATURE = TINY_MODEL | {

@@ -13,7 +13,6 @@ import signal
 
 import numpy as np
 import pytest
-from sources import make_source, make_trainer
 import torch
 
 from mtv_world_ros.cli.train import found_broken, set_overrides
@@ -32,6 +31,7 @@ from mtv_world_ros.training.resume import DiskError
 from mtv_world_ros.training.training_config import TrainingRun
 from mtv_world_ros.training.training_run import load_recordings, notes, train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from test.support.sources import make_source, make_trainer
 
 Change = Callable[[BagMessage], list[bytes]]
 

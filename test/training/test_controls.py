@@ -7,7 +7,6 @@ from pathlib import Path
 import shutil
 
 import pytest
-from sources import make_source, ONE_STEP
 import torch
 
 from mtv_world_ros.cli import main
@@ -18,6 +17,7 @@ from mtv_world_ros.training.objective import pooled_weights
 from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
 from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from test.support.sources import make_source, ONE_STEP
 
 
 def run(config: TrainingConfig, episode: Path, out: Path, robot: RobotModel, **options) -> Path:

@@ -11,15 +11,15 @@ from types import SimpleNamespace
 
 import pytest
 from safetensors.torch import load_file
-from sources import make_trainer, run_script, write_preset
 import torch
 
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import TrainingConfig
+from test.support.sources import make_trainer, run_script, write_preset
 
-SCRIPT = Path(__file__).with_name('train_recorded.py')
+SCRIPT = Path(__file__).parents[1] / 'support' / 'train_recorded.py'
 #: of two processes one gets two of the clips of a step
 THREE_CLIPS = {'batch_size': 3, 'max_grad_norm': 1e6}
 

@@ -1,13 +1,13 @@
 """What a step takes: counted on shapes, against a step that is really computed."""
 
 import pytest
-from sources import TINY_MODEL
 import torch
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.dry_run import step_cost
 from mtv_world_ros.training.training_config import load_training_config
+from test.support.sources import TINY_MODEL
 
 
 def test_counts_what_a_real_step_does():

@@ -7,7 +7,6 @@ from pathlib import Path
 import shutil
 
 import pytest
-from sources import ONE_STEP
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import ConfigError
@@ -16,6 +15,7 @@ from mtv_world_ros.training.training_config import TrainingRun
 from mtv_world_ros.training.training_run import HeldOut, HeldOutScores, train
 from mtv_world_ros.viewing.video import decode_video
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from test.support.sources import ONE_STEP
 
 
 def test_the_best_checkpoint_by_the_judge_is_kept(episode, tiny, robot, tmp_path):

@@ -6,8 +6,9 @@ import json
 import shutil
 
 from safetensors.torch import load_file
-from sources import make_trainer, run_script, write_preset
 import torch
+
+from test.support.sources import make_trainer, run_script, write_preset
 
 
 def test_kill_9_changes_neither_curve_nor_weights(tiny, episode, tmp_path):

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sources import make_source, make_trainer
 import torch
 
 from mtv_world_ros.core.data_types import History, JointTrajectory, Observation
@@ -29,6 +28,7 @@ from mtv_world_ros.training.training_config import (
     TrainingConfig,
 )
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from test.support.sources import make_source, make_trainer
 
 
 @pytest.fixture

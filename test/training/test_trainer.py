@@ -9,7 +9,6 @@ import sys
 
 import numpy as np
 import pytest
-from sources import losses_of, make_source, make_trainer
 import torch
 
 from mtv_world_ros.core.errors import ConfigError, TrainingError
@@ -23,6 +22,7 @@ from mtv_world_ros.training.training_config import (
 )
 from mtv_world_ros.training.training_run import find_episodes, train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from test.support.sources import losses_of, make_source, make_trainer
 
 
 def test_a_killed_run_continues_as_if_nothing_had_happened(tiny, source, tmp_path):

@@ -9,13 +9,13 @@ import shutil
 
 import pytest
 import torch
-from wan_base import tiny_preset
-from wan_files import write_videox
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.card import check_same_model, HistorySettings, read_card
 from mtv_world_ros.training.training_config import load_training_config
+from test.support.wan_base import tiny_preset
+from test.support.wan_files import write_videox
 
 SMALL = ['--dtype', 'float32', '--threads', '1']
 

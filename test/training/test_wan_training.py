@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.torch import load_file
-from sources import losses_of, make_source, make_trainer
 import torch
-from wan_base import make_base, tiny_preset
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.control.control import ControlInputs
@@ -28,6 +26,8 @@ from mtv_world_ros.training.training_config import (
 )
 from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from test.support.sources import losses_of, make_source, make_trainer
+from test.support.wan_base import make_base, tiny_preset
 
 CPU = torch.device('cpu')
 

@@ -1,7 +1,8 @@
 from pathlib import Path
 
 import pytest
-from tiny_vision import save_dino, save_sam2, save_sam3
+
+from test.support.tiny_vision import save_dino, save_sam2, save_sam3
 
 
 @pytest.fixture(scope='session')

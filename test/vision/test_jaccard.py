@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from square_masks import objects, square
 
 from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.vision.jaccard import (
@@ -12,6 +11,7 @@ from mtv_world_ros.vision.jaccard import (
     object_jaccard,
     score_statuses,
 )
+from test.support.square_masks import objects, square
 
 
 def test_square_of_27_px_displaced_by_10_px_scores_0_46():

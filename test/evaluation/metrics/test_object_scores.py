@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from square_masks import objects, square
 
 from mtv_world_ros.evaluation.metrics.jaccard_scores import keep_doubts
 from mtv_world_ros.evaluation.metrics.object_scores import boundary_f, moves, object_scores
+from test.support.square_masks import objects, square
 
 
 def test_union_and_object_mean_differ_when_objects_swap_identity():

@@ -12,11 +12,8 @@ from typing import Any
 from diffusers.models.attention_dispatch import _AttentionBackendRegistry
 import numpy as np
 import pytest
-from small_transformer import build
 import torch
 from torch import Tensor
-from wan_files import TRANSFORMER
-from wan_predictions import imported, predict
 
 from mtv_world_ros.core.errors import CheckpointError, ConfigError, ModelMemoryError
 from mtv_world_ros.model import serving
@@ -28,6 +25,9 @@ from mtv_world_ros.model.serving import ServingOptions
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.training.training_config import HistoryConfig, load_training_config
+from test.support.small_transformer import build
+from test.support.wan_files import TRANSFORMER
+from test.support.wan_predictions import imported, predict
 
 
 @pytest.fixture(scope='module')

@@ -13,9 +13,6 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from wan_encoder_reference import clip_tokens, umt5_encode
-from wan_files import CARD, clip_weights, umt5_weights, vae_model
-from wan_predictions import frames, imported, predict, T, VIEWS
 
 from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.data_types import History
@@ -27,6 +24,9 @@ from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.serving import compile_norms
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.training.adapter import add_adapter, save_adapter
+from test.support.wan_encoder_reference import clip_tokens, umt5_encode
+from test.support.wan_files import CARD, clip_weights, umt5_weights, vae_model
+from test.support.wan_predictions import frames, imported, predict, T, VIEWS
 
 
 @pytest.fixture(scope='module')

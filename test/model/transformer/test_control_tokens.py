@@ -6,13 +6,13 @@ from dataclasses import asdict
 from typing import Any
 
 import pytest
-from small_transformer import build, inputs, PATCH, SMALL
 import torch
 
 from mtv_world_ros.control.control import ContextInput, FrameInput, InputLayout
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.conditioning import pad_rows
 from mtv_world_ros.model.transformer.control_tokens import by_slot, Context
+from test.support.small_transformer import build, inputs, PATCH, SMALL
 
 FRAMES, SIZE = 4, 14
 #: with patches nothing is merged in time, so a token frame is a video frame

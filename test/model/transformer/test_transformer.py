@@ -1,12 +1,12 @@
 """The transformer: shapes, view symmetry, and no leak of reference tokens."""
 
 import pytest
-from small_transformer import build, inputs, PATCH, SMALL
 import torch
 
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.transformer import attention
 from mtv_world_ros.model.transformer.attention import attend
+from test.support.small_transformer import build, inputs, PATCH, SMALL
 
 CONFIGS = {'conv': (SMALL, 0), 'patch': (PATCH, 16)}
 

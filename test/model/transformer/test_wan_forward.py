@@ -8,13 +8,20 @@ import pytest
 from safetensors.torch import save_file
 import torch
 from torch import Tensor
-from wan_files import CLIP_DIM, HEADS, LAYERS, TEXT_DIM, TRANSFORMER, transformer_weights
-from wan_reference import wan_forward
 
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.tensor_files import open_tensors
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.wan_keys import transformer_keys
+from test.support.wan_files import (
+    CLIP_DIM,
+    HEADS,
+    LAYERS,
+    TEXT_DIM,
+    TRANSFORMER,
+    transformer_weights,
+)
+from test.support.wan_reference import wan_forward
 
 FRAMES, SIZE = 3, 8
 

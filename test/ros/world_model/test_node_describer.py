@@ -3,7 +3,6 @@
 import base64
 import json
 
-from chat_server import ChatServer, completion, error
 import cv2
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
 from mtv_world_ros.ros.messages.image_messages import to_rgb
+from test.support.chat_server import ChatServer, completion, error
 
 pytest.importorskip('openai')
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from sources import make_source, with_batch_size
 import torch
 
 from mtv_world_ros.core.errors import CheckpointError, ConfigError
@@ -20,6 +19,7 @@ from mtv_world_ros.training.training_config import (
     load_training_config,
     TrainingConfig,
 )
+from test.support.sources import make_source, with_batch_size
 
 HISTORY = HistoryConfig(num_frames=4, reference='first_frame')
 

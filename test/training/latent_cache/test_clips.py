@@ -8,9 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from safetensors.torch import load_file, save_file
-from sources import make_source, with_batch_size
 import torch
-from wan_base import make_base, tiny_preset
 
 from mtv_world_ros.core.errors import ConfigError, TrainingError
 from mtv_world_ros.data.recording import load_recording
@@ -23,6 +21,8 @@ from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.latent_cache import cached, CachedSource
 from mtv_world_ros.training.objective import pixel_weights, pooled_weights
 from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
+from test.support.sources import make_source, with_batch_size
+from test.support.wan_base import make_base, tiny_preset
 
 CPU = torch.device('cpu')
 

@@ -10,7 +10,6 @@ import pickle
 import socket
 import time
 
-from chat_server import after, break_off, ChatServer, completion, dribble, error, knows_only
 import cv2
 import numpy as np
 import pytest
@@ -19,6 +18,15 @@ from mtv_world_ros.core.errors import ConfigError, DescriptionError
 from mtv_world_ros.vision.describers.describer import DescribedObject
 from mtv_world_ros.vision.describers.openai_chat import OpenAIChat, OpenAIConfig, retry_after
 from mtv_world_ros.vision.describers.vlm import DescriptionCache, VlmDescriber
+from test.support.chat_server import (
+    after,
+    break_off,
+    ChatServer,
+    completion,
+    dribble,
+    error,
+    knows_only,
+)
 
 pytest.importorskip('openai')
 

@@ -2,7 +2,6 @@ import os
 
 import numpy as np
 import pytest
-from tiny_vision import save_sam2
 import torch
 
 from mtv_world_ros.core.errors import ModelMemoryError, ObservationError
@@ -17,6 +16,7 @@ from mtv_world_ros.vision.segmenters.sam import (
     sam3_segmenter,
 )
 from mtv_world_ros.vision.segmenters.tracking import TrackingConfig
+from test.support.tiny_vision import save_sam2
 
 HEIGHT, WIDTH = 48, 64
 NAMES = ('red block', 'blue cup')

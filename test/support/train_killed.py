@@ -16,7 +16,7 @@ import sys
 import time
 import traceback
 
-from sources import run_training
+from test.support.sources import run_training
 
 _KILLS = 4
 

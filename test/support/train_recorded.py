@@ -10,11 +10,11 @@ from pathlib import Path
 import sys
 
 from safetensors.torch import save_file
-from sources import run_training
 import torch
 
 from mtv_world_ros.training.batches import ClipBatch
 from mtv_world_ros.training.trainer import Trainer
+from test.support.sources import run_training
 
 
 def record(out: Path) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from wan_files import CLIP_DIM, TEXT_DIM, TRANSFORMER
 
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
+from test.support.wan_files import CLIP_DIM, TEXT_DIM, TRANSFORMER
 
 RANK = 4
 

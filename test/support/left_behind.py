@@ -14,10 +14,11 @@ from typing import Any
 
 #: what stops a process, ends its children or wakes it
 _SIGNALS = ('SIGINT', 'SIGTERM', 'SIGALRM', 'SIGCHLD', 'SIGHUP', 'SIGUSR1', 'SIGUSR2')
-#: libraries and `test/ros/conftest.py` set these when they are imported, always to the same
+#: libraries and `test/support/ros_nodes.py` set these when they are imported, always to the same
 _SET_BY_IMPORTS = (
     'ROS_DOMAIN_ID',
     'ROS_AUTOMATIC_DISCOVERY_RANGE',
+    'FASTRTPS_DEFAULT_PROFILES_FILE',
     'MUJOCO_GL',
     'PYOPENGL_PLATFORM',
     'TORCHINDUCTOR_CACHE_DIR',

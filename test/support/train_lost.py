@@ -12,9 +12,8 @@ import socket
 import sys
 import time
 
-from sources import run_training
-
 from mtv_world_ros.core.errors import MtvWorldError
+from test.support.sources import run_training
 
 
 def start(number: int, port: int, out: Path, episodes: Path, preset: Path) -> int:

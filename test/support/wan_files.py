@@ -14,9 +14,9 @@ from safetensors.torch import save_file
 from tokenizers import models, pre_tokenizers, Tokenizer
 import torch
 from transformers import PreTrainedTokenizerFast
-from wan_reference import random_weights, video_tensors, Weights
 
 from mtv_world_ros.model.card import CheckpointCard
+from test.support.wan_reference import random_weights, video_tensors, Weights
 
 Shapes = dict[str, tuple[int, ...]]
 

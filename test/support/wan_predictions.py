@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from wan_files import AUTOENCODER, CARD, SCHEDULER, TRANSFORMER, write_videox
 
 from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.model.wan_weights import import_weights
 from mtv_world_ros.model.world_model import DiffusionWorldModel
+from test.support.wan_files import AUTOENCODER, CARD, SCHEDULER, TRANSFORMER, write_videox
 
 VIEWS, T = 2, 4
 

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from wan_files import AUTOENCODER, TRANSFORMER, write_videox
 import yaml
 
 from mtv_world_ros.model.wan_weights import import_weights
 from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
+from test.support.wan_files import AUTOENCODER, TRANSFORMER, write_videox
 
 #: the preset of the paper's size, made tiny; the episode has 5 frames a second
 CHANGES: dict[str, dict[str, Any]] = {

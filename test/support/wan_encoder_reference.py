@@ -11,7 +11,8 @@ import math
 import torch
 from torch import Tensor
 import torch.nn.functional as F
-from wan_reference import Weights
+
+from test.support.wan_reference import Weights
 
 
 def umt5_encode(w: Weights, ids: Tensor, *, layers: int, heads: int) -> Tensor:

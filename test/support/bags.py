@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from crane import FPS, JOINTS, make_cameras, render, START_NS, URDF
 import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
@@ -16,6 +15,7 @@ from mtv_world_ros.core.images import encode_jpeg
 from mtv_world_ros.core.transforms import inverse, quaternion
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.robot.model import RobotModel
+from test.support.crane import FPS, JOINTS, make_cameras, render, START_NS, URDF
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 FRAMES = {'door': 'door_optical', 'palm': 'palm_optical'}
