@@ -46,7 +46,13 @@ from mtv_world_ros.data.episode import (
     parse_info,
     Track,
 )
-from mtv_world_ros.data.joint_plans import complete_plans, following, join_streams, read_plan
+from mtv_world_ros.data.joint_plans import (
+    complete_plans,
+    following,
+    hold_at_stops,
+    join_streams,
+    read_plan,
+)
 from mtv_world_ros.data.measured_joints import merge_joint_states
 from mtv_world_ros.data.stream_clocks import (
     arrival_times,
@@ -482,10 +488,24 @@ class _EpisodeReader:
             if leader is None:
                 return []
             return following(leader, self.mapping.chunk_s, self.seen_ns)
-        plans = self._parsed(topic, messages.JOINT_TRAJECTORY, self._plan)
+        plan = self._plan if states is None else self._plan_or_stop
+        plans = self._parsed(topic, messages.JOINT_TRAJECTORY, plan)
+        if states is not None:
+            plans, count = hold_at_stops(plans, states)
+            if count:
+                self._warn_once(
+                    f"'{topic}': {count} empty trajectories stop the plans before them; the "
+                    'measured positions are held from then on, until the next plan'
+                )
         if topic not in self.types and (others := self._topics_of(messages.JOINT_TRAJECTORY)):
             self._warn_once(f"no trajectories at '{topic}'; there are some at {_listed(others)}")
         return self._whole_plans(topic, plans, states)
+
+    def _plan_or_stop(self, message: Any) -> JointTrajectory | tuple[str, ...]:
+        """A plan, or the joints that an empty trajectory stops; empty = all."""
+        if not len(message.points):
+            return self._renamed(message.joint_names)
+        return self._plan(message)
 
     def _plan(self, message: Any) -> JointTrajectory:
         plan = read_plan(message)

@@ -119,6 +119,45 @@ def following(states: JointStates, chunk_s: float, start_ns: int) -> list[Plan]:
     return chunks
 
 
+def hold_at_stops(
+    plans: Sequence[tuple[int, JointTrajectory | tuple[str, ...]]], states: JointStates
+) -> tuple[list[Plan], int]:
+    """Put plans that hold still in place of empty trajectories, as controllers take these.
+
+    A trajectory without points makes a controller give up the plan before it and hold the
+    position; drivers and teleoperation stop with it.
+
+    Args:
+        plans: (start stamp [ns], trajectory, or the joint names of an empty one), by stamp.
+        states: measured positions.
+
+    Returns:
+        Plans by stamp, and how many were empty. An empty one of other joints is left out.
+    """
+    found: list[Plan] = []
+    count = 0
+    for index, (stamp_ns, plan) in enumerate(plans):
+        if isinstance(plan, JointTrajectory):
+            found.append((stamp_ns, plan))
+            continue
+        names = [name for name in plan or states.joint_names if name in states.joint_names]
+        if not names:
+            continue
+        count += 1
+        later = plans[index + 1][0] if index + 1 < len(plans) else int(states.stamps_ns[-1])
+        at = np.array([(stamp_ns - states.stamps_ns[0]) / NANO])
+        known = np.asarray((states.stamps_ns - states.stamps_ns[0]) / NANO, np.float64)
+        columns = [states.joint_names.index(name) for name in names]
+        held = interpolated(at, known, states.positions[:, columns])
+        still = JointTrajectory(
+            joint_names=tuple(names),
+            times=np.array([0.0, max((later - stamp_ns) / NANO - SAME_S, _PERIOD_S)]),
+            positions=np.repeat(held, 2, axis=0),
+        )
+        found.append((stamp_ns, still))
+    return found, count
+
+
 def join_streams(plans: Sequence[Plan], chunk_s: float) -> tuple[list[Plan], int]:
     """Joins plans of one point that follow one another quickly, as MoveIt Servo sends them.
 

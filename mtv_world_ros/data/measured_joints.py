@@ -135,7 +135,11 @@ class Unreachable(NamedTuple):
 
 
 def find_unreachable(
-    topic: str, stamps_ns: Stamps, positions: FloatArray, reach: JointReach
+    topic: str,
+    stamps_ns: Stamps,
+    positions: FloatArray,
+    reach: JointReach,
+    items: str = 'messages',
 ) -> Unreachable:
     """Return the samples that no joint can have moved to: glitches, or a second publisher.
 
@@ -148,6 +152,7 @@ def find_unreachable(
         stamps_ns: (N,) in increasing order.
         positions: (N, J) in the order of `reach` [rad or m]; NaN = not in the message.
         reach: of the robot.
+        items: word for the samples, for texts.
 
     Raises:
         EpisodeError: it cannot be told which samples are the robot's.
@@ -179,9 +184,9 @@ def find_unreachable(
         what = 'a second publisher that stands still'
     count = int((~kept).sum())
     handled = (
-        f'{count} of {len(times)} messages are out of reach of the others and were left out'
+        f'{count} of {len(times)} {items} are out of reach of the others and were left out'
         if count
-        else 'all messages are kept; cut the recording there where its images do not fit'
+        else f'all {items} are kept; cut the recording there where its images do not fit'
     )
     return Unreachable(~kept, f"'{topic}': {step} ({what}); {handled}")
 
@@ -266,6 +271,41 @@ def _moves(positions: FloatArray, settings: ReachSettings) -> bool:
     with np.errstate(invalid='ignore'):
         away = np.nan_to_num(np.abs(positions - np.nanmedian(positions, axis=0)))
     return bool(np.quantile(away.max(axis=1), 0.9) > settings.still)
+
+
+def mend_rows(
+    what: str, times: FloatArray, positions: FloatArray, robot: RobotModel
+) -> tuple[FloatArray, list[str]]:
+    """Return the measured positions (T, J) of the rows of a table, and what was odd.
+
+    A joint without a number, and a row that no joint can have moved to, has a position between
+    those of the rows around it.
+
+    Args:
+        what: name of the table or feature, for texts.
+        times: (T,) of the rows [s].
+        positions: (T, J) in the robot's order [rad or m].
+        robot: gives names and limits.
+
+    Raises:
+        EpisodeError: a joint has no position at all, or see `find_unreachable`.
+    """
+    mended, notes = positions.copy(), []
+    stamps = np.round((times - times[0]) * 1e9).astype(np.int64)
+    mended[~np.isfinite(mended)] = np.nan
+    for joint in np.flatnonzero(np.isnan(mended).any(axis=0)):
+        count, name = int(np.isnan(mended[:, joint]).sum()), robot.joint_names[joint]
+        text = f"'{what}': joint '{name}' is not finite in {count} of {len(times)} rows"
+        if count == len(times):
+            raise EpisodeError(f'{text}, so that it has no position at all')
+        notes.append(f'{text}; the positions before and after stand in')
+    found = find_unreachable(what, stamps, mended, JointReach(robot), 'rows')
+    notes += [found.text] if found.text else []
+    mended[found.rows] = np.nan
+    for joint in np.flatnonzero(np.isnan(mended).any(axis=0)):
+        known = np.flatnonzero(np.isfinite(mended[:, joint]))
+        mended[:, joint] = np.interp(times, times[known], mended[known, joint])
+    return mended, notes
 
 
 @dataclass(frozen=True, slots=True)

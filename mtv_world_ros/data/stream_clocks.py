@@ -214,7 +214,8 @@ def _mend(
 ) -> tuple[Stamps, BoolArray, list[ClockStep]]:
     """Stamps of a stream by itself, which of them are kept, and its steps."""
     stamps, all_rows = stream.stamps_ns.copy(), np.ones(len(stream.stamps_ns), bool)
-    if _takes_received(stream) or len(stamps) < settings.stretch_messages:
+    is_plan = stream.spans_ns is not None
+    if is_plan or _takes_received(stream) or len(stamps) < settings.stretch_messages:
         missing = stamps == 0
         stamps[missing | stream.use_received] = stream.received_ns[missing | stream.use_received]
         if stream.use_received:
@@ -225,8 +226,6 @@ def _mend(
     stamps = _with_missing(stream, stamps, notes)
     order = np.argsort(stream.received_ns, kind='stable')
     received = stream.received_ns[order]
-    if stream.spans_ns is not None:
-        return stamps, all_rows, []
     own = find_steps(stamps[order], received, settings)
     stamps[order], own = _unwrapped(
         stream.name, stamps[order], received, own, begin_ns, notes, settings

@@ -318,6 +318,7 @@ def write_imported(
     Raises:
         MtvWorldError: it cannot be converted; nothing is left behind.
     """
+    _check_views(episode)
     for camera in episode.cameras.values():  # names a mount_link that is not there
         camera_poses(camera, robot, np.zeros((1, len(robot.joint_names))))
     stamps, positions = _measured(episode, robot, mapping)
@@ -357,6 +358,18 @@ def write_imported(
             write()
         masks.finish()
     return tuple(warnings)
+
+
+def _check_views(episode: Episode) -> None:
+    """Refuse a view that cannot be one: a still, as of a topic that was published once."""
+    for view, track in episode.images.items():
+        if len(track.stamps_ns) < 2:
+            others = [name for name in episode.views if name != view]
+            raise EpisodeError(
+                f"'{episode.info.path}', view '{view}': it has {len(track.stamps_ns)} frame, at "
+                "least 2 are needed; name the other views in the mapping (--topics): 'views' with "
+                f'{", ".join(others) or "a topic of images"}'
+            )
 
 
 def _measured(

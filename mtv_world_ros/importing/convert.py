@@ -18,6 +18,8 @@ from mtv_world_ros.core.errors import ConfigError, EpisodeError, MtvWorldError, 
 from mtv_world_ros.data.episode import Episode, EpisodeInfo, Track
 from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.data.episode_writer import EpisodeWriter
+from mtv_world_ros.data.measured_joints import mend_rows
+from mtv_world_ros.data.stream_clocks import check_row_times
 from mtv_world_ros.importing.camera_parameters import camera_track
 from mtv_world_ros.importing.lerobot import EpisodeEntry, LeRobotDataset
 from mtv_world_ros.importing.mapping import DatasetMapping, digest_of, load_mapping, Stream
@@ -219,9 +221,8 @@ def convert_episode(
     """
     rows = _read_rows(dataset, entry, mapping)
     times = rows['timestamp'].ravel()
-    if len(times) < 2 or (np.diff(times) <= 0).any() or not np.isfinite(times).all():
-        raise EpisodeError(f'its {len(times)} timestamps do not increase')
-    measured = _measured(dataset, rows, mapping)
+    paused = check_row_times(times, 'timestamp', dataset.fps)
+    measured, mended = _measured(dataset, rows, mapping)
     commanded, odd = _commanded(dataset, rows, mapping, measured)
     videos = {
         view: dataset.frames(entry, source.feature, times)
@@ -269,7 +270,7 @@ def convert_episode(
         masks.finish()
     shown = {view: dataset.video_note(entry, row.feature) for view, row in mapping.views.items()}
     turned = [f"view '{view}': {note}" for view, note in shown.items() if note]
-    return *odd, *notes, *turned, *jumps(commands.values(), mapping.robot)
+    return *paused, *mended, *odd, *notes, *turned, *jumps(commands.values(), mapping.robot)
 
 
 def _stream_features(mapping: DatasetMapping) -> tuple[str, ...]:
@@ -291,13 +292,15 @@ def _read_rows(
 
 def _measured(
     dataset: LeRobotDataset, rows: dict[str, FloatArray], mapping: DatasetMapping
-) -> FloatArray:
-    """(T, J)."""
+) -> tuple[FloatArray, list[str]]:
+    """(T, J), and what was odd."""
     stream = mapping.state
     values, names = _table(dataset, rows, stream)
     positions = to_positions(values, names, stream.columns, stream.label)
-    _check(positions, stream, mapping, 'state')
-    return positions
+    times = rows['timestamp'].ravel()
+    mended, notes = mend_rows(stream.label, times, positions, mapping.robot)
+    _check(mended, stream, mapping, 'state')
+    return mended, notes
 
 
 def _commanded(

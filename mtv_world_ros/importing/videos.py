@@ -19,6 +19,8 @@ from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest
 from mtv_world_ros.data.bag_mapping import BagMapping, ViewSource, Written
 from mtv_world_ros.data.episode import Episode, EpisodeInfo, JointStates, Track
 from mtv_world_ros.data.joint_plans import following
+from mtv_world_ros.data.measured_joints import mend_rows
+from mtv_world_ros.data.stream_clocks import check_row_times
 from mtv_world_ros.importing.bags import write_imported
 from mtv_world_ros.importing.camera_parameters import sized_camera
 from mtv_world_ros.importing.convert import import_each, ImportSummary, START_NS
@@ -197,9 +199,13 @@ def read_recording(
     """
     path = recording.file(mapping.rows)
     table = read_table(path, mapping.state.features)
-    times = _times(table, mapping)
+    times, paused = _times(table, mapping)
     stamps = START_NS + np.round(times * 1e9).astype(np.int64)
     positions, notes = _positions(table, mapping)
+    if not mapping.state.tools:
+        positions, mended = mend_rows(path.name, times, positions, mapping.robot)
+        notes += mended
+    notes += paused
     images, cameras, unknown = {}, {}, {}
     known = {} if calibration is None else load_calibration(calibration)
     for view, pattern in mapping.views.items():
@@ -267,11 +273,11 @@ def _positions(table: NumberTable, mapping: VideoMapping) -> tuple[FloatArray, l
     return positions, notes
 
 
-def _times(table: NumberTable, mapping: VideoMapping) -> FloatArray:
-    """Return (T,) times of rows, from 0 on [s]."""
+def _times(table: NumberTable, mapping: VideoMapping) -> tuple[FloatArray, list[str]]:
+    """Return (T,) times of rows, from 0 on [s], and what is odd."""
     path, keys, name = table.path, table.keys, mapping.time
     if mapping.fps is not None:
-        return np.arange(len(table.values)) / mapping.fps
+        return np.arange(len(table.values)) / mapping.fps, []
     if name not in keys:
         raise EpisodeError(
             f"'{path}' has no '{name}'{nearest(name, keys)}; it has {', '.join(keys)}"
@@ -282,15 +288,14 @@ def _times(table: NumberTable, mapping: VideoMapping) -> FloatArray:
         times = np.asarray(keys[name], float).ravel()
     except (TypeError, ValueError) as error:
         raise EpisodeError(f"'{path}': '{name}' must hold numbers: {error}") from error
-    if len(times) != len(table.values) or not np.isfinite(times).all():
-        raise EpisodeError(f"'{path}': '{name}' must have a finite number for each row")
-    if (np.diff(times) <= 0).any():
-        row = int(np.argmax(np.diff(times) <= 0)) + 1
-        raise EpisodeError(
-            f"'{path}': '{name}' must increase; it goes from {times[row - 1]:.9g} to "
-            f'{times[row]:.9g} at row {row + 1}'
-        )
-    return (times - times[0]) / _PER_SECOND[mapping.time_unit]
+    if len(times) != len(table.values):
+        raise EpisodeError(f"'{path}': '{name}' must have a number for each row")
+    times = times / _PER_SECOND[mapping.time_unit]
+    try:
+        notes = check_row_times(times, name)
+    except EpisodeError as error:
+        raise EpisodeError(f"'{path}': {error}") from error
+    return times - times[0], notes
 
 
 def _instruction(keys: Mapping[str, Any], mapping: VideoMapping, path: Path) -> str:

@@ -13,6 +13,7 @@ from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.measured_joints import (
     find_unreachable,
     JointReach,
+    mend_rows,
     merge_joint_states,
     read_sample,
 )
@@ -239,3 +240,25 @@ def test_joints_in_degrees_are_named_as_that(franka):
     states, warnings = merged(franka, recorded(franka, stamps, rows))
     assert len(states.stamps_ns) == len(rows)
     assert 'nearly every step does (degrees instead of radians?)' in warnings[0]
+
+
+def test_rows_of_a_table_without_a_number_are_between_their_neighbours(franka):
+    stamps, rows = motion(2.0)
+    given = rows.copy()
+    given[40, 3] = math.nan
+    given[60, :] = math.inf
+    mended, notes = mend_rows('observation.state', stamps * 1e-9, given, franka)
+    np.testing.assert_allclose(mended, rows, atol=2e-4)
+    assert mended[40, 3] == pytest.approx((rows[39, 3] + rows[41, 3]) / 2)
+    assert "joint 'panda_joint4' is not finite in 2 of 100 rows" in ' '.join(notes)
+
+
+def test_a_spike_in_the_rows_of_a_table_is_left_out_and_named(franka):
+    stamps, rows = motion(2.0)
+    given = rows.copy()
+    given[50, 1] += 1.2
+    mended, (note,) = mend_rows('observation.state', stamps * 1e-9, given, franka)
+    np.testing.assert_allclose(mended, rows, atol=2e-4)
+    assert '1 of 100 rows are out of reach of the others and were left out' in note
+    with pytest.raises(EpisodeError, match='has no position at all'):
+        mend_rows('observation.state', stamps * 1e-9, np.full_like(rows, math.nan), franka)

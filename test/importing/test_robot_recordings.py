@@ -1,0 +1,284 @@
+"""Bags with one oddity that real robots record: what import-bag and the reader make of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.core.data_types import CameraModel, JointTrajectory
+from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.images import encode_jpeg
+from mtv_world_ros.data.bag import messages
+from mtv_world_ros.data.bag.writer import BagWriter
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.stream_clocks import ClockBreakError
+
+NANO = 1_000_000_000
+START = 1_750_000_000 * NANO
+SECONDS, FPS, RATE = 4.0, 10, 50
+JOINTS = [*(f'panda_joint{k}' for k in range(1, 8)), 'panda_finger_joint1']
+HOME = np.array([0, -0.4, 0, -2.2, 0, 1.9, 0.785, 0.03])
+VIEWS = ('front', 'side')
+IMAGE = '/{}/image_raw/compressed'
+
+Event = tuple[float, str, str, Any]
+
+
+def positions(seconds: float) -> np.ndarray:
+    row = HOME.copy()
+    row[0] += 0.4 * np.sin(0.9 * seconds)
+    row[5] += 0.2 * np.sin(1.7 * seconds)
+    return row
+
+
+def camera(view: str) -> CameraModel:
+    T = np.array([[1.0, 0, 0, 0.1], [0, 0, 1, -1.0], [0, -1, 0, 0.4], [0, 0, 0, 1]])
+    K = np.array([[40.0, 0, 15.5], [0, 40, 11.5], [0, 0, 1]])
+    return CameraModel(view=view, width=32, height=24, K=K, mount_link='base', T_mount_camera=T)
+
+
+def ns(seconds: float) -> int:
+    return START + round(seconds * NANO)
+
+
+def plan(seconds: float) -> Any:
+    """The positions of the second that follows."""
+    times = np.arange(1, 11) / 10
+    rows = np.stack([positions(seconds + t) for t in times])
+    trajectory = JointTrajectory(joint_names=tuple(JOINTS), times=times, positions=rows)
+    return messages.make_joint_trajectory(ns(seconds), trajectory)
+
+
+def events() -> list[Event]:
+    """Messages of a recording: receive time [s], topic, type, message."""
+    found: list[Event] = []
+    for view in VIEWS:
+        tf = messages.make_tf(
+            START, 'panda_link0', f'{view}_optical_frame', camera(view).T_mount_camera
+        )
+        found.append((0.0, '/tf_static', messages.TF_MESSAGE, tf))
+    for k in range(round(SECONDS * RATE)):
+        t = k / RATE
+        state = messages.make_joint_state(ns(t), JOINTS, positions(t))
+        found.append((t, '/joint_states', messages.JOINT_STATE, state))
+    jpeg = encode_jpeg(np.full((24, 32, 3), 90, np.uint8), 90)
+    for k in range(round(SECONDS * FPS)):
+        t = k / FPS + 0.003
+        for view in VIEWS:
+            frame = f'{view}_optical_frame'
+            image = messages.make_compressed(ns(t), frame, jpeg)
+            info = messages.make_camera_info(ns(t), camera(view), frame)
+            found.append((t, IMAGE.format(view), messages.COMPRESSED_IMAGE, image))
+            found.append((t, f'/{view}/camera_info', messages.CAMERA_INFO, info))
+    for k in range(round(SECONDS)):
+        found.append((k + 0.004, '/joint_trajectory', messages.JOINT_TRAJECTORY, plan(k + 0.004)))
+    return found
+
+
+Edit = Callable[[str, float, int], int | None]
+
+
+@pytest.fixture
+def record(tmp_path):
+    """Writes a recording whose stamps [ns] are edited; messages without one are left out."""
+
+    def make(
+        edit: Edit = lambda _topic, _seconds, stamp: stamp,
+        more: list[Event] | None = None,
+        name: str = 'bag',
+        received: Callable[[float], float] = lambda seconds: seconds,
+        change: Callable[[str, float, Any], None] = lambda *_: None,
+    ) -> Path:
+        with BagWriter(tmp_path / name) as writer:
+            for seconds, topic, kind, message in sorted(
+                [*events(), *(more or [])], key=lambda event: event[0]
+            ):
+                items = [message] if hasattr(message, 'header') else message.transforms
+                stamps = [messages.header_stamp(item) for item in items]
+                edited = [edit(topic, seconds, stamp) for stamp in stamps]
+                if None in edited:
+                    continue
+                for item, stamp in zip(items, edited, strict=True):
+                    item.header.stamp.sec, item.header.stamp.nanosec = divmod(stamp, NANO)
+                change(topic, seconds, message)
+                data = messages.serialize(kind, message)
+                writer.write_raw(topic, kind, ns(received(seconds)), data)
+        return tmp_path / name
+
+    return make
+
+
+@pytest.fixture
+def run(tmp_path, capsys):
+    """Imports a bag; returns the exit status and what was printed."""
+
+    def imported(bag: Path, *more: str, **mapping: Any) -> tuple[int, str]:
+        file = tmp_path / 'mapping.yaml'
+        views = {view: f'/{view}/image_raw' for view in VIEWS}
+        file.write_text(yaml.safe_dump({'robot': 'franka', 'views': views, **mapping}))
+        out = str(tmp_path / 'out')
+        status = main(['import-bag', str(bag), '--topics', str(file), '--out', out, *more])
+        printed = capsys.readouterr()
+        return status, printed.out + printed.err
+
+    return imported
+
+
+def test_a_plain_recording_is_imported_without_a_word(record, run):
+    status, said = run(record())
+    assert status == 0
+    assert 'bag: 4.0 s; frames: front 40, side 40' in said
+    assert len([line for line in said.splitlines() if line.startswith(("'", '/'))]) == 0, said
+
+
+@pytest.mark.parametrize(
+    'jump',
+    [
+        lambda stamp, seconds: stamp - (2 * NANO if seconds >= 2 else 0),
+        lambda stamp, seconds: stamp - START + NANO - (2 * NANO if seconds >= 2 else 0),
+        lambda stamp, seconds: stamp + (40 * NANO if seconds >= 2 else 0),
+    ],
+    ids=['set back', 'simulated time starts over', 'set ahead'],
+)
+def test_a_recording_whose_clocks_jump_becomes_two_episodes(record, run, tmp_path, jump):
+    bag = record(lambda topic, s, stamp: stamp if topic == '/tf_static' else jump(stamp, s))
+    status, said = run(bag, outcome='success')
+    assert status == 0, said
+    assert '2 made, 0 kept, 0 failed' in said
+    assert re.search(r'jump by [+-](2|40) s at 2.000 s of the recording', said), said
+    for part in (1, 2):
+        episode = read_episode(tmp_path / 'out' / f'bag_part{part}')
+        assert len(episode.images['front'].stamps_ns) == 20
+        assert (np.diff(episode.joint_states.stamps_ns) == NANO // RATE).all()
+        assert episode.info.outcome == 'unknown'
+        wanted = np.stack([positions(2 * (part - 1) + k / RATE) for k in range(100)])
+        np.testing.assert_allclose(episode.joint_states.positions[:, 0], wanted[:, 0], atol=1e-9)
+    status, said = run(bag, outcome='success')
+    assert '0 made, 2 kept, 0 failed' in said
+    with pytest.raises(ClockBreakError, match='mtv-world import-bag makes an episode of each'):
+        read_episode(bag)
+
+
+def test_a_recorder_whose_own_clock_is_set_back_makes_two_episodes(record, run):
+    """Stamps and receive times go back together; the order of the file tells."""
+    status, said = run(
+        record(
+            lambda topic, s, stamp: stamp - (NANO if s >= 2 else 0),
+            received=lambda s: s - (1 if s >= 2 else 0),
+        )
+    )
+    assert status == 0
+    assert 'bag_part1: 2.0 s; frames: front 20, side 20' in said
+    assert 'bag_part2: 2.0 s; frames: front 20, side 20' in said
+
+
+def test_a_camera_of_another_clock_is_refused_until_its_receive_times_are_taken(
+    record, run, tmp_path
+):
+    bag = record(lambda topic, _, stamp: stamp + 40 * NANO if 'front/image' in topic else stamp)
+    status, said = run(bag)
+    assert status == 1
+    assert "'/front/image_raw/compressed' is not of the clock of '/joint_states'" in said
+    assert '40 s ahead of those of the latter' in said
+    assert "'received_times: [front]' in the mapping" in said
+    status, said = run(bag, received_times=['front'])
+    assert status == 0
+    stamps = read_episode(tmp_path / 'out' / 'bag').images['front'].stamps_ns
+    assert stamps[0] == ns(0.003) and len(stamps) == 40
+
+
+def test_frames_that_share_no_moment_with_joint_states_are_refused(record, run):
+    late = lambda topic, s, stamp: None if topic == '/joint_states' and s < 3.9 else stamp  # noqa: E731
+    early = lambda topic, s, stamp: (  # noqa: E731
+        None if 'image' in topic and s > 1 else late(topic, s, stamp)
+    )
+    status, said = run(record(early))
+    assert status == 1
+    assert "no frame of view 'front' has joint states: its frames are from 1750000000.003" in said
+
+
+def test_a_view_with_one_frame_is_refused(record, run):
+    edit = lambda topic, s, stamp: None if 'side/image' in topic and s > 0.01 else stamp  # noqa: E731
+    status, said = run(record(edit))
+    assert status == 1
+    assert "view 'side': it has 1 frame, at least 2 are needed" in said
+    assert "'views' with front" in said
+
+
+def stop(seconds: float, names: list[str]) -> Event:
+    header = messages.make_header(ns(seconds), '')
+    message = messages.make(messages.JOINT_TRAJECTORY, header=header, joint_names=names, points=[])
+    return seconds, '/joint_trajectory', messages.JOINT_TRAJECTORY, message
+
+
+@pytest.mark.parametrize('names', [JOINTS, []], ids=['named', 'bare'])
+def test_an_empty_trajectory_holds_the_arm_where_it_is(record, run, tmp_path, names):
+    edit = lambda topic, s, stamp: None if topic == '/joint_trajectory' and s > 3 else stamp  # noqa: E731
+    status, said = run(record(edit, more=[stop(2.5, names)]))
+    assert status == 0
+    assert '1 empty trajectories stop the plans before them' in said
+    plans = read_episode(tmp_path / 'out' / 'bag').trajectories
+    assert plans[-1][0] == ns(2.5)
+    np.testing.assert_allclose(plans[-1][1].positions[:, 0], positions(2.5)[0], atol=1e-6)
+    assert plans[-1][1].times[-1] == pytest.approx(3.98 - 2.5, abs=1e-3)
+
+
+def test_a_camera_info_of_zeros_leaves_the_camera_unknown_or_to_the_file(record, run, tmp_path):
+    def zeros(topic, _seconds, message):
+        if topic == '/side/camera_info':
+            message.k, message.p, message.d = np.zeros(9), np.zeros(12), np.zeros(0)
+            message.width = message.height = 0
+
+    bag = record(change=zeros)
+    status, said = run(bag)
+    assert status == 0
+    assert 'cameras not known: side' in said
+    assert "'/side/camera_info' is not calibrated (K[0] = 0)" in said
+    file = tmp_path / 'cameras.yaml'
+    values = {
+        'width': 32, 'height': 24, 'K': [40.0, 42.0, 15.5, 11.5], 'mount_link': 'panda_link0',
+        'T_mount_camera': camera('side').T_mount_camera.tolist(),
+    }  # fmt: skip
+    file.write_text(yaml.safe_dump({'views': dict.fromkeys(VIEWS, values)}))
+    episode = read_episode(bag, calibration=file)
+    assert episode.cameras['side'].K[1, 1] == 42.0
+    assert episode.unknown == {}
+
+
+def test_a_joint_that_is_not_measured_has_its_constant(record, run, tmp_path):
+    def bare(topic, _seconds, message):
+        if topic == '/joint_states':
+            message.name, message.position = message.name[:7], message.position[:7]
+
+    bag = record(change=bare)
+    status, said = run(bag)
+    assert status == 1
+    assert "'constants: {panda_finger_joint1: 0.0}'" in said
+    status, said = run(bag, constants={'panda_finger_joint1': 0.01})
+    assert status == 0
+    states = read_episode(tmp_path / 'out' / 'bag').joint_states
+    assert set(states.positions[:, states.joint_names.index('panda_finger_joint1')]) == {0.01}
+
+
+def test_positions_out_of_reach_are_said_once_for_the_recording(record, run):
+    def spike(topic, seconds, message):
+        if topic == '/joint_states' and abs(seconds - 2) < 1e-6:
+            message.position[3] += 1.0
+
+    status, said = run(record(change=spike))
+    assert status == 0
+    assert said.count('out of reach') == 1
+    assert "'/joint_states': joint 'panda_joint4' jumps from -2.2 to -1.2" in said
+
+
+def test_a_broken_clock_is_refused_by_every_reader(record):
+    bag = record(lambda topic, s, stamp: stamp - 5 * NANO if 'front' in topic and s > 2 else stamp)
+    with pytest.raises(EpisodeError, match="'/front/image_raw/compressed': its clock jumps by -5"):
+        read_episode(bag)
