@@ -31,7 +31,12 @@ from mtv_world_ros.core.errors import (  # noqa: E402
     nearest,
     TrainingInterrupted,
 )
-from mtv_world_ros.core.processes import ended_by_signals, stopped_by_sigterm  # noqa: E402
+from mtv_world_ros.core.files import check_output  # noqa: E402
+from mtv_world_ros.core.processes import (  # noqa: E402
+    ended_by_signals,
+    escape_unprintable_output,
+    stopped_by_sigterm,
+)
 
 if _interrupt is signal.default_int_handler:
     with suppress(ValueError):
@@ -43,6 +48,8 @@ _MORE_MEMORY = (
     'recordings, views or --workers'
 )
 _READ_ONLY = '; choose another folder'
+#: options that name what a command writes
+_OUTPUTS = ('out', 'picture', 'save')
 #: modules of commands as `--help` shows them; those of other packages come last
 _ORDER = (
     'demo',
@@ -154,6 +161,11 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
         hints = [f'{word}{nearest(word, options)}' for word in more]
         parser.error(f'unrecognized arguments: {" ".join(hints)}')
     _check_texts(commands.choices[words[0]], arguments)
+    for name in _OUTPUTS:
+        given = getattr(arguments, name, None)
+        path = getattr(arguments, f'default_{name}', None) if given is None else given
+        if isinstance(path, Path):
+            check_output(path, f'--{name}')
     return arguments
 
 
@@ -162,6 +174,7 @@ def main(argv: list[str] | None = None) -> int:
 
     That is 1 for an error of the user's or of the disk, and 128 + n where signal n ended it.
     """
+    escape_unprintable_output()
     try:
         with ended_by_signals('mtv-world'):
             arguments = _parsed(sys.argv[1:] if argv is None else argv)

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from mtv_world_ros.cli.shared_options import add_options, names, number_or_0
-from mtv_world_ros.core.files import check_free
+from mtv_world_ros.core.files import check_free, check_output
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -45,6 +45,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _fit(arguments: argparse.Namespace) -> int:
+    check_output(arguments.checkpoint)  # before the slow imports
     from tqdm import tqdm
 
     from mtv_world_ros.core.processes import threads_each

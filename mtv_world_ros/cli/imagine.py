@@ -41,7 +41,10 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--offline', action='store_true', help='without ROS, as fast as possible')
     parser.add_argument('--out', type=Path, help='folder for the predictions (with --offline)')
     add_options(parser, 'overwrite source checkpoint dtype model describer segmenter serving task')
-    parser.set_defaults(handler=_replay, takes_player_options=lambda chosen: not chosen.offline)
+    parser.set_defaults(
+        handler=_replay,
+        takes_player_options=lambda chosen: not chosen.offline,
+    )
 
 
 def _replay(arguments: argparse.Namespace) -> int:

@@ -54,7 +54,7 @@ def _add_robot(commands: argparse._SubParsersAction) -> None:
         '--out', type=Path, help='YAML to write (of a URDF); default: beside the URDF'
     )
     parser.add_argument('--picture', type=Path, help='PNG to draw; default: out/robot/<name>.png')
-    parser.set_defaults(handler=_robot)
+    parser.set_defaults(handler=_robot, default_picture=Path('out/robot'))
 
 
 def _robot(arguments: argparse.Namespace) -> int:
@@ -157,7 +157,7 @@ def _add_doctor(commands: argparse._SubParsersAction) -> None:
     add_options(parser, 'source')
     parser.add_argument('--robot', help="YAML, or a bundled robot; default: the episode's")
     parser.add_argument('--out', type=Path, help='default: out/doctor/<episode>')
-    parser.set_defaults(handler=_doctor)
+    parser.set_defaults(handler=_doctor, default_out=Path('out/doctor'))
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
@@ -340,7 +340,7 @@ def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--out', type=Path, help='calibration file to write; default: out/camera/<view>.yaml'
     )
-    parser.set_defaults(handler=_calibrate_camera)
+    parser.set_defaults(handler=_calibrate_camera, default_out=Path('out/camera'))
 
 
 def _interval(text: str) -> tuple[float, float]:

@@ -14,11 +14,14 @@ from pathlib import Path
 import re
 import shutil
 import sys
+import tempfile
 from typing import Any
 
 from mtv_world_ros.core.errors import ConfigError, nearest
 
 PACKAGE = 'mtv_world_ros'
+#: what the names of files in progress have besides the name [bytes]
+_OWN_NAME_BYTES = 24
 #: file of a robot in a folder of its own
 ROBOT_YAML = 'robot.yaml'
 
@@ -107,9 +110,69 @@ def check_free(path: Path, overwrite: bool, instead: str = '--out') -> None:
     Raises:
         ConfigError: the path exists.
     """
-    is_free = not any(path.iterdir()) if path.is_dir() else not path.exists()
-    if not (overwrite or is_free):
+    if not (overwrite or is_free(path)):
         raise ConfigError(f"'{path}' exists; give another {instead}, or --overwrite to replace it")
+    check_output(path, instead)
+
+
+def is_free(path: Path) -> bool:
+    """True if nothing is there but, at most, an empty folder."""
+    return not any(path.iterdir()) if path.is_dir() else not path.exists()
+
+
+def check_output(path: Path, option: str = '--out') -> None:
+    """Check that a file or folder can be written, before any work; it leaves nothing behind.
+
+    Args:
+        path: that would be made, or replaced; folders above it may be missing.
+        option: that names another place.
+
+    Raises:
+        ConfigError: it cannot be written; names the path, the reason and the option.
+    """
+    try:
+        with tempfile.TemporaryFile(dir=_written_folder(path)):
+            return
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = (isinstance(error, OSError) and error.strerror) or str(error)
+        raise ConfigError(
+            f"'{path}' cannot be written: {reason}; give another {option}"
+        ) from error
+
+
+def _written_folder(path: Path) -> Path:
+    """Return the folder in which a path, or the first missing folder above it, would be made.
+
+    Raises:
+        OSError, ValueError: nothing can be made there; the text is the reason.
+    """
+    if path.is_symlink():
+        _check_link(path)
+    if path.exists() and not (path.is_dir() or path.is_file()):
+        raise ValueError('it is a device, a pipe or a socket')
+    folder = path if path.is_dir() else path.absolute().parent
+    while not os.path.lexists(folder) and folder != folder.parent:
+        folder = folder.parent
+    if folder.is_symlink():
+        _check_link(folder)
+    if not folder.is_dir():
+        raise ValueError(f"'{folder}' is a file, so that nothing can be made in it")
+    longest = os.pathconf(folder, 'PC_NAME_MAX') - _OWN_NAME_BYTES
+    for name in path.absolute().parts[len(folder.absolute().parts) :]:
+        if len(os.fsencode(name)) > longest:
+            raise ValueError(f'a name in it has more than {longest} bytes')
+    return folder
+
+
+def _check_link(link: Path) -> None:
+    try:
+        os.stat(link)
+    except FileNotFoundError as error:
+        raise ValueError(
+            f"'{link}' is a link to '{os.readlink(link)}', which is missing"
+        ) from error
+    except OSError as error:
+        raise ValueError(f"'{link}' is a link that leads to itself") from error
 
 
 def check_room(folder: Path, num_bytes: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+import io
 import os
 from pathlib import Path
 import random
@@ -116,6 +117,16 @@ def _give_up_tidying() -> None:
     text = f'mtv-world: stopped (SIGTERM); it was not tidied up within {_TIDY_S:g} s\n'
     os.write(2, text.encode())
     os._exit(128 + signal.SIGTERM)
+
+
+def escape_unprintable_output() -> None:
+    """Let stdout and stderr print every text, with escapes for characters that they lack.
+
+    With `LC_ALL=C` and no UTF-8 mode they are ASCII, and names of files may hold any bytes.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors='backslashreplace')
 
 
 def private_domain() -> dict[str, str]:

@@ -18,7 +18,11 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from mtv_world_ros.core.errors import MtvWorldError
-from mtv_world_ros.core.processes import end_on_signals, PARENT_VARIABLE
+from mtv_world_ros.core.processes import (
+    end_on_signals,
+    escape_unprintable_output,
+    PARENT_VARIABLE,
+)
 from mtv_world_ros.ros.parameters import guard_parameter_services
 from mtv_world_ros.ros.receive_paths import receive_paths, resolved_topics
 
@@ -74,6 +78,7 @@ def run(
         The exit status: 1 after an error of the user's or of the disk, whose text goes to stderr,
         else 0. A signal n that comes while the node is made ends the process with 128 + n.
     """
+    escape_unprintable_output()
     if help_text and '--help' in (sys.argv if args is None else args):
         sys.stdout.write(f'{help_text}\n')
         return 0

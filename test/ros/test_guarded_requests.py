@@ -55,7 +55,7 @@ def ended(node: Node) -> Iterator[Node]:
 @pytest.fixture
 def signals() -> Iterator[None]:
     """Handlers of signals, which `run` sets, are put back."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = [signal.getsignal(number) for number in numbers]
     yield
     for number, handler in zip(numbers, before, strict=True):

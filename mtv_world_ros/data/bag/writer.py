@@ -15,6 +15,7 @@ from typing import cast, IO, Self
 from mcap.writer import CompressionType, Writer
 
 from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.files import is_free
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.metadata import (
     bag_information,
@@ -191,15 +192,17 @@ class BagWriter:
             self.abort()
 
     def _check_free(self) -> None:
-        if self.path.exists() and not self._overwrite:
+        if is_free(self.path):
+            return
+        if not self._overwrite:
             raise EpisodeError(
                 f"'{self.path}' exists already; choose another name or overwrite it"
             )
-        if self.path.exists() and not (self.path / 'metadata.yaml').is_file():
+        if not (self.path / 'metadata.yaml').is_file():
             raise EpisodeError(f"'{self.path}' is not a bag folder; it will not be overwritten")
 
     def _open(self) -> tuple[Path, _Spool]:
-        parent = self.path.absolute().parent
+        parent = Path(os.path.realpath(self.path)).parent  # a link stays a link
         try:
             parent.mkdir(parents=True, exist_ok=True)
             folder = parent / f'.{self.path.name}.{secrets.token_hex(4)}.tmp'
@@ -277,12 +280,13 @@ class BagWriter:
         )
 
     def _take_name(self) -> None:
-        if not self.path.exists():
-            self._folder.rename(self.path)
+        path = Path(os.path.realpath(self.path))
+        if is_free(path):
+            self._folder.rename(path)
             return
         old = self._folder.with_suffix('.old')
-        self.path.rename(old)
-        self._folder.rename(self.path)
+        path.rename(old)
+        self._folder.rename(path)
         shutil.rmtree(old, ignore_errors=True)
 
     def _drop(self) -> None:

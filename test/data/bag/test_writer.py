@@ -71,6 +71,7 @@ def test_a_folder_that_is_no_bag_is_never_overwritten(tmp_path):
 def test_a_name_that_was_taken_meanwhile_is_respected(tmp_path):
     writer = _writer(tmp_path / 'episode')
     (tmp_path / 'episode').mkdir()
+    (tmp_path / 'episode' / 'mine').write_text('')
     with pytest.raises(EpisodeError, match='exists already'):
         writer.close()
     assert list((tmp_path / 'episode').iterdir()) == []
