@@ -31,6 +31,7 @@ from mtv_world_ros.ros.qos_profiles import LATCHED
 from mtv_world_ros.ros.receive_paths import SERVICES
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
+from mtv_world_ros.ros.sensing.samples import NodeTime
 from mtv_world_ros.ros.sensing.subscriptions import subscribe_observations
 from mtv_world_ros.ros.status_publisher import StatusPublisher
 from mtv_world_ros.ros.world_model.loading import check_calibration, load_spec, reload_cameras
@@ -74,6 +75,7 @@ class PolicyNode(Node):
             width=self._spec.width,
             height=self._spec.height,
             limits=self._settings,
+            time=NodeTime.of(self),
         )
         frames = PredictedFrames(self._spec.views, joint_names)
         self._actor = Actor(lambda: self._answers.trigger())

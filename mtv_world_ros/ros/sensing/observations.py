@@ -5,10 +5,10 @@ The first CameraInfo of a view holds until a reset; a change is refused.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from math import prod, sqrt
+from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
@@ -24,13 +24,17 @@ from mtv_world_ros.ros.messages import image_messages
 from mtv_world_ros.ros.messages.conversions import check_sample, NANO, to_ns, to_sample
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 from mtv_world_ros.ros.parameters import NodeSettings
+from mtv_world_ros.ros.sensing.samples import NodeTime, Samples
 
-#: images kept a view, so that views which arrive one after the other still find their partner
-_NUM_IMAGES = 3
+AnyImage = Image | CompressedImage
+#: images kept a view, so that views that arrive one after the other, or lose some, find partners
+_NUM_IMAGES = 8
 #: joint samples kept a joint; at 1 kHz this reaches back a quarter of a second
 _NUM_SAMPLES = 256
 #: more pixels tell no more about where objects are, and take time
 _MOST_PIXELS = 640 * 480
+#: images whose sides are below this fraction of the model's frame show no objects
+_LEAST_SIDE_FRACTION = 0.5
 #: no joint moves faster than this [rad/s or m/s]; encoders may jump by a little
 _FASTEST = 1000.0
 _LEAST_JUMP = 0.3
@@ -73,6 +77,7 @@ class ObservationBuffer:
         on_image: also gets every image that is stored.
         pose: asked with view, frame and stamp [ns] of an image for what carries the camera; None
             = the calibrated pose.
+        time: of the node; None = samples are not compared with a clock when they arrive.
     """
 
     def __init__(
@@ -83,21 +88,22 @@ class ObservationBuffer:
         width: int,
         height: int,
         limits: Callable[[], NodeSettings],
-        on_image: Callable[[str, Image | CompressedImage], None] | None = None,
+        on_image: Callable[[str, AnyImage], None] | None = None,
         pose: Callable[[str, str, int], Mount | None] | None = None,
+        time: NodeTime | None = None,
     ) -> None:
         self._intrinsics = Intrinsics(cameras, lambda: bool(limits().calibration_file))
         self._pose = pose
         self._size = (width, height)
-        self._limits, self._on_image = limits, on_image
-        self._images: dict[str, deque[tuple[int, Image | CompressedImage]]] = {
-            camera.view: deque(maxlen=_NUM_IMAGES) for camera in cameras
+        self._limits, self._on_image, self._time = limits, on_image, time
+        self._images: dict[str, Samples[AnyImage]] = {
+            camera.view: Samples(_NUM_IMAGES) for camera in cameras
         }
         self._received: dict[str, float] = {}
         #: frame of the images of each view, as they came first
         self._frames: dict[str, str] = {}
-        self._joints: dict[str, deque[tuple[int, float]]] = {
-            name: deque(maxlen=_NUM_SAMPLES) for name in joint_names
+        self._joints: dict[str, Samples[float]] = {
+            name: Samples(_NUM_SAMPLES) for name in joint_names
         }
 
     @property
@@ -108,18 +114,29 @@ class ObservationBuffer:
     @property
     def newest_stamp_ns(self) -> int:
         """The newest moment that every view has seen [ns]; 0 = none yet."""
-        return min(images[-1][0] if images else 0 for images in self._images.values())
+        return min(images.newest[0] if images else 0 for images in self._images.values())
 
-    def add_image(self, view: str, message: Image | CompressedImage) -> None:
+    def add_image(self, view: str, message: AnyImage) -> None:
         """Stores an image.
 
         Raises:
-            Rejection: the image cannot be read.
+            Rejection: the image cannot be read, comes from the future, or is stale while a newer
+                one is not.
         """
         image_messages.check(message)
-        self._images[view].append((to_ns(message.header.stamp), message))
+        images, stamp_ns = self._images[view], to_ns(message.header.stamp)
+        limit_s = self._limits().max_image_age_s
+        what = f"an image of view '{view}'"
+        images.refusal = _refusal(images, what, stamp_ns, self._now_ns(), limit_s)
+        if images.refusal:
+            raise Rejection(Reason.IMAGE_STALE, images.refusal)
+        images.add(stamp_ns, message)
         if self._on_image is not None:
             self._on_image(view, message)
+
+    def _now_ns(self) -> int:
+        """The node's time [ns]; 0 = there is none."""
+        return self._time.now_ns() if self._time is not None else 0
 
     def add_camera_info(
         self, view: str, message: CameraInfo, *, is_rectified: bool = False
@@ -143,32 +160,41 @@ class ObservationBuffer:
         that are not the robot's do not matter.
 
         Raises:
-            Rejection: no positions, not one a name, or a joint of the robot has none.
+            Rejection: no positions, not one a name, a joint of the robot has none or jumps, or the
+                message comes from the future, or is stale while newer states are not.
         """
-        stamp_ns = to_ns(message.header.stamp)
+        stamp_ns, now_ns = to_ns(message.header.stamp), self._now_ns()
+        limit_s = self._limits().max_joint_state_age_s
         sample = to_sample(message, self._joints.keys())
-        self._add_positions(stamp_ns, sample.positions)
-        check_sample(sample)
+        faults = dict(sample.faults)
+        stale = ''
+        before, self._received = self._received, {**self._received, **sample.positions}
+        for name, position in sample.positions.items():
+            joint = self._joints[name]
+            what = f"a state of joint '{name}'"
+            joint.refusal = _refusal(joint, what, stamp_ns, now_ns, limit_s)
+            stale = stale or joint.refusal
+            jump = self._jump(name, stamp_ns, position, before.get(name, position))
+            if jump:
+                faults[name] = jump
+            elif not joint.refusal:
+                joint.add(stamp_ns, position)
+        for name, fault in faults.items():
+            self._joints[name].refusal = fault
+        check_sample(sample._replace(faults=faults))
+        if stale:
+            raise Rejection(Reason.JOINT_STATE_STALE, stale)
 
-    def _add_positions(self, stamp_ns: int, positions: Mapping[str, float]) -> None:
-        before, self._received = self._received, {**self._received, **positions}
-        for name, position in positions.items():
-            self._check_speed(name, stamp_ns, position, before.get(name, position))
-        for name, position in positions.items():
-            self._joints[name].append((stamp_ns, position))
-
-    def _check_speed(self, name: str, stamp_ns: int, position: float, received: float) -> None:
-        """Refuses a sample out of reach of the last one, unless two in a row agree."""
+    def _jump(self, name: str, stamp_ns: int, position: float, received: float) -> str:
+        """Why a sample is out of reach of the last one, unless two in a row agree."""
         if not self._joints[name]:
-            return
-        last_ns, last = self._joints[name][-1]
-        reach = _LEAST_JUMP + _FASTEST * abs(stamp_ns - last_ns) / NANO
-        if min(abs(position - last), abs(position - received)) > reach:
-            raise Rejection(
-                Reason.JOINT_STATE_INVALID,
-                f"joint '{name}' jumps from {last:g} to {position:g} in "
-                f'{(stamp_ns - last_ns) / NANO:.4f} s',
-            )
+            return ''
+        last_ns, last = self._joints[name].newest
+        seconds = (stamp_ns - last_ns) / NANO
+        reach = _LEAST_JUMP + _FASTEST * abs(seconds)
+        if min(abs(position - last), abs(position - received)) <= reach:
+            return ''
+        return f'it jumps from {last:g} to {position:g} in {seconds:.4f} s'
 
     def clear(self) -> None:
         """Forgets images and joint states (the clock jumped); camera infos stay."""
@@ -231,6 +257,7 @@ class ObservationBuffer:
         self._check_frames([message.header.frame_id for _, message in images])
         stamp_ns = min(stamp for stamp, _ in images)
         shown = [image_messages.to_rgb(message) for _, message in images]
+        self._check_sizes(shown)
         size = _common_size(shown, self._size)
         cameras, frames, infos = [], [], []
         for view, (_, message), frame in zip(self.views, images, shown, strict=True):
@@ -249,6 +276,18 @@ class ObservationBuffer:
             observation=observation, camera_infos=tuple(infos), source_stamp_ns=stamp_ns
         )
 
+    def _check_sizes(self, frames: Sequence[ByteArray]) -> None:
+        """Refuses images that are too small to show objects."""
+        least = [round(_LEAST_SIDE_FRACTION * side) for side in self._size]
+        for view, frame in zip(self.views, frames, strict=True):
+            height, width = frame.shape[:2]
+            if width < least[0] or height < least[1]:
+                raise Rejection(
+                    Reason.IMAGE_DATA,
+                    f"images of view '{view}' have {width}x{height} pixels; the model needs at "
+                    f'least {least[0]}x{least[1]}',
+                )
+
     def _check_frames(self, frames: Sequence[str]) -> None:
         """Refuses images that come from another camera than those before, as after a swap."""
         for view, frame in zip(self.views, frames, strict=True):
@@ -260,7 +299,7 @@ class ObservationBuffer:
                     f"'{before}': was another camera connected? call ~/reset to accept it",
                 )
 
-    def _posed(self, camera: CameraModel, image: Image | CompressedImage) -> CameraModel:
+    def _posed(self, camera: CameraModel, image: AnyImage) -> CameraModel:
         """The camera with its pose at the image's time."""
         if self._pose is None:
             return camera
@@ -270,25 +309,34 @@ class ObservationBuffer:
             return camera
         return replace(camera, mount_link=mount.link, T_mount_camera=mount.T_link_frame)
 
-    def _pick_images(
-        self, now_ns: int, limits: NodeSettings
-    ) -> list[tuple[int, Image | CompressedImage]]:
-        """Per view the image nearest to the newest moment that every view has seen."""
+    def _pick_images(self, now_ns: int, limits: NodeSettings) -> list[tuple[int, AnyImage]]:
+        """Per view the image nearest to the newest moment that every view has seen.
+
+        Where these are too far apart, because images were lost, the newest ones that are not.
+        """
         for view, images in self._images.items():
             if not images:
                 raise Rejection(
-                    Reason.IMAGE_MISSING,
-                    f"no image of view '{view}' was received; is its camera running, and does "
-                    f"the parameter 'camera_topics.{view}' name it?",
+                    Reason.IMAGE_STALE if images.refusal else Reason.IMAGE_MISSING,
+                    images.refusal
+                    or f"no image of view '{view}' was received; is its camera "
+                    f"running, and does the parameter 'camera_topics.{view}' name it?",
                 )
-        newest = {view: images[-1][0] for view, images in self._images.items()}
+        newest = {view: images.newest[0] for view, images in self._images.items()}
         for view, stamp in newest.items():
             what = f"the newest image of view '{view}'"
             _check_age(Reason.IMAGE_STALE, what, stamp, now_ns, limits.max_image_age_s)
         common = min(newest.values())
-        picked = [min(i, key=lambda image: abs(image[0] - common)) for i in self._images.values()]
+        earliest_ns = now_ns - round(limits.max_image_age_s * NANO)
+        moments = {stamp for images in self._images.values() for stamp in images.stamps}
+        earlier = sorted((m for m in moments if earliest_ns <= m < common), reverse=True)
+        choices = [
+            [images.nearest(moment) for images in self._images.values()]
+            for moment in (common, *earlier)
+        ]
+        picked = next((c for c in choices if _skew_s(c) <= limits.max_view_skew_s), choices[0])
         stamps = [stamp for stamp, _ in picked]
-        skew = (max(stamps) - min(stamps)) / NANO
+        skew = _skew_s(picked)
         if skew > limits.max_view_skew_s:
             apart = ', '.join(
                 f'{view} {(stamp - min(stamps)) / NANO:.3f} s'
@@ -305,18 +353,33 @@ class ObservationBuffer:
         """(J,) positions nearest in time to the images."""
         missing = [name for name, samples in self._joints.items() if not samples]
         if missing:
+            why = next((w for name in missing if (w := self._joints[name].refusal)), '')
             raise Rejection(
-                Reason.JOINT_STATE_MISSING, f'no joint state of {missing} was received'
+                Reason.JOINT_STATE_MISSING,
+                f'no joint state of {missing} was received{_because(why)}',
             )
         for name, samples in self._joints.items():
             what, limit = f"the newest state of joint '{name}'", limits.max_joint_state_age_s
-            _check_age(Reason.JOINT_STATE_STALE, what, samples[-1][0], now_ns, limit)
-        return np.array(
-            [
-                min(samples, key=lambda sample: abs(sample[0] - stamp_ns))[1]
-                for samples in self._joints.values()
-            ]
-        )
+            stamp = samples.newest[0]
+            _check_age(Reason.JOINT_STATE_STALE, what, stamp, now_ns, limit, samples.refusal)
+        return np.array([samples.nearest(stamp_ns)[1] for samples in self._joints.values()])
+
+
+def _refusal(samples: Samples[Any], what: str, stamp_ns: int, now_ns: int, limit_s: float) -> str:
+    """Why a sample is not taken by its stamp; empty = it is taken."""
+    why = samples.refuse_reason(stamp_ns, now_ns, limit_s) if now_ns else ''
+    return f'{what} {why}; do the clocks of its sender and this node agree?' if why else ''
+
+
+def _because(refusal: str) -> str:
+    """The reason why newer samples were refused, to be appended to a text."""
+    return f'; the last one was refused: {refusal}' if refusal else ''
+
+
+def _skew_s(images: Sequence[tuple[int, AnyImage]]) -> float:
+    """Time between the oldest and the newest image [s]."""
+    stamps = [stamp for stamp, _ in images]
+    return (max(stamps) - min(stamps)) / NANO
 
 
 def _common_size(frames: Sequence[ByteArray], least: tuple[int, int]) -> tuple[int, int]:
@@ -506,28 +569,30 @@ def _copied(info: CameraInfo, **changes: object) -> CameraInfo:
     return copied
 
 
-def _age(samples: Sequence[tuple[int, object]], now_ns: int) -> float:
-    return (now_ns - samples[-1][0]) / NANO if samples else float('nan')
+def _age(samples: Samples[Any], now_ns: int) -> float:
+    return (now_ns - samples.newest[0]) / NANO if samples else float('nan')
 
 
-def _freshness(
-    what: str, samples: Sequence[tuple[int, object]], now_ns: int, limit: float
-) -> list[str]:
+def _freshness(what: str, samples: Samples[Any], now_ns: int, limit: float) -> list[str]:
     if not samples:
-        return [f'no {what}']
+        return [f'no {what}{_because(samples.refusal)}']
     age = _age(samples, now_ns)
-    return [] if abs(age) <= limit else [f'{what} are {age:.1f} s old']
+    if abs(age) <= limit:
+        return []
+    return [f'{what} are {age:.1f} s old{_because(samples.refusal)}']
 
 
-def _check_age(reason: Reason, what: str, stamp_ns: int, now_ns: int, limit: float) -> None:
+def _check_age(
+    reason: Reason, what: str, stamp_ns: int, now_ns: int, limit: float, refusal: str = ''
+) -> None:
     age = (now_ns - stamp_ns) / NANO
     if abs(age) <= limit:
         return
     when = f'{age:.3f} s old' if age > 0 else f'stamped {-age:.3f} s in the future'
     raise Rejection(
         reason,
-        f"{what} is {when}; '{_AGE_LIMITS[reason]}' allows {limit:g} s (for recorded data at its "
-        "own time set 'use_sim_time' and play with a clock)",
+        f"{what} is {when}{_because(refusal)}; '{_AGE_LIMITS[reason]}' allows {limit:g} s (for "
+        "recorded data at its own time set 'use_sim_time' and play with a clock)",
     )
 
 

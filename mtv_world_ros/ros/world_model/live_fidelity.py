@@ -23,6 +23,7 @@ from mtv_world_ros.ros.messages import image_messages
 from mtv_world_ros.ros.messages.conversions import NANO, to_multi_array, to_ns
 from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.node_events import NodeEvents
+from mtv_world_ros.ros.sensing.samples import Samples
 from mtv_world_ros.ros.status_publisher import create_publisher
 from mtv_world_ros.ros.world_model.worker import Chunk, Request, Result
 from mtv_world_ros.success.doubts import PhysicsWatch, unforeseen
@@ -114,7 +115,9 @@ class LiveFidelity:
         self._changed = Condition()
         self._images: deque[tuple[str, Image | CompressedImage]] = deque(maxlen=MAX_WAITING)
         self._expected: deque[Expected] = deque(maxlen=MAX_CHUNKS)
-        self._frames = {view: deque(maxlen=MAX_FRAMES) for view in self._spec.views}
+        self._frames: dict[str, Samples[ByteArray]] = {
+            view: Samples(MAX_FRAMES) for view in self._spec.views
+        }
         self._seen: _SeenRollout | None = None
         self._results: deque[ScoredChunk | Exception] = deque(maxlen=MAX_CHUNKS)
         self._kept: deque[float] = deque(maxlen=MAX_KEPT)
@@ -205,10 +208,10 @@ class LiveFidelity:
                 self._done.trigger()
 
     def _keep(self, view: str, message: Image | CompressedImage) -> None:
-        """Stores a real frame at the model's size, unless the last one is nearly as new."""
+        """Stores a real frame at the model's size, unless there is one of nearly the same time."""
         stamp_ns = to_ns(message.header.stamp)
         frames = self._frames[view]
-        if frames and stamp_ns - frames[-1][0] < self._tolerance_ns / 4:
+        if frames and abs(frames.nearest(stamp_ns)[0] - stamp_ns) < self._tolerance_ns / 4:
             return
         try:
             frame = image_messages.to_rgb(message)
@@ -216,11 +219,11 @@ class LiveFidelity:
             return  # counted where it came in
         small = resize_frames(frame[None], self._spec.width, self._spec.height)[0]
         with self._changed:
-            frames.append((stamp_ns, small))
+            frames.add(stamp_ns, small)
 
     def _due(self) -> Expected | None:
         """A chunk whose last frame every view has passed."""
-        newest = [frames[-1][0] if frames else -1 for frames in self._frames.values()]
+        newest = [frames.newest[0] if frames else -1 for frames in self._frames.values()]
         for expected in self._expected:
             if not expected.stamps or min(newest) >= expected.stamps[-1]:
                 return expected
@@ -275,7 +278,7 @@ class LiveFidelity:
         for index, stamp in enumerate(stamps):
             row = []
             for frames in self._frames.values():
-                near = min(frames, key=lambda item: abs(item[0] - stamp), default=None)
+                near = frames.nearest(stamp) if frames else None
                 if near is not None and abs(near[0] - stamp) <= self._tolerance_ns:
                     row.append(near[1])
             if len(row) == len(self._frames):

@@ -26,6 +26,7 @@ from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 from mtv_world_ros.ros.parameters import refusing, Settings
 from mtv_world_ros.ros.sensing.live_robot import Extrinsics, RobotDescription
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer, SensedScene
+from mtv_world_ros.ros.sensing.samples import NodeTime
 from mtv_world_ros.ros.sensing.subscriptions import Inputs
 from mtv_world_ros.ros.world_model.follow_joint_trajectory import (
     find_action,
@@ -187,6 +188,8 @@ class Rollouts:
 
     def _build(self, pipeline: Pipeline, undo: ExitStack) -> None:
         node, settings = self._node, self.settings
+        self._time = NodeTime.of(node)
+        self._time.step_s()
         check = refusing(lambda changed: check_calibration(changed, settings(), self._spec))
         node.add_on_set_parameters_callback(check)
         undo.callback(node.remove_on_set_parameters_callback, check)
@@ -206,6 +209,7 @@ class Rollouts:
             limits=settings,
             on_image=self.on_image,
             pose=self._extrinsics.pose,
+            time=self._time,
         )
         self._maker = RequestMaker(
             self._robot, self._buffer, settings, lambda: self._worker.last_scene
@@ -262,6 +266,7 @@ class Rollouts:
 
     def refresh(self) -> None:
         """Looks at the worker and at the publishers again; to be called now and then."""
+        self._check_clock()
         self._worker.supervise(self.settings().stuck_after_s)
         self._inputs.refresh()
         self._look_again()
@@ -307,7 +312,7 @@ class Rollouts:
 
     def on_image(self, view: str, message: Image | CompressedImage) -> None:
         """Passes real images on, and one observation of all views per frame of the model."""
-        if not self._is_active:
+        if not self._is_active or self._check_clock():
             return
         self._look_again()
         self._fidelity.see(view, message)
@@ -418,6 +423,22 @@ class Rollouts:
         self._worker.reset(state, text)
         self._fidelity.reset()
         self._publisher.reset()
+
+    def _check_clock(self) -> bool:
+        """Tells whether the system clock was set back; then everything from before is dropped.
+
+        rclpy tells of jumps of `/clock` only.
+        """
+        step_s = self._time.step_s()
+        if step_s:
+            self._reporter.count('clock_steps')
+            self._node.get_logger().warning(
+                f'the system clock was set by {step_s:+.3f} s'
+                + ('; what was received before is dropped' if step_s < 0 else '')
+            )
+        if step_s < 0:
+            self._on_jump(step_s)
+        return step_s < 0
 
     def _on_jump(self, _: object) -> None:
         """Drops what is stored when the clock jumps back, as when a bag starts over."""

@@ -9,6 +9,7 @@ from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.parameters import NodeSettings
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
+from mtv_world_ros.ros.sensing.samples import NodeTime, Samples
 
 NOW = 1_000 * NANO
 MS = 1_000_000
@@ -18,7 +19,7 @@ MS = 1_000_000
 def make_buffer(ros, tmp_path):
     cameras = load_calibration(ros.make_calibration(tmp_path / 'calibration.yaml'))
 
-    def make(skew=0.05, joint_names=('a', 'b'), seen=None):
+    def make(skew=0.05, joint_names=('a', 'b'), seen=None, clock=None):
         limits = NodeSettings(max_view_skew_s=skew)
         buffer = ObservationBuffer(
             cameras=[cameras[view] for view in ('low', 'high')],
@@ -26,6 +27,7 @@ def make_buffer(ros, tmp_path):
             width=96,
             height=72,
             limits=lambda: limits,
+            time=clock and NodeTime(lambda: clock[0], lambda: False),
         )
         for number, view in enumerate(('low', 'high')):
             info = ros.make_info(view)
@@ -96,6 +98,9 @@ def test_skew_within_the_limit_is_stamped_with_the_older_view(make_buffer, ros):
     buffer.add_image('low', ros.make_image('low', NOW))
     buffer.add_image('high', ros.make_image('high', NOW - 40 * MS))
     assert buffer.observe(NOW).observation.stamp_ns == NOW - 40 * MS
+    buffer.clear()
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    buffer.add_image('low', ros.make_image('low', NOW))
     buffer.add_image('high', ros.make_image('high', NOW - 60 * MS))
     with pytest.raises(Rejection, match='the views are 0.060 s apart') as refused:
         buffer.observe(NOW)
@@ -189,3 +194,131 @@ def test_joints_of_another_device_do_not_matter(make_buffer):
     names, values = ['wheel', 'a', 'wheel', 'b'], [float('nan'), 0.1, 2.0, 0.2]
     buffer.add_joint_state(JointState(header=make_header(NOW), name=names, position=values))
     assert not [text for text in buffer.problems(NOW) if 'joint_states' in text]
+
+
+@pytest.fixture
+def clock():
+    """The node's time [ns], which a test may change."""
+    return [NOW]
+
+
+def show(buffer, ros, stamp_ns, views=('low', 'high')):
+    for view in views:
+        buffer.add_image(view, ros.make_image(view, stamp_ns))
+
+
+def test_an_image_an_hour_ahead_is_refused_and_the_others_stay(make_buffer, ros, clock):
+    taken = []
+    buffer = make_buffer(clock=clock)
+    buffer._on_image = lambda view, message: taken.append(message)
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    show(buffer, ros, NOW)
+    with pytest.raises(Rejection, match="view 'low' is stamped 3600.000 s in the future"):
+        buffer.add_image('low', ros.make_image('low', NOW + 3600 * NANO))
+    assert buffer.observe(NOW).observation.stamp_ns == NOW
+    assert len(taken) == 2  # who watches the images does not see it either
+    with pytest.raises(Rejection, match="joint 'a' is stamped 3600.000 s in the future"):
+        buffer.add_joint_state(joints(NOW + 3600 * NANO, a=0.0, b=0.0))
+    assert not buffer.problems(NOW)
+
+
+def test_images_that_are_all_refused_are_not_called_missing(make_buffer, ros, clock):
+    buffer = make_buffer(clock=clock)
+    for view in ('low', 'high'):
+        with pytest.raises(Rejection):
+            show(buffer, ros, NOW + 2 * NANO, [view])
+    with pytest.raises(Rejection, match='stamped 2.000 s in the future; do the clocks') as refused:
+        buffer.observe(NOW)
+    assert refused.value.reason is Reason.IMAGE_STALE
+
+
+def test_a_system_clock_that_is_set_back_does_not_blind(make_buffer, ros, clock):
+    """What was stored before lies in the future then, and would stay the newest for an hour."""
+    buffer = make_buffer(clock=clock)
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    show(buffer, ros, NOW)
+    clock[0] = later = NOW - 900 * NANO
+    buffer.add_joint_state(joints(later, a=0.0, b=0.0))
+    show(buffer, ros, later)
+    assert buffer.observe(later).observation.stamp_ns == later
+
+
+def test_a_late_older_frame_is_not_the_newest(make_buffer, ros, clock):
+    buffer = make_buffer(clock=clock)
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    show(buffer, ros, NOW)
+    show(buffer, ros, NOW - 300 * MS)
+    assert buffer.observe(NOW).observation.stamp_ns == NOW
+    with pytest.raises(Rejection, match='is 0.800 s old; there are newer ones'):
+        show(buffer, ros, NOW - 800 * MS)
+    assert buffer.observe(NOW).observation.stamp_ns == NOW
+
+
+def test_views_that_lose_frames_are_paired_by_the_newest_that_belong_together(make_buffer, ros):
+    """Two large cameras at 10 Hz of which each loses frames of its own."""
+    buffer = make_buffer()
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    for step in (-400, -300, 0):
+        show(buffer, ros, NOW + step * MS, ['low'])
+    for step in (-400, -300, -200, -100):
+        show(buffer, ros, NOW + step * MS, ['high'])
+    assert buffer.observe(NOW).observation.stamp_ns == NOW - 300 * MS
+    with pytest.raises(Rejection, match='the views are 0.100 s apart'):
+        buffer.observe(NOW + 250 * MS)  # those that belong together are too old by now
+
+
+def test_one_joint_that_jumps_does_not_blind_the_others(make_buffer):
+    buffer = make_buffer()
+    buffer.add_joint_state(joints(NOW - 600 * MS, a=0.0, b=0.0))
+    buffer.add_joint_state(joints(NOW - 599 * MS, a=0.0, b=0.0))
+    with pytest.raises(Rejection, match="joint 'b': it jumps from 0 to 5000"):
+        buffer.add_joint_state(joints(NOW, a=0.1, b=5000.0))
+    assert 'no fresh joint_states of b' in buffer.problems(NOW)
+
+
+def test_a_stale_joint_is_named_with_why_its_newer_states_were_refused(make_buffer, ros):
+    buffer = make_buffer()
+    show(buffer, ros, NOW)
+    buffer.add_joint_state(joints(NOW - 700 * MS, a=0.0, b=0.0))
+    with pytest.raises(Rejection):
+        buffer.add_joint_state(joints(NOW, a=0.0, b=float('nan')))
+    with pytest.raises(Rejection, match="joint 'b' is 0.700 s old; .* its position is nan"):
+        buffer.observe(NOW)
+
+
+@pytest.mark.parametrize('size', [(1, 1), (4, 3), (8, 6), (44, 33)])
+def test_images_of_a_few_pixels_are_not_judged(make_buffer, ros, size):
+    """The model's frames are 96x72."""
+    buffer = make_buffer(seen=[(384, 288)] * 2)
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    for view in ('low', 'high'):
+        image = ros.make_image(view, NOW)
+        image.width, image.height, image.step = *size, 3 * size[0]
+        image.data = bytes(3 * size[0] * size[1])
+        buffer.add_image(view, image)
+    with pytest.raises(Rejection, match=f'have {size[0]}x{size[1]} pixels; .* 48x36') as refused:
+        buffer.observe(NOW)
+    assert refused.value.reason is Reason.IMAGE_DATA
+
+
+def test_samples_are_in_the_order_of_their_stamps():
+    samples = Samples(3)
+    for stamp, value in ((30, 'c'), (10, 'a'), (20, 'b'), (20, 'again'), (25, 'd'), (5, 'old')):
+        samples.add(stamp, value)
+    assert samples.stamps == [20, 25, 30] and samples.newest == (30, 'c')
+    assert samples.nearest(21) == (20, 'again')
+    samples.add(30 - 2 * NANO, 'anew')  # as when a recording starts over
+    assert samples.stamps == [30 - 2 * NANO]
+
+
+def test_steps_of_the_system_clock_are_told_from_its_drift():
+    now, steady, simulated = [NOW], [0], [False]
+    time = NodeTime(lambda: now[0], lambda: simulated[0], lambda: steady[0])
+    assert time.step_s() == 0.0
+    for passed, gone, step in ((1000, 1010, 0.0), (1000, -2600, -3.6), (50, 950, 0.9)):
+        steady[0] += passed * MS
+        now[0] += gone * MS
+        assert time.step_s() == pytest.approx(step)
+    simulated[0] = True  # rclpy tells of jumps of /clock
+    now[0] = 0
+    assert time.step_s() == 0.0
