@@ -23,6 +23,7 @@ from mtv_world_ros.core.processes import (
     escape_unprintable_output,
     PARENT_VARIABLE,
 )
+from mtv_world_ros.ros.guarded_clock import guard_clock
 from mtv_world_ros.ros.parameters import guard_parameter_services
 from mtv_world_ros.ros.receive_paths import receive_paths, resolved_topics
 
@@ -41,6 +42,12 @@ def end_with_parent() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
     if os.getppid() != int(parent):  # gone before the signal was set
         sys.exit(1)
+
+
+def guard_node(node: Node) -> None:
+    """Let a node outlive messages and requests of peers that rclpy itself fails on."""
+    guard_parameter_services(node)
+    guard_clock(node)
 
 
 def spin_forever(node: Node) -> None:
@@ -97,7 +104,7 @@ def run(
         groups = [resolved_topics(words, name, topics) for topics in own_paths]
         with receive_paths(groups) as paths:
             node = make()
-        guard_parameter_services(node)
+        guard_node(node)
         for note in paths.notes:
             node.get_logger().info(note)
         starting.is_over = True  # from now on rclpy's handler, or the node's own, ends it

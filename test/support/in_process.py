@@ -17,6 +17,8 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl import rcutils_logger
 from rclpy.node import Node
 
+from mtv_world_ros.ros.run_node import guard_node
+
 #: time that a node may take to end on a busy machine [s]
 PATIENCE_S = 120.0
 Listener = Callable[[str, str], object]
@@ -81,6 +83,7 @@ class NodeInProcess:
         _listeners.append(self._listen)
         try:
             self.node = make(self._context)
+            guard_node(self.node)
             self._name = self.node.get_logger().name
         except BaseException:
             _listeners.remove(self._listen)
