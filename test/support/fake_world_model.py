@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
+from mtv_world_ros.control.trajectory_video import TrajectoryVideo, TrajectoryVideoConfig
 from mtv_world_ros.core.errors import ModelMemoryError, RolloutPreempted
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.robot.file import load_robot
@@ -80,7 +80,7 @@ def load(settings):
         world_model=FakeWorldModel(),
         segmenter=ColourSegmenter(),
         estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks'))),
-        rendering=TrajectoryVideoConfig(),
+        control=TrajectoryVideo(config=TrajectoryVideoConfig()),
         objects=settings.objects,
         describer=asked_describer(settings.describer),
     )
