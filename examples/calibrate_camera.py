@@ -17,9 +17,8 @@ from mtv_world_ros.core.files import check_free, share_path
 from mtv_world_ros.inspection.camera_pose import difference
 from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
 from mtv_world_ros.inspection.clocks import JointTrack
-from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.shape import load_shape
-from mtv_world_ros.rollout.assembly import robot_path
 
 parser = argparse.ArgumentParser()
 parser.add_argument(

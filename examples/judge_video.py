@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros import judge, load_pipeline
+from mtv_world_ros import judge, Pipeline
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
 
@@ -20,7 +20,7 @@ parser.add_argument(
 )
 options = parser.parse_args()
 
-pipeline = load_pipeline('bundled')
+pipeline = Pipeline.load('bundled')
 recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
 success = judge(pipeline, recording)
 print(f'{recording.instruction}: success {success.probability:.2f}, recorded {recording.outcome}')

@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mtv_world_ros import judge, load_pipeline
+from mtv_world_ros import judge, Pipeline
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
@@ -56,7 +56,7 @@ parser.add_argument(
 )
 options = parser.parse_args()
 
-pipeline = load_pipeline('bundled')
+pipeline = Pipeline.load('bundled')
 recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
 for segmenter in (pipeline.segmenter, HueSegmenter()):
     success = judge(replace(pipeline, segmenter=segmenter), recording)

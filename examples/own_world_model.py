@@ -14,13 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros import load_pipeline
+from mtv_world_ros import Pipeline
 from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.data_types import ByteArray, WorldModelSpec
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import commands_from, load_recording
 from mtv_world_ros.rollout.options import RolloutOptions
-from mtv_world_ros.rollout.pipeline import Pipeline
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ parser.add_argument(
 )
 options = parser.parse_args()
 
-bundled = load_pipeline('bundled')
+bundled = Pipeline.load('bundled')
 recording = load_recording(options.episode, bundled.spec, bundled.robot)
 held = replace(bundled, world_model=HeldFrame(bundled.spec), object_motion=None)
 print(f'bundled model: success {imagined(bundled):.2f}; held frame: {imagined(held):.2f}')

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros import load_pipeline
+from mtv_world_ros import Pipeline
 from mtv_world_ros.core.data_types import JointTrajectory, Observation
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
@@ -51,7 +51,7 @@ parser.add_argument(
 )
 options = parser.parse_args()
 
-pipeline = load_pipeline('bundled')
+pipeline = Pipeline.load('bundled')
 recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
 observation = recording.observation(0)
 policy = SwingingPolicy(pipeline.robot.joint_names)

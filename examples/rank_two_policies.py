@@ -12,7 +12,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from mtv_world_ros import load_pipeline
+from mtv_world_ros import Pipeline
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.policies.policy import RecordedPolicy
@@ -24,7 +24,7 @@ parser.add_argument(
 )
 options = parser.parse_args()
 
-pipeline = load_pipeline('bundled')
+pipeline = Pipeline.load('bundled')
 recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
 
 commands = recording.commands

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros import load_pipeline
+from mtv_world_ros import Pipeline
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import commands_from, load_recording
 from mtv_world_ros.rollout.options import RolloutOptions
@@ -25,7 +25,7 @@ parser.add_argument(
 )
 options = parser.parse_args()
 
-pipeline = load_pipeline('bundled')
+pipeline = Pipeline.load('bundled')
 recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
 observation = recording.observation(0)
 episode = pipeline.begin(observation, RolloutOptions(instruction=recording.instruction))

@@ -35,10 +35,9 @@ from mtv_world_ros.inspection.camera_pose import CameraEstimate, difference, mov
 from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
 from mtv_world_ros.inspection.cameras.wrist_camera import follow_scene, WristCamera
 from mtv_world_ros.inspection.clocks import JointTrack
-from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import load_shape
-from mtv_world_ros.rollout.assembly import robot_path
 from mtv_world_ros.simulation.arm import actuators_of
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.opengl import load_mujoco

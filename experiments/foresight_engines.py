@@ -47,15 +47,15 @@ from mtv_world_ros.data.splits import refuse_test_kinds
 from mtv_world_ros.evaluation.metrics.statistics import wilson
 from mtv_world_ros.evaluation.metrics.success_agreement import area_under_roc
 from mtv_world_ros.evaluation.result_settings import fingerprint
-from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
+from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
+from mtv_world_ros.model.checkpoint import Checkpoint, checkpoint_folder
 from mtv_world_ros.physics.checkpoint_files import load_foresight
 from mtv_world_ros.physics.fitting.tracks import fine_commands, first_frame
 from mtv_world_ros.physics.foreseen_motions import foreseen_of
 from mtv_world_ros.physics.object_motion import FoundObjects
 from mtv_world_ros.physics.solid_foresight import SolidForesight
 from mtv_world_ros.ranking.no_picture_rule import is_done, things_in
-from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import checkpoint_path, checkpoint_robot, robot_path
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.success.foreseen import foreseen_ends
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
 
@@ -91,12 +91,14 @@ import json, sys, time
 time.perf_counter = time.process_time  # other work does not count
 from dataclasses import replace
 import numpy as np
-from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros import Pipeline
+from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
+from mtv_world_ros.robot.file import robot_path
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.core.data_types import JointTrajectory, Observation
 from mtv_world_ros.core.files import share_path
 futures = int(sys.argv[1])
-pipeline = load_pipeline('bundled', num_threads=1)
+pipeline = Pipeline.load('bundled', num_threads=1)
 if futures:
     from mtv_world_ros.physics.solid_foresight import SolidForesight
     known = pipeline.object_motion
@@ -222,8 +224,12 @@ class New:
         self, futures: list[int], contact: str, robot: str | None, tasks: Sequence[Path] = ()
     ) -> None:
         self._tasks = (*map(load_task, tasks), *load_tasks(share_path('config', 'tasks')))
-        self.robot = checkpoint_robot(contact) if robot is None else load_robot(robot_path(robot))
-        found = load_foresight(checkpoint_path(contact) / OBJECT_MOTION_FOLDER, self.robot)
+        self.robot = (
+            Checkpoint.open(contact).load_robot()
+            if robot is None
+            else load_robot(robot_path(robot))
+        )
+        found = load_foresight(checkpoint_folder(contact) / OBJECT_MOTION_FOLDER, self.robot)
         if found is None:
             raise MtvWorldError(f"'{contact}' holds no numbers of contact; run fit-contact")
         self._engines = {

@@ -28,7 +28,7 @@ import numpy as np
 
 from mtv_world_ros.cli.shared_options import machine
 from mtv_world_ros.core.files import content_digest
-from mtv_world_ros.rollout.assembly import checkpoint_path
+from mtv_world_ros.model.checkpoint import checkpoint_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 #: what speed is compared with
@@ -201,7 +201,7 @@ def made_line(what: str, checkpoint: str | Path | None = None) -> str:
     if checkpoint is None and kind in ('', *OF_A_CHECKPOINT):
         checkpoint = 'bundled'
     if checkpoint is not None:
-        digest = content_digest(checkpoint_path(checkpoint))[:8]
+        digest = content_digest(checkpoint_folder(checkpoint))[:8]
         held = f'{"bundled" if str(checkpoint) == "bundled" else "other"} checkpoint `{digest}`'
     parts = ', '.join(f'`{path}`' for path in DESCRIBES.get(kind, ())) or 'the checkpoint'
     return f'Made at commit `{commit}{changed}`, {held}. Describes: {parts}.'
@@ -249,7 +249,7 @@ def main() -> None:
     if sys.argv[1:]:
         print(made_line(sys.argv[1]))
         return
-    current = content_digest(checkpoint_path('bundled'))[:8]
+    current = content_digest(checkpoint_folder('bundled'))[:8]
     for path in sorted((ROOT / 'experiments' / 'results').glob('*.md')):
         for reason in why_stale(path, bundled=current):
             print(f'{path.name}: {reason}')

@@ -41,10 +41,9 @@ from mtv_world_ros.inspection.cameras.shared_camera import (
     SharedEstimate,
 )
 from mtv_world_ros.inspection.clocks import JointTrack
-from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import load_shape, RobotShape
-from mtv_world_ros.rollout.assembly import robot_path
 
 WAYS = ('recorded', 'search', 'points', 'same-focal')
 HEAD = (

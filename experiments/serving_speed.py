@@ -19,7 +19,7 @@ import torch
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.evaluation.imagined_stretches import imagine_stretch, stretches
-from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.prediction import Prediction
 
 
@@ -52,7 +52,7 @@ def lines(options: argparse.Namespace) -> list[str]:
         '|---|---|---|---|---|---|',
     ]
     pipelines = {
-        dtype: load_pipeline(
+        dtype: Pipeline.load(
             options.checkpoint, device=options.device, dtype=dtype, num_threads=options.threads
         )
         for dtype in ('float32', 'bfloat16')

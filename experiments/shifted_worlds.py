@@ -50,7 +50,7 @@ from mtv_world_ros.core.errors import MtvWorldError, PolicyError, SimulatorError
 from mtv_world_ros.core.images import encode_png, resize_frames
 from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.evaluation.metrics.statistics import clustered_wilson
-from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
+from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
 from mtv_world_ros.physics.arm_response import PERIOD_S
 from mtv_world_ros.physics.checkpoint_files import load_foresight
 from mtv_world_ros.physics.foreseen_motions import foreseen_of
@@ -60,7 +60,6 @@ from mtv_world_ros.ranking.judges import area_interval
 from mtv_world_ros.ranking.no_picture_rule import judge_without_pictures
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.resample import resample
-from mtv_world_ros.rollout.assembly import load_pipeline
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.rollout import Rollout
@@ -622,7 +621,7 @@ def main() -> None:
     options = parse_arguments(__doc__, 1, more)
     names = options.checkpoints.split(',')
     pipelines = {
-        name: load_pipeline(name, camera_check=not options.no_camera_check) for name in names
+        name: Pipeline.load(name, camera_check=not options.no_camera_check) for name in names
     }
     found = run(options, pipelines)
     if not found:

@@ -32,8 +32,7 @@ from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.data.splits import select
 from mtv_world_ros.model.runtime import choose_dtype, place
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
-from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import robot_path
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.training.batches import BatchSource, ClipBatch
 from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.objective import NoiseDraws

@@ -24,7 +24,6 @@ from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data.recordings import commanded
 from mtv_world_ros.evaluation.imagined_stretches import predicted_frames, stretches
 from mtv_world_ros.evaluation.result_settings import fingerprint
-from mtv_world_ros.rollout.assembly import load_pipeline
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 
@@ -92,7 +91,7 @@ def stays(real: BoolArray) -> BoolArray:
 def main() -> None:
     """Prints a row for each choice of names, and writes them as a result page."""
     options = parse_arguments(__doc__, 40, more)
-    pipeline = load_pipeline(options.checkpoint)
+    pipeline = Pipeline.load(options.checkpoint)
     paths = list_episodes(options.dataset)
     paths = [paths[k] for k in np.linspace(0, len(paths), options.repeats, False).astype(int)]
     shares: dict[str, list[float]] = {}

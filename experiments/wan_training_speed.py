@@ -26,9 +26,9 @@ import torch
 from wan_bench import Bench
 
 from mtv_world_ros.cli.train import set_overrides
-from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import ControlBatch
 from mtv_world_ros.model.serving import ServingOptions
+from mtv_world_ros.model.trained_model import TrainedModel
 from mtv_world_ros.training.adapter import add_adapter
 from mtv_world_ros.training.base_checkpoint import Base
 from mtv_world_ros.training.batches import ClipBatch
@@ -84,7 +84,7 @@ def make(bench: Bench, config: TrainingConfig, encoders: Encoders, work: Path) -
     transformer = bench.transformer.requires_grad_(config.lora.rank == 0)
     if config.lora.rank:
         add_adapter(transformer, rank=config.lora.rank, alpha=config.lora.alpha)
-    parts = Checkpoint(
+    parts = TrainedModel(
         transformer=transformer,
         autoencoder=bench.autoencoder,
         scheduler=bench.scheduler,

@@ -2,8 +2,8 @@
 
 The names below are enough to begin with; they are imported when they are asked for:
 
-    load_pipeline    checkpoint and options -> Pipeline
-    Pipeline         `begin(observation, options)` -> Rollout
+    Checkpoint       `open(name or folder)` reads the card of a checkpoint
+    Pipeline         `load(checkpoint, ...)`; `begin(observation, options)` -> Rollout
     Rollout          `extend(trajectory)` imagines chunk after chunk
     RolloutOptions   instruction, seed, denoising steps, limits of a rollout
     Observation      camera frames and joint positions at one instant
@@ -22,16 +22,16 @@ import warnings
 if TYPE_CHECKING:
     from mtv_world_ros.core.data_types import JointTrajectory, Observation
     from mtv_world_ros.data.episode_reader import read_episode
-    from mtv_world_ros.rollout.assembly import load_pipeline
+    from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.rollout.offline import judge
     from mtv_world_ros.rollout.options import RolloutOptions
     from mtv_world_ros.rollout.pipeline import Pipeline
     from mtv_world_ros.rollout.rollout import Rollout
 
 __all__ = [
+    'Checkpoint',
     'JointTrajectory',
     'judge',
-    'load_pipeline',
     'Observation',
     'Pipeline',
     'read_episode',
@@ -40,17 +40,17 @@ __all__ = [
 ]
 #: public name -> module
 _PLACES = {
+    'Checkpoint': 'model.checkpoint',
     'JointTrajectory': 'core.data_types',
     'judge': 'rollout.offline',
-    'load_pipeline': 'rollout.assembly',
     'Observation': 'core.data_types',
     'Pipeline': 'rollout.pipeline',
     'read_episode': 'data.episode_reader',
     'Rollout': 'rollout.rollout',
     'RolloutOptions': 'rollout.options',
 }
-#: names of version 0.1 -> public name that replaced them
-_RENAMED = {'ImaginedEpisode': 'Rollout'}
+#: names of version 0.1 -> what replaced them
+_RENAMED = {'ImaginedEpisode': 'Rollout', 'load_pipeline': 'Pipeline.load'}
 
 # Threads of torch that wait for one another sleep. By default they spin: where another process
 # takes a core, those that wait use up the time that the last one needs, and all is many times as
@@ -63,17 +63,18 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 def __getattr__(name: str) -> Any:
     """Imports one of the public names."""
-    if name in _RENAMED:
-        new = _RENAMED[name]
+    new = _RENAMED.get(name, name)
+    if new != name:
         warnings.warn(
             f'mtv_world_ros.{name} is now mtv_world_ros.{new}; the old name goes with version 0.3',
             DeprecationWarning,
             stacklevel=2,
         )
-        name = new
-    if name not in _PLACES:
+    public, _, method = new.partition('.')
+    if public not in _PLACES:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    return getattr(import_module(f'{__name__}.{_PLACES[name]}'), name)
+    found = getattr(import_module(f'{__name__}.{_PLACES[public]}'), public)
+    return getattr(found, method) if method else found
 
 
 def __dir__() -> list[str]:

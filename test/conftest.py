@@ -14,10 +14,10 @@ import warnings
 import pytest
 
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.model.checkpoint import checkpoint_folder
 from mtv_world_ros.physics.arm_response import ArmResponse
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.rollout.assembly import checkpoint_path
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.opengl import missing_opengl
 from mtv_world_ros.simulation.workcell import workcell_of
@@ -105,7 +105,7 @@ def response(robot: RobotModel) -> ArmResponse:
     """How it follows commands, as the bundled checkpoint found."""
     from mtv_world_ros.physics.checkpoint_files import load_response
 
-    found = load_response(checkpoint_path('bundled') / 'object_motion', robot)
+    found = load_response(checkpoint_folder('bundled') / 'object_motion', robot)
     assert found is not None
     return found
 

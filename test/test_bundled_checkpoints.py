@@ -10,7 +10,7 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.model.card import CARD
-from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros.rollout.pipeline import Pipeline
 
 CHECKPOINTS = sorted(path.parent for path in share_path('resource').glob(f'*/{CARD}'))
 WHOLE_EPISODE = EvaluationConfig(mode='imagine', actions=('true',), ceiling=False, seed=3)
@@ -21,7 +21,7 @@ WHOLE_EPISODE = EvaluationConfig(mode='imagine', actions=('true',), ceiling=Fals
 def test_imagined_objects_overlap_the_true_ones_more_than_a_held_frame_does(
     checkpoint: Path, foresight: bool, tmp_path: Path
 ):
-    pipeline = load_pipeline(checkpoint, foresight=foresight)
+    pipeline = Pipeline.load(checkpoint, foresight=foresight)
     demo = share_path('resource', 'demo_episode')
     found = evaluate(pipeline, [demo], tmp_path, WHOLE_EPISODE, show_progress=False)
     scores = found.estimates(None)

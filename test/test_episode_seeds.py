@@ -10,8 +10,8 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import assemble
 from mtv_world_ros.rollout.options import RolloutOptions
+from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.rollout import SEED_STEP
 from mtv_world_ros.success.calibration import HorizonCurve
 from test.support.small_episodes import PersistenceWorldModel
@@ -54,7 +54,7 @@ def imagine(recording, num_seeds, horizon=None):
     trajectory = JointTrajectory(
         joint_names=whole.joint_names, times=whole.times[kept], positions=whole.positions[kept]
     )
-    episode = assemble(CARD, model, robot=YAM, horizon=horizon).begin(
+    episode = Pipeline.assemble(CARD, model, robot=YAM, horizon=horizon).begin(
         observation, RolloutOptions(instruction=recording.instruction, seed=3, num_seeds=num_seeds)
     )
     return model, list(episode.extend(trajectory))

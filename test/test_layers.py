@@ -13,8 +13,8 @@ from mtv_world_ros import cli
 from mtv_world_ros.core import entry_points
 from mtv_world_ros.core.entry_points import COMMANDS, load, POLICIES, registered, ROLLOUTS
 from mtv_world_ros.core.errors import ConfigError
-from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import policy_settings, robot_path
+from mtv_world_ros.robot.file import load_robot, robot_path
+from mtv_world_ros.rollout.assembly import policy_settings
 
 PRODUCT = ('ros.world_model.node', 'ros.policy.node', 'rollout.offline')
 LABORATORY = ('training', 'evaluation', 'simulation', 'ranking', 'reports')
@@ -36,8 +36,8 @@ def test_no_laboratory_is_reached_from(graph, module):
 def test_the_bundled_checkpoint_is_loaded_without_the_simulator():
     code = (
         'import sys\n'
-        'from mtv_world_ros.rollout.assembly import load_pipeline\n'
-        "load_pipeline(segmenter='colour', num_threads=1)\n"
+        'from mtv_world_ros.rollout.pipeline import Pipeline\n'
+        "Pipeline.load(segmenter='colour', num_threads=1)\n"
         "print([n for n in sys.modules if n.startswith('mtv_world_ros.simulation')])"
     )
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)

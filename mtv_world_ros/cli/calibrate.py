@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.evaluate import load_pipelines, say_failed
-from mtv_world_ros.cli.shared_options import add_options, check_model, provenance
+from mtv_world_ros.cli.shared_options import add_options, open_checkpoints, provenance
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.files import check_free
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.data.splits import Selection
     from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary
     from mtv_world_ros.evaluation.results import EpisodeResult
+    from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.success.calibration import HorizonCurve
     from mtv_world_ros.success.fitted_to import FittedTo
 
@@ -64,12 +65,10 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _calibrate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.splits import select
-    from mtv_world_ros.rollout.assembly import checkpoint_path
     from mtv_world_ros.success.calibration import save_fit
 
-    check_model(arguments.device, arguments.checkpoint)
-    folder = checkpoint_path(arguments.checkpoint)
-    _check_places(arguments, folder)
+    (checkpoint,) = open_checkpoints(arguments.device, arguments.checkpoint)
+    _check_places(arguments, checkpoint)
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
     from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.evaluation.fit import calibrate, samples_of
@@ -78,7 +77,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     print(f'{arguments.dataset}: {selection}')
     refuse_test_kinds(selection.paths, 'calibration')
     made = {**provenance(arguments), 'dataset': f'{arguments.dataset}: {selection}'}
-    runs = _imagine(arguments, selection)
+    runs = _imagine(arguments, checkpoint, selection)
     failed = say_failed([run.failed for run in runs])  # before what is too few is refused
     segmenter = str(runs[0].settings['segmenter'])
     samples = samples_of([run.results for run in runs], result_kinds(selection.paths))
@@ -86,9 +85,9 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     horizon = _horizon([run.results for run in runs], runs[0], made)
     text = write_calibration_report(arguments.out, found, horizon)
     if arguments.store:
-        fitted_to = _fitted_to(arguments, selection)
+        fitted_to, folder = _fitted_to(arguments, checkpoint, selection), checkpoint.folder
         stored = found.calibration.replace(fitted_to=fitted_to)
-        of_pictures = _is_of_pictures(arguments)
+        of_pictures = _is_of_pictures(arguments, checkpoint)
         if horizon is not None:  # first: with the calibration the checkpoint counts as calibrated
             print(f'stored: {save_fit(folder, horizon, of_pictures=of_pictures)}')
         print(f'stored: {save_fit(folder, stored, of_pictures=of_pictures)}')
@@ -96,20 +95,19 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     return int(failed)
 
 
-def _fitted_to(arguments: argparse.Namespace, selection: Selection) -> FittedTo:
+def _fitted_to(
+    arguments: argparse.Namespace, checkpoint: Checkpoint, selection: Selection
+) -> FittedTo:
     """Robot, foresight and cameras of the episodes; of those only that can be read."""
     from mtv_world_ros.data.episode_reader import read_episode
-    from mtv_world_ros.model.card import read_card
-    from mtv_world_ros.rollout.assembly import checkpoint_path, checkpoint_robot, fitting_setting
-    from mtv_world_ros.success.fitted_to import FittedTo
+    from mtv_world_ros.success.fitted_to import FittedTo, Setting
 
-    views = read_card(checkpoint_path(arguments.checkpoint)).views
-    cameras = []
+    views, cameras = checkpoint.card.views, []
     for path in selection.paths:
         with suppress(MtvWorldError):  # was named when it was imagined
             cameras.append(tuple(read_episode(path, views=views).cameras.values()))
-    robot = checkpoint_robot(arguments.checkpoint, arguments.robot)
-    setting = fitting_setting(arguments.checkpoint, robot)
+    robot = checkpoint.load_robot(arguments.robot)
+    setting = Setting.of(robot, checkpoint.object_motion_digest)
     if not arguments.foresight:
         setting = setting.replace(foresight='')
     return FittedTo.episodes(setting, cameras)
@@ -129,38 +127,39 @@ def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
     return {names[path]: kinds for path, kinds in recorded_kinds(paths).items()}
 
 
-def _check_places(arguments: argparse.Namespace, folder: Path) -> None:
+def _check_places(arguments: argparse.Namespace, checkpoint: Checkpoint) -> None:
     """Refuses to write into the installed package, and to replace an earlier calibration."""
-    from mtv_world_ros.rollout.assembly import BUNDLED_FOLDERS
     from mtv_world_ros.success.calibration import Calibration, fit_path
 
     check_free(arguments.out / 'calibration.json', arguments.overwrite)
     if not arguments.store:
         return
-    if arguments.checkpoint in BUNDLED_FOLDERS:
+    folder = checkpoint.folder
+    if checkpoint.is_bundled:
         raise ConfigError(
-            f"'{arguments.checkpoint}' is part of the installed package, into which nothing is "
+            f"'{checkpoint}' is part of the installed package, into which nothing is "
             f"written; copy it with 'cp -r {folder} DIR' and calibrate DIR, or give --no-store"
         )
-    file = fit_path(folder, Calibration, of_pictures=_is_of_pictures(arguments))
+    file = fit_path(folder, Calibration, of_pictures=_is_of_pictures(arguments, checkpoint))
     check_free(file, arguments.overwrite, 'checkpoint')
 
 
-def _is_of_pictures(arguments: argparse.Namespace) -> bool:
+def _is_of_pictures(arguments: argparse.Namespace, checkpoint: Checkpoint) -> bool:
     """Whether the fit is to rollouts without the object motion that the checkpoint foresees."""
-    from mtv_world_ros.rollout.assembly import can_foresee
+    robot = checkpoint.load_robot(arguments.robot)
+    return not arguments.foresight and checkpoint.can_foresee(robot)
 
-    return not arguments.foresight and can_foresee(arguments.checkpoint, arguments.robot)
 
-
-def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[EvaluationSummary]:
+def _imagine(
+    arguments: argparse.Namespace, checkpoint: Checkpoint, selection: Selection
+) -> list[EvaluationSummary]:
     """Imagines and scores the episodes once a seed."""
     from mtv_world_ros.evaluation.evaluate_episodes import evaluate
     from mtv_world_ros.evaluation.result_settings import fingerprint
     from mtv_world_ros.evaluation.settings import EvaluationConfig
     from mtv_world_ros.rollout.rollout import SEED_STEP
 
-    pipeline, parallel = load_pipelines(arguments, arguments.checkpoint, calibrated=False)
+    pipeline, parallel = load_pipelines(arguments, checkpoint, calibrated=False)
     return [
         evaluate(
             pipeline,
@@ -175,7 +174,7 @@ def _imagine(arguments: argparse.Namespace, selection: Selection) -> list[Evalua
                 observed=True,
             ),
             name=fingerprint(
-                arguments.checkpoint,
+                checkpoint,
                 calibrated=False,
                 adapter=arguments.adapter,
                 task=arguments.task,

@@ -131,8 +131,7 @@ def recorded_robot(episode: Path, name: str) -> Path:
     """
     from mtv_world_ros.core.files import ROBOT_YAML
     from mtv_world_ros.model.card import ROBOT_FOLDER
-    from mtv_world_ros.robot.file import load_robot
-    from mtv_world_ros.rollout.assembly import robot_path
+    from mtv_world_ros.robot.file import load_robot, robot_path
 
     for folder in (episode, *list(episode.resolve().parents)[:2]):
         file = folder / ROBOT_FOLDER / ROBOT_YAML
@@ -147,7 +146,7 @@ def robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, Episode
     """Returns the robot's YAML (`--robot`, the mapping's, the episode's), and the source."""
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.data.episode_reader import read_info
-    from mtv_world_ros.rollout.assembly import robot_path
+    from mtv_world_ros.robot.file import robot_path
 
     source = load_source(arguments.topics, arguments.calibration)
     name = arguments.robot or (source.mapping.robot if source.mapping else '')

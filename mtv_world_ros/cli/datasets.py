@@ -276,7 +276,7 @@ def _import_status(summary: ImportSummary[Any], name: Callable[[Any], str]) -> i
 def _robot_of_bags(arguments: argparse.Namespace, mapping: BagMapping, bag: Path) -> Path:
     """The robot's YAML; that of the first bag's `/robot_description` is written into OUT."""
     from mtv_world_ros.importing.bags import described_robot
-    from mtv_world_ros.rollout.assembly import robot_path
+    from mtv_world_ros.robot.file import robot_path
 
     name = arguments.robot or mapping.robot
     if name:

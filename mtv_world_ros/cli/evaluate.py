@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import (
     add_options,
-    check_model,
     names,
+    open_checkpoints,
     pipeline_choices,
     provenance,
     threads_of_workers,
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.data.splits import Selection
     from mtv_world_ros.evaluation.evaluate_episodes import Parallel
     from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary
+    from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.rollout.pipeline import Pipeline
 
 
@@ -152,7 +153,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.splits import of_physics, select
 
     entries = parse_entries(arguments.checkpoints)
-    check_model(arguments.device, *(entry.path for entry in entries))
+    checkpoints = open_checkpoints(arguments.device, *(entry.path for entry in entries))
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
     selection, truth = of_physics(selection, arguments.physics)
     from mtv_world_ros.reports.comparison import write_comparison
@@ -161,8 +162,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     alone = len(entries) == 1
     folders = [arguments.out if alone else arguments.out / _slug(e.label) for e in entries]
     summaries = [
-        _score(arguments, entry, selection, truth, folder)
-        for entry, folder in zip(entries, folders, strict=True)
+        _score(arguments, entry, checkpoint, selection, truth, folder)
+        for entry, checkpoint, folder in zip(entries, checkpoints, folders, strict=True)
     ]
     write_comparison(summaries, arguments.out)
     for entry, summary in zip(entries, summaries, strict=True):
@@ -221,20 +222,25 @@ def _slug(label: str) -> str:
 
 
 def load_pipelines(
-    arguments: argparse.Namespace, checkpoint: str | Path, **options: Any
+    arguments: argparse.Namespace, checkpoint: Checkpoint, **options: Any
 ) -> tuple[Pipeline, Parallel]:
     """Returns the pipeline of this process, and what makes those of worker processes."""
     from mtv_world_ros.evaluation.evaluate_episodes import Parallel
-    from mtv_world_ros.rollout.assembly import load_pipeline
+    from mtv_world_ros.rollout.pipeline import Pipeline
 
-    load = partial(load_pipeline, checkpoint, **pipeline_choices(arguments), **options)
+    load = partial(Pipeline.load, checkpoint, **pipeline_choices(arguments), **options)
     pipeline, threads = load(num_threads=arguments.threads), threads_of_workers(arguments)
     make = partial(load, num_threads=threads)
     return pipeline, Parallel(workers=arguments.workers, make_pipeline=make, threads=threads)
 
 
 def _score(
-    arguments: argparse.Namespace, entry: Entry, selection: Selection, truth: str, out: Path
+    arguments: argparse.Namespace,
+    entry: Entry,
+    checkpoint: Checkpoint,
+    selection: Selection,
+    truth: str,
+    out: Path,
 ) -> EvaluationSummary:
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.evaluation.evaluate_episodes import evaluate
@@ -242,7 +248,7 @@ def _score(
     from mtv_world_ros.evaluation.settings import EvaluationConfig
     from mtv_world_ros.rollout.assembly import asked_describer
 
-    pipeline, parallel = load_pipelines(arguments, entry.path)
+    pipeline, parallel = load_pipelines(arguments, checkpoint)
     return evaluate(
         pipeline,
         selection.paths,
@@ -260,7 +266,7 @@ def _score(
             fvd_weights=arguments.fvd_weights,
             source=load_source(arguments.topics, arguments.calibration),
         ),
-        name=fingerprint(entry.path, adapter=arguments.adapter, task=arguments.task),
+        name=fingerprint(checkpoint, adapter=arguments.adapter, task=arguments.task),
         label=_row(entry, pipeline),
         zero_shot=selection.zero_shot,
         provenance={

@@ -50,7 +50,7 @@ def _fit(arguments: argparse.Namespace) -> int:
 
     from mtv_world_ros.core.processes import threads_each
     from mtv_world_ros.data.splits import refuse_test_kinds
-    from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
+    from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
     from mtv_world_ros.physics.arms import Arms
     from mtv_world_ros.physics.checkpoint_files import (
         CONTACT_FILE,
@@ -65,8 +65,7 @@ def _fit(arguments: argparse.Namespace) -> int:
         read_recordings,
     )
     from mtv_world_ros.physics.fitting.response_fit import found_response
-    from mtv_world_ros.robot.file import load_robot
-    from mtv_world_ros.rollout.assembly import robot_path
+    from mtv_world_ros.robot.file import load_robot, robot_path
     from mtv_world_ros.training.training_run import find_episodes, spread
 
     folder = arguments.checkpoint / OBJECT_MOTION_FOLDER

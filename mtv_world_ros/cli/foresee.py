@@ -59,7 +59,8 @@ def _foresee(arguments: argparse.Namespace) -> int:
 def _foresight(arguments: argparse.Namespace) -> SolidForesight:
     from mtv_world_ros.core.errors import CheckpointError
     from mtv_world_ros.core.processes import threads_each
-    from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
+    from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
+    from mtv_world_ros.model.checkpoint import checkpoint_folder
     from mtv_world_ros.physics.arms import Arms
     from mtv_world_ros.physics.checkpoint_files import load_foresight
     from mtv_world_ros.physics.fitting.contact_fit import (
@@ -68,8 +69,7 @@ def _foresight(arguments: argparse.Namespace) -> SolidForesight:
         settings_of_place,
     )
     from mtv_world_ros.physics.solid_foresight import SolidForesight
-    from mtv_world_ros.robot.file import load_robot
-    from mtv_world_ros.rollout.assembly import checkpoint_path, robot_path
+    from mtv_world_ros.robot.file import load_robot, robot_path
 
     robot = load_robot(robot_path(arguments.robot))
     threads, count = threads_each(1), {'num_motions': arguments.futures}
@@ -81,7 +81,7 @@ def _foresight(arguments: argparse.Namespace) -> SolidForesight:
             settings = settings_of_place(settings.replace(table_varies=True), [recording], print)
         return SolidForesight(robot, None, settings, threads)
     found = load_foresight(
-        checkpoint_path(arguments.contact) / OBJECT_MOTION_FOLDER, robot, threads
+        checkpoint_folder(arguments.contact) / OBJECT_MOTION_FOLDER, robot, threads
     )
     if found is None:
         raise CheckpointError(

@@ -12,7 +12,7 @@ import sys
 from mtv_world_ros.cli.shared_options import (
     add_options,
     add_watch,
-    check_model,
+    open_checkpoints,
     pipeline_of,
     watch_arguments,
 )
@@ -56,7 +56,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.rollout.assembly import asked_describer
     from mtv_world_ros.rollout.offline import replay_offline
 
-    check_model(arguments.device, arguments.checkpoint)
+    (arguments.checkpoint,) = open_checkpoints(arguments.device, arguments.checkpoint)
     out = arguments.out or Path('out') / f'{arguments.episode.name}_predictions'
     check_free(out, arguments.overwrite)
     summary = replay_offline(
@@ -121,7 +121,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.episode_reader import list_episodes
     from mtv_world_ros.ros.launching import imagine_episodes, ImagineOptions
 
-    check_model(arguments.device, arguments.checkpoint)
+    (arguments.checkpoint,) = open_checkpoints(arguments.device, arguments.checkpoint)
     watch = watch_arguments(arguments)
     for folder in arguments.episodes:
         if not folder.exists():
@@ -142,7 +142,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
         instruction=arguments.instruction,
         seed=arguments.seed,
         watch=watch and (*watch, '--by-episode'),
-        checkpoint=arguments.checkpoint,
+        checkpoint=arguments.checkpoint.name,
         robot=arguments.robot or '',
         device=arguments.device,
         num_threads=arguments.threads,

@@ -45,8 +45,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _import_weights(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.robot.file import load_robot
-    from mtv_world_ros.rollout.assembly import robot_path
+    from mtv_world_ros.robot.file import load_robot, robot_path
     from mtv_world_ros.training.training_config import load_training_config
 
     if not arguments.path.exists():

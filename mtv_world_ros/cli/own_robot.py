@@ -58,9 +58,8 @@ def _add_robot(commands: argparse._SubParsersAction) -> None:
 
 
 def _robot(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.robot.file import load_robot
+    from mtv_world_ros.robot.file import load_robot, robot_path
     from mtv_world_ros.robot.shape import load_shape
-    from mtv_world_ros.rollout.assembly import robot_path
 
     path = Path(arguments.file)
     guessed: Path | None = None

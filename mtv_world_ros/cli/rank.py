@@ -15,7 +15,7 @@ from mtv_world_ros.cli.physics_option import add_physics, physics_text
 from mtv_world_ros.cli.shared_options import (
     add_options,
     add_watch,
-    check_model,
+    open_checkpoints,
     pipeline_choices,
     provenance,
     threads_of_workers,
@@ -24,10 +24,12 @@ from mtv_world_ros.cli.shared_options import (
 from mtv_world_ros.core.errors import ConfigError, PolicyError
 
 if TYPE_CHECKING:
+    from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.ranking.policy_list import ListedPolicy
     from mtv_world_ros.ranking.rollout_jobs import Job
     from mtv_world_ros.ranking.run_jobs import RankedCheckpoint
     from mtv_world_ros.reports.shown_rankings import LiveRanking
+    from mtv_world_ros.robot.model import RobotModel
 
 _DESCRIPTION = """\
 Runs policies on the same episodes in the simulator and in imagination, and says how well the two
@@ -115,12 +117,13 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _rank(arguments: argparse.Namespace) -> int:
     names, truth = _names(arguments), physics_text(arguments.physics)
-    check_model(arguments.device, *names)
+    opened = open_checkpoints(arguments.device, *names)
     watched = watch_arguments(arguments)
     if watched and not arguments.clips:
         raise ConfigError('--watch shows what --no-video leaves out; give one of them')
-    listed = _listed(arguments)
-    jobs = _jobs(arguments, listed)
+    robot = opened[0].load_robot(arguments.robot)
+    listed = _listed(arguments, robot)
+    jobs = _jobs(arguments, listed, robot)
     from mtv_world_ros.core.images import write_png
     from mtv_world_ros.ranking.flips import flip_sheet
     from mtv_world_ros.ranking.policy_list import ListedPolicies
@@ -130,9 +133,7 @@ def _rank(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.reports.ranking_report import console, write_ranking
 
     folders = [arguments.out, arguments.out / 'compared'][: len(names)]
-    checkpoints = [
-        _checkpoint(arguments, name, out) for name, out in zip(names, folders, strict=True)
-    ]
+    checkpoints = [_ranked(arguments, one, out) for one, out in zip(opened, folders, strict=True)]
     config = RolloutConfig(
         num_inference_steps=arguments.steps,
         max_chunks=arguments.max_chunks,
@@ -212,30 +213,29 @@ def _names(arguments: argparse.Namespace) -> list[str]:
     return names
 
 
-def _checkpoint(arguments: argparse.Namespace, name: str, out: Path) -> RankedCheckpoint:
+def _ranked(arguments: argparse.Namespace, checkpoint: Checkpoint, out: Path) -> RankedCheckpoint:
     from mtv_world_ros.ranking.run_jobs import RankedCheckpoint
-    from mtv_world_ros.rollout.assembly import load_pipeline
+    from mtv_world_ros.rollout.pipeline import Pipeline
 
     make_pipeline = partial(
-        load_pipeline,
-        name,
+        Pipeline.load,
+        checkpoint,
         num_threads=threads_of_workers(arguments),
         describer=arguments.describer,
         **pipeline_choices(arguments),
     )
-    settings = _settings(arguments, name)
+    settings = _settings(arguments, checkpoint)
     return RankedCheckpoint(make_pipeline=make_pipeline, out=out, settings=settings)
 
 
-def _listed(arguments: argparse.Namespace) -> tuple[ListedPolicy, ...]:
+def _listed(arguments: argparse.Namespace, robot: RobotModel) -> tuple[ListedPolicy, ...]:
     """The policies of a file; none where `--policies` is a comma-separated list."""
     from mtv_world_ros.ranking.policy_list import check_single_clients, load_policy_list
-    from mtv_world_ros.rollout.assembly import checkpoint_robot
 
     path = Path(arguments.policies or '')
     if path.suffix not in ('.yaml', '.yml'):
         return ()
-    listed = load_policy_list(path, checkpoint_robot(arguments.checkpoint, arguments.robot))
+    listed = load_policy_list(path, robot)
     check_single_clients(listed, arguments.workers)
     return listed
 
@@ -250,7 +250,9 @@ def _fault_set(text: str) -> str:
     return text
 
 
-def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list[Job]:
+def _jobs(
+    arguments: argparse.Namespace, listed: Sequence[ListedPolicy], robot: RobotModel
+) -> list[Job]:
     from mtv_world_ros.ranking.policy_list import check_tasks, tasks_of
     from mtv_world_ros.ranking.rollout_jobs import (
         BENCHMARK_TASKS,
@@ -259,7 +261,6 @@ def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list
         make_jobs,
         policies_named,
     )
-    from mtv_world_ros.rollout.assembly import checkpoint_robot
     from mtv_world_ros.simulation.expert.expert import Expert
     from mtv_world_ros.simulation.faults.catalogue import policies_of
     from mtv_world_ros.simulation.tasks import tasks_named
@@ -274,7 +275,6 @@ def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list
         policies, names = policies_of(arguments.faults), BENCHMARK_TASKS
     tasks = [task.name for task in tasks_named(arguments.tasks or ','.join(names))]
     check_tasks(listed, tasks)
-    robot = checkpoint_robot(arguments.checkpoint, arguments.robot)
     expert = Expert(robot, physics=arguments.physics)
     jobs = make_jobs(policies, tasks, arguments.episodes, arguments.seed, expert)
     if listed:
@@ -288,16 +288,16 @@ def _jobs(arguments: argparse.Namespace, listed: Sequence[ListedPolicy]) -> list
     return jobs
 
 
-def _settings(arguments: argparse.Namespace, name: str) -> dict[str, str]:
+def _settings(arguments: argparse.Namespace, checkpoint: Checkpoint) -> dict[str, str]:
     """Settings that rollouts depend on: with other settings they are run again."""
-    from mtv_world_ros.core.files import share_path
+    from mtv_world_ros.core.files import content_digest, share_path
     from mtv_world_ros.data.episode import NOMINAL
     from mtv_world_ros.evaluation.result_settings import fingerprint
     from mtv_world_ros.importing.stored_objects import stage_key
 
     settings = {
-        'checkpoint': fingerprint(name),
-        'task files': fingerprint(share_path('config', 'tasks')).split()[-1],
+        'checkpoint': fingerprint(checkpoint),
+        'task files': f'({content_digest(share_path("config", "tasks"))[:8]})',
         'robot': arguments.robot or '',
         'segmenter': arguments.segmenter,
         **({} if arguments.physics == NOMINAL else {'physics': arguments.physics}),

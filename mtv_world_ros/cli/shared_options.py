@@ -15,9 +15,10 @@ from typing import Any, TYPE_CHECKING
 from mtv_world_ros.viewing.viewer_process import PageAddress
 
 if TYPE_CHECKING:
+    from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.rollout.pipeline import Pipeline
 
-#: options that are arguments of `load_pipeline`
+#: options that are arguments of `Pipeline.load`
 _CHOICES = (
     'robot',
     'task',
@@ -221,32 +222,29 @@ def threads_of_workers(arguments: argparse.Namespace) -> int:
 
 
 def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
-    """Returns the pipeline of a command's checkpoint and model options."""
-    from mtv_world_ros.model.card import read_card
-    from mtv_world_ros.rollout.assembly import checkpoint_path, load_pipeline
+    """Returns the pipeline of a command's checkpoint, which was opened, and model options."""
+    from mtv_world_ros.rollout.pipeline import Pipeline
 
-    read_card(checkpoint_path(arguments.checkpoint))  # before torch is imported, which is slow
-    return load_pipeline(
+    return Pipeline.load(
         arguments.checkpoint, num_threads=arguments.threads, **pipeline_choices(arguments)
     )
 
 
-def check_model(device: str, *checkpoints: str) -> None:
-    """Checks checkpoints and device before the slow imports.
+def open_checkpoints(device: str, *names: str) -> list[Checkpoint]:
+    """Open the checkpoints that a command names, and check the device, before the slow imports.
 
     Raises:
         CheckpointError: a folder is no checkpoint.
         ConfigError: this machine has no such device.
     """
-    from mtv_world_ros.model.card import read_card
-    from mtv_world_ros.rollout.assembly import checkpoint_path
+    from mtv_world_ros.model.checkpoint import Checkpoint
 
-    for name in checkpoints:
-        read_card(checkpoint_path(name))
+    opened = [Checkpoint.open(name) for name in names]
     if device != 'cpu':
         from mtv_world_ros.model.runtime import check_device
 
         check_device(device)
+    return opened
 
 
 def pipeline_choices(arguments: argparse.Namespace) -> dict[str, Any]:

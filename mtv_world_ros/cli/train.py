@@ -143,14 +143,15 @@ def _train(arguments: argparse.Namespace) -> int:
             'mtv-world train DATASET --out DIR; without them only --dry-run works'
         )
     from mtv_world_ros.model.card import read_card
-    from mtv_world_ros.rollout.assembly import asked_describer, checkpoint_path, robot_path
+    from mtv_world_ros.model.checkpoint import Checkpoint
+    from mtv_world_ros.robot.file import robot_path
+    from mtv_world_ros.rollout.assembly import asked_describer
     from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
     # importing torch takes seconds: what is often mistyped is checked before
     if not arguments.dataset.is_dir():
         select(arguments.dataset)  # says that it holds no episodes
-    if arguments.init:
-        read_card(checkpoint_path(arguments.init))
+    initial = Checkpoint.open(arguments.init) if arguments.init else None
     from mtv_world_ros.model.runtime import check_device, choose_dtype
 
     check_device(arguments.device)
@@ -173,7 +174,7 @@ def _train(arguments: argparse.Namespace) -> int:
         broken=broken,
         num_episodes=arguments.episodes,
         source=source,
-        initial=checkpoint_path(arguments.init) if arguments.init else None,
+        initial=initial.folder if initial else None,
         **{name: getattr(arguments, name) for name in same},
     )
     folder = train(
@@ -281,8 +282,7 @@ def set_overrides(items: list[str]) -> dict[str, Any]:
 def _dry_run(config: TrainingConfig, arguments: argparse.Namespace) -> int:
     from mtv_world_ros.control.registry import create_control
     from mtv_world_ros.model.runtime import choose_dtype
-    from mtv_world_ros.robot.file import load_robot
-    from mtv_world_ros.rollout.assembly import robot_path
+    from mtv_world_ros.robot.file import load_robot, robot_path
     from mtv_world_ros.training.dry_run import step_cost
 
     dtype = choose_dtype(arguments.dtype, arguments.device)
@@ -355,7 +355,8 @@ def _judge(
     from mtv_world_ros.evaluation.results import rollout_path
     from mtv_world_ros.evaluation.settings import EvaluationConfig
     from mtv_world_ros.model.lora import ADAPTER
-    from mtv_world_ros.rollout.assembly import asked_describer, load_pipeline
+    from mtv_world_ros.rollout.assembly import asked_describer
+    from mtv_world_ros.rollout.pipeline import Pipeline
     from mtv_world_ros.training.training_run import HeldOutScores
     from mtv_world_ros.viewing.stored_rollout import load_rollout
 
@@ -364,7 +365,7 @@ def _judge(
     def judge(checkpoint: Path, step: int) -> HeldOutScores:
         folder = arguments.out / 'held_out' / f'{step:07d}'
         is_adapter = (checkpoint / ADAPTER).is_file()
-        pipeline = load_pipeline(
+        pipeline = Pipeline.load(
             arguments.init if is_adapter and arguments.init else checkpoint,
             adapter=checkpoint if is_adapter else None,
             device=arguments.device,

@@ -9,10 +9,11 @@ from typing import Any
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import content_digest, plain
+from mtv_world_ros.model.checkpoint import Checkpoint
 
 
 def fingerprint(
-    checkpoint: str | Path,
+    checkpoint: Checkpoint,
     *,
     calibrated: bool = True,
     adapter: Path | None = None,
@@ -21,16 +22,15 @@ def fingerprint(
     """Returns the checkpoint's name and a hash of its files: other weights, other name.
 
     Args:
-        checkpoint: folder, or `bundled`.
+        checkpoint: the checkpoint.
         calibrated: the calibration counts too.
         adapter: LoRA adapter that is used with it.
         task: name or file of the task that is judged.
     """
-    from mtv_world_ros.rollout.assembly import checkpoint_path
     from mtv_world_ros.success.calibration import CALIBRATION, HORIZON
 
     without = () if calibrated else (CALIBRATION, HORIZON)
-    parts = [f'{checkpoint} ({content_digest(checkpoint_path(checkpoint), without)[:8]})']
+    parts = [f'{checkpoint} ({checkpoint.digest(without)[:8]})']
     files = [] if adapter is None else [('adapter', adapter)]
     if task is not None and not task.endswith(('.yaml', '.yml')):
         parts.append(f'task {task}')

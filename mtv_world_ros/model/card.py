@@ -17,6 +17,10 @@ from mtv_world_ros.core.errors import CheckpointError, ConfigError
 CARD = 'world_model.json'
 #: the robot that a checkpoint was trained on (see `robot.file.save_robot`), and its cameras
 ROBOT_FOLDER, CAMERAS = 'robot', 'cameras.yaml'
+#: LoRA adapter of the transformer
+ADAPTER_FOLDER = 'adapter'
+#: contact settings and response of the arms, for object motion
+OBJECT_MOTION_FOLDER = 'object_motion'
 
 
 class HistorySettings(Schema):

@@ -1,179 +1,178 @@
-"""Checkpoint folders: diffusers' layout, safetensors only, and `world_model.json` beside it."""
+"""A checkpoint folder, opened once: its card, its robot, its default cameras, its parts."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
-import shutil
-from typing import Any, cast
+from typing import Any
 
-import torch
+from mtv_world_ros.control.control import Control, ControlOptions
+from mtv_world_ros.control.registry import load_control
+from mtv_world_ros.core.data_types import WorldModelSpec
+from mtv_world_ros.core.errors import CalibrationError, CheckpointError, ConfigError, nearest
+from mtv_world_ros.core.files import content_digest, ROBOT_YAML, share_path
+from mtv_world_ros.model.card import (
+    CAMERAS,
+    CheckpointCard,
+    OBJECT_MOTION_FOLDER,
+    read_card,
+    ROBOT_FOLDER,
+)
+from mtv_world_ros.robot.file import load_robot, robot_path
+from mtv_world_ros.robot.model import RobotModel
 
-from mtv_world_ros.control.control import Control
-from mtv_world_ros.control.registry import save_control
-from mtv_world_ros.core.bounded_input import read_json
-from mtv_world_ros.core.errors import CheckpointError, MtvWorldError
-from mtv_world_ros.core.files import whole_folder
-from mtv_world_ros.core.network_sizes import check_sizes
-from mtv_world_ros.model.card import CheckpointCard, read_card, ROBOT_FOLDER
-from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
-from mtv_world_ros.model.parts import Autoencoder, build_autoencoder, build_scheduler, Scheduler
-from mtv_world_ros.model.runtime import place
-from mtv_world_ros.model.tensor_files import disk_errors, PICKLES, read_tensors
-from mtv_world_ros.model.transformer.transformer import copy_of, MultiViewWanTransformer
-
-WEIGHTS = 'diffusion_pytorch_model'
-ADAPTER_FOLDER = 'adapter'
-OBJECT_MOTION_FOLDER = 'object_motion'
-PARTS = ('transformer', 'autoencoder', 'scheduler')
-#: in transformers' configurations of version 0.1.0, for actions that are not drawn
-_OF_0_1 = ('control', 'action_dim', 'num_context_tokens')
+BUNDLED = 'bundled'
+#: folders of `resource` with the checkpoints that ship with the package, by name; the second one
+#: was trained the paper's way: trails and first masks, no object motion
+BUNDLED_FOLDERS = {BUNDLED: 'checkpoint', 'bundled-paper': 'checkpoint_paper'}
+_YAML = ('.yaml', '.yml')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Checkpoint:
-    """The parts of a trained world model.
+    """A checkpoint folder whose card was read.
+
+    `Checkpoint.open` makes it from a name or a path; commands, nodes and training pass it on.
 
     Attributes:
-        transformer: the diffusion transformer.
-        autoencoder: pixels to latents and back.
-        scheduler: noise levels and the step rule.
-        card: inputs and outputs of the model, and its training data.
-        text_encoder: umT5, in models with text.
-        image_encoder: CLIP, in models with text.
-        adapter: folder of a LoRA adapter for the transformer.
-        object_motion: folder of the contact settings and the arms' response, for foresight.
-        robot: folder of the robot that the model was trained on, and of the default calibration.
-        control: how plans enter the model, to be saved; loaded with a robot, see
-            `control.registry.load_control`.
+        name: name or path as it was given.
+        folder: the folder.
+        card: contents of its `world_model.json`.
     """
 
-    transformer: MultiViewWanTransformer
-    autoencoder: Autoencoder
-    scheduler: Scheduler
+    name: str
+    folder: Path
     card: CheckpointCard
-    text_encoder: TextEncoder | None = None
-    image_encoder: ImageEncoder | None = None
-    adapter: Path | None = None
-    object_motion: Path | None = None
-    robot: Path | None = None
-    control: Control | None = None
+
+    @classmethod
+    def open(cls, name: str | Path | Checkpoint = BUNDLED) -> Checkpoint:
+        """Returns the checkpoint of a name of `BUNDLED_FOLDERS` or of a folder.
+
+        Raises:
+            CheckpointError: there is no such folder, or it is no checkpoint.
+        """
+        if isinstance(name, Checkpoint):
+            return name
+        folder = checkpoint_folder(name)
+        return cls(name=str(name), folder=folder, card=read_card(folder))
+
+    def __str__(self) -> str:
+        return self.name
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # another machine has the package's checkpoints elsewhere
+        return Checkpoint.open, (self.name,)
+
+    @property
+    def is_bundled(self) -> bool:
+        """Whether it ships with the package, into which nothing is written."""
+        return self.name in BUNDLED_FOLDERS
+
+    @property
+    def spec(self) -> WorldModelSpec:
+        """Views, frame size and rate of the model."""
+        return self.card.spec
+
+    @property
+    def object_motion(self) -> Path | None:
+        """Folder of the contact settings and the arms' response; None = it has none."""
+        folder = self.folder / OBJECT_MOTION_FOLDER
+        return folder if folder.is_dir() else None
+
+    @property
+    def object_motion_digest(self) -> str:
+        """Digest of the object motion that estimates are fitted to; empty = there is none."""
+        folder = self.object_motion
+        return '' if folder is None else content_digest(folder)[:16]
+
+    @property
+    def cameras_file(self) -> Path:
+        """Default calibration: the one that it carries or, of older checkpoints, the robot's.
+
+        Raises:
+            CalibrationError: neither the checkpoint nor the robot has one.
+        """
+        carried = self.folder / ROBOT_FOLDER / CAMERAS
+        if carried.is_file():
+            return carried
+        try:
+            return share_path('config', 'robots', self.card.robot, 'cameras.yaml')
+        except ConfigError as error:
+            raise CalibrationError(
+                f"checkpoint '{self.name}' has no default calibration (its episodes were recorded "
+                "with different ones): set 'calibration_file' (on commands, --calibration) to "
+                "that of the cameras as they stand now, e.g. an episode's calibration.yaml "
+                f'({error})'
+            ) from error
+
+    def load_robot(self, file: str | Path | None = None) -> RobotModel:
+        """Returns the robot that it carries or, of older checkpoints, names.
+
+        Args:
+            file: another file of the same robot, or the name of a bundled one.
+
+        Raises:
+            CheckpointError: the file describes a robot of another name.
+            ConfigError: there is no file of the robot.
+        """
+        trained = self.card.robot
+        carried = self.folder / ROBOT_FOLDER / ROBOT_YAML
+        default = carried if carried.is_file() else trained
+        robot = load_robot(robot_path(file or default))
+        # older cards name the file of a robot that is not bundled
+        if robot.name != trained and Path(trained).suffix not in _YAML:
+            raise CheckpointError(
+                f"the checkpoint was trained with robot '{trained}', 'robot_file' describes "
+                f"'{robot.name}'; use the trained one or train on this robot's episodes"
+            )
+        return robot
+
+    def load_control(self, robot: RobotModel) -> Control:
+        """Returns how plans of a robot enter the model.
+
+        Raises:
+            ConfigError: no such control, or it cannot be imported or created.
+            CheckpointError: what it was fitted to cannot be read.
+        """
+        return load_control(self.card.control, control_options(self.card, robot), self.folder)
+
+    def can_foresee(self, robot: RobotModel) -> bool:
+        """Returns whether it foresees object motion and was trained to see it."""
+        return self.object_motion is not None and self.load_control(robot).shows_objects
+
+    def digest(self, without: Collection[str] = ()) -> str:
+        """Returns a digest of all its files.
+
+        Args:
+            without: names of files that do not count.
+        """
+        return content_digest(self.folder, without)
 
 
-def save_checkpoint(
-    checkpoint: Checkpoint, folder: Path, *, dtype: torch.dtype = torch.float32
-) -> None:
-    """Writes a checkpoint folder, which appears under its name only when it is complete."""
-    with disk_errors(), whole_folder(folder) as partial:
-        stored = place(copy_of(checkpoint.transformer), torch.device('cpu'), dtype)
-        stored.save_pretrained(partial / 'transformer', safe_serialization=True)
-        cast(Any, checkpoint.autoencoder).save_pretrained(
-            partial / 'autoencoder', safe_serialization=True
-        )
-        checkpoint.scheduler.save_pretrained(partial / 'scheduler')
-        for encoder in (checkpoint.text_encoder, checkpoint.image_encoder):
-            if encoder is not None:
-                encoder.save(partial)
-        for name, part in _folders(checkpoint).items():
-            shutil.copytree(part, partial / name)
-        checkpoint.card.write(partial)
-        if checkpoint.control is not None:
-            save_control(checkpoint.control, checkpoint.card.control, partial)
-
-
-def _folders(checkpoint: Checkpoint) -> dict[str, Path]:
-    """Folders of parts that are copied unchanged."""
-    parts = {
-        ADAPTER_FOLDER: checkpoint.adapter,
-        OBJECT_MOTION_FOLDER: checkpoint.object_motion,
-        ROBOT_FOLDER: checkpoint.robot,
-    }
-    return {name: part for name, part in parts.items() if part is not None}
-
-
-def load_checkpoint(folder: Path, *, dtype: torch.dtype = torch.float32) -> Checkpoint:
-    """Reads a checkpoint folder.
+def checkpoint_folder(name: str | Path) -> Path:
+    """Returns the folder of a checkpoint, given by path or by a name of `BUNDLED_FOLDERS`.
 
     Raises:
-        CheckpointError: a part is missing, is a pickle, or belongs to another model.
+        CheckpointError: no folder, and nearly the name of one that ships with the package.
     """
-    try:
-        return _load(Path(folder), dtype)
-    except MtvWorldError:
-        raise
-    except Exception as error:  # configurations of other libraries raise all kinds of errors
+    folder = BUNDLED_FOLDERS.get(str(name))
+    if folder is not None:
+        return share_path('resource', folder)
+    path = Path(name)
+    if not path.exists() and path.name.replace('_', '-').startswith(BUNDLED):
         raise CheckpointError(
-            f"checkpoint '{folder}' cannot be loaded ({type(error).__name__}: {error}); copy or "
-            'export it again'
-        ) from error
-
-
-def _load(folder: Path, dtype: torch.dtype) -> Checkpoint:
-    card = read_card(folder)
-    for part in PARTS:
-        if not (folder / part).is_dir():
-            raise CheckpointError(f"checkpoint '{folder}' has no folder '{part}/'")
-    pickles = [p.name for p in folder.rglob('*') if p.suffix in PICKLES]
-    if pickles:
-        raise CheckpointError(
-            f"checkpoint '{folder}' holds pickle files {sorted(pickles)}; only safetensors are "
-            'loaded: convert them and remove these'
+            f"checkpoint '{name}' is no folder and no checkpoint of the package"
+            f'{nearest(str(name), BUNDLED_FOLDERS)}; those are {", ".join(BUNDLED_FOLDERS)}'
         )
-    with_text = (folder / 'text_encoder').is_dir()
-    adapter, motion = folder / ADAPTER_FOLDER, folder / OBJECT_MOTION_FOLDER
-    robot = folder / ROBOT_FOLDER
-    return Checkpoint(
-        transformer=_load_transformer(folder / 'transformer', dtype),
-        autoencoder=_load_autoencoder(folder / 'autoencoder', dtype),
-        scheduler=build_scheduler(_config(folder / 'scheduler' / 'scheduler_config.json')),
-        card=card,
-        text_encoder=TextEncoder(folder, dtype=dtype) if with_text else None,
-        image_encoder=ImageEncoder.load(folder, dtype=dtype) if with_text else None,
-        adapter=adapter if adapter.is_dir() else None,
-        object_motion=motion if motion.is_dir() else None,
-        robot=robot if robot.is_dir() else None,
+    return path
+
+
+def control_options(card: CheckpointCard, robot: RobotModel) -> ControlOptions:
+    """Return what the control of a checkpoint is created for."""
+    return ControlOptions(
+        robot=robot,
+        rendering=card.rendering,
+        object_mask=card.object_mask,
+        num_frames=card.num_frames,
     )
-
-
-def _load_transformer(folder: Path, dtype: torch.dtype) -> MultiViewWanTransformer:
-    config = _config(folder / 'config.json')
-    found, expected = config.get('_class_name'), MultiViewWanTransformer.__name__
-    if found != expected:
-        raise CheckpointError(f"'{folder}' holds a {found}, expected a {expected}")
-    check_sizes(config, f"'{folder / 'config.json'}'")
-    given = {name: value for name, value in config.items() if name not in _OF_0_1}
-    with torch.device('meta'):
-        transformer: Any = MultiViewWanTransformer.from_config(given)
-    _fill(transformer, folder)
-    return place(transformer, torch.device('cpu'), dtype).eval()
-
-
-def _load_autoencoder(folder: Path, dtype: torch.dtype) -> Autoencoder:
-    config = _config(folder / 'config.json')
-    with torch.device('meta'):
-        autoencoder: Any = build_autoencoder(config)
-    _fill(getattr(autoencoder, 'vae', autoencoder), folder)
-    return place(autoencoder, torch.device('cpu'), dtype).eval()
-
-
-def _fill(module: Any, folder: Path) -> None:
-    """Replaces the module's meta tensors, which use no memory, by the stored ones."""
-    tensors = read_tensors(folder, WEIGHTS)
-    try:
-        module.load_state_dict(tensors, assign=True)
-    except RuntimeError as error:
-        raise CheckpointError(f"'{folder}' does not fit its config: {error}") from error
-
-
-def _config(file: Path) -> dict[str, Any]:
-    try:
-        values = read_json(file)
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"'{file}' cannot be loaded: {error}") from error
-    if not isinstance(values, dict):
-        raise CheckpointError(f"'{file}' cannot be loaded: it must hold keys and values")
-    for key, value in values.items():
-        if isinstance(value, float) and not isfinite(value):
-            raise CheckpointError(f"'{file}' has {key} {value}; give a finite number")
-    return values

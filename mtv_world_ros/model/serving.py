@@ -182,7 +182,7 @@ def _words(text: str) -> list[str]:
 
 
 if TYPE_CHECKING:
-    from mtv_world_ros.model.checkpoint import Checkpoint
+    from mtv_world_ros.model.trained_model import TrainedModel
 
 _GIB = 2**30
 #: models with fewer bytes of weights are not looked at: they fit
@@ -192,7 +192,7 @@ _IMAGE_TOKENS = 257
 
 
 def check_memory(
-    checkpoint: Checkpoint, serving: ServingOptions, device: torch.device, dtype: torch.dtype
+    checkpoint: TrainedModel, serving: ServingOptions, device: torch.device, dtype: torch.dtype
 ) -> None:
     """Checks that a model fits into the free memory of the device.
 
@@ -235,7 +235,7 @@ def free_bytes(device: torch.device) -> int | None:
     return int(lines['MemAvailable'].split()[0]) * 1024
 
 
-def weight_bytes(checkpoint: Checkpoint, serving: ServingOptions, dtype: torch.dtype) -> int:
+def weight_bytes(checkpoint: TrainedModel, serving: ServingOptions, dtype: torch.dtype) -> int:
     """Returns the size of the weights that stay on the device."""
     blocks = [_weights(block) for block in checkpoint.transformer.blocks]
     numbers = _weights(checkpoint.transformer)
@@ -250,7 +250,7 @@ def _weights(module: nn.Module) -> int:
     return sum(p.numel() for p in module.parameters())
 
 
-def activation_bytes(checkpoint: Checkpoint, serving: ServingOptions, dtype: torch.dtype) -> int:
+def activation_bytes(checkpoint: TrainedModel, serving: ServingOptions, dtype: torch.dtype) -> int:
     """Returns the peak memory of a pass of the transformer or of decoding, without weights."""
     config: Any = checkpoint.transformer.config
     spec = checkpoint.card.spec
@@ -288,7 +288,7 @@ def activation_bytes(checkpoint: Checkpoint, serving: ServingOptions, dtype: tor
     return max(parts)
 
 
-def _class_name(checkpoint: Checkpoint) -> str:
+def _class_name(checkpoint: TrainedModel) -> str:
     own = isinstance(checkpoint.autoencoder, WanAutoencoder)
     return 'AutoencoderKLWan' if own else 'SpaceToDepthAutoencoder'
 

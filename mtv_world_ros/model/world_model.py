@@ -16,7 +16,6 @@ from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.data_types import ByteArray, FloatArray, History
 from mtv_world_ros.core.errors import CheckpointError, ModelMemoryError, RolloutPreempted
 from mtv_world_ros.model.card import check_same_model
-from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import (
     check_history,
     condition,
@@ -37,6 +36,7 @@ from mtv_world_ros.model.serving import (
     prepare,
     ServingOptions,
 )
+from mtv_world_ros.model.trained_model import TrainedModel
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 
@@ -177,7 +177,7 @@ class DiffusionWorldModel:
 
     def __init__(
         self,
-        checkpoint: Checkpoint,
+        checkpoint: TrainedModel,
         *,
         device: str = 'cpu',
         dtype: torch.dtype = torch.float32,

@@ -21,7 +21,7 @@ from mtv_world_ros.core.bounded_input import read_text
 from mtv_world_ros.core.config import ListOf, Metres, Quaternion, read_yaml, Schema, validated
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import ConfigError, RobotError
-from mtv_world_ros.core.files import ROBOT_YAML, whole_folder
+from mtv_world_ros.core.files import bundled, ROBOT_YAML, whole_folder
 from mtv_world_ros.core.transforms import denavit_hartenberg, pose
 from mtv_world_ros.robot.mesh_pieces import (
     convex_pieces,
@@ -38,6 +38,19 @@ from mtv_world_ros.robot.xml_file import check_xml, NO_XML, parse_xml, root_link
 _LARGEST_OFFSET = 0.05
 _LARGEST_TURN = 0.2
 _NUM_CONFIGURATIONS = 64
+
+
+def robot_path(name: str | Path) -> Path:
+    """Returns the YAML of a robot given by path or by the name of a bundled one.
+
+    Raises:
+        ConfigError: no such file, and no bundled robot of this name.
+    """
+    path = bundled('robots', name, 'robot_file')
+    if not path.is_file():
+        problem = 'is no regular file' if path.exists() else 'does not exist'
+        raise ConfigError(f"robot file '{path}' {problem}; set 'robot_file' to one")
+    return path
 
 
 def described_robot(expected: RobotModel, urdf: str) -> tuple[RobotModel, float]:

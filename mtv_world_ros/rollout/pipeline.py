@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import MappingProxyType
-from typing import Protocol
+from typing import Any, Protocol
 
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.control.control import Control, ControlInputs, ControlScene
+from mtv_world_ros.control.registry import create_control
 from mtv_world_ros.control.trajectory_video import TrajectoryVideo, TrajectoryVideoConfig
 from mtv_world_ros.core.data_types import (
     BoolArray,
@@ -20,25 +22,36 @@ from mtv_world_ros.core.data_types import (
     Observation,
     WorldModelSpec,
 )
+from mtv_world_ros.core.errors import CheckpointError
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.core.processes import threads_each
+from mtv_world_ros.model.card import CheckpointCard
+from mtv_world_ros.model.checkpoint import BUNDLED, Checkpoint, control_options
 from mtv_world_ros.physics.episode_objects import Majority, ObjectForesight
 from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
 from mtv_world_ros.physics.object_motion import ObjectMotionModel
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import ChunkPlan
+from mtv_world_ros.robot.shape import load_shape
+from mtv_world_ros.rollout.assembly import asked_describer
 from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions
 from mtv_world_ros.rollout.prediction import Prediction, StageClock
 from mtv_world_ros.rollout.rollout import ObservedChunk, Rollout
 from mtv_world_ros.rollout.state import RolloutState
-from mtv_world_ros.success.calibration import Fits, HorizonCurve
+from mtv_world_ros.success.calibration import Calibration, Fits, HorizonCurve, load_fits
 from mtv_world_ros.success.doubts import doubted, Grounds, widened
 from mtv_world_ros.success.estimator import JudgedChunk, SuccessEstimator
+from mtv_world_ros.success.fitted_to import Setting
 from mtv_world_ros.success.rollout_memory import footage_of
+from mtv_world_ros.success.task import load_task, load_tasks, TaskSpec
 from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
+from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 #: reason against an estimate if the plan is drawn outside of all views
 _UNSEEN = 'no view shows a tool at any time'
+_YAML = ('.yaml', '.yml')
 
 
 class WorldModel(Protocol):
@@ -114,6 +127,141 @@ class Pipeline:
     grounds: Grounds = Grounds()
     drawing: TrajectoryVideo = TrajectoryVideo(config=TrajectoryVideoConfig())
     picture_fits: Fits | None = None
+
+    @classmethod
+    def load(
+        cls,
+        checkpoint: Checkpoint | str | Path = BUNDLED,
+        *,
+        robot: str | Path | None = None,
+        objects: tuple[str, ...] = (),
+        task: str | None = None,
+        device: str = 'cpu',
+        dtype: str = 'auto',
+        num_threads: int = 0,
+        segmenter: str = 'auto',
+        describer: str | Path | None = None,
+        serving: str = '',
+        calibrated: bool = True,
+        adapter: Path | None = None,
+        foresight: bool = True,
+        camera_check: bool = True,
+    ) -> Pipeline:
+        """Returns the pipeline around the world model of a checkpoint.
+
+        Args:
+            checkpoint: folder, or `bundled`.
+            robot: YAML file or name of a bundled robot; default: the one in the checkpoint.
+            objects: names of the objects; empty = the describer's.
+            task: the task to judge, by name or YAML file; default: the one that the instruction
+                matches.
+            device: `cpu`, `cuda`, ...
+            dtype: `float32`, `bfloat16`, or `auto` (bfloat16 where the processor has it).
+            num_threads: threads of the model on a CPU; 0 = all cores but one, of two both. As many
+                processes, or one a core, compute motions of rigid bodies.
+            segmenter: `auto`, `colour`, `sam2` or `sam3`; see `choose_segmenter`.
+            describer: YAML file of what names the objects of the first real frame; empty = the
+                words of the instruction.
+            serving: what makes the model faster or smaller, e.g. `compile=true`; see
+                `ServingOptions`.
+            calibrated: use the checkpoint's calibration of the success estimate, where it has one,
+                and abstain where an estimate rests on nothing; False = the bare estimate.
+            adapter: LoRA adapter to use in place of the checkpoint's own.
+            foresight: foresee where objects go, where the checkpoint can; False = the imagined
+                frames alone decide, see `Pipeline.without_foresight`.
+            camera_check: compare the first pictures of an episode with the arm's outline, correct
+                small errors of the calibration and refuse a verdict on large ones.
+
+        Raises:
+            CheckpointError, ConfigError, RobotError: see their messages.
+        """
+        from mtv_world_ros.model.loading import load_world_model
+        from mtv_world_ros.physics.checkpoint_files import load_foresight
+
+        opened = Checkpoint.open(checkpoint)
+        world_model = load_world_model(
+            opened,
+            device=device,
+            dtype=dtype,
+            num_threads=num_threads,
+            serving=serving,
+            adapter=adapter,
+        )
+        model, motion = opened.load_robot(robot), None
+        control = opened.load_control(model)
+        _check_inputs(opened.card.control, control, world_model.transformer.config)
+        foresees = control.shows_objects and opened.object_motion is not None
+        if foresight and foresees and opened.object_motion is not None:
+            threads = num_threads or threads_each(1)
+            motion = load_foresight(opened.object_motion, model, threads)
+        fits = load_fits(opened.folder, of_pictures=foresees and not foresight)
+        calibration = fits.calibration if calibrated else None
+        pipeline = cls.assemble(
+            opened.card,
+            world_model,
+            robot=model,
+            control=control,
+            objects=objects,
+            task=task,
+            segmenter=choose_segmenter(segmenter, device=device),
+            describer=asked_describer(describer),
+            calibration=calibration,
+            horizon=fits.horizon,
+            object_motion=motion,
+            camera_checker=CameraChecker(model, load_shape(model)) if camera_check else None,
+            setting=Setting.of(model, opened.object_motion_digest),
+        )
+        if not calibrated:  # to be fitted, or compared: the bare estimate
+            return pipeline
+        doubt = motion.settings.doubt if motion else ''
+        return replace(
+            pipeline,
+            grounds=Grounds.of(doubt, calibration is not None),
+            picture_fits=load_fits(opened.folder, of_pictures=True) if motion else None,
+        )
+
+    @classmethod
+    def assemble(
+        cls,
+        card: CheckpointCard,
+        world_model: WorldModel,
+        *,
+        robot: RobotModel,
+        control: Control | None = None,
+        objects: tuple[str, ...] = (),
+        task: str | None = None,
+        segmenter: Segmenter | None = None,
+        describer: Describer | None = None,
+        calibration: Calibration | None = None,
+        horizon: HorizonCurve | None = None,
+        object_motion: ObjectMotionModel | None = None,
+        camera_checker: CameraChecker | None = None,
+        setting: Setting | None = None,
+    ) -> Pipeline:
+        """Returns the pipeline around a world model trained as the card says.
+
+        The control is that of the card; one that is fitted to a training set has to be given.
+        """
+        segmenter = segmenter or choose_segmenter()
+        if control is None:
+            control = create_control(card.control, control_options(card, robot))
+        return cls(
+            robot=robot,
+            world_model=world_model,
+            segmenter=segmenter,
+            estimator=SuccessEstimator(
+                *_tasks(task),
+                calibration=calibration,
+                segmenter=segmenter,
+                setting=setting,
+            ),
+            control=control,
+            objects=objects,
+            describer=describer,
+            horizon=horizon,
+            object_motion=object_motion,
+            camera_checker=camera_checker,
+        )
 
     @property
     def spec(self) -> WorldModelSpec:
@@ -348,3 +496,27 @@ class Pipeline:
             first=observation,
             source=observation,
         )
+
+
+def _check_inputs(name: str, control: Control, transformer: Mapping[str, Any]) -> None:
+    """Raises if the transformer was not built for the inputs that a control feeds."""
+    wanted = control.layout.transformer_arguments()
+    for kind in ('context', 'frame'):
+        key = f'{kind}_input'
+        given, held = wanted.get(key), transformer.get(key)
+        if given != (None if held is None else dict(held)):
+            fed = f"feeds '{kind}' of {given}" if given else f"does not feed '{kind}'"
+            taken = f'takes {dict(held)}' if held else 'takes none'
+            raise CheckpointError(
+                f"control '{name}' {fed}, the checkpoint's transformer {taken}; the control that "
+                'it was trained with stands in world_model.json, as `control`'
+            )
+
+
+def _tasks(task: str | None) -> tuple[tuple[TaskSpec, ...], str | None]:
+    """The known tasks, and the name of the one to judge; a file of the user's own is one more."""
+    known = load_tasks(share_path('config', 'tasks'))
+    if task is None or not task.endswith(_YAML):
+        return known, task
+    given = load_task(Path(task))
+    return (*(spec for spec in known if spec.name != given.name), given), given.name

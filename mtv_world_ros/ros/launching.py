@@ -31,9 +31,9 @@ from mtv_world_ros.core.processes import (
     StoppedProcesses,
 )
 from mtv_world_ros.data.episode import CALIBRATION_FILE
-from mtv_world_ros.model.card import read_card
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.policies.policy import RecordedPolicySettings, ScriptedPolicySettings
-from mtv_world_ros.rollout.assembly import checkpoint_path, checkpoint_robot, policy_settings
+from mtv_world_ros.rollout.assembly import policy_settings
 
 #: of logs and bags, before anything is started
 ROOM_BYTES = 8 * 2**20
@@ -102,7 +102,7 @@ def imagine_episodes(
         EpisodeError: a process failed; the message says what it said last and names its log.
         OSError: the disk is full.
     """
-    views = read_card(checkpoint_path(options.checkpoint)).spec.views
+    views = Checkpoint.open(options.checkpoint).card.spec.views
     # a wrong name is an error here, before anything is removed
     _check_policy(options)
     check_same_cameras(options.episodes, views)
@@ -174,7 +174,7 @@ def _same(a: CameraModel, b: CameraModel) -> bool:
 
 
 def _check_policy(options: ImagineOptions) -> None:
-    robot = checkpoint_robot(options.checkpoint, options.robot or None)
+    robot = Checkpoint.open(options.checkpoint).load_robot(options.robot or None)
     policy = policy_settings(options.policy, robot)
     if isinstance(policy, RecordedPolicySettings) and not options.episodes:
         raise ConfigError(

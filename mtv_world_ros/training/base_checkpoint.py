@@ -14,9 +14,10 @@ from mtv_world_ros.control.control import InputLayout, VIDEO_ONLY
 from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.model.card import CheckpointCard, SHARED_KEYS
-from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.parts import check_video
 from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.trained_model import load_trained_model, TrainedModel
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.adapter import add_adapter
 from mtv_world_ros.training.encoding import Encoders
@@ -35,7 +36,7 @@ class Base:
     """
 
     folder: Path
-    checkpoint: Checkpoint
+    checkpoint: TrainedModel
     encoders: Encoders
     digest: str
 
@@ -68,7 +69,7 @@ def load_base(
             'this preset trains on top of a checkpoint; give --init FOLDER, which '
             "'mtv-world import-weights' makes of public weights"
         )
-    loaded = load_checkpoint(folder, dtype=dtype)
+    loaded = load_trained_model(Checkpoint.open(folder), dtype=dtype)
     _check_transformer(config, layout, loaded.transformer, folder)
     _check_card(config, loaded.card, folder)
     autoencoder = place(loaded.autoencoder, device, dtype).eval().requires_grad_(False)

@@ -17,17 +17,13 @@ from mtv_world_ros.control.control import Control
 from mtv_world_ros.control.registry import control_class
 from mtv_world_ros.control.trajectory_video import TrajectoryVideo
 from mtv_world_ros.core.errors import TrainingError
-from mtv_world_ros.model.card import OPTIONAL_KEYS, ROBOT_FOLDER
-from mtv_world_ros.model.checkpoint import (
-    Checkpoint,
-    load_checkpoint,
-    OBJECT_MOTION_FOLDER,
-    save_checkpoint,
-)
+from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER, OPTIONAL_KEYS, ROBOT_FOLDER
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import check_history
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
 from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.serving import compile_blocks
+from mtv_world_ros.model.trained_model import load_trained_model, save_trained_model, TrainedModel
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.adapter import save_adapter
 from mtv_world_ros.training.averaged_weights import AveragedWeights
@@ -176,7 +172,7 @@ class Trainer:
             CheckpointError: the folder holds no checkpoint.
             TrainingError: its transformer is of another shape.
         """
-        loaded = load_checkpoint(folder)
+        loaded = load_trained_model(Checkpoint.open(folder))
         theirs, video = loaded.card, self.config.video
         if not self.control.shows_objects:
             self._object_motion = None  # its trajectory videos will not show what is foreseen
@@ -364,7 +360,7 @@ class Trainer:
             )
         # what `fit-contact` put there stays
         mine = folder / OBJECT_MOTION_FOLDER
-        parts = Checkpoint(
+        parts = TrainedModel(
             transformer=self.weights.averaged(),
             autoencoder=self.encoders.autoencoder,
             scheduler=build_scheduler(self.config.scheduler),
@@ -375,7 +371,7 @@ class Trainer:
             text_encoder=base and base.checkpoint.text_encoder,
             image_encoder=base and base.checkpoint.image_encoder,
         )
-        save_checkpoint(parts, folder, dtype=dtype)
+        save_trained_model(parts, folder, dtype=dtype)
 
     @property
     def robot(self) -> Path | None:

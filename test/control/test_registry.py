@@ -26,8 +26,9 @@ from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.model.card import read_card
-from mtv_world_ros.rollout.assembly import checkpoint_path, load_pipeline
+from mtv_world_ros.model.checkpoint import checkpoint_folder
 from mtv_world_ros.rollout.options import RolloutOptions
+from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.training.training_config import load_training_config
 
 TINY = {
@@ -74,7 +75,7 @@ def test_a_name_that_is_not_registered_names_the_nearest(robot):
 
 
 def test_a_checkpoint_of_an_unknown_control_is_refused(tmp_path):
-    shutil.copytree(checkpoint_path('bundled'), tmp_path / 'own')
+    shutil.copytree(checkpoint_folder('bundled'), tmp_path / 'own')
     card = tmp_path / 'own' / 'world_model.json'
     card.write_text(card.read_text().replace('trajectory_video', 'telepathy'))
     with pytest.raises(CheckpointError, match="'telepathy' is not registered"):
@@ -158,7 +159,7 @@ def test_any_control_trains_and_predicts(control, outside, tmp_path, robot):
     assert main([*command, *(f'--set={key}={value}' for key, value in values.items())]) == 0
     card = json.loads((run / 'checkpoint' / 'world_model.json').read_text())
     assert card['control'] == control
-    pipeline = load_pipeline(run / 'checkpoint', dtype='float32', num_threads=1)
+    pipeline = Pipeline.load(run / 'checkpoint', dtype='float32', num_threads=1)
     assert pipeline.object_motion is None
     recording = load_recording(episodes / 'demo', pipeline.spec, robot)
     rest = recording.positions[0]

@@ -84,7 +84,8 @@ def test_a_checkpoint_beyond_the_bounds_takes_neither_time_nor_memory(
     tmp_path, part, field, value
 ):
     pytest.importorskip('torch')
-    from mtv_world_ros.model.checkpoint import load_checkpoint
+    from mtv_world_ros.model.checkpoint import BUNDLED, Checkpoint
+    from mtv_world_ros.model.trained_model import load_trained_model
 
     folder = shutil.copytree(BUNDLED, tmp_path / 'checkpoint')
     values = json.loads((folder / part).read_text()) | {field: value}
@@ -94,7 +95,7 @@ def test_a_checkpoint_beyond_the_bounds_takes_neither_time_nor_memory(
     begin_s = time.perf_counter()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(CheckpointError, match='at most'):
-        load_checkpoint(folder)
+        load_trained_model(Checkpoint.open(folder))
     assert time.perf_counter() - begin_s < MOST_S
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MOST_MB * 1024
 

@@ -10,7 +10,7 @@ import warnings
 import pytest
 
 from mtv_world_ros.core.files import content_digest
-from mtv_world_ros.rollout.assembly import checkpoint_path
+from mtv_world_ros.model.checkpoint import checkpoint_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / 'experiments' / 'results').glob('*.md'))
@@ -26,7 +26,7 @@ def page():
 
 
 def test_every_page_names_its_commit_and_checkpoint(page):
-    bundled = content_digest(checkpoint_path('bundled'))[:8]
+    bundled = content_digest(checkpoint_folder('bundled'))[:8]
     stale = {path.name: why for path in PAGES if (why := page.why_stale(path, bundled=bundled))}
     told = ''.join(f'\n  {name}: {"; ".join(why)}' for name, why in stale.items())
     if stale:
@@ -82,5 +82,5 @@ def test_a_new_page_gets_the_line(page, tmp_path):
     line = page.made_line('wan_1_3b')
     assert 'Describes: `mtv_world_ros/model`.' in line and 'no checkpoint' in line
     (tmp_path / 'page.md').write_text(f'# Title\n\n{page.made_line("serving_cpu2")}\n')
-    bundled = content_digest(checkpoint_path('bundled'))[:8]
+    bundled = content_digest(checkpoint_folder('bundled'))[:8]
     assert page.why_stale(tmp_path / 'page.md', bundled=bundled) == []

@@ -234,7 +234,7 @@ def check_values(given: dict[str, Any]) -> None:
     """Raises a user error where a preset, policy, task ... does not exist."""
     from mtv_world_ros.cli.train import set_overrides
     from mtv_world_ros.model.serving import ServingOptions
-    from mtv_world_ros.rollout.assembly import robot_path
+    from mtv_world_ros.robot.file import robot_path
     from mtv_world_ros.simulation.faults.catalogue import parse_variant
     from mtv_world_ros.simulation.tasks import tasks_named
     from mtv_world_ros.simulation.zero_shot import kinds_named

@@ -9,8 +9,7 @@ import yaml
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import robot_path
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.viewing.video import encode_video
 
 FPS, ROWS = 5, 12

@@ -12,8 +12,7 @@ import yaml
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.importing.object_boxes import load_object_boxes
-from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import robot_path
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.viewing.video import encode_video
 from mtv_world_ros.vision.jaccard import jaccard
 from test.support.browser import Browser

@@ -14,25 +14,26 @@ from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.errors import CheckpointError, ModelMemoryError, RolloutPreempted
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.card import CheckpointCard
-from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.model.trained_model import load_trained_model, save_trained_model, TrainedModel
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from test.support.small_transformer import build, CARD, inputs, SMALL
 
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    checkpoint = Checkpoint(
+    checkpoint = TrainedModel(
         transformer=build(SMALL),
         autoencoder=SpaceToDepthAutoencoder(),
         scheduler=FlowMatchEulerDiscreteScheduler(shift=5.0),
         card=CheckpointCard(**CARD),
     )
-    save_checkpoint(checkpoint, tmp_path / 'checkpoint')
+    save_trained_model(checkpoint, tmp_path / 'checkpoint')
     return tmp_path / 'checkpoint'
 
 
 def test_loads_bit_for_bit_what_was_saved(folder):
-    loaded = load_checkpoint(folder)
+    loaded = load_trained_model(Checkpoint.open(folder))
     for name, value in build(SMALL).state_dict().items():
         assert torch.equal(loaded.transformer.state_dict()[name], value), name
     torch.testing.assert_close(loaded.transformer(**inputs()), build(SMALL)(**inputs()))
@@ -49,7 +50,7 @@ def test_leaves_nothing_but_safetensors_and_json(folder):
 
 
 def test_predicts_frames_of_the_cards_size_from_a_seed(folder):
-    model = DiffusionWorldModel(load_checkpoint(folder))
+    model = DiffusionWorldModel(load_trained_model(Checkpoint.open(folder)))
     first, again, other = (predict(model, seed) for seed in (1, 1, 2))
     assert first.shape == (2, 4, 32, 32, 3)
     assert first.dtype == np.uint8
@@ -70,7 +71,7 @@ def predict(model: DiffusionWorldModel, seed: int = 0, should_stop=lambda: False
 
 
 def test_a_preempted_prediction_is_given_up(folder):
-    model = DiffusionWorldModel(load_checkpoint(folder))
+    model = DiffusionWorldModel(load_trained_model(Checkpoint.open(folder)))
     with pytest.raises(RolloutPreempted):
         predict(model, should_stop=lambda: True)
 
@@ -83,7 +84,7 @@ def test_a_preempted_prediction_is_given_up(folder):
     ],
 )
 def test_out_of_memory_is_a_clear_error_and_the_next_call_works(folder, monkeypatch, error):
-    model = DiffusionWorldModel(load_checkpoint(folder))
+    model = DiffusionWorldModel(load_trained_model(Checkpoint.open(folder)))
 
     def fail(*_: object, **__: object) -> None:
         raise error
@@ -119,7 +120,7 @@ DAMAGES = {
 def test_a_damaged_folder_is_refused_by_what_is_wrong(folder, message):
     DAMAGES[message](folder)
     with pytest.raises(CheckpointError, match=message):
-        load_checkpoint(folder)
+        load_trained_model(Checkpoint.open(folder))
 
 
 @pytest.mark.parametrize(
@@ -134,4 +135,4 @@ def test_a_damaged_folder_is_refused_by_what_is_wrong(folder, message):
 def test_a_wrong_card_is_refused(folder, change, message):
     (folder / 'world_model.json').write_text(json.dumps({**CARD, **change}))
     with pytest.raises(CheckpointError, match=message):
-        load_checkpoint(folder)
+        load_trained_model(Checkpoint.open(folder))

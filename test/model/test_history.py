@@ -16,7 +16,7 @@ from mtv_world_ros.core.data_types import History
 from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 from mtv_world_ros.model.card import CheckpointCard
-from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.model.trained_model import TrainedModel
 from mtv_world_ros.model.transformer.tokens import MultiViewRotaryPosEmbed
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from test.support.small_transformer import build, CARD, inputs, PATCH, SMALL
@@ -178,7 +178,7 @@ SETTINGS = {'num_frames': 4, 'noise_level': 0.1, 'reference': 'first_frame'}
 
 def world_model(**card: object) -> DiffusionWorldModel:
     return DiffusionWorldModel(
-        Checkpoint(
+        TrainedModel(
             transformer=build(SMALL),
             autoencoder=SpaceToDepthAutoencoder(),
             scheduler=FlowMatchEulerDiscreteScheduler(shift=5.0),

@@ -13,7 +13,12 @@ import yaml
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import CheckpointError
-from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.model.trained_model import (
+    load_trained_model,
+    save_trained_model,
+    TrainedModel,
+)
 from mtv_world_ros.model.wan_weights import import_weights, PartReport
 from test.support.wan_files import (
     AUTOENCODER,
@@ -89,16 +94,18 @@ def test_number_formats_and_values_are_kept(videox, tmp_path):
 
 def test_the_autoencoder_is_the_published_one(videox, tmp_path):
     bring_in(videox, tmp_path / 'out')
-    loaded = load_checkpoint(tmp_path / 'out').autoencoder
+    loaded = load_trained_model(Checkpoint.open(tmp_path / 'out')).autoencoder
     for name, value in vae_model().state_dict().items():
         assert torch.equal(loaded.vae.state_dict()[name], value), name
 
 
 def test_loads_and_saves_bit_for_bit(videox, tmp_path):
     bring_in(videox, tmp_path / 'out')
-    first = load_checkpoint(tmp_path / 'out', dtype=torch.bfloat16)
-    save_checkpoint(first, tmp_path / 'again', dtype=torch.bfloat16)
-    second: Checkpoint = load_checkpoint(tmp_path / 'again', dtype=torch.bfloat16)
+    first = load_trained_model(Checkpoint.open(tmp_path / 'out'), dtype=torch.bfloat16)
+    save_trained_model(first, tmp_path / 'again', dtype=torch.bfloat16)
+    second: TrainedModel = load_trained_model(
+        Checkpoint.open(tmp_path / 'again'), dtype=torch.bfloat16
+    )
     for name, value in first.transformer.state_dict().items():
         assert torch.equal(second.transformer.state_dict()[name], value), name
     assert second.text_encoder is not None and second.image_encoder is not None
@@ -112,7 +119,9 @@ def test_shards_and_one_file_are_the_same(videox, tmp_path):
     write_shards(videox, {k: v.bfloat16() for k, v in transformer_weights().items()})
     bring_in(videox, tmp_path / 'shards', shard_bytes=20_000)
     assert len(list((tmp_path / 'shards' / 'transformer').glob('*.safetensors'))) > 2
-    whole, shards = (load_checkpoint(tmp_path / name) for name in ('whole', 'shards'))
+    whole, shards = (
+        load_trained_model(Checkpoint.open(tmp_path / name)) for name in ('whole', 'shards')
+    )
     for name, value in whole.transformer.state_dict().items():
         assert torch.equal(shards.transformer.state_dict()[name], value), name
     (videox / 'diffusion_pytorch_model.safetensors.index.json').unlink()
@@ -226,7 +235,9 @@ def test_the_command_prints_what_became_of_every_part(videox, tmp_path, capsys):
     assert 'transformer: 89 tensors, 0.0 M parameters (BF16)' in printed
     assert 'new, zero: view_embedding' in printed
     assert "left out: 1 (CLIP's temperature)" in printed
-    assert load_checkpoint(out).card.prompt.startswith('The robotic arm picks up objects')
+    assert load_trained_model(Checkpoint.open(out)).card.prompt.startswith(
+        'The robotic arm picks up objects'
+    )
     (videox / WEIGHTS).unlink()
     assert main(['import-weights', str(videox), '--out', str(tmp_path / 'other')]) == 1
     assert 'holds no transformer: expected a folder transformer/' in capsys.readouterr().err

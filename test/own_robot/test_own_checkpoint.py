@@ -9,8 +9,8 @@ from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import CalibrationError, CheckpointError, ConfigError
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.robot.shape import load_shape
-from mtv_world_ros.rollout.assembly import checkpoint_cameras, checkpoint_robot
 from test.support.crane import load, make_cameras, make_positions, write_episode
 from test.support.sources import set_options, TINY_MODEL
 
@@ -42,12 +42,12 @@ def trained(tmp_path_factory):
 
 
 def test_it_carries_robot_shapes_and_calibration(trained):
-    robot = checkpoint_robot(trained / 'elsewhere')
+    robot = Checkpoint.open(trained / 'elsewhere').load_robot()
     assert robot.name == 'crane'
     assert json.loads((trained / 'elsewhere/world_model.json').read_text())['robot'] == 'crane'
     shape = load_shape(robot)
     assert shape.is_known and 'hand' in {part.link for part in shape.parts}
-    cameras = load_calibration(checkpoint_cameras(trained / 'elsewhere'))
+    cameras = load_calibration(Checkpoint.open(trained / 'elsewhere').cameras_file)
     assert list(cameras) == ['door', 'window']
 
 
@@ -62,25 +62,27 @@ def test_evaluate_and_replay_take_it_without_flags(trained, capsys, monkeypatch)
 
 def test_another_file_of_the_same_robot_can_be_given_but_not_another_robot(trained, tmp_path):
     copy = shutil.copytree(trained / 'elsewhere' / 'robot', tmp_path / 'mine')
-    assert checkpoint_robot(trained / 'elsewhere', copy / 'robot.yaml').file.parent == copy
+    assert (
+        Checkpoint.open(trained / 'elsewhere').load_robot(copy / 'robot.yaml').file.parent == copy
+    )
     with pytest.raises(CheckpointError, match="trained with robot 'crane'"):
-        checkpoint_robot(trained / 'elsewhere', 'yam_bimanual')
+        Checkpoint.open(trained / 'elsewhere').load_robot('yam_bimanual')
 
 
 def test_older_checkpoints_find_their_robot_by_name_or_path(trained, tmp_path):
-    assert checkpoint_robot('bundled').name == 'yam_bimanual'
-    assert checkpoint_cameras('bundled').is_file()
+    assert Checkpoint.open('bundled').load_robot().name == 'yam_bimanual'
+    assert Checkpoint.open('bundled').cameras_file.is_file()
     older = tmp_path / 'older'
     older.mkdir()
     card = json.loads((trained / 'elsewhere' / 'world_model.json').read_text())
     card['robot'] = str(trained / 'elsewhere' / 'robot' / 'robot.yaml')
     (older / 'world_model.json').write_text(json.dumps(card))
-    assert checkpoint_robot(older).name == 'crane'
+    assert Checkpoint.open(older).load_robot().name == 'crane'
     with pytest.raises(CalibrationError, match='no default calibration'):
-        checkpoint_cameras(older)
+        _ = Checkpoint.open(older).cameras_file
     card['robot'] = str(tmp_path / 'gone.yaml')
     (older / 'world_model.json').write_text(json.dumps(card))
     with pytest.raises(ConfigError, match=r'gone.yaml.* does not exist'):
-        checkpoint_robot(older)
+        Checkpoint.open(older).load_robot()
     yam = share_path('config', 'robots', 'yam_bimanual', 'robot.yaml')
-    assert checkpoint_robot(older, yam).name == 'yam_bimanual'
+    assert Checkpoint.open(older).load_robot(yam).name == 'yam_bimanual'

@@ -18,8 +18,8 @@ import torch
 from mtv_world_ros.core.data_types import JointTrajectory
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.rollout.assembly import load_pipeline
 from mtv_world_ros.rollout.options import RolloutOptions
+from mtv_world_ros.rollout.pipeline import Pipeline
 
 #: turns, of which the fastest counts: other work only ever makes one slower
 TURNS = 6
@@ -58,7 +58,7 @@ def calibrating() -> float:
 
 
 def test_a_chunk_takes_no_longer_than_the_floors_allow(one_thread, record_property):
-    pipeline = load_pipeline('bundled', num_threads=1, dtype='float32')  # all machines have it
+    pipeline = Pipeline.load('bundled', num_threads=1, dtype='float32')  # all machines have it
     recording = load_recording(
         share_path('resource', 'demo_episode'), pipeline.spec, pipeline.robot
     )

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.model.checkpoint import checkpoint_folder
 from mtv_world_ros.physics.checkpoint_files import load_contact, load_response
 from mtv_world_ros.physics.fitting.contact_fit import read_contact
 from mtv_world_ros.physics.solid_foresight import SolidForesight
-from mtv_world_ros.rollout.assembly import checkpoint_path
 
 
 @pytest.fixture(scope='module')
@@ -19,7 +19,7 @@ def recording(robot):
 
 @pytest.fixture(scope='module')
 def foresight(robot):
-    folder = checkpoint_path('bundled') / 'object_motion'
+    folder = checkpoint_folder('bundled') / 'object_motion'
     settings = load_contact(folder)
     assert settings is not None and settings.table_m == 0.0
     few = settings.model_copy(update={'num_motions': 2})

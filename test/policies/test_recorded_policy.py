@@ -9,9 +9,9 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.policies.policy import EpisodeOrigin, RecordedPolicy
 from mtv_world_ros.ranking.policy_list import load_policy_list
-from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.resample import resample
-from mtv_world_ros.rollout.assembly import assemble_policy, robot_path
+from mtv_world_ros.rollout.assembly import assemble_policy
 from mtv_world_ros.ros.launching import imagine_episodes, ImagineOptions
 
 ROBOT = load_robot(robot_path('yam_bimanual'))

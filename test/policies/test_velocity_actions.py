@@ -14,9 +14,9 @@ from mtv_world_ros.core.data_types import CameraModel, Observation
 from mtv_world_ros.core.errors import ConfigError, PolicyError
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.policies.server_mapping import ActionOutput
-from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.plan import Plan
-from mtv_world_ros.rollout.assembly import assemble_policy, robot_path
+from mtv_world_ros.rollout.assembly import assemble_policy
 
 FRANKA = load_robot(robot_path('franka'))
 HOME = np.array([0.0, -0.4, 0.1, -2.2, 0.2, 1.9, 0.785, 0.03])

@@ -12,8 +12,8 @@ import sys
 import numpy as np
 import pytest
 
-from mtv_world_ros.model.checkpoint import OBJECT_MOTION_FOLDER
-from mtv_world_ros.rollout.assembly import checkpoint_path
+from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
+from mtv_world_ros.model.checkpoint import checkpoint_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 #: the gripper holds too wide, and the block stays where it is
@@ -34,7 +34,7 @@ def test_numbers_fitted_in_a_physics_are_asked_there_and_flips_are_counted(
     benchmark, opengl, tmp_path, monkeypatch, capsys
 ):
     folder = tmp_path / 'fitted' / 'bold' / OBJECT_MOTION_FOLDER
-    shutil.copytree(checkpoint_path('bundled') / OBJECT_MOTION_FOLDER, folder)
+    shutil.copytree(checkpoint_folder('bundled') / OBJECT_MOTION_FOLDER, folder)
     contact = json.loads((folder / 'contact.json').read_text())
     # fingers that hold nothing, as if that had been found there
     contact |= {'grip_friction': 0.01, 'table_friction': 0.5, 'num_motions': 4}

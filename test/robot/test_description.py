@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.core.errors import RobotError
-from mtv_world_ros.robot.file import described_robot, load_robot
-from mtv_world_ros.rollout.assembly import robot_path
+from mtv_world_ros.robot.file import described_robot, load_robot, robot_path
 
 FILE = robot_path('yam_bimanual')
 YAM = load_robot(FILE)

@@ -173,7 +173,7 @@ def test_a_link_that_is_scaled_twice_is_named(tmp_path):
 
 @pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
 def test_bundled_robots_have_no_doubtful_links(name):
-    from mtv_world_ros.rollout.assembly import robot_path
+    from mtv_world_ros.robot.file import robot_path
 
     assert load_shape(load_robot(robot_path(name))).doubts == ()
 

@@ -141,8 +141,7 @@ def serve(port: int) -> None:
 def policy_server(folder: Path, one: Signal) -> None:
     """A policy of a ranking is asked until its server is hit; then it is to answer again."""
     from mtv_world_ros.ranking.policy_list import GuardedPolicy, load_policy_list
-    from mtv_world_ros.robot.file import load_robot
-    from mtv_world_ros.rollout.assembly import robot_path
+    from mtv_world_ros.robot.file import load_robot, robot_path
 
     command = [sys.executable, str(Path(__file__).resolve()), '--serve', '{port}']
     entry = {'name': 'fine', 'policy': 'openpi', 'command': command}

@@ -424,9 +424,10 @@ def _read_folder(make: Any, read: Callable[[Path], Any], data: bytes, folder: Pa
 
 
 def _load_checkpoint(folder: Path) -> Any:
-    from mtv_world_ros.model.checkpoint import load_checkpoint
+    from mtv_world_ros.model.checkpoint import Checkpoint
+    from mtv_world_ros.model.trained_model import load_trained_model
 
-    return load_checkpoint(folder)
+    return load_trained_model(Checkpoint.open(folder))
 
 
 DESCRIBERS = 'vision.describers.describer_config'

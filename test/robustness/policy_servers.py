@@ -28,8 +28,8 @@ from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.policies.openpi_client import pack
 from mtv_world_ros.policies.policy import EpisodeOrigin
-from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import assemble_policy, robot_path
+from mtv_world_ros.robot.file import load_robot, robot_path
+from mtv_world_ros.rollout.assembly import assemble_policy
 
 #: of the client, and by how much the end may be later, on a machine that is not busy [s]
 TIMEOUT_S, MARGIN_S = 1.0, 2.0

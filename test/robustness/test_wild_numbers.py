@@ -16,7 +16,8 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.core.bounded_input import check_finite
 from mtv_world_ros.core.errors import CalibrationError, CheckpointError, ConfigError, RobotError
 from mtv_world_ros.core.files import share_path
-from mtv_world_ros.model.checkpoint import load_checkpoint
+from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.physics.checkpoint_files import load_contact
 from mtv_world_ros.robot.file import load_robot
 from test.robustness.folder_kinds import FOLDERS
@@ -32,7 +33,7 @@ def test_a_tensor_with_one_value_that_is_no_number_is_not_loaded(tmp_path, value
     tensors[name].reshape(-1)[-1] = value
     save_file(tensors, file)
     with pytest.raises(CheckpointError, match=f"tensor '{name}'.* holds 1 of"):
-        load_checkpoint(tmp_path / 'copy')
+        load_trained_model(Checkpoint.open(tmp_path / 'copy'))
 
 
 def test_sums_that_are_too_large_are_not_taken_for_values_that_are_no_numbers(tmp_path):

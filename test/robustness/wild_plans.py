@@ -26,9 +26,9 @@ REACH_M = 3.0
 @cache
 def bundled() -> Any:
     """The bundled model, on one thread."""
-    from mtv_world_ros.rollout.assembly import load_pipeline
+    from mtv_world_ros.rollout.pipeline import Pipeline
 
-    return load_pipeline('bundled', num_threads=1)
+    return Pipeline.load('bundled', num_threads=1)
 
 
 @cache

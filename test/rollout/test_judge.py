@@ -14,7 +14,7 @@ from mtv_world_ros.data.recording import load_recording
 
 @pytest.fixture(scope='module')
 def pipeline():
-    return mtv_world_ros.load_pipeline(segmenter='colour', num_threads=1)
+    return mtv_world_ros.Pipeline.load(segmenter='colour', num_threads=1)
 
 
 @pytest.fixture(scope='module')

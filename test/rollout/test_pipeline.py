@@ -41,7 +41,6 @@ from mtv_world_ros.physics.checkpoint_files import load_foresight
 from mtv_world_ros.physics.object_motion import ObjectMotion
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.shape import load_shape
-from mtv_world_ros.rollout.assembly import assemble
 from mtv_world_ros.rollout.observed_episode import ObservedEpisode
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
@@ -89,7 +88,7 @@ def world_model() -> CountingWorldModel:
 
 @pytest.fixture
 def pipeline(world_model) -> Pipeline:
-    return assemble(CARD, world_model, robot=YAM)
+    return Pipeline.assemble(CARD, world_model, robot=YAM)
 
 
 def observe(recording: Recording) -> Observation:
@@ -122,7 +121,7 @@ def draw(pipeline: Pipeline, motion: Motion, times: np.ndarray, masks: ObjectMas
 def with_motion(world_model: CountingWorldModel, object_motion) -> Pipeline:
     """A pipeline that shows the model where objects go."""
     card = CARD.replace(rendering={'object_motion': True})
-    return replace(assemble(card, world_model, robot=YAM), object_motion=object_motion)
+    return replace(Pipeline.assemble(card, world_model, robot=YAM), object_motion=object_motion)
 
 
 def imagine(pipeline: Pipeline, recording: Recording, seconds: float, **options):
@@ -162,7 +161,7 @@ def test_denoises_in_the_steps_that_the_model_is_made_for_unless_told_otherwise(
 ):
     world_model = CountingWorldModel(replace(SPEC, num_inference_steps=made_for))
     options = {'num_inference_steps': asked} if asked else {}
-    (chunk,) = imagine(assemble(CARD, world_model, robot=YAM), recording, 1.6, **options)
+    (chunk,) = imagine(Pipeline.assemble(CARD, world_model, robot=YAM), recording, 1.6, **options)
     assert world_model.num_steps == [expected]
     assert chunk.num_inference_steps == expected
 
@@ -177,7 +176,7 @@ def test_history_is_the_frames_before_the_start_and_the_first_one_stays_the_anch
     recording, num_history
 ):
     model = CountingWorldModel(replace(SPEC, num_history=num_history))
-    chunks = imagine(assemble(CARD, model, robot=YAM), recording, 4.8)
+    chunks = imagine(Pipeline.assemble(CARD, model, robot=YAM), recording, 4.8)
     first = recording.frames[:, 0]
     shown = np.concatenate([first[:, None], *(c.video.frames for c in chunks)], axis=1)
     assert len(model.histories) == 3
@@ -200,7 +199,7 @@ def part_of(asked: JointTrajectory, begin_s: float, end_s: float) -> JointTrajec
 def test_chained_extends_are_one_long_extend(recording, num_seeds):
     """The clock, seeds, history, anchor and memory are those of an episode without stops."""
     model = CountingWorldModel(replace(SPEC, num_history=5))
-    pipeline = assemble(CARD, model, robot=YAM)
+    pipeline = Pipeline.assemble(CARD, model, robot=YAM)
     whole = imagine(pipeline, recording, 4.8, seed=3, num_seeds=num_seeds)
     asked = commands(recording, 4.8)
     episode = pipeline.begin(
@@ -244,7 +243,7 @@ class StoppingWorldModel(CountingWorldModel):
 @pytest.mark.parametrize('num_seeds', [1, 2])
 def test_a_stop_in_mid_chunk_leaves_the_episode_where_it_was(recording, num_seeds):
     model = StoppingWorldModel(SPEC)
-    episode = assemble(CARD, model, robot=YAM).begin(
+    episode = Pipeline.assemble(CARD, model, robot=YAM).begin(
         observe(recording), RolloutOptions(num_seeds=num_seeds)
     )
     done = []
@@ -280,7 +279,7 @@ class NoisyWorldModel(CountingWorldModel):
 
 
 def test_the_same_seed_twice_gives_the_same_frames(recording):
-    pipeline = assemble(CARD, NoisyWorldModel(SPEC), robot=YAM)
+    pipeline = Pipeline.assemble(CARD, NoisyWorldModel(SPEC), robot=YAM)
     first, again, other = (
         np.concatenate([c.video.frames for c in imagine(pipeline, recording, 3.2, seed=seed)], 1)
         for seed in (5, 5, 6)
@@ -305,7 +304,7 @@ def test_real_frames_are_judged_as_imagined_ones_are(pipeline, recording):
 
 def test_imagining_goes_on_from_what_was_observed(recording):
     model = CountingWorldModel(replace(SPEC, num_history=5))
-    episode = assemble(CARD, model, robot=YAM).begin(
+    episode = Pipeline.assemble(CARD, model, robot=YAM).begin(
         observe(recording), RolloutOptions(instruction=recording.instruction)
     )
     real = recording.frames[:, :9]
@@ -565,7 +564,7 @@ def test_arms_are_drawn_as_the_frame_that_each_chunk_starts_from_shows_them(
     world_model, recording
 ):
     card = CARD.replace(rendering={'arm_pictures': True})
-    chunks = imagine(assemble(card, world_model, robot=YAM), recording, 3.2)
+    chunks = imagine(Pipeline.assemble(card, world_model, robot=YAM), recording, 3.2)
     parts = load_shape(YAM).parts
     for chunk, control in zip(chunks, world_model.trajectories, strict=True):
         start = chunk.start.frames
@@ -584,8 +583,10 @@ def test_the_objects_are_those_of_the_instruction(pipeline, recording):
 
 
 def test_without_object_masks_the_control_is_dark_but_for_the_trails(world_model, recording):
-    imagine(assemble(CARD.replace(object_mask=False), world_model, robot=YAM), recording, 1.6)
-    imagine(assemble(CARD, world_model, robot=YAM), recording, 1.6)
+    imagine(
+        Pipeline.assemble(CARD.replace(object_mask=False), world_model, robot=YAM), recording, 1.6
+    )
+    imagine(Pipeline.assemble(CARD, world_model, robot=YAM), recording, 1.6)
     without, with_masks = (np.count_nonzero(t) for t in world_model.trajectories)
     assert 0 < without < with_masks
 
@@ -707,7 +708,7 @@ def large_recording() -> Recording:
 
 @pytest.fixture
 def observed() -> ObservedEpisode:
-    return ObservedEpisode(assemble(CARD, PersistenceWorldModel(LARGE), robot=YAM))
+    return ObservedEpisode(Pipeline.assemble(CARD, PersistenceWorldModel(LARGE), robot=YAM))
 
 
 def seen_at(recording: Recording, frame: int) -> Observation:
@@ -843,8 +844,8 @@ def test_without_foresight_a_model_is_drawn_what_it_was_trained_with(recording, 
     """Fills of the first masks are drawn for models that were trained with them alone."""
     foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
     trained = with_motion(world_model, foresight)
-    blind = assemble(CARD.replace(object_mask=False), world_model, robot=YAM)
-    paper = assemble(CARD, world_model, robot=YAM)
+    blind = Pipeline.assemble(CARD.replace(object_mask=False), world_model, robot=YAM)
+    paper = Pipeline.assemble(CARD, world_model, robot=YAM)
     drawn = []
     for pipeline in (trained.without_foresight(), blind, paper.without_foresight(), paper):
         imagine(pipeline, recording, 1.6)

@@ -12,8 +12,7 @@ from mtv_world_ros.core.transforms import rotation
 from mtv_world_ros.data.episode import ObjectPoses
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.policies.policy import EpisodeOrigin
-from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import robot_path
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.simulation.randomize import draw_scene
 from mtv_world_ros.simulation.recorded_scene import recorded_scene, SCENE, scene_of
 from mtv_world_ros.simulation.simulator import scene_generator

@@ -7,14 +7,14 @@ import pytest
 from mtv_world_ros.cameras.calibration_file import load_calibration as load_cameras
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import checkpoint_cameras, checkpoint_robot, fitting_setting
 from mtv_world_ros.success.calibration import Calibration, Fits, load_fit, load_fits, save_fit
 from mtv_world_ros.success.fitted_to import CameraRange, FittedTo, Setting
 
-ROBOT = checkpoint_robot('bundled')
+ROBOT = Checkpoint.open('bundled').load_robot()
 HERE = Setting.of(ROBOT, 'contact')
-CAMERAS = tuple(load_cameras(checkpoint_cameras('bundled')).values())
+CAMERAS = tuple(load_cameras(Checkpoint.open('bundled').cameras_file).values())
 FITTED = FittedTo.episodes(HERE, [CAMERAS])
 
 
@@ -93,15 +93,19 @@ def test_another_robot_and_a_longer_arm_are_other_robots():
 def test_other_numbers_of_contact_are_another_setting(tmp_path):
     own = tmp_path / 'own'
     copytree(share_path('resource', 'checkpoint'), own)
-    assert fitting_setting(own, ROBOT) == fitting_setting('bundled', ROBOT)
+    assert Setting.of(ROBOT, Checkpoint.open(own).object_motion_digest) == Setting.of(
+        ROBOT, Checkpoint.open('bundled').object_motion_digest
+    )
     file = own / 'object_motion' / 'contact.json'
     file.write_text(file.read_text().replace('"table_friction": 0.8', '"table_friction": 0.4'))
-    assert fitting_setting(own, ROBOT) != fitting_setting('bundled', ROBOT)
+    assert Setting.of(ROBOT, Checkpoint.open(own).object_motion_digest) != Setting.of(
+        ROBOT, Checkpoint.open('bundled').object_motion_digest
+    )
 
 
 def test_the_bundled_estimate_is_calibrated_for_its_own_foresight_and_cameras():
     calibration = load_fit(share_path('resource', 'checkpoint'), Calibration)
-    here = fitting_setting('bundled', ROBOT)
+    here = Setting.of(ROBOT, Checkpoint.open('bundled').object_motion_digest)
     assert calibration.elsewhere(here, CAMERAS, is_foreseen=True) == ''
     found = calibration.elsewhere(HERE, CAMERAS, is_foreseen=True)
     assert found.startswith('fitted with another foresight')
@@ -113,7 +117,7 @@ def test_the_bundled_estimate_is_calibrated_for_its_own_foresight_and_cameras():
 
 def test_weights_are_those_of_rollouts_of_the_same_kind():
     calibration = load_fit(share_path('resource', 'checkpoint'), Calibration)
-    here = fitting_setting('bundled', ROBOT)
+    here = Setting.of(ROBOT, Checkpoint.open('bundled').object_motion_digest)
     assert calibration.given(False, is_foreseen=False) is calibration.unforeseen
     seen_alone = calibration.replace(unforeseen=None)
     found = seen_alone.elsewhere(here, CAMERAS, is_foreseen=False)

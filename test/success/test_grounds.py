@@ -14,8 +14,8 @@ from mtv_world_ros.core.files import share_path, write_json
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.physics.checkpoint_files import load_contact, save_contact
 from mtv_world_ros.physics.contact_settings import ContactOrigin
-from mtv_world_ros.rollout.assembly import load_pipeline
 from mtv_world_ros.rollout.options import RolloutOptions
+from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.success.calibration import CALIBRATION
 from mtv_world_ros.success.doubts import Grounds
 
@@ -114,11 +114,11 @@ def test_a_checkpoint_says_what_its_numbers_of_contact_rest_on(own, origin, doub
     contact = load_contact(folder)
     assert contact is not None
     save_contact(contact.replace(fitted=origin), folder)
-    grounds = load_pipeline(own, num_threads=1, segmenter='colour').grounds
+    grounds = Pipeline.load(own, num_threads=1, segmenter='colour').grounds
     assert grounds.foreseen.startswith(doubt) and bool(grounds.foreseen) == bool(doubt)
     assert grounds.pictures.startswith('the estimate was never calibrated for this checkpoint')
     # what `calibrate` fits has to be the bare estimate
-    bare = load_pipeline(own, num_threads=1, segmenter='colour', calibrated=False)
+    bare = Pipeline.load(own, num_threads=1, segmenter='colour', calibrated=False)
     assert bare.grounds == Grounds()
 
 
@@ -136,7 +136,7 @@ def test_files_of_before_count_as_never_fitted(own):
 
 
 def test_the_bundled_model_has_grounds():
-    assert load_pipeline(num_threads=1, segmenter='colour').grounds == Grounds()
+    assert Pipeline.load(num_threads=1, segmenter='colour').grounds == Grounds()
 
 
 @pytest.mark.parametrize(('foresight', 'mends'), [(True, 'fit-contact'), (False, 'calibrate')])
@@ -146,7 +146,7 @@ def test_imagined_frames_abstain_and_recorded_ones_do_not(own, foresight, mends)
     contact = load_contact(folder)
     assert contact is not None
     save_contact(contact.replace(fitted=None), folder)
-    pipeline = load_pipeline(own, num_threads=1, segmenter='colour', foresight=foresight)
+    pipeline = Pipeline.load(own, num_threads=1, segmenter='colour', foresight=foresight)
     recording = load_recording(
         share_path('resource', 'demo_episode'), pipeline.spec, pipeline.robot
     )

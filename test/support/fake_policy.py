@@ -57,7 +57,7 @@ JOINTS = tuple(
 )
 
 
-def load(settings):
+def load(settings, robot):
     return lambda origin: FakePolicy(origin.task)
 
 

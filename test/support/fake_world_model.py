@@ -12,8 +12,8 @@ import numpy as np
 from mtv_world_ros.control.trajectory_video import TrajectoryVideo, TrajectoryVideoConfig
 from mtv_world_ros.core.errors import ModelMemoryError, RolloutPreempted
 from mtv_world_ros.core.files import share_path
-from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import asked_describer, robot_path
+from mtv_world_ros.robot.file import load_robot, robot_path
+from mtv_world_ros.rollout.assembly import asked_describer
 from mtv_world_ros.rollout.pipeline import Pipeline, WorldModelSpec
 from mtv_world_ros.ros.world_model.node import main
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator

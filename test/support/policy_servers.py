@@ -14,8 +14,8 @@ import yaml
 from mtv_world_ros.core.data_types import CameraModel, Observation
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.policies.policy import EpisodeOrigin
-from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import assemble_policy, robot_path
+from mtv_world_ros.robot.file import load_robot, robot_path
+from mtv_world_ros.rollout.assembly import assemble_policy
 
 ROBOT = load_robot(robot_path('yam_bimanual'))
 HOME = np.array([0.0, 1.047, 1.047, 0.0, 0.0, 0.0, 0.03] * 2)

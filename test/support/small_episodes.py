@@ -16,7 +16,6 @@ from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import assemble
 from mtv_world_ros.rollout.pipeline import Pipeline, WorldModel
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter, PALETTE
@@ -209,4 +208,4 @@ def persistence(spec: WorldModelSpec) -> Pipeline:
     """A pipeline whose world model holds the first frame; a worker process can make it, too."""
     card = read_card(share_path('resource', 'checkpoint')).replace(rendering={})
     yam = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
-    return assemble(card, PersistenceWorldModel(spec), robot=yam)
+    return Pipeline.assemble(card, PersistenceWorldModel(spec), robot=yam)

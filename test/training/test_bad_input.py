@@ -24,9 +24,9 @@ from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.inspection.inspection_report import BROKEN
 from mtv_world_ros.model.card import read_card
-from mtv_world_ros.model.checkpoint import load_checkpoint
+from mtv_world_ros.model.checkpoint import Checkpoint, checkpoint_folder
+from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import checkpoint_path
 from mtv_world_ros.training.resume import DiskError
 from mtv_world_ros.training.training_config import TrainingRun
 from mtv_world_ros.training.training_run import load_recordings, notes, train
@@ -136,7 +136,7 @@ def test_a_report_of_other_episodes_is_refused(report):
 
 
 def test_weights_that_know_other_drawings_are_told(tiny, recording):
-    bundled = checkpoint_path('bundled')
+    bundled = checkpoint_folder('bundled')
     said = ' '.join(notes(tiny, [recording], bundled))
     assert 'rendering.object_motion=true' in said and 'rendering.finger_width_m=0.008' in said
     alike = tiny.replace(rendering=TrajectoryVideoConfig(**read_card(bundled).rendering))
@@ -173,7 +173,9 @@ def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(tiny, source, tm
     assert sorted(path.name for path in tmp_path.iterdir()) == ['checkpoint', 'state']
     resumed = make_trainer(tiny, tmp_path)
     assert resumed.load_state() and resumed.step == 1
-    assert load_checkpoint(tmp_path / 'checkpoint').card.trained_on['steps'] == 1
+    assert (
+        load_trained_model(Checkpoint.open(tmp_path / 'checkpoint')).card.trained_on['steps'] == 1
+    )
 
 
 def test_a_killed_data_process_is_said_and_others_make_the_same_clips(

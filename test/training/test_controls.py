@@ -11,8 +11,9 @@ import torch
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import CheckpointError
+from mtv_world_ros.model.checkpoint import checkpoint_folder
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.rollout.assembly import checkpoint_path, load_pipeline
+from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.training.objective import pooled_weights
 from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
 from mtv_world_ros.training.training_run import train
@@ -80,11 +81,11 @@ def test_training_needs_a_dataset_and_a_folder(capsys):
 
 
 def test_a_checkpoint_of_another_control_is_refused(tmp_path):
-    shutil.copytree(checkpoint_path('bundled'), tmp_path / 'old')
+    shutil.copytree(checkpoint_folder('bundled'), tmp_path / 'old')
     card = tmp_path / 'old' / 'world_model.json'
     card.write_text(card.read_text().replace('trajectory_video', 'ee_mlp'))
     with pytest.raises(CheckpointError, match=r"no control.json, which control 'ee_mlp' needs"):
-        load_pipeline(tmp_path / 'old')
+        Pipeline.load(tmp_path / 'old')
 
 
 def test_a_control_whose_inputs_the_transformer_does_not_take_is_refused(tmp_path, monkeypatch):
@@ -92,11 +93,11 @@ def test_a_control_whose_inputs_the_transformer_does_not_take_is_refused(tmp_pat
     folder.mkdir()
     shutil.copy(Path(__file__).parents[1] / 'control' / 'own_control.py', folder / 'pixels.py')
     monkeypatch.syspath_prepend(folder)
-    shutil.copytree(checkpoint_path('bundled'), tmp_path / 'old')
+    shutil.copytree(checkpoint_folder('bundled'), tmp_path / 'old')
     card = tmp_path / 'old' / 'world_model.json'
     card.write_text(card.read_text().replace('trajectory_video', 'pixels:ToolPixels'))
     with pytest.raises(CheckpointError, match=r"feeds 'frame'.*takes none"):
-        load_pipeline(tmp_path / 'old')
+        Pipeline.load(tmp_path / 'old')
 
 
 def test_latents_of_four_frames_weigh_their_pixels_mean():

@@ -12,7 +12,8 @@ import torch
 from mtv_world_ros.core.data_types import History, JointTrajectory, Observation
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.data.recording import frame_indices, Recording
-from mtv_world_ros.model.checkpoint import load_checkpoint
+from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.rollout.options import RolloutOptions
@@ -101,7 +102,7 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
     assert torch.equal(before.frames, after.frames)
     rolled = [i for i, lead in enumerate(before.lead_ins) if lead is not None]
     assert rolled
-    model = DiffusionWorldModel(load_checkpoint(tmp_path / 'checkpoint'))
+    model = DiffusionWorldModel(load_trained_model(Checkpoint.open(tmp_path / 'checkpoint')))
     spec = rolling.spec
     pipeline = Pipeline(
         robot=robot,

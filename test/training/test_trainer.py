@@ -13,7 +13,7 @@ import torch
 
 from mtv_world_ros.core.errors import ConfigError, TrainingError
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
-from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.training.trainer import learning_rate
 from mtv_world_ros.training.training_config import (
     load_training_config,
@@ -146,7 +146,7 @@ def test_trains_from_a_folder_to_a_checkpoint_that_serves(episode, tiny, robot, 
     out = tmp_path / 'run'
     run = TrainingRun(config=tiny, dataset=episode.parent, out=out, save_every=2)
     folder = train(run, robot=robot, segmenter=ColourSegmenter())
-    pipeline = load_pipeline(folder, dtype='float32')
+    pipeline = Pipeline.load(folder, dtype='float32')
     assert pipeline.spec.num_frames == 2
     assert json.loads((folder / 'world_model.json').read_text())['trained_on']['steps'] == 4
     assert json.loads((out / 'skipped.json').read_text()) == {}

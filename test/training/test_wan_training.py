@@ -15,7 +15,8 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.errors import CheckpointError, TrainingError
 from mtv_world_ros.data.recording import load_recording, Recording
-from mtv_world_ros.model.checkpoint import load_checkpoint
+from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.training.base_checkpoint import load_base
 from mtv_world_ros.training.trainer import Trainer
@@ -87,7 +88,7 @@ def test_the_command_trains_an_adapter_that_changes_the_prediction(
     assert not (tmp_path / 'checkpoint').exists()
     card = json.loads((adapter / 'world_model.json').read_text())
     assert card['trained_on']['steps'] == 2 and card['prompt'] == 'pick the block'
-    model = DiffusionWorldModel(load_checkpoint(base))
+    model = DiffusionWorldModel(load_trained_model(Checkpoint.open(base)))
     plain = predict(model, clips.frames[:, :5])
     model.use_adapter(adapter)
     assert np.abs(predict(model, clips.frames[:, :5]).astype(int) - plain).max() > 0
@@ -180,7 +181,7 @@ def test_a_state_on_top_of_other_weights_is_refused(config, base, tmp_path):
 def test_an_adapter_of_another_clock_is_refused_when_it_is_loaded(config, base, tmp_path):
     trainer = make(config, tmp_path, base)
     trainer.export(trainer.result)
-    checkpoint = load_checkpoint(base)
+    checkpoint = load_trained_model(Checkpoint.open(base))
     slower = replace(checkpoint, card=checkpoint.card.replace(fps=2.5))
     model = DiffusionWorldModel(slower)
     with pytest.raises(CheckpointError, match=r"'fps' 5.0, this checkpoint's is 2.5"):

@@ -27,8 +27,7 @@ from mtv_world_ros.evaluation.metrics.jaccard_scores import (
     ScoreRow,
     true_masks,
 )
-from mtv_world_ros.model.card import read_card
-from mtv_world_ros.rollout.assembly import checkpoint_path, checkpoint_robot
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.viewing.video import Comparison, contact_sheet, side_by_side, write_video
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
@@ -41,8 +40,8 @@ def run_demo(episode: Path, out: Path, options: DemoOptions) -> str:
     Raises:
         EpisodeError: the episode cannot be used or a process failed.
     """
-    spec = read_card(checkpoint_path(options.checkpoint)).spec
-    robot = checkpoint_robot(options.checkpoint, options.robot)
+    checkpoint = Checkpoint.open(options.checkpoint)
+    spec, robot = checkpoint.spec, checkpoint.load_robot(options.robot)
     recording = load_recording(episode, spec, robot)
     record_through_node(episode, spec.views, out, options)
     predictions = read_predictions(out / 'predictions', spec.views)

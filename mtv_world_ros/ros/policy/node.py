@@ -19,9 +19,10 @@ from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
 from mtv_world_ros.core.data_types import JointTrajectory, Observation
 from mtv_world_ros.core.errors import MtvWorldError
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.rollout.assembly import assemble_policy, checkpoint_robot, PolicyMaker
+from mtv_world_ros.rollout.assembly import assemble_policy, PolicyMaker
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.messages.conversions import make_header, to_trajectory_message, values_of
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
@@ -34,20 +35,15 @@ from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 from mtv_world_ros.ros.sensing.samples import NodeTime
 from mtv_world_ros.ros.sensing.subscriptions import subscribe_observations
 from mtv_world_ros.ros.status_publisher import StatusPublisher
-from mtv_world_ros.ros.world_model.loading import check_calibration, load_spec, reload_cameras
+from mtv_world_ros.ros.world_model.loading import check_calibration, reload_cameras
 
-Load = Callable[[PolicySettings], PolicyMaker]
+Load = Callable[[PolicySettings, RobotModel], PolicyMaker]
 _TICK_S = 0.02
 
 
-def load_named_robot(settings: PolicySettings) -> RobotModel:
-    """Loads the robot that is set, by default the checkpoint's."""
-    return checkpoint_robot(settings.checkpoint, settings.robot_file or None)
-
-
-def load_named_policy(settings: PolicySettings) -> PolicyMaker:
-    """Returns the maker of the policy that is set."""
-    return assemble_policy(settings.policy, load_named_robot(settings))
+def load_named_policy(settings: PolicySettings, robot: RobotModel) -> PolicyMaker:
+    """Returns the maker of the policy that is set, for a robot."""
+    return assemble_policy(settings.policy, robot)
 
 
 class PolicyNode(Node):
@@ -65,9 +61,10 @@ class PolicyNode(Node):
         super().__init__('policy', context=context)
         parameters.declare(self, PolicySettings)
         settings = self._settings()
-        self._make_policy = load(settings)
-        self._spec = load_spec(settings.checkpoint)
-        joint_names = load_named_robot(settings).joint_names
+        checkpoint = Checkpoint.open(settings.checkpoint)
+        robot = checkpoint.load_robot(settings.robot_file or None)
+        self._make_policy = load(settings, robot)
+        self._spec, joint_names = checkpoint.spec, robot.joint_names
         self._status = StatusPublisher(self)
         self._buffer = ObservationBuffer(
             cameras=reload_cameras(settings, self._spec),

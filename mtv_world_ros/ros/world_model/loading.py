@@ -15,8 +15,7 @@ from rclpy.parameter import Parameter
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.core.data_types import CameraModel
 from mtv_world_ros.core.errors import CalibrationError, CheckpointError, MtvWorldError
-from mtv_world_ros.model.card import read_card
-from mtv_world_ros.rollout.assembly import checkpoint_cameras, checkpoint_path, load_pipeline
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.rollout.pipeline import Pipeline, WorldModel, WorldModelSpec
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
 from mtv_world_ros.ros.parameters import NodeSettings, refusing, Settings
@@ -124,7 +123,7 @@ _READ_S = 3.0
 
 def load_named_pipeline(settings: Settings) -> Pipeline:
     """Loads the checkpoint, on the device and for the robot and task that are set."""
-    return load_pipeline(
+    return Pipeline.load(
         settings.checkpoint,
         robot=settings.robot_file or None,
         task=settings.task or None,
@@ -144,7 +143,7 @@ def load_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[CameraMo
     Raises:
         CalibrationError: the file is wrong or lacks a view, or there is none.
     """
-    path = Path(settings.calibration_file or checkpoint_cameras(settings.checkpoint))
+    path = Path(settings.calibration_file or Checkpoint.open(settings.checkpoint).cameras_file)
     cameras = load_calibration(path)
     missing = [view for view in spec.views if view not in cameras]
     if missing:
@@ -202,8 +201,3 @@ def check_calibration(
     for parameter in changed:
         if parameter.name == 'calibration_file':
             reload_cameras(settings.model_copy(update={'calibration_file': parameter.value}), spec)
-
-
-def load_spec(checkpoint: str) -> WorldModelSpec:
-    """Returns what a checkpoint takes and gives, without loading it."""
-    return read_card(checkpoint_path(checkpoint)).spec

@@ -18,10 +18,11 @@ from torch import Tensor
 from mtv_world_ros.core.errors import CheckpointError, ConfigError, ModelMemoryError
 from mtv_world_ros.model import serving
 from mtv_world_ros.model.autoencoders import TinyAutoencoder
-from mtv_world_ros.model.checkpoint import load_checkpoint
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import decode_frames
 from mtv_world_ros.model.parts import build_autoencoder
 from mtv_world_ros.model.serving import ServingOptions
+from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.training.training_config import HistoryConfig, load_training_config
@@ -39,7 +40,7 @@ def load(folder: Path, serving: str = '', device: str = 'cpu') -> DiffusionWorld
     dtype = torch.float32 if device == 'cpu' else torch.bfloat16
     options = ServingOptions.parse(serving)
     return DiffusionWorldModel(
-        load_checkpoint(folder), device=device, dtype=dtype, serving=options
+        load_trained_model(Checkpoint.open(folder)), device=device, dtype=dtype, serving=options
     )
 
 
@@ -178,7 +179,7 @@ def test_the_tiny_decoder_decodes_what_was_denoised(
 
 
 def test_the_tiny_decoder_is_for_wans_latents(folder: Path, tiny_file: Path) -> None:
-    checkpoint = load_checkpoint(folder)
+    checkpoint = load_trained_model(Checkpoint.open(folder))
     other = replace(checkpoint, autoencoder=build_autoencoder({'block_size': 2}))
     with pytest.raises(CheckpointError, match="tiny_decoder decodes Wan's latents"):
         DiffusionWorldModel(other, serving=ServingOptions(tiny_decoder=str(tiny_file)))
@@ -254,10 +255,12 @@ def test_a_lack_of_memory_outside_torchs_own_is_named(
 _STARVED = """
 import resource
 import numpy as np
-from mtv_world_ros.rollout.assembly import load_pipeline
+from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.errors import ModelMemoryError
-model = load_pipeline(num_threads=1, dtype='float32').world_model
+model = Pipeline.load(num_threads=1, dtype='float32').world_model
 spec = model.spec
 shape = (len(spec.views), 1 + spec.num_frames, spec.height, spec.width, 3)
 def predict(scale):

@@ -18,10 +18,11 @@ from mtv_world_ros.control.control import ControlInputs
 from mtv_world_ros.core.data_types import History
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.autoencoders import WanAutoencoder
-from mtv_world_ros.model.checkpoint import Checkpoint, load_checkpoint
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import condition, ControlBatch, decode_frames, encode_chunk
 from mtv_world_ros.model.encoders import ImageEncoder, TextEncoder
 from mtv_world_ros.model.serving import compile_norms
+from mtv_world_ros.model.trained_model import load_trained_model, TrainedModel
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.training.adapter import add_adapter, save_adapter
 from test.support.wan_encoder_reference import clip_tokens, umt5_encode
@@ -35,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def load(folder: Path, dtype: torch.dtype = torch.float32, **card: Any) -> DiffusionWorldModel:
-    checkpoint: Checkpoint = load_checkpoint(folder)
+    checkpoint: TrainedModel = load_trained_model(Checkpoint.open(folder))
     changed = replace(checkpoint, card=checkpoint.card.replace(**card))
     return DiffusionWorldModel(changed, dtype=dtype)
 
@@ -99,7 +100,7 @@ def test_an_adapter_in_the_checkpoint_is_used_and_can_be_taken_away(
 ) -> None:
     plain = load(folder)
     before = predict(plain)
-    trained = load_checkpoint(folder).transformer
+    trained = load_trained_model(Checkpoint.open(folder)).transformer
     add_adapter(trained, rank=2)
     with torch.no_grad():
         for name, parameter in trained.named_parameters():

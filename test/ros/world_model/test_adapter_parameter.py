@@ -6,8 +6,8 @@ from sensor_msgs.msg import Image
 import torch
 
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
-from mtv_world_ros.model.checkpoint import Checkpoint, save_checkpoint
 from mtv_world_ros.model.parts import build_scheduler
+from mtv_world_ros.model.trained_model import save_trained_model, TrainedModel
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.ros.messages.image_messages import to_rgb
 from mtv_world_ros.ros.world_model.loading import load_named_pipeline
@@ -55,13 +55,13 @@ def folder(tmp_path_factory):
     root = tmp_path_factory.mktemp('adapter')
     video = {'width': 48, 'height': 40, 'fps': 5.0, 'num_frames': FRAMES}
     config = load_training_config('small', {f'video.{k}': v for k, v in video.items()})
-    parts = Checkpoint(
+    parts = TrainedModel(
         transformer=make_transformer(),
         autoencoder=SpaceToDepthAutoencoder(),
         scheduler=build_scheduler(config.scheduler),
         card=config.card({}),
     )
-    save_checkpoint(parts, root / 'checkpoint')
+    save_trained_model(parts, root / 'checkpoint')
     save_trained(root / 'mine')
     save_trained(root / 'deeper', num_layers=2)
     (root / 'empty').mkdir()

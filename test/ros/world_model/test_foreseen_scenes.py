@@ -11,7 +11,7 @@ from std_msgs.msg import String
 from mtv_world_ros.core.data_types import JointTrajectory, WorldModelSpec
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.rollout.assembly import checkpoint_robot
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.ros.messages.conversions import (
     make_header,
     NANO,
@@ -32,7 +32,7 @@ def recording():
     spec = WorldModelSpec(
         views=('low', 'high'), fps=FPS, num_frames=16, width=384, height=288, robot='yam_bimanual'
     )
-    return load_recording(EPISODE, spec, checkpoint_robot('bundled'))
+    return load_recording(EPISODE, spec, Checkpoint.open('bundled').load_robot())
 
 
 @pytest.fixture(scope='module')

@@ -14,7 +14,7 @@ from std_msgs.msg import Header, String
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.core.transforms import pose, quaternion
-from mtv_world_ros.rollout.assembly import robot_path
+from mtv_world_ros.robot.file import robot_path
 from mtv_world_ros.ros.messages.conversions import NANO, to_ns, to_stamp
 
 needs_tf2 = pytest.mark.skipif(

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import robot_path
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.simulation.faults import glitches
 from mtv_world_ros.simulation.faults.glitches import with_glitches
 from mtv_world_ros.simulation.faults.signals import Commands

@@ -8,7 +8,8 @@ import torch
 
 from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.data.recording import frame_indices, Recording
-from mtv_world_ros.model.checkpoint import load_checkpoint
+from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.training.batches import BatchSource
@@ -102,12 +103,14 @@ def test_a_model_trained_with_history_serves_with_it(recording, tiny, robot, tmp
     made.close()
     assert np.isfinite(losses).all()
     trainer.export(tmp_path / 'checkpoint')
-    served = DiffusionWorldModel(load_checkpoint(tmp_path / 'checkpoint')).history
+    served = DiffusionWorldModel(
+        load_trained_model(Checkpoint.open(tmp_path / 'checkpoint'))
+    ).history
     assert (served.num_frames, served.noise_level, served.reference) == (4, 0.05, 'first_frame')
     plain = Trainer(tiny, tmp_path / 'plain', seed=0, device='cpu', dtype=torch.float32,
                     trained_on={})  # fmt: skip
     plain.export(tmp_path / 'off')
-    assert 'history' not in load_checkpoint(tmp_path / 'off').card.plain()
+    assert 'history' not in load_trained_model(Checkpoint.open(tmp_path / 'off')).card.plain()
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.model.checkpoint import checkpoint_folder
 from mtv_world_ros.physics.arms import Arms
 from mtv_world_ros.physics.checkpoint_files import CONTACT_FILE, load_contact, load_foresight
 from mtv_world_ros.physics.contact_settings import ContactOrigin
@@ -29,8 +30,7 @@ from mtv_world_ros.physics.fitting.contact_fit import (
     read_recordings,
 )
 from mtv_world_ros.physics.solid_foresight import SolidForesight
-from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.rollout.assembly import checkpoint_path, robot_path
+from mtv_world_ros.robot.file import load_robot, robot_path
 
 VIEWS = ('low', 'high')
 DEMO = share_path('resource', 'demo_episode')
@@ -43,7 +43,7 @@ def recording(robot):
 
 @pytest.fixture
 def settings():
-    found = load_contact(checkpoint_path('bundled') / 'object_motion')
+    found = load_contact(checkpoint_folder('bundled') / 'object_motion')
     assert found is not None
     return found
 
@@ -51,7 +51,7 @@ def settings():
 @pytest.fixture
 def checkpoint(tmp_path) -> Path:
     copied = tmp_path / 'checkpoint'
-    shutil.copytree(checkpoint_path('bundled'), copied)
+    shutil.copytree(checkpoint_folder('bundled'), copied)
     return copied
 
 

@@ -1,0 +1,37 @@
+"""The world model of a checkpoint, on a device; imports torch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.model.runtime import check_device, choose_dtype, set_num_threads
+from mtv_world_ros.model.serving import ServingOptions
+from mtv_world_ros.model.trained_model import load_trained_model
+from mtv_world_ros.model.world_model import DiffusionWorldModel
+
+
+def load_world_model(
+    checkpoint: Checkpoint,
+    *,
+    device: str = 'cpu',
+    dtype: str = 'auto',
+    num_threads: int = 0,
+    serving: str = '',
+    adapter: Path | None = None,
+) -> DiffusionWorldModel:
+    """Returns the world model of a checkpoint. Arguments as in `Pipeline.load`.
+
+    Raises:
+        CheckpointError: a part is missing or wrong.
+        ConfigError: this machine has no such device, or a serving option is wrong.
+    """
+    options = ServingOptions.parse(serving)
+    check_device(device)
+    set_num_threads(num_threads)
+    number_format = choose_dtype(dtype, device)
+    loaded = load_trained_model(checkpoint, dtype=number_format)
+    if adapter is not None:
+        loaded = replace(loaded, adapter=adapter)
+    return DiffusionWorldModel(loaded, device=device, dtype=number_format, serving=options)
