@@ -92,8 +92,6 @@ time.perf_counter = time.process_time  # other work does not count
 from dataclasses import replace
 import numpy as np
 from mtv_world_ros import Pipeline
-from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
-from mtv_world_ros.robot.file import robot_path
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.core.data_types import JointTrajectory, Observation
 from mtv_world_ros.core.files import share_path
@@ -399,7 +397,7 @@ def main() -> None:
     publish(
         'foresight_engines',
         'What foresees objects, and how fast',
-        f'python experiments/foresight_engines.py, {fingerprint("bundled")}',
+        f'python experiments/foresight_engines.py, {fingerprint(Checkpoint.open())}',
         '\n\n'.join([(__doc__ or '').split('\n' * 2, 2)[-1], *parts, load]),
         options,
         '1 thread each',

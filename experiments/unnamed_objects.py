@@ -24,6 +24,7 @@ from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data.recordings import commanded
 from mtv_world_ros.evaluation.imagined_stretches import predicted_frames, stretches
 from mtv_world_ros.evaluation.result_settings import fingerprint
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 
@@ -116,7 +117,8 @@ def main() -> None:
     publish(
         'unnamed_objects',
         'What is left of objects that are not named',
-        f'python experiments/unnamed_objects.py DIR, {fingerprint(options.checkpoint)}',
+        f'python experiments/unnamed_objects.py DIR, '
+        f'{fingerprint(Checkpoint.open(options.checkpoint))}',
         f'{(__doc__ or "").split(chr(10) * 2)[-1]}\n{table(HEAD, rows)}',
         options,
         '1 process',
