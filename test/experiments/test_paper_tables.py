@@ -11,12 +11,12 @@ from types import ModuleType
 
 import pytest
 from safetensors.torch import save_file
-from sources import set_options, TINY_MODEL
 import torch
 
 from mtv_world_ros.cli import main as mtv_world
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import share_path
+from test.support.sources import set_options, TINY_MODEL
 
 ROOT = Path(__file__).resolve().parents[2]
 TASK = 'stack_blocks_two'

@@ -109,7 +109,7 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
         world_model=model,
         segmenter=ColourSegmenter(),
         estimator=SuccessEstimator({}),
-        rendering=rolling.rendering,
+        control=trainer.control,
     )
     for index in rolled:
         lead = before.lead_ins[index]
