@@ -1,6 +1,6 @@
 # `make` installs into .venv; nothing here needs root. `make help` lists the targets.
 .DEFAULT_GOAL := install
-.PHONY: help install demo test tests style types fuzz kills soak attacks lint format docs clean distclean upstream
+.PHONY: help install demo test test-all fast-tests slow-tests tiers style types fuzz kills soak attacks lint format docs clean distclean upstream
 
 # .venv has its own ROS: a native one that is sourced, or wheels of another environment, would load
 # in its place.
@@ -11,11 +11,12 @@ unexport AMENT_PREFIX_PATH PYTHONPATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 BIN := .venv/bin
 STAMP := .venv/.installed
+INTERFACES := .venv/interfaces/.built
 # what the demo needs; an installation of everything has it, too
 DEMO_STAMP := $(if $(wildcard $(STAMP)),$(STAMP),.venv/.demo)
 
 help:  ## list the targets
-	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
+	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
 
 install: $(STAMP)  ## install everything into .venv; the second call does nothing
 
@@ -36,13 +37,29 @@ style: $(STAMP)
 types: $(STAMP)
 	$(BIN)/pyright
 
-test: style  ## the linters and all tests (8 to 14 minutes)
-	@$(MAKE) --no-print-directory --jobs=2 types tests
-
 # a worker has a core: torch's threads would only take turns
-tests: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
-		--no-loadscope-reorder
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 \
+	--dist worksteal
+
+test: style  ## the linters and the fast tests (5 minutes)
+	@$(MAKE) --no-print-directory --jobs=2 types fast-tests
+
+test-all: test slow-tests  ## the linters and all tests (20 minutes)
+
+fast-tests: $(STAMP) $(INTERFACES)
+	$(PYTEST) -m 'not slow'
+
+slow-tests: $(STAMP) $(INTERFACES)  ## the tests that `make test` leaves out
+	$(PYTEST) -m slow
+
+tiers: $(STAMP) $(INTERFACES)  ## time all tests, one by one; list those whose marker `slow` is wrong
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q --tiers
+
+# Python modules of ROS interfaces that have no wheel, for tests
+$(INTERFACES): test/support/interfaces.py $(STAMP)
+	@mkdir -p $(@D) out
+	@$(BIN)/python -m test.support.interfaces $(@D) 2>out/interfaces.log || cat out/interfaces.log
+	@mkdir -p $(@D) && touch $@
 
 fuzz: $(STAMP)  ## damage everything that is read from outside (minutes); prints seed and table
 	@mkdir -p out

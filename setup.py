@@ -105,7 +105,7 @@ setup(
             )
         ],
         # `colcon test` looks for pytest under this name
-        'test': ['mcap-ros2-support>=0.6', 'pytest>=7.4', 'pytest-xdist>=3.5'],
+        'test': ['argcomplete>=3', 'mcap-ros2-support>=0.6', 'pytest>=7.4', 'pytest-xdist>=3.5'],
         'lint': ['import-linter>=2.16', 'pyright[nodejs]', 'ruff>=0.17'],
         # `make docs`
         'docs': ['mkdocs>=1.6,<2', 'mkdocs-material>=9.6,<10'],

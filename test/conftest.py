@@ -22,6 +22,7 @@ from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.opengl import missing_opengl
 from mtv_world_ros.simulation.workcell import workcell_of
 from test.support.left_behind import left, restore, state
+from test.support.tiers import tier_lines
 
 
 def _no_gpu() -> str:
@@ -46,7 +47,11 @@ def _no_native_ros() -> str:
 
 
 def _no_control_msgs() -> str:
-    return '' if find_spec('control_msgs') is not None else 'control_msgs is not installed'
+    return '' if find_spec('control_msgs') is not None else 'not built (make fast-tests)'
+
+
+def _no_tf2_msgs() -> str:
+    return '' if find_spec('tf2_msgs') is not None else 'not built (make fast-tests)'
 
 
 #: marker -> why its tests cannot run here; an empty text where they can
@@ -55,21 +60,16 @@ OBSTACLES = {
     'weights': _no_weights,
     'native_ros': _no_native_ros,
     'control_msgs': _no_control_msgs,
+    'tf2_msgs': _no_tf2_msgs,
 }
-#: files of tests that take longest, which begin first: no worker has one of them alone at the end
-SLOW = [
-    'test_shell_lines', 'test_your_robot_page', 'test_imagine_command', 'test_foreseen_scenes',
-    'test_calibrate_camera', 'test_shared_camera', 'test_doctor', 'test_contact_fit',
-    'test_doctor_of_folders', 'test_node_setups', 'test_cli', 'test_distributed',
-    'test_wan_benchmarks', 'test_player_recorder', 'test_kill', 'test_interval_coverage',
-    'test_never_lost', 'test_full_disk', 'test_wan_commands', 'test_collect', 'test_runner',
-    'test_workers', 'test_wan_training', 'test_processes', 'test_serving', 'test_evaluate',
-    'test_lifecycle', 'test_interrupts', 'test_policy_in_the_loop', 'test_html',
-    'test_bundled_episode', 'test_trainer', 'test_rank_command', 'test_comparison',
-    'test_doctor_of_own_robot', 'test_held_out', 'test_policy_beside_a_robot', 'test_both_worlds',
-    'test_own_checkpoint', 'test_adapter_parameter', 'test_signals', 'test_evaluate_command',
-    'test_bad_input', 'test_stored_objects',
-]  # fmt: skip
+#: tests in the wrong tier that a run lists; `make tiers` lists all
+MOST_LISTED = 5
+
+
+#: Python modules of control_msgs and tf2_msgs where they are built, see test/support/interfaces.py
+INTERFACES = Path(sys.prefix) / 'interfaces'
+if INTERFACES.is_dir():
+    sys.path.append(str(INTERFACES))
 
 
 @pytest.fixture(scope='session')
@@ -151,8 +151,6 @@ class Failing:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    rank = {name: number for number, name in enumerate(SLOW)}
-    items.sort(key=lambda item: rank.get(item.path.stem, len(SLOW)))
     for marker, obstacle in OBSTACLES.items():
         marked = [item for item in items if item.get_closest_marker(marker)]
         reason = obstacle() if marked else ''
@@ -161,7 +159,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(pytest.mark.skip(reason=f'{marker}: {reason}'))
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption('--tiers', action='store_true', help='list all tests in the wrong tier')
+
+
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
     counted: Counter[str] = Counter()
     for report in terminalreporter.stats.get('skipped', ()):
         reason = str(report.longrepr[-1]).removeprefix('Skipped: ')
@@ -169,3 +173,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
             counted[reason] += 1
     for reason, count in counted.most_common():
         terminalreporter.write_line(f'skipped for want of {reason}: {count}')
+    reports = [one for kind in ('', 'passed') for one in terminalreporter.stats.get(kind, ())]
+    for line in tier_lines(reports, most=None if config.getoption('tiers') else MOST_LISTED):
+        terminalreporter.write_line(line)

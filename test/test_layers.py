@@ -33,6 +33,7 @@ def test_no_laboratory_is_reached_from(graph, module):
     assert len(reached) > 20 and not [name for name in reached if name.startswith(rooms)]
 
 
+@pytest.mark.slow
 def test_the_bundled_checkpoint_is_loaded_without_the_simulator():
     code = (
         'import sys\n'

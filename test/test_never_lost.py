@@ -153,6 +153,7 @@ def stopped_here(words: list[str], kind: int, log: Path) -> tuple[int, str]:
     return status, said.getvalue()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('kind', 'stopped'),
     [(signal.SIGINT, stopped_in_a_process), (signal.SIGTERM, stopped_here)],
@@ -185,6 +186,7 @@ def trained(tmp_path_factory) -> tuple[Path, str]:
     return out, said.getvalue()
 
 
+@pytest.mark.slow
 def test_the_evaluation_that_train_prints_runs(trained):
     out, said = trained
     words = shlex.split(said.partition('evaluate it with: ')[2])

@@ -212,6 +212,7 @@ def test_the_page_of_installation_has_every_extra(setup_arguments):
     assert sorted(named) == sorted(setup_arguments['extras_require'])
 
 
+@pytest.mark.slow
 def test_imports_are_declared(setup_arguments, manifest):
     extras = [name for names in setup_arguments['extras_require'].values() for name in names]
     requirements = setup_arguments['install_requires'] + extras
@@ -250,6 +251,7 @@ def _loads_a_pickle(call: ast.Call) -> bool:
     return name.partition('.')[0] in ('pickle', 'joblib', 'dill', 'cloudpickle', 'shelve')
 
 
+@pytest.mark.slow
 def test_no_pickle_is_loaded():
     found = []
     for path in MODULES:

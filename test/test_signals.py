@@ -63,6 +63,7 @@ def test_a_command_that_still_imports_ends_with_one_line(number, tmp_path):
     assert said == [f'mtv-world: stopped while starting ({signal.Signals(number).name})']
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_command_that_runs_ends_with_one_line(number, tmp_path):
     words = ('mtv_world_ros.cli', 'replay', str(EPISODE), '--offline', '--out', 'out')

@@ -108,6 +108,7 @@ def test_a_module_that_no_extra_asks_for_is_no_error_of_the_user(monkeypatch):
         main(['train', 'data', '--out', 'runs'])
 
 
+@pytest.mark.slow
 def test_the_demo_runs_over_the_middleware_and_beats_the_held_frame(tmp_path):
     done = run('demo', '--out', 'out', '--threads', '1', cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -130,6 +131,7 @@ def test_the_demo_runs_over_the_middleware_and_beats_the_held_frame(tmp_path):
     assert log.count('trajectory is answered: done') == 3
 
 
+@pytest.mark.slow
 @needs_checkpoint
 def test_replays_offline_to_a_bag_with_all_frames(tmp_path):
     from mtv_world_ros.data.bag.reader import BagReader
@@ -146,6 +148,7 @@ def test_replays_offline_to_a_bag_with_all_frames(tmp_path):
     assert infos[0] == infos[1] == 48
 
 
+@pytest.mark.slow
 @needs_checkpoint
 def test_evaluates_the_bundled_model(tmp_path):
     words = ['--out', str(tmp_path / 'scores'), '--steps', '1', '--threads', '1']

@@ -92,6 +92,7 @@ workers.close()
 """
 
 
+@pytest.mark.slow
 def test_forked_workers_begin_after_opencv_had_threads():
     """Its pool does not survive the fork: whoever waits for its threads waits for ever."""
     subprocess.run([sys.executable, '-c', AFTER_OPENCV], check=True, timeout=180)

@@ -141,6 +141,7 @@ def test_yaml_in_the_pages_can_be_used(block, tmp_path):
         assert 'qos_overrides' in values or has_boxes(file, values)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     importlib.util.find_spec('material') is None, reason='mkdocs-material is not installed'
 )

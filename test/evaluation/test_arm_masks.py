@@ -30,6 +30,7 @@ def views(tmp_path_factory):
     ]
 
 
+@pytest.mark.slow
 def test_recorded_frames_show_the_arm_where_it_is_drawn(views):
     frames, (door, _) = views
     assert door is not None

@@ -33,6 +33,7 @@ def same_threads():
     torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures('same_threads')
 def test_an_episode_that_fails_is_named_and_in_the_exit_status(tmp_path, capsys):
     """First where too few others are left for a fit, then, as the run goes on, beside a fit."""

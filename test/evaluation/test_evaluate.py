@@ -32,6 +32,7 @@ def held(make_pipeline, episodes, tmp_path_factory):
     return out, *run(make_pipeline(), episodes, out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('mode', ['observe', 'imagine'])
 def test_persistence_model_scores_exactly_the_persistence_baseline(
     make_pipeline, episodes, tmp_path, mode
@@ -44,6 +45,7 @@ def test_persistence_model_scores_exactly_the_persistence_baseline(
         assert view['skill'] == view['margin_moving'] == 0.0
 
 
+@pytest.mark.slow
 def test_recorded_frames_score_the_ceiling(make_pipeline, episodes, oracle, tmp_path):
     oracle.autoencoder = SpaceToDepthAutoencoder()
     metrics, _ = run(make_pipeline(oracle), episodes, tmp_path)
@@ -73,6 +75,7 @@ def test_what_is_not_measured_is_null(make_pipeline, episodes, tmp_path):
     assert low['intervals']['j_shuffled_moving'] == [None, None]
 
 
+@pytest.mark.slow
 def test_scores_against_true_masks_need_no_perfect_segmenter(
     make_pipeline, episodes, blurred_oracle, tmp_path
 ):

@@ -27,6 +27,7 @@ def test_rows_that_are_called_alike_are_an_error():
         parse_entries(['=one'])
 
 
+@pytest.mark.slow
 def test_checkpoints_are_compared_in_one_set_of_tables(episodes, tmp_path, capsys):
     dataset = episodes[0].parent
     out = tmp_path / 'out'
@@ -67,6 +68,7 @@ def test_without_named_objects_the_line_is_of_pictures(make_episode, tmp_path, c
     assert 'give at least 3); PSNR ' in line and '–' not in line and 'J of' not in line
 
 
+@pytest.mark.slow
 def test_an_episode_without_a_result_is_told_and_is_in_the_exit_status(
     make_episode, tmp_path, capsys
 ):

@@ -17,6 +17,7 @@ def make(make_pipeline):
     return partial(persistence, make_pipeline().spec)
 
 
+@pytest.mark.slow
 def test_two_workers_find_what_one_finds(make, episodes, tmp_path):
     paths = [*episodes, tmp_path / 'nothing']
     parallel = Parallel(workers=2, make_pipeline=make, threads=1)
@@ -31,6 +32,7 @@ def test_two_workers_find_what_one_finds(make, episodes, tmp_path):
         assert all(left[key] == right[key] for key in left if key not in timing)
 
 
+@pytest.mark.slow
 def test_what_a_worker_lacks_is_the_reason(make, episodes, tmp_path):
     parallel = Parallel(workers=2, make_pipeline=make, threads=1)
     config = EvaluationConfig(fid_weights=tmp_path / 'weights.pth')

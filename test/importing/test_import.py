@@ -286,6 +286,7 @@ def test_a_stale_video_index_is_the_reason(is_there, datasets, make_mapping, tmp
     assert 'the video index in meta/ is of an earlier state of the dataset' in said
 
 
+@pytest.mark.slow
 def test_bars_with_the_time_left_are_drawn_on_a_terminal_only(datasets, make_mapping, tmp_path):
     command = ['import-dataset', str(datasets('v2.1')), '--mapping', str(make_mapping())]
     words = [sys.executable, '-m', 'mtv_world_ros.cli', *command]

@@ -22,6 +22,7 @@ from mtv_world_ros.inspection.motion_residual import (
 )
 from mtv_world_ros.robot.shape import load_shape, rods
 from test.support.crane import write_cuboid
+from test.support.tiers import rest_slow
 
 QUICK = ResidualSearch(max_pairs=25, lags_s=(0.0,), rolls_deg=(), zooms=())
 
@@ -60,6 +61,7 @@ def texts(section):
     return ' '.join(finding.text for finding in section.findings)
 
 
+@pytest.mark.slow
 def test_the_command_passes_a_good_recording_and_writes_report_and_pictures(tmp_path, capsys):
     status = main(['doctor', str(share_path('resource', 'demo_episode')), '--out', str(tmp_path)])
     report = (tmp_path / 'report.md').read_text()
@@ -73,7 +75,10 @@ def test_the_command_passes_a_good_recording_and_writes_report_and_pictures(tmp_
 
 @pytest.mark.parametrize(
     ('view', 'shift'),
-    [('low', (10, 0)), ('high', (-10, 0)), ('low', (0, 10)), ('high', (0, -10))],
+    rest_slow(
+        [('low', (10, 0)), ('high', (-10, 0)), ('low', (0, 10)), ('high', (0, -10))],
+        [('low', (10, 0))],
+    ),
 )
 def test_a_principal_point_10_px_off_flips_the_verdict(episode, inspector, view, shift):
     wrong = inspector.inspect(shifted_k(episode, view, *shift)).views[0]
@@ -93,6 +98,7 @@ def test_the_residual_says_where_the_moving_pixels_are(episode, inspector):
     assert np.subtract(measured[1], measured[0]) == pytest.approx((-12, 7), abs=1.0)
 
 
+@pytest.mark.slow
 def test_a_camera_3_cm_or_3_degrees_off_is_found(episode, inspector):
     def aside(T):
         T = T.copy()
@@ -151,6 +157,7 @@ def test_a_camera_on_the_arm_is_not_called_ok(episode, inspector):
     assert "the camera moves with 'left_link_6'" in texts(section)
 
 
+@pytest.mark.slow
 def test_joints_in_degrees_are_broken(episode, inspector):
     states = episode.joint_states
     degrees = replace(states, positions=np.degrees(states.positions))

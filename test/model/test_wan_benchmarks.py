@@ -26,6 +26,7 @@ def scripts() -> SimpleNamespace:
         return SimpleNamespace(**{name: __import__(name) for name in names})
 
 
+@pytest.mark.slow
 def test_the_run_on_a_gpu_goes_through_on_a_cpu_at_tiny_size(tmp_path: Path) -> None:
     # the tests themselves are in this suite, and 14B is the script of Speed again
     command = [sys.executable, ROOT / 'experiments' / 'gpu.py', 'run', '--tiny', '--out', tmp_path]
@@ -53,6 +54,7 @@ def test_a_run_on_a_gpu_fits_ten_minutes(scripts: SimpleNamespace) -> None:
     assert listed == marked
 
 
+@pytest.mark.slow
 def test_operations_of_the_floor_are_those_of_a_dry_run(scripts: SimpleNamespace) -> None:
     values = dict(text.split('=') for text in scripts.gpu._TINY)
     changes = {name: int(value) for name, value in values.items()}

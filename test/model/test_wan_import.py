@@ -113,6 +113,7 @@ def test_loads_and_saves_bit_for_bit(videox, tmp_path):
     assert type(second.scheduler).__name__ == 'UniPCMultistepScheduler'
 
 
+@pytest.mark.slow
 def test_shards_and_one_file_are_the_same(videox, tmp_path):
     bring_in(videox, tmp_path / 'whole')
     (videox / WEIGHTS).unlink()

@@ -20,6 +20,7 @@ from mtv_world_ros.robot.shape import load_shape
 from test.support.crane import load, make_cameras, make_positions, write_episode
 
 
+@pytest.mark.slow
 def test_a_fixed_camera_is_found_from_a_guess_in_a_part_of_the_recording(tmp_path, capsys):
     robot = load(tmp_path)
     door = replace(make_cameras()['door'], mount_link='world')
@@ -60,6 +61,7 @@ def recorded_door(tmp_path):
     return robot, door, episode.images['door'], joints, parts
 
 
+@pytest.mark.slow
 def test_a_guess_from_round_the_corner_ends_where_the_camera_is(tmp_path):
     """Least squares alone, along poses that look alike, end 27 mm away here, the search 15."""
     robot, door, images, joints, parts = recorded_door(tmp_path)
@@ -76,6 +78,7 @@ def test_a_guess_from_round_the_corner_ends_where_the_camera_is(tmp_path):
     assert mm < 2 * found.std_mm
 
 
+@pytest.mark.slow
 def test_shadows_on_the_table_do_not_move_the_camera(tmp_path):
     """Real arms cast soft shadows: here one lies beside the arm, a fifth darker than the rest."""
     robot, door, track, joints, parts = recorded_door(tmp_path)
@@ -122,6 +125,7 @@ def wrist(tmp_path_factory):
     return robot, palm, path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('options', [[], ['--no-guess'], ['--no-guess', '--mount-link', 'find']])
 def test_a_camera_on_the_arm_is_found(wrist, tmp_path, capsys, options):
     robot, palm, path = wrist
@@ -135,6 +139,7 @@ def test_a_camera_on_the_arm_is_found(wrist, tmp_path, capsys, options):
     assert mm < 15 and degrees < 0.6, (mm, degrees)
 
 
+@pytest.mark.slow
 def test_a_camera_without_any_calibration_is_found(wrist, tmp_path):
     robot, palm, path = wrist
     bag = tmp_path / 'bag'
@@ -157,6 +162,7 @@ def test_a_guess_is_of_the_recorded_link(wrist, tmp_path, capsys):
     assert 'give --no-guess' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_wrist_that_turns_about_one_axis_determines_nothing(tmp_path):
     robot = load(tmp_path)
     positions = np.repeat(make_positions(3.0)[:1], 30, axis=0)

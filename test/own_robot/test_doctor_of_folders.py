@@ -137,6 +137,7 @@ def test_what_is_wrong_is_named_in_its_own_row(inspected, name, verdict, said):
     assert said in row and verdict in row, row
 
 
+@pytest.mark.slow
 def test_pictures_of_something_else_are_not_called_mirrored(inspected):
     """Of two unrelated motions one always correlates more; .02 against -.05 says nothing."""
     found, _ = inspected
@@ -145,6 +146,7 @@ def test_pictures_of_something_else_are_not_called_mirrored(inspected):
         assert not [text for text in said if 'moves like the mirrored image' in text], said
 
 
+@pytest.mark.slow
 def test_training_is_told_what_is_broken(inspected):
     found, _ = inspected
     parts = broken_parts(found)
@@ -154,12 +156,14 @@ def test_training_is_told_what_is_broken(inspected):
     assert 'outside its limits' in ' '.join(parts['degrees'].values())
 
 
+@pytest.mark.slow
 def test_good_episodes_are_not_blamed(inspected):
     found, text = inspected
     for name in ('good0', 'good1'):
         assert found.episodes[name].verdict == 'ok', text
 
 
+@pytest.mark.slow
 def test_a_moved_camera_and_who_belongs_where_are_named(inspected):
     found, text = inspected
     assert found.place('door', 'good0') == found.place('door', 'good1')
@@ -169,6 +173,7 @@ def test_a_moved_camera_and_who_belongs_where_are_named(inspected):
     assert found.verdict == 'broken'
 
 
+@pytest.mark.slow
 def test_another_scene_before_the_right_camera_is_no_fault(tmp_path):
     """Nothing of the background is that of the others, but the robot moves as it is drawn."""
     robot, camera = load(tmp_path), make_cameras()['door']
@@ -199,6 +204,7 @@ def test_what_was_not_checked_is_said_once_with_its_episodes():
     assert '- not checked in a b: wrist: pose not known' in folder_markdown(found, '').splitlines()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('has_own_pose', [True, False])
 def test_a_moved_camera_is_a_fault_only_with_the_pose_of_before(folder, tmp_path, has_own_pose):
     robot, data = folder

@@ -37,6 +37,7 @@ def test_links_that_move_are_those_beyond_a_joint(recorded):
     assert {'tower', 'hand', 'left', 'right'} <= moving_links(robot)
 
 
+@pytest.mark.slow
 def test_a_camera_of_the_root_link_is_compared_with_the_images(recorded, tmp_path, capsys):
     robot, path = recorded
     assert doctor(robot, path, tmp_path, '--views', 'door') == 0, capsys.readouterr().out

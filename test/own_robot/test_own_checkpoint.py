@@ -41,6 +41,7 @@ def trained(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_it_carries_robot_shapes_and_calibration(trained):
     robot = Checkpoint.open(trained / 'elsewhere').load_robot()
     assert robot.name == 'crane'
@@ -51,6 +52,7 @@ def test_it_carries_robot_shapes_and_calibration(trained):
     assert list(cameras) == ['door', 'window']
 
 
+@pytest.mark.slow
 def test_evaluate_and_replay_take_it_without_flags(trained, capsys, monkeypatch):
     monkeypatch.chdir(trained)
     options = ['--no-ceiling', '--actions', 'true', '--threads', '1', '--no-report']

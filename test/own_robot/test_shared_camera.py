@@ -70,6 +70,7 @@ def test_a_turned_camera_is_another_place_and_its_turn_is_measured(recorded):
     assert np.degrees(np.arccos(min(1.0, (np.trace(R @ wanted.T) - 1) / 2))) < 0.5
 
 
+@pytest.mark.slow
 def test_poses_by_place_and_the_focal_length_are_found_from_a_guess(recorded, tmp_path, capsys):
     robot, true, paths = recorded
     command = ['calibrate-camera', *map(str, paths), '--view', 'door', '--robot', str(robot.file)]
@@ -86,6 +87,7 @@ def test_poses_by_place_and_the_focal_length_are_found_from_a_guess(recorded, tm
         assert (tmp_path / f'door_{place}.png').is_file()
 
 
+@pytest.mark.slow
 def test_seen_points_start_a_search_where_nothing_is_known(recorded, tmp_path, capsys):
     robot, true, paths = recorded
     data = paths[0].parent
@@ -116,6 +118,7 @@ def test_seen_points_start_a_search_where_nothing_is_known(recorded, tmp_path, c
             (path / 'guess.yaml').replace(path / 'calibration.yaml')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('is_wrong', [False, True])
 def test_a_seen_point_that_contradicts_the_others_is_named(is_wrong, recorded, tmp_path, capsys):
     """One of fifteen is clicked 8 px too low, as where a finger is hidden; others .7 px beside."""
@@ -138,6 +141,7 @@ def test_a_seen_point_that_contradicts_the_others_is_named(is_wrong, recorded, t
     assert ('contradict the others' in printed) == is_wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('is_estimated', [True, False])
 def test_a_wide_lens_that_bends_is_estimated(is_estimated, tmp_path, capsys, monkeypatch):
     """A barrel distortion of k1 = -.2, unknown; held at 0 it is far off, and said to be."""

@@ -89,6 +89,7 @@ def test_an_import_asks_once_and_stores_names_and_masks(bag, ask, robot, capsys)
             assert (np.asarray(ids[k]) > 0).sum() < 4000
 
 
+@pytest.mark.slow
 def test_later_stages_read_the_names_and_training_the_masks(bag, ask, robot):
     with ChatServer(answer('red box', 'blue box')) as server:
         assert run(bag, '--describer', ask(server), '--segmenter', 'colour') == 0
@@ -129,6 +130,7 @@ def test_an_episode_without_names_is_described_where_it_is_used(bag, ask, robot,
         described_objects(path, asked, 'door')
 
 
+@pytest.mark.slow
 def test_another_describer_is_another_import(bag, ask, capsys):
     assert run(bag) == 0
     with ChatServer(answer('red box')) as server:

@@ -53,6 +53,7 @@ def test_unknown_poses_and_intrinsics_are_imported_and_marked(bag, tmp_path, cap
     assert 'pose not known: mtv-world calibrate-camera FOLDER --view door' in printed
 
 
+@pytest.mark.slow
 def test_a_mapping_may_have_more_views_than_are_asked_for(bag, tmp_path, capsys):
     assert run(tmp_path, bag) == 0
     mapping = load_bag_mapping(tmp_path / 'out' / 'mapping.yaml')

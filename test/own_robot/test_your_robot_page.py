@@ -152,6 +152,7 @@ def of_ros(words):
     return words[0] == 'world_model' or words[1] == 'imagine' or '--lock-step' in words
 
 
+@pytest.mark.slow
 def test_the_page_leads_from_a_urdf_to_predictions(at_the_desk, capsys):
     done = []
     for words in (words for words in lines() if not of_ros(words)):
@@ -202,6 +203,7 @@ def lab(tmp_path_factory):
     return folder, cameras
 
 
+@pytest.mark.slow
 def test_the_page_leads_from_videos_to_a_contact_sheet(lab, monkeypatch, capsys):
     """With at most eight commands, and cameras of which nothing was known."""
     folder, cameras = lab
@@ -240,6 +242,7 @@ def test_the_page_leads_from_videos_to_a_contact_sheet(lab, monkeypatch, capsys)
             assert abs(found[view].K[0, 0] / camera.K[0, 0] - 1) < 0.07
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec('rclpy') is None, reason='rclpy is not installed')
 def test_the_page_leads_on_to_the_node_and_a_policy_in_it(at_the_desk, capfd):
     """Goes on from what the test above has trained."""

@@ -57,6 +57,7 @@ def calibrating() -> float:
     return time.process_time() - begun
 
 
+@pytest.mark.slow
 def test_a_chunk_takes_no_longer_than_the_floors_allow(one_thread, record_property):
     pipeline = Pipeline.load('bundled', num_threads=1, dtype='float32')  # all machines have it
     recording = load_recording(

@@ -22,6 +22,7 @@ def run(out, policy, *more):
     return main([*command, *more])
 
 
+@pytest.mark.slow
 def test_the_expert_succeeds_as_the_page_says(tmp_path, capsys):
     """The command of docs/watch_it.md."""
     pytest.importorskip('rerun')
@@ -44,6 +45,7 @@ def test_the_expert_succeeds_as_the_page_says(tmp_path, capsys):
     assert main(['view', str(tmp_path), '--save', str(tmp_path / 'all.rrd')]) == 0
 
 
+@pytest.mark.slow
 def test_a_policy_that_fails_ends_with_1_and_its_reason_on_the_screen(
     tmp_path, capsys, failing_policy
 ):
@@ -55,6 +57,7 @@ def test_a_policy_that_fails_ends_with_1_and_its_reason_on_the_screen(
     assert 'success rate: no verdict in 1 episodes' in printed.out
 
 
+@pytest.mark.slow
 def test_a_policy_server_that_is_down_is_named(tmp_path, capsys):
     text = share_path('config', 'policies', 'openpi.yaml').read_text()
     text = text.replace('localhost:8000', 'localhost:1').replace('timeout_s: 60.0', 'timeout_s: 1')

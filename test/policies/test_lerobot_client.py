@@ -31,6 +31,7 @@ def make(tmp_path, port, **changes):
     return make_policy(tmp_path, values)
 
 
+@pytest.mark.slow
 def test_actions_become_commands_in_the_robots_units_at_the_servers_rate(tmp_path, server):
     policy = make(tmp_path, server)
     policy.reset(seed=0)
@@ -88,6 +89,7 @@ def test_a_late_answer_is_told(tmp_path, server):
         policy.act(observe(), 'sleep')
 
 
+@pytest.mark.slow
 def test_a_server_that_dies_is_told(tmp_path):
     with running('lerobot_server') as (process, port):
         policy = make(tmp_path, port)

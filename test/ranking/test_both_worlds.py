@@ -93,6 +93,7 @@ def ranked(runner, expert, tmp_path_factory):
     return out, {result.policy: result for result in read_results(out)}
 
 
+@pytest.mark.slow
 def test_worlds_that_are_alike_do_not_part(ranked):
     for result in ranked[1].values():
         course = result.course

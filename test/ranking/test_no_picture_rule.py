@@ -29,6 +29,7 @@ def test_reach_is_2_cm_in_the_plane_and_3_in_height_and_at_the_rim_of_a_plate():
     assert plate.is_within_reach(np.array([0.05, 0, 0.02]))
 
 
+@pytest.mark.slow
 def test_the_rule_sees_a_grasp_that_is_too_high_and_not_a_gripper_that_is_too_wide(runner, expert):
     """The expert, a grasp 5 cm too high, and one whose fingers stay a little open."""
     names = ('expert', 'expert-high-0.05', 'expert-drops-1')

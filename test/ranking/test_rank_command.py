@@ -30,6 +30,7 @@ def test_a_wrong_option_is_refused_before_anything_runs(options, says, tmp_path,
     assert not (tmp_path / 'out').exists()
 
 
+@pytest.mark.slow
 def test_a_ranking_is_watched_while_it_runs(tmp_path, capsys):
     """Rates so far and each rollout as it ends; those of an earlier run are there at once."""
     pytest.importorskip('rerun')
@@ -74,6 +75,7 @@ def test_a_watched_port_that_is_taken_is_told_before_anything_runs(tmp_path, cap
     assert not (tmp_path / 'out').exists()
 
 
+@pytest.mark.slow
 def test_a_rollout_that_fails_ends_with_1_and_its_reason_and_the_others_count(
     tmp_path, capsys, failing_policy
 ):

@@ -122,6 +122,7 @@ def test_a_describer_is_asked_once_about_the_simulator_s_first_frame(runner, exp
     assert [len(row) for row in result.imagined.jaccard] == [len(COLOURS)] * 2
 
 
+@pytest.mark.slow
 def test_two_checkpoints_share_one_simulated_rollout(runner, expert, results, monkeypatch):
     simulated = []
     simulate = runner.simulate

@@ -30,6 +30,7 @@ def benchmark():
         sys.modules.pop(name, None)
 
 
+@pytest.mark.slow
 def test_numbers_fitted_in_a_physics_are_asked_there_and_flips_are_counted(
     benchmark, opengl, tmp_path, monkeypatch, capsys
 ):

@@ -42,6 +42,7 @@ def cells_of(table):
     return {row[0]: row[1:] for row in found}
 
 
+@pytest.mark.slow
 def test_each_zero_shot_set_is_a_row_of_its_own(summaries, rows):
     assert [line.label for line in rows] == [
         'oracle',
@@ -69,6 +70,7 @@ def test_table_1_has_a_dash_for_a_view_that_a_model_lacks(summaries, rows):
     assert cells['still'][2:] == cells['First frame held'][2:]
 
 
+@pytest.mark.slow
 def test_table_3_has_a_column_per_task_and_view(summaries, rows):
     (table,) = task_tables(rows, all_views(summaries))
     cells = cells_of(table)

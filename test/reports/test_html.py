@@ -201,6 +201,7 @@ def test_report_is_made_again_without_the_model(held, page, tmp_path, capsys):
     assert path.stat().st_size < 2_000_000
 
 
+@pytest.mark.slow
 def test_folder_of_several_checkpoints_is_one_report(make_pipeline, episodes, held, tmp_path):
     summaries = [
         evaluate(
@@ -320,6 +321,7 @@ def test_equal_charts_are_equal_bytes():
     assert dot_chart('t', dots) == dot_chart('t', dots)
 
 
+@pytest.mark.slow
 def test_without_named_objects_pictures_are_what_is_compared(
     make_pipeline, make_episode, tmp_path
 ):

@@ -14,6 +14,7 @@ def browser(tmp_path_factory):
     opened.close()
 
 
+@pytest.mark.slow
 def test_episodes_are_filtered_and_played(browser, make_pipeline, episodes, oracle, tmp_path):
     for name, model in (('held', None), ('oracle', oracle)):
         pipeline = make_pipeline(*([model] if model else []))

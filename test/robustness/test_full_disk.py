@@ -18,6 +18,7 @@ from mtv_world_ros.inspection.camera_pose import CameraEstimate
 from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
 from mtv_world_ros.inspection.motion_residual import ResidualSearch
 from test.robustness.interrupts import ONE_STEP, settings
+from test.support.tiers import rest_slow
 from test.support.wan_files import AUTOENCODER, SCHEDULER, TRANSFORMER, write_videox
 
 EPISODE = share_path('resource', 'demo_episode')
@@ -58,6 +59,9 @@ WRITERS: dict[str, Callable[[Path], list[str]]] = {
     'imagine': lambda out: [
         'imagine', '--episodes', str(EPISODE), '--out', str(out / 'imagined'), *ONE_STEP],
 }  # fmt: skip
+
+#: writers of each kind of output that are quick: YAML, pictures, Rerun files, bags
+FAST_WRITERS = ['robot', 'robot picture', 'view', 'import-bag', 'recover']
 
 
 @pytest.fixture
@@ -124,7 +128,7 @@ PREPARED = {
 }
 
 
-@pytest.mark.parametrize('name', WRITERS)
+@pytest.mark.parametrize('name', rest_slow(WRITERS, FAST_WRITERS))
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     name: str, full_disk: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,7 +138,9 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     check_refused(WRITERS[name](full_disk), full_disk, capfd)
 
 
-@pytest.mark.parametrize('name', ['train', 'rank', 'import-bag', 'collect', 'export-dataset'])
+@pytest.mark.parametrize(
+    'name', rest_slow(['train', 'rank', 'import-bag', 'collect', 'export-dataset'], ['import-bag'])
+)
 def test_a_disk_that_fills_up_in_the_middle_is_one_line(
     name: str, full_disk: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -150,7 +156,7 @@ def test_a_disk_that_fills_up_in_the_middle_is_one_line(
 
 
 @pytest.mark.parametrize('is_full', [True, False], ids=['full', 'fills_up'])
-@pytest.mark.parametrize('name', PREPARED)
+@pytest.mark.parametrize('name', rest_slow(PREPARED, list(PREPARED)[:1]))
 def test_a_disk_that_is_full_or_fills_up_keeps_no_part_of_an_import_or_a_report(
     name: str,
     is_full: bool,

@@ -16,9 +16,13 @@ from mtv_world_ros.core.errors import MtvWorldError
 from test.robustness import fuzz, node_messages, parameter_calls
 from test.robustness.accidents import ACCIDENTS
 from test.robustness.file_kinds import Kind, KINDS
+from test.support.tiers import rest_slow
 
 SEED = 20261122
 COUNT = 40
+#: kinds whose cases compute: networks and simulations
+SLOW_KINDS = ('plan, imagined', 'scene, foreseen', 'checkpoint', 'checkpoint, numbers')
+FAST_KINDS = [kind for kind in KINDS if kind not in SLOW_KINDS]
 #: more memory than an accident may take [MB]
 MOST_MB = 300
 
@@ -30,7 +34,7 @@ def nodes_end() -> Iterator[None]:
     parameter_calls.close()
 
 
-@pytest.mark.parametrize('name', KINDS)
+@pytest.mark.parametrize('name', rest_slow(KINDS, FAST_KINDS))
 def test_damaged_input_is_read_or_refused_with_a_reason(name, tmp_path) -> None:
     kind = KINDS[name]
     samples = kind.samples()

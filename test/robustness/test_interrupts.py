@@ -28,6 +28,7 @@ def heed_sigint():
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', ['import-bag', 'export-dataset'])
 def test_an_interrupted_command_leaves_nothing_half_and_a_second_run_makes_it_whole(
     name: str, given: Path, tmp_path: Path

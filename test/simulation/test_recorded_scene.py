@@ -36,6 +36,7 @@ def without_scene(episode, **changes):
     return replace(episode, info=replace(episode.info, metadata=rest, **changes))
 
 
+@pytest.mark.slow
 def test_the_demos_objects_are_where_its_object_poses_say(demo):
     task, scene = recorded_scene(DEMO, WORKCELL)
     assert task.name == demo.info.task

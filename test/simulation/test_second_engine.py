@@ -37,6 +37,7 @@ def outcome(expert: Expert, policy: str) -> tuple[bool, float]:
     return take.final, take.moved['a']
 
 
+@pytest.mark.slow
 def test_the_expert_carries_a_block_and_what_misses_it_does_not(expert):
     final, moved = outcome(expert, 'expert')
     assert final and moved > 0.05

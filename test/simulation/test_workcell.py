@@ -16,6 +16,7 @@ from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.simulator import SimEpisode
 from mtv_world_ros.simulation.tasks import TASKS
 from mtv_world_ros.simulation.workcell import workcell_of
+from test.support.tiers import rest_slow
 
 ROBOTS = ('yam_bimanual', 'franka', 'ur5e_pair')
 OTHERS = ROBOTS[1:]
@@ -45,7 +46,10 @@ def test_ur5e_flange_is_where_the_published_parameters_put_it():
 
 
 @pytest.mark.parametrize('name', OTHERS)
-@pytest.mark.parametrize('task', ['stack_blocks_two', 'place_cup_plate', 'collect_food'])
+@pytest.mark.parametrize(
+    'task',
+    rest_slow(['stack_blocks_two', 'place_cup_plate', 'collect_food'], ['stack_blocks_two']),
+)
 def test_expert_does_tasks_with_other_arms(name, task):
     robot = bundled(name)
     expert = Expert(robot)
@@ -88,6 +92,7 @@ def test_default_calibration_is_that_of_the_workcell(name):
         np.testing.assert_allclose(stored[spec.view].T_mount_camera, camera.T_mount_camera)
 
 
+@pytest.mark.slow
 def test_collect_records_another_robot_with_its_views(tmp_path, opengl):
     out = tmp_path / 'set'
     arguments = f'collect --robot franka --task place_cup_plate --episodes 1 --out {out}'

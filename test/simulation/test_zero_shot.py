@@ -107,6 +107,7 @@ def test_unknown_kinds_and_tasks_that_cannot_be_varied_are_refused():
         tasks_of('object', [TASKS['move_stack_plate']])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures('opengl')
 def test_a_zero_shot_set_is_for_testing_and_names_its_kinds(tmp_path):
     config = CollectConfig(randomization=RandomizationConfig(width=96, height=72))

@@ -41,7 +41,14 @@ os.environ['ROS_DOMAIN_ID'] = str(claim_domain())
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(share_path('config', 'fastdds_heartbeat.xml'))
 
-PACKAGES = filter(None, (str(Path(__file__).parents[2]), os.environ.get('PYTHONPATH')))
+PACKAGES = filter(
+    None,
+    (
+        str(Path(__file__).parents[2]),
+        os.environ.get('PYTHONPATH'),
+        str(Path(sys.prefix) / 'interfaces'),
+    ),
+)
 ENVIRONMENT = {**os.environ, 'PYTHONPATH': os.pathsep.join(PACKAGES), 'OMP_NUM_THREADS': '1'}
 FAKE = Path(__file__).with_name('fake_world_model.py')
 FAKE_POLICY = Path(__file__).with_name('fake_policy.py')

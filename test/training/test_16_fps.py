@@ -20,6 +20,7 @@ MINIATURE = TINY_MODEL | {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(missing_opengl()), reason='the simulator cannot render here')
 def test_episodes_of_16_fps_are_collected_trained_on_and_scored(tmp_path):
     data, run, scores = (str(tmp_path / name) for name in ('data', 'run', 'scores'))

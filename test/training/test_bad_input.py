@@ -66,6 +66,7 @@ def other_robot(message: BagMessage) -> list[bytes]:
     return [messages.serialize(message.msgtype, content)]
 
 
+@pytest.mark.slow
 def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
     episode, tiny, robot, tmp_path, capsys
 ):

@@ -32,6 +32,7 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     return load_file(folder / 'transformer' / 'diffusion_pytorch_model.safetensors')
 
 
+@pytest.mark.slow
 def test_a_run_cut_in_two_ends_as_the_whole_one(episode, tiny, robot, tmp_path):
     config = tiny.replace(optimizer=tiny.optimizer.replace(decay_share=0.0))
     whole = run(config, episode, tmp_path / 'whole', robot)
@@ -56,6 +57,7 @@ def test_object_masks_off_leaves_them_out_of_the_trajectory_video(recording, tin
     assert drawn_pixels(True) > drawn_pixels(False)
 
 
+@pytest.mark.slow
 def test_one_view_from_the_command_line_trains_and_evaluates(episode, tmp_path, capsys):
     out = tmp_path / 'run'
     command = ['train', str(episode.parent), '--out', str(out), '--threads', '1', *ONE_STEP]

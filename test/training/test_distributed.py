@@ -24,6 +24,7 @@ SCRIPT = Path(__file__).parents[1] / 'support' / 'train_recorded.py'
 THREE_CLIPS = {'batch_size': 3, 'max_grad_norm': 1e6}
 
 
+@pytest.mark.slow
 def test_two_processes_make_the_steps_of_one(tiny, episode, tmp_path, monkeypatch):
     arguments = [episode.parent, write_preset(tmp_path, tiny, steps=3, **THREE_CLIPS)]
     two, one = tmp_path / 'two', tmp_path / 'one'
@@ -101,6 +102,7 @@ def test_fewer_clips_than_processes_are_refused(tiny, tmp_path):
         make_trainer(tiny, tmp_path, processes=processes)
 
 
+@pytest.mark.slow
 def test_a_process_whose_sister_was_killed_says_so_and_the_state_is_whole(tiny, episode, tmp_path):
     preset = write_preset(tmp_path, tiny, steps=10**6, **THREE_CLIPS)
     run_script('train_lost.py', tmp_path, episode.parent, preset)

@@ -38,6 +38,7 @@ def test_the_best_checkpoint_by_the_judge_is_kept(episode, tiny, robot, tmp_path
     assert [row['j_moving'] for row in rows if 'j_moving' in row][1:] == [0.3, 0.5, 0.4]
 
 
+@pytest.mark.slow
 def test_the_command_scores_held_out_episodes_as_evaluate_does(episode, tmp_path, capsys):
     data = tmp_path / 'data'
     for name in ('seen', 'unseen'):

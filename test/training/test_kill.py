@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 
+import pytest
 from safetensors.torch import load_file
 import torch
 
 from test.support.sources import make_trainer, run_script, write_preset
 
 
+@pytest.mark.slow
 def test_kill_9_changes_neither_curve_nor_weights(tiny, episode, tmp_path):
     preset = write_preset(tmp_path, tiny, steps=40)
     run_script('train_killed.py', tmp_path, episode.parent, preset)

@@ -89,6 +89,7 @@ def test_a_lack_of_memory_says_what_to_set(tiny, source, tmp_path, monkeypatch):
         losses_of(trainer, source)
 
 
+@pytest.mark.slow
 def test_learns_one_clip(recording, tiny, robot, tmp_path):
     """The loss on the first frames of one episode halves within 60 steps."""
     config = tiny.replace(optimizer=tiny.optimizer.replace(steps=60))

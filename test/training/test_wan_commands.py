@@ -57,6 +57,7 @@ def test_the_history_of_the_preset_goes_through_import_and_training(recipe):
         assert read_card(folder).guidance_scale == config.sampling.guidance_scale
 
 
+@pytest.mark.slow
 def test_the_printed_evaluation_of_the_adapter_runs(recipe):
     words = shlex.split(recipe['said.txt'].read_text().partition('evaluate it with: ')[2])
     more = ['--steps', '1', '--no-report', '--no-ceiling', '--actions', 'true', *SMALL]
@@ -66,6 +67,7 @@ def test_the_printed_evaluation_of_the_adapter_runs(recipe):
     assert metrics['num_episodes'] == 1 and 'adapter' in metrics['name']
 
 
+@pytest.mark.slow
 def test_the_node_imagines_with_the_adapter(recipe, tmp_path, capsys):
     pytest.importorskip('rclpy')
     served = tmp_path / 'served'

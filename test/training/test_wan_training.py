@@ -77,6 +77,7 @@ def predict(model: DiffusionWorldModel, clip: np.ndarray) -> np.ndarray:
     )
 
 
+@pytest.mark.slow
 def test_the_command_trains_an_adapter_that_changes_the_prediction(
     preset, base, episode, clips, tmp_path, capsys
 ):
@@ -96,6 +97,7 @@ def test_the_command_trains_an_adapter_that_changes_the_prediction(
     np.testing.assert_array_equal(predict(model, clips.frames[:, :5]), plain)
 
 
+@pytest.mark.slow
 def test_the_loss_falls_and_the_frozen_weights_stay(config, base, batches, tmp_path):
     """On one batch with the same noise; the base's weights are those of its files."""
     still = config.augment.replace(control_dropout=0, reference_dropout=0, image_dropout=0)

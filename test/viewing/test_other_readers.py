@@ -30,6 +30,7 @@ def written(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_rerun_plays_every_video_without_a_transcoder(written):
     """Its viewer leaves H.264 out whose frames are stored in another order than shown."""
     videos = sorted(written.rglob('*.mp4'))

@@ -58,6 +58,7 @@ def test_broken_file_is_an_error_and_a_missing_one_is_not_measured(tmp_path):
     assert load_features(tmp_path / 'y.npz') == {}
 
 
+@pytest.mark.slow
 def test_distances_reach_metrics_and_are_kept_for_the_next_run(
     make_pipeline, episodes, oracle, tmp_path, monkeypatch
 ):

@@ -282,6 +282,7 @@ print(predict(1).shape == (shape[0], shape[1] - 1, *shape[2:]))
 """
 
 
+@pytest.mark.slow
 def test_a_real_lack_of_memory_drops_the_rollout_and_the_process_goes_on() -> None:
     run = subprocess.run(
         [sys.executable, '-c', _STARVED], capture_output=True, text=True, check=False

@@ -98,6 +98,7 @@ def finish(process, number=None):
     return process.returncode, output
 
 
+@pytest.mark.slow
 def test_episode_is_imagined_in_lock_step_and_recorded(node, episode, launch, tmp_path):
     out = tmp_path / 'predictions'
     recorder = launch('recorder', out, *RECORDED, '--stamp', 'header')
@@ -241,6 +242,7 @@ def test_recorder_leaves_no_half_written_folder(launch, tmp_path):
     assert code == 1 and 'exists already' in said and 'Traceback' not in said
 
 
+@pytest.mark.slow
 def test_a_recorder_whose_parent_is_killed_closes_its_bag_and_ends(tmp_path, ros):
     client = ros.Client()
     out = tmp_path / 'bag'
@@ -307,6 +309,7 @@ def recorded(launch, tmp_path, ros):
     client.close()
 
 
+@pytest.mark.slow
 def test_a_recorder_stops_soon_though_publishers_go_on(recorded, tmp_path):
     recorder, client, _ = recorded
     recorder.send_signal(signal.SIGINT)
@@ -376,6 +379,7 @@ def is_alive(pid):
         return False
 
 
+@pytest.mark.slow
 def test_two_robots_and_two_players_do_not_meet(episode, launch, tmp_path, ros, client):
     """Each in a namespace of its own, with its own clock, on one machine."""
     heard = {}

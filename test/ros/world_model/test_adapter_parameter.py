@@ -112,6 +112,7 @@ def wait_for(client, value):
     client.wait(lambda: client.diagnostic_values().get('adapter') == value, f'adapter {value}')
 
 
+@pytest.mark.slow
 def test_adapters_are_taken_and_left_while_the_node_runs(node, client, folder):
     plain = roll_out(client)
     use(client, folder / 'mine')

@@ -34,6 +34,7 @@ def bundled():
         pytest.skip(f'no bundled checkpoint or episode: {error}')
 
 
+@pytest.mark.slow
 def test_bundled_episode_is_imagined_over_the_middleware(bundled, ros, tmp_path):
     values = {
         'use_sim_time': 'true',
@@ -107,6 +108,7 @@ def ended_children_cpu_s():
     return used.ru_utime + used.ru_stime
 
 
+@pytest.mark.slow
 def test_sigint_while_the_bundled_model_computes_ends_the_node(started):
     process, client = started
     client.send_trajectory(seconds=40 * CHUNK_S)

@@ -1,7 +1,7 @@
 """The action `~/follow_joint_trajectory`, by real action clients over the middleware."""
 
 import importlib
-from importlib.util import find_spec
+import sys
 
 from action_msgs.msg import GoalStatus
 from lifecycle_msgs.msg import Transition
@@ -93,10 +93,17 @@ def change(client, transition):
     assert client.call(ChangeState, '/world_model/change_state', request).success
 
 
-@pytest.mark.skipif(find_spec('control_msgs') is not None, reason='control_msgs is installed')
-def test_without_control_msgs_the_node_says_so_once_and_goes_on(node, client):
-    assert client.imagine_one()['state'] == 'done'
-    assert node.output().count('control_msgs is not installed') == 1
+def test_without_control_msgs_the_node_says_so_once_and_goes_on(tmp_path, ros, monkeypatch):
+    for name in ('control_msgs', 'control_msgs.action'):
+        monkeypatch.setitem(sys.modules, name, None)
+    node, client = ros.start_node(tmp_path, 'pace:=burst', remaps=['__ns:=/other']), ros.Client()
+    try:
+        client.wait(lambda: client.node.count_publishers('/other/world_model/report'), 'the node')
+        assert node.output().count('control_msgs is not installed') == 1
+        assert client.node.count_publishers('/other/world_model/success')
+    finally:
+        client.close()
+        assert node.stop() == 0, node.output()
 
 
 @needs_control_msgs

@@ -99,6 +99,7 @@ def execute(client, recording, at):
     client.reset()
 
 
+@pytest.mark.slow
 def test_the_node_says_that_its_physics_is_another_one_and_estimates_widen(node, recording):
     truly = np.arange(1, round(PLAN_S * FPS) + 1) / FPS
     node.publish('/instruction', String(data=recording.instruction))
@@ -139,6 +140,7 @@ def width(chunk) -> float:
     return float(chunk['success_high']) - float(chunk['success_low'])
 
 
+@pytest.mark.slow
 def test_objects_that_one_view_alone_shows_are_counted_and_the_next_plan_is_judged(
     node, recording
 ):

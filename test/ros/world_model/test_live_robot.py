@@ -1,7 +1,7 @@
 """The node beside a robot that describes itself and publishes TF."""
 
-from importlib.util import find_spec
 import re
+import sys
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
@@ -17,10 +17,7 @@ from mtv_world_ros.core.transforms import pose, quaternion
 from mtv_world_ros.robot.file import robot_path
 from mtv_world_ros.ros.messages.conversions import NANO, to_ns, to_stamp
 
-needs_tf2 = pytest.mark.skipif(
-    find_spec('tf2_msgs') is None,
-    reason='tf2_msgs is not among the wheels: run this in a native ROS, or build its definition',
-)
+needs_tf2 = pytest.mark.tf2_msgs
 URDF = (robot_path('yam_bimanual').parent / 'yam_bimanual.urdf').read_text()
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LOW, HIGH = 'low_optical_frame', 'high_optical_frame'
@@ -79,8 +76,9 @@ def test_descriptions_can_be_ignored(start, new_client, ros):
     assert 'robot_description' not in client.diagnostic_values()
 
 
-@pytest.mark.skipif(find_spec('tf2_msgs') is not None, reason='tf2_msgs is installed')
-def test_poses_from_tf_need_tf2_msgs(tmp_path, ros):
+def test_poses_from_tf_need_tf2_msgs(tmp_path, ros, monkeypatch):
+    for name in ('tf2_msgs', 'tf2_msgs.msg'):
+        monkeypatch.setitem(sys.modules, name, None)
     status, said = ros.run_node(tmp_path, 'extrinsics:=tf')
     assert status == 1
     assert "'extrinsics' is 'tf'" in said and 'tf2_msgs' in said

@@ -135,6 +135,7 @@ def test_zero_shot_sets_take_neither_policies_nor_moved_cameras(options, tmp_pat
     assert not (tmp_path / 'set').exists()
 
 
+@pytest.mark.slow
 def test_a_set_that_was_killed_in_the_middle_is_completed_by_the_same_command(data_set, tmp_path):
     """Also: the same seed gives the same bytes in other processes."""
     out = tmp_path / 'set'
@@ -169,6 +170,7 @@ def _alive(group):
     return True
 
 
+@pytest.mark.slow
 def test_episodes_that_fit_stay_when_the_disk_is_full_and_the_rest_follows(data_set, tmp_path):
     out = tmp_path / 'set'
     sizes = {

@@ -78,6 +78,7 @@ def still(robot, seconds: float) -> np.ndarray:
     return np.repeat(joints[None], round(seconds / 0.02) + 1, axis=0)
 
 
+@pytest.mark.slow
 def test_a_block_is_carried_to_where_the_recorded_one_was(robot, response, recording):
     """And fingers are where it stops them, whatever they are commanded to."""
     points, joints = acted(robot, response, recording)
@@ -98,6 +99,7 @@ def test_a_gripper_that_stays_open_carries_nothing(robot, response, recording):
     assert np.ptp(points[..., 2], axis=0).max() < 0.005
 
 
+@pytest.mark.slow
 def test_fingers_that_do_not_rub_lose_the_block(robot, response, recording):
     points, _ = acted(robot, response, recording, grip_friction=0.02)
     assert np.linalg.norm(points[-1, 0] - points[0, 0] - recording.displacements[-1, 0]) > 0.05
@@ -314,6 +316,7 @@ def test_friction_is_the_same_in_all_directions_where_fingers_touch(robot, respo
     assert way == pytest.approx(speed**2 / 2 / SETTINGS.table_friction / 9.81, rel=0.1)
 
 
+@pytest.mark.slow
 def test_arms_that_pass_by_save_the_dynamics_and_nothing_else(
     robot, response, recording, monkeypatch
 ):

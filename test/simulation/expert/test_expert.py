@@ -8,6 +8,7 @@ from mtv_world_ros.simulation.collect.record import chunk, expert_generator, Rec
 from mtv_world_ros.simulation.expert.expert import top_down
 from mtv_world_ros.simulation.simulator import SimEpisode
 from mtv_world_ros.simulation.tasks import TASKS
+from test.support.tiers import rest_slow
 
 
 @pytest.fixture(scope='module')
@@ -29,7 +30,7 @@ def first_takes(sim, expert, name, count, *, miss):
     pytest.fail(f'{found} of 4')
 
 
-@pytest.mark.parametrize('name', TASKS)
+@pytest.mark.parametrize('name', rest_slow(TASKS, ['stack_blocks_two', 'shake_bottle']))
 def test_expert_succeeds_in_three_of_four_and_carries_things_to_their_goals(sim, expert, name):
     for take in first_takes(sim, expert, name, 3, miss=False):
         assert take.ever and take.final
@@ -45,7 +46,7 @@ def check_places(situation, take):
         assert centres[:, 2].min() > 0.005 and take.observations[-1].success
 
 
-@pytest.mark.parametrize('name', TASKS)
+@pytest.mark.parametrize('name', rest_slow(TASKS, ['stack_blocks_two', 'shake_bottle']))
 def test_a_miss_leaves_the_missed_object_alone(sim, expert, name):
     for miss in first_takes(sim, expert, name, 2, miss=True):
         assert not miss.ever and miss.moved[miss.missed] < 0.02

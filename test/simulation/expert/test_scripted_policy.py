@@ -171,6 +171,7 @@ def test_a_wrong_object_needs_another_one_that_can_be_grasped(expert):
         policy.reset(seed=0)
 
 
+@pytest.mark.slow
 def test_success_is_graded_by_the_faults(sim, expert):
     """The expert succeeds, small faults fail sometimes, large ones always."""
 

@@ -132,6 +132,7 @@ def test_an_epoch_takes_every_clip_once_and_the_next_in_another_order(source, ro
     assert order[:count] != order[count:]
 
 
+@pytest.mark.slow
 def test_other_encoder_weights_are_noticed(source, root, config, folder, tmp_path, capsys):
     other = Path(shutil.copytree(folder, tmp_path / 'other'))
     file = other / 'autoencoder' / 'diffusion_pytorch_model.safetensors'

@@ -91,6 +91,7 @@ def test_slippery_fingers_are_unlikely_where_a_block_was_carried(
     assert middle > low + 2 and high > low + 2
 
 
+@pytest.mark.slow
 def test_the_search_finds_what_made_the_motions(robot, response, settings, recording, monkeypatch):
     """Recordings made by foresight itself under known numbers, in place of real ones."""
     monkeypatch.setattr(contact_fit, '_DRAWS', 32)
@@ -119,6 +120,7 @@ def test_the_search_finds_what_made_the_motions(robot, response, settings, recor
     assert 'too narrow' not in ' '.join(told)
 
 
+@pytest.mark.slow
 def test_numbers_that_make_up_for_each_other_are_within_their_intervals(
     robot, response, settings, recording, monkeypatch
 ):

@@ -51,6 +51,7 @@ def test_a_gripper_that_closes_is_left_out_from_there_on(robot, response):
     assert np.isnan(others).all()
 
 
+@pytest.mark.slow
 def test_the_drives_of_fingers_are_found(robot, response, monkeypatch):
     monkeypatch.setattr(contact_fit, '_CANDIDATES', 24)
     arms = Arms(robot, response)

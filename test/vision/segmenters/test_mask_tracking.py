@@ -43,6 +43,7 @@ def clip(num_frames, seed=0):
     return frames, masks
 
 
+@pytest.mark.slow
 def test_dropping_what_is_out_of_reach_changes_no_mask(video, monkeypatch):
     frames, masks = clip(22)
     dropped = list(track_masks(video, frames[0], masks, frames[1:]))
