@@ -187,7 +187,7 @@ def levels(folder):
     [
         (lambda path, data: {'bytes': None, 'path': path}, PLACE),
         (lambda path, data: path, PLACE),
-        (lambda path, data: {'bytes': None, 'path': f'/home/someone/cache/name/{path}'}, PLACE),
+        (lambda path, data: {'bytes': None, 'path': f'/mnt/someone/cache/name/{path}'}, PLACE),
         (lambda path, data: {'bytes': None, 'path': Path(path).name}, PLACE),
         (lambda path, data: {'bytes': None, 'path': 'C:\\sets\\' + path.replace('/', '\\')},
          PLACE),

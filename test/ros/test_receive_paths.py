@@ -115,7 +115,7 @@ def test_two_nodes_never_reserve_one_port(own_paths, monkeypatch):
 
 @pytest.mark.parametrize(
     ('variable', 'value'),
-    [(module.PROFILES_VARIABLE, '/home/me/mine.xml'), (module.TRANSPORTS_VARIABLE, 'SHM')],
+    [(module.PROFILES_VARIABLE, '/etc/mine.xml'), (module.TRANSPORTS_VARIABLE, 'SHM')],
 )
 def test_settings_of_the_user_are_left_alone_and_the_limit_is_said(
     variable, value, own_paths, monkeypatch
