@@ -13,11 +13,6 @@ from setuptools import find_packages, setup
 PACKAGE = 'mtv_world_ros'
 SHARE = f'share/{PACKAGE}'
 MARKER = f'resource/{PACKAGE}'
-#: modules of commands in the folder cli
-COMMANDS = (
-    'calibrate', 'collect', 'datasets', 'demo', 'evaluate', 'faults', 'fit_contact', 'foresee',
-    'imagine', 'import_weights', 'own_robot', 'rank', 'train', 'view',
-)  # fmt: skip
 
 
 def data_files() -> list[tuple[str, Sequence[str]]]:
@@ -80,7 +75,7 @@ setup(
         'wan': ['accelerate>=1.15', 'peft>=0.21', 'transformers>=5.23,<6'],
         # `mtv-world view`: the Rerun viewer, native and for browsers.
         'view': ['rerun-sdk>=0.30'],
-        # LeRobot datasets are read with it (mtv-world import-dataset).
+        # LeRobot datasets are read with it (mtv-world import lerobot).
         'import': ['pyarrow>=17'],
         # Clients of policy servers: LeRobot's (grpcio), openpi's.
         'policies': ['grpcio>=1.60', 'msgpack>=1', 'websockets>=13'],
@@ -114,13 +109,6 @@ setup(
         'console_scripts': [
             'mtv-world = mtv_world_ros.cli:main',
             'world_model = mtv_world_ros.ros:run_world_model',
-        ],
-        # A module of commands adds them to the parser: `add(subparsers)`.
-        'mtv_world.commands': [
-            f'{name} = {PACKAGE}.cli.{name}'
-            if name != 'demo'
-            else f'demo = {PACKAGE}.cli.demo.command'
-            for name in COMMANDS
         ],
         # Policy kinds that the simulator makes.
         'mtv_world.policies': [f'scripted = {PACKAGE}.simulation.expert.policy_kind'],

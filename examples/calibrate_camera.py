@@ -3,7 +3,7 @@
     python examples/calibrate_camera.py [EPISODE] [--view low] [--out out/examples/camera.yaml]
 
 Begins with the recorded pose as a guess; `guess=False` searches everywhere. The same as
-`mtv-world calibrate-camera`, which also finds cameras on the arm.
+`mtv-world fit camera`, which also finds cameras on the arm.
 """
 
 from __future__ import annotations

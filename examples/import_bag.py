@@ -3,7 +3,7 @@
     python examples/import_bag.py [BAG] [--out out/examples/imported]
 
 The mapping says which topic is what; here the topics have their usual names, so that the views
-are guessed. The same as `mtv-world import-bag`.
+are guessed. The same as `mtv-world import bag`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How far are the camera poses of `mtv-world calibrate-camera` from the truth?
+"""How far are the camera poses of `mtv-world fit camera` from the truth?
 
     python experiments/camera_calibration.py --repeats 20 [--robots franka,ur5e_pair,yam_bimanual]
 
@@ -26,7 +26,7 @@ import numpy as np
 from page import parse_arguments, publish, table
 
 from mtv_world_ros.cameras.camera import camera_poses
-from mtv_world_ros.cli.own_robot import GOOD_MATCH, is_doubtful
+from mtv_world_ros.cli.fits.camera import GOOD_MATCH, is_doubtful
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.core.transforms import looking_along

@@ -1,4 +1,4 @@
-"""Which faults of a recording does `mtv-world doctor` find, and which right ones does it pass?
+"""Which faults of a recording does `mtv-world check` find, and which right ones does it pass?
 
     python experiments/doctor_faults.py DATASET [DATASET ...] [--repeats 20] [--minutes 60]
 
@@ -32,7 +32,7 @@ from page import parse_arguments, publish, table
 import yaml
 
 from mtv_world_ros.cameras.camera import scaled
-from mtv_world_ros.cli.calibrate_camera import recorded_robot
+from mtv_world_ros.cli.fits.several_cameras import recorded_robot
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.data.episode import Episode, Track
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info

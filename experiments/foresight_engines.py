@@ -13,7 +13,7 @@ temporary folder, in turns with this one; with `--no-old` they are left out. Sec
 processor for finding and foreseeing a plan, medians; the ratio is of each episode to 0.1.0's, the
 median. What is chosen by this must not be measured by it: kinds of the split `test` are refused.
 
-`--robot` and `--contact` judge another robot's episodes with what fit-contact found, this version
+`--robot` and `--contact` judge another robot's episodes with what fit contact found, this version
 alone; `--task` gives the files of tasks that are not bundled. Where no two outcomes are known, as of
 real recordings, shares stand alone. The no-picture rule (commands and first masks alone: an object sticks to a gripper that closes
 near it) stands beside it.
@@ -141,7 +141,7 @@ def more(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--no-old', action='store_true', help='this version alone')
     parser.add_argument('--robot', help="YAML file or bundled name; default: the checkpoint's")
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
-    parser.add_argument('--contact', default='bundled', help='checkpoint, or of fit-contact')
+    parser.add_argument('--contact', default='bundled', help='checkpoint, or of fit contact')
     parser.add_argument('--task', type=Path, nargs='+', default=(), help='files of other tasks')
     parser.add_argument('--chunks', type=int, default=0, help='plans to imagine in turns')
     parser.add_argument('--futures', type=int, nargs='+', default=[16, 64])
@@ -213,7 +213,7 @@ class New:
 
     Args:
         futures: numbers of them.
-        contact: checkpoint, or folder of fit-contact.
+        contact: checkpoint, or folder of fit contact.
         robot: whose it is; None = the checkpoint's.
         tasks: files of tasks that are looked at before the bundled ones.
     """
@@ -229,7 +229,7 @@ class New:
         )
         found = load_foresight(checkpoint_folder(contact) / OBJECT_MOTION_FOLDER, self.robot)
         if found is None:
-            raise MtvWorldError(f"'{contact}' holds no numbers of contact; run fit-contact")
+            raise MtvWorldError(f"'{contact}' holds no numbers of contact; run fit contact")
         self._engines = {
             f'MuJoCo, {number} futures': SolidForesight(
                 self.robot,

@@ -144,7 +144,7 @@ def _collect(root: Path, task: str, options: argparse.Namespace) -> None:
         kind = ['--task', task, '--failures-of-ten', '0']
         _mtv_world('collect', *kind, *size, '--out', str(demos))
         kind = ['--fps', str(FPS), '--size', f'{WIDTH}x{HEIGHT}', '--images']
-        _mtv_world('export-dataset', str(demos), '--out', str(out), *kind)
+        _mtv_world('export', 'lerobot', str(demos), '--out', str(out), *kind)
     starts = _starts(root, task)
     if not starts.exists():
         print(f'$ {options.starts} first frames of {task}', flush=True)

@@ -2,7 +2,7 @@
 
     python experiments/seen_points.py EPISODES POINTS [--ways points,same-focal] [--fitted 2]
 
-POINTS is what `mtv-world calibrate-camera --click` saves. Cameras are estimated from the first
+POINTS is what `mtv-world fit camera --click` saves. Cameras are estimated from the first
 points of each recording, in different ways; the others judge them. The error that a way states
 from the others of all recordings but one is compared with those of that one. `recorded` judges
 the calibrations of the episodes as they are. Last but one comes by how much later the joint
@@ -28,7 +28,7 @@ from page import table
 from scipy.stats import binomtest
 
 from mtv_world_ros.cameras.camera import project
-from mtv_world_ros.cli.calibrate_camera import recorded_robot
+from mtv_world_ros.cli.fits.several_cameras import recorded_robot
 from mtv_world_ros.core.config import read_yaml
 from mtv_world_ros.core.data_types import CameraModel, FloatArray
 from mtv_world_ros.data.episode import Episode

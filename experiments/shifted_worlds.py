@@ -9,7 +9,7 @@ from the pictures of the first frame alone, as the node does: cameras are checke
 outline, objects are found by the segmenter. Judges: *foreseen motions alone*, the share of futures
 that succeed; where `--pictures` says so, *pictures alone* (no motion foreseen) and *both* (the estimate);
 where `--real` says so, *real frames*, the estimate on the simulator's; where `--contact FOLDER` has a
-folder `FOLDER/PHYSICS` that `fit-contact` wrote in that physics, *foreseen motions, fitted there*; the
+folder `FOLDER/PHYSICS` that `fit contact` wrote in that physics, *foreseen motions, fitted there*; the
 *no-picture rule*: an object sticks to a gripper that closes near it. From .75 on it is called a success,
 below .5 a failure.
 False success is of real failures that have a verdict, false failure of real successes. Intervals over
@@ -110,7 +110,7 @@ def more(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--pictures', default='', metavar='PHYSICS', help='of these, or all')
     parser.add_argument('--real', default='', metavar='PHYSICS', help='of these, or all')
     parser.add_argument('--checkpoints', default='bundled', help='each sees the same rollouts')
-    parser.add_argument('--contact', type=Path, help='FOLDER/PHYSICS, which fit-contact wrote')
+    parser.add_argument('--contact', type=Path, help='FOLDER/PHYSICS, which fit contact wrote')
     parser.add_argument('--faults', default='drawn:0', help='a split, or drawn:SEED')
     parser.add_argument('--size', type=float, default=1.1, help='of drawn kinds')
     parser.add_argument('--tasks', default=','.join(TASKS))

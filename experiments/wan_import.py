@@ -1,4 +1,4 @@
-"""What do import-weights and a dry run take at the full size of a Wan preset?
+"""What do import wan and a dry run take at the full size of a Wan preset?
 
     python experiments/wan_import.py --preset wan-1.3b --out experiments/results
     python experiments/wan_import.py --preset wan-14b --layers 8 --shards 3 --out out/wan
@@ -142,7 +142,7 @@ def measure(options: argparse.Namespace) -> str:
         mtv = [sys.executable, '-m', 'mtv_world_ros.cli']
         out = str(work / 'checkpoint')
         commands: Mapping[str, list[str]] = {
-            'import-weights': ['import-weights', str(work / 'public'), '--out', out],
+            'import-weights': ['import', 'wan', str(work / 'public'), '--out', out],
             'train --dry-run': ['train', '--dry-run'],
         }
         for title, command in commands.items():

@@ -10,8 +10,10 @@ import grimp
 import pytest
 
 from mtv_world_ros import cli
+from mtv_world_ros.cli.commands import COMMANDS as COMMANDS_OF_THE_PACKAGE
+from mtv_world_ros.cli.commands import RENAMED
 from mtv_world_ros.core import entry_points
-from mtv_world_ros.core.entry_points import COMMANDS, load, POLICIES, registered, ROLLOUTS
+from mtv_world_ros.core.entry_points import load, POLICIES, registered, ROLLOUTS
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.rollout.assembly import policy_settings
@@ -45,14 +47,36 @@ def test_the_bundled_checkpoint_is_loaded_without_the_simulator():
     assert done.stdout.strip() == '[]'
 
 
-def test_every_command_of_help_is_registered_and_in_its_order():
-    found = registered(COMMANDS)
-    assert set(cli._ORDER) == {
-        name for name, entry in found.items() if entry.value.startswith('mtv_world_ros.')
-    }
-    modules = [load(found[name]).__name__ for name in cli._ORDER]
-    assert modules[0] == 'mtv_world_ros.cli.demo.command'
-    assert [load(entry).__name__ for entry in cli._commands()][: len(modules)] == modules
+def test_every_command_of_the_table_is_a_parser_with_its_help():
+    found = set()
+    for name in COMMANDS_OF_THE_PACKAGE:
+        parser = cli.make_parser(name)
+        for word in name.split():
+            parser = cli._choices(parser)[word]
+        found.add(parser.prog)
+    assert found == {f'mtv-world {name}' for name in COMMANDS_OF_THE_PACKAGE}
+
+
+def test_the_overview_imports_no_command():
+    code = (
+        'import sys\n'
+        'from mtv_world_ros import cli\n'
+        'cli._overview()\n'
+        "print([n for n in sys.modules if n.startswith('mtv_world_ros.cli.')])"
+    )
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "['mtv_world_ros.cli.commands']"
+
+
+@pytest.mark.parametrize(('old', 'words'), RENAMED.items())
+def test_an_old_name_says_the_new_one_and_works(old, words, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main([old] if old == 'faults' else [old, '--help'])
+    assert end.value.code == 0
+    said = capsys.readouterr()
+    assert ' '.join(words) in said.err
+    shown = 'joint_noise' if old == 'faults' else f'usage: mtv-world {" ".join(words)}'
+    assert shown in said.out
 
 
 def registering(monkeypatch, **entries):
@@ -64,19 +88,17 @@ def registering(monkeypatch, **entries):
     monkeypatch.setattr(metadata, 'entry_points', lambda group: listed.get(group, []))
 
 
-def test_a_command_of_another_package_comes_last(monkeypatch):
-    registering(
-        monkeypatch,
-        COMMANDS={'aaa': 'mtv_world_ros.cli.view', 'demo': 'mtv_world_ros.cli.demo.command'},
+def test_a_command_of_another_package_comes_last_and_runs(monkeypatch, tmp_path, capsys):
+    (tmp_path / 'of_somebody.py').write_text(
+        'def add(commands):\n'
+        "    parser = commands.add_parser('mine')\n"
+        '    parser.set_defaults(handler=lambda arguments: 7)\n'
     )
-    modules = [load(entry).__name__ for entry in cli._commands()]
-    assert modules == ['mtv_world_ros.cli.demo.command', 'mtv_world_ros.cli.view']
-
-
-def test_an_installation_without_commands_says_what_to_do(monkeypatch, capsys):
-    registering(monkeypatch)
-    assert cli.main(['demo']) == 1
-    assert 'registers no commands; install it again: make' in capsys.readouterr().err
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, 'of_somebody', raising=False)
+    registering(monkeypatch, COMMANDS={'mine': 'of_somebody'})
+    assert cli.main(['mine']) == 7
+    assert cli._overview().endswith('Of other packages:\n  mine')
 
 
 @pytest.mark.parametrize(
@@ -92,9 +114,8 @@ def test_a_package_with_a_broken_command_is_named(monkeypatch, tmp_path, capsys,
     (tmp_path / 'of_somebody.py').write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, 'of_somebody', raising=False)
-    pairs = {'demo': 'mtv_world_ros.cli.demo.command', 'mine': 'of_somebody'}
-    registering(monkeypatch, COMMANDS=pairs)
-    assert cli.main(['demo', '--help']) == 1
+    registering(monkeypatch, COMMANDS={'mine': 'of_somebody'})
+    assert cli.main(['mine', '--help']) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "entry point 'mine = of_somebody'" in line and says in line
 

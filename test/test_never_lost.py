@@ -78,13 +78,15 @@ def test_results_with_other_settings_are_replaced_only_when_asked(tmp_path):
 
 def test_calibrate_writes_neither_into_the_package_nor_over_a_calibration(tmp_path, capsys):
     words = [str(EPISODE.parent), '--out', str(tmp_path / 'out')]
-    said = refused(['calibrate', 'bundled', *words], capsys)
+    said = refused(['fit', 'success', 'bundled', *words], capsys)
     assert 'part of the installed package' in said and '--no-store' in said
     mine = tmp_path / 'mine'
     mine.mkdir()
     for name in ('world_model.json', 'success_calibration.json'):
         shutil.copy(share_path('resource', 'checkpoint') / name, mine)
-    assert "success_calibration.json' exists" in refused(['calibrate', str(mine), *words], capsys)
+    assert "success_calibration.json' exists" in refused(
+        ['fit', 'success', str(mine), *words], capsys
+    )
 
 
 def test_imagined_episodes_and_predictions_stay(tmp_path, capsys):
@@ -107,11 +109,11 @@ def test_a_report_of_several_evaluations_needs_a_place_of_its_own(tmp_path, caps
     (half / 'one.json').write_text('{}')
     page = tmp_path / 'page.html'
     page.write_text('old')
-    both = ['report', str(half.parent), str(tmp_path)]
+    both = ['export', 'report', str(half.parent), str(tmp_path)]
     assert '2 evaluations go into one page; give --out FILE' in refused(both, capsys)
     assert 'page.html' in refused([*both, '--out', str(page)], capsys)
     assert page.read_text() == 'old'
-    assert 'is not finished' in refused(['report', str(half.parent)], capsys)
+    assert 'is not finished' in refused(['export', 'report', str(half.parent)], capsys)
 
 
 def stopped_in_a_process(words: list[str], kind: int, log: Path) -> tuple[int, str]:

@@ -13,7 +13,7 @@ if _interrupt is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import argparse  # noqa: E402
-from collections.abc import Iterable, Sequence  # noqa: E402
+from collections.abc import Sequence  # noqa: E402
 import errno  # noqa: E402
 from importlib import import_module, metadata  # noqa: E402
 import os  # noqa: E402
@@ -24,7 +24,13 @@ import sys  # noqa: E402
 from types import ModuleType  # noqa: E402
 from typing import Any  # noqa: E402
 
-from mtv_world_ros.core.entry_points import broken, COMMANDS, load, registered  # noqa: E402
+from mtv_world_ros.cli.commands import (  # noqa: E402
+    COMMANDS,
+    REMOVED,
+    RENAMED,
+    SECTIONS,
+)
+from mtv_world_ros.core import entry_points  # noqa: E402
 from mtv_world_ros.core.errors import (  # noqa: E402
     ConfigError,
     MtvWorldError,
@@ -50,26 +56,16 @@ _MORE_MEMORY = (
 _READ_ONLY = '; choose another folder'
 #: options that name what a command writes
 _OUTPUTS = ('out', 'picture', 'save')
-#: modules of commands as `--help` shows them; those of other packages come last
-_ORDER = (
-    'demo',
-    'imagine',
-    'collect',
-    'train',
-    'fit_contact',
-    'foresee',
-    'evaluate',
-    'rank',
-    'faults',
-    'calibrate',
-    'view',
-    'own_robot',
-    'datasets',
-    'import_weights',
-)
+#: groups of commands of two words -> their help
+_GROUPS = {
+    'import': 'recordings and weights of others become episodes and checkpoints',
+    'fit': 'fit parameters to recordings',
+    'export': 'write episodes and results in other formats',
+}
+_OWN = 'mtv_world_ros.'
+_DESCRIPTION = 'An online embodied world model for ROS 2.'
+_USAGE = 'mtv-world [-h] [--version] COMMAND ...'
 _EMPTY = "it is empty; leave it out, or give a path or a name ('.' is the present folder)"
-#: commands that left, and the last version that has them
-_REMOVED = {'distill': '0.1.0', 'train-motion': '0.1.0'}
 _ADVICE = {
     errno.ENOSPC: _FULL,
     errno.EDQUOT: _FULL,
@@ -79,34 +75,79 @@ _ADVICE = {
 }
 
 
-def make_parser() -> argparse.ArgumentParser:
-    """Returns the parser of the command line."""
-    parser = _Parser(prog='mtv-world', description='An online embodied world model for ROS 2.')
+def make_parser(*wanted: str) -> argparse.ArgumentParser:
+    """Return the parser of the command line.
+
+    Args:
+        wanted: commands of the table to add, such as 'train' or 'import bag'; default: all of them
+            and those of other packages. Modules of commands that are not wanted are not imported.
+
+    Raises:
+        ConfigError: a command of another package cannot be loaded.
+    """
+    parser = _Parser(prog='mtv-world', description=_DESCRIPTION)
     parser.add_argument('--version', action=_Version, nargs=0, help='print the version, then exit')
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
-    for entry in _commands():
-        module: ModuleType = load(entry)
-        try:
-            module.add(commands)
-        except Exception as error:  # without `add`, or of a name that is taken
-            raise broken(entry, error) from error
+    groups: dict[str, argparse._SubParsersAction] = {}
+    for name in wanted or COMMANDS:
+        group, _, last = name.rpartition(' ')
+        if group and group not in groups:
+            made = commands.add_parser(group, help=_GROUPS[group])
+            groups[group] = made.add_subparsers(required=True, metavar=group.upper())
+        module = import_module(f'mtv_world_ros.cli.{COMMANDS[name].module}')
+        getattr(module, COMMANDS[name].function)(groups.get(group, commands))
+    if not wanted:
+        _add_others(commands)
     return parser
 
 
-def _commands() -> Iterable[metadata.EntryPoint]:
-    """The commands, in the order of `--help`.
+def _add_others(commands: argparse._SubParsersAction) -> None:
+    """Add the commands that other packages register.
 
     Raises:
-        ConfigError: none is registered.
+        ConfigError: one cannot be loaded, or has a name that is taken.
     """
-    found = registered(COMMANDS)
-    if not found:
-        raise ConfigError(
-            'the installed mtv_world_ros registers no commands; install it again: make, or '
-            'pip install --no-deps --no-build-isolation -e .'
-        )
-    others = sorted(found.keys() - set(_ORDER))
-    return [found[name] for name in (*_ORDER, *others) if name in found]
+    found = entry_points.registered(entry_points.COMMANDS)
+    for name in sorted(found):
+        if found[name].value.startswith(_OWN):  # of an installation before 0.2
+            continue
+        module: ModuleType = entry_points.load(found[name])
+        try:
+            module.add(commands)
+        except Exception as error:  # without `add`, or of a name that is taken
+            raise entry_points.broken(found[name], error) from error
+
+
+def _others_parser() -> argparse.ArgumentParser:
+    """Return a parser of the commands of other packages; the names of the table are taken."""
+    parser = _Parser(prog='mtv-world', description=_DESCRIPTION)
+    commands = parser.add_subparsers(required=True, metavar='COMMAND')
+    for name in _first_words():
+        commands.add_parser(name)
+    _add_others(commands)
+    return parser
+
+
+def _first_words() -> list[str]:
+    return list(dict.fromkeys(name.split()[0] for name in COMMANDS))
+
+
+def _choices(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """Return the parsers of a parser's commands by name; empty = it has none."""
+    found = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    return next((dict(action.choices) for action in found), {})
+
+
+def _overview() -> str:
+    """Return the text of `mtv-world --help`: the table of commands under its headings."""
+    lines = [f'usage: {_USAGE}', '', f'{_DESCRIPTION} `mtv-world COMMAND --help` has the options.']
+    for section in SECTIONS:
+        lines += ['', f'{section}:']
+        named = {name: entry.help for name, entry in COMMANDS.items() if entry.section == section}
+        lines += [f'  {name:15} {text}' for name, text in named.items()]
+    others = [name for name in _choices(_others_parser()) if name not in _first_words()]
+    lines += ['', 'Of other packages:', *(f'  {name}' for name in others)] if others else []
+    return '\n'.join(lines)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -138,29 +179,71 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def _parsed(words: Sequence[str]) -> argparse.Namespace:
-    parser = make_parser()
-    with suppress(ImportError):  # completion in the shell, where this is installed
-        import_module('argcomplete').autocomplete(parser)
-    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-    if words and not words[0].startswith('-') and words[0] not in commands.choices:
-        known = list(commands.choices)
-        if words[0] in _REMOVED:
-            parser.error(
-                f"'{words[0]}' is no longer a command: no measurement showed its worth; version "
-                f'{_REMOVED[words[0]]} has it. Commands are {", ".join(known)}'
+def _current(words: Sequence[str]) -> list[str]:
+    """Return the words with today's name of the command; say so where it had another name."""
+    if not words:
+        return []
+    first, *rest = words
+    if first in RENAMED:
+        now = ' '.join(RENAMED[first])
+        _said(f"'{first}' is called '{now}' now; the old name works in this release alone", 0)
+        return [*RENAMED[first], *rest]
+    return list(words)
+
+
+def _parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
+    """Return a parser that knows the command which words begin with.
+
+    Ends the process with a message where there is no such command.
+    """
+    plain = _Parser(prog='mtv-world', usage=_USAGE)
+    first, second = [*words, '', ''][:2]
+    if first in ('-h', '--help'):
+        print(_overview())
+        plain.exit()
+    if first in COMMANDS:
+        return make_parser(first)
+    if first in _GROUPS:
+        members = [name.split()[1] for name in COMMANDS if name.split()[0] == first]
+        if second in members:
+            return make_parser(f'{first} {second}')
+        if second and not second.startswith('-'):
+            plain.error(
+                f"there is no '{first} {second}'{nearest(second, members)}; there are "
+                f'{", ".join(f"{first} {name}" for name in members)}'
             )
-        parser.error(
-            f"there is no command '{words[0]}'{nearest(words[0], known)}; commands are "
-            f'{", ".join(known)}'
+        return make_parser(*(f'{first} {name}' for name in members))
+    if not first or first.startswith('-'):
+        return make_parser('demo')
+    others = _others_parser()
+    known = list(_choices(others))
+    if first in known:
+        return others
+    if first in REMOVED:
+        plain.error(
+            f"'{first}' is no longer a command: no measurement showed its worth; version "
+            f'{REMOVED[first]} has it. Commands are {", ".join(known)}'
         )
+    plain.error(
+        f"there is no command '{first}'{nearest(first, known)}; commands are {', '.join(known)}"
+    )
+
+
+def _parsed(words: Sequence[str]) -> argparse.Namespace:
+    if '_ARGCOMPLETE' in os.environ:  # completion in the shell, where this is installed
+        with suppress(ImportError):
+            import_module('argcomplete').autocomplete(make_parser())
+    words = _current(words)
+    parser = _parser_for(words)
     arguments, more = parser.parse_known_args(words)
-    arguments.player, arguments.command_line = more, list(words)
+    arguments.player, arguments.command_line = more, words
+    leaf = parser
+    for word in words[:2]:
+        leaf = _choices(leaf).get(word, leaf)
     if more and not getattr(arguments, 'takes_player_options', lambda _: False)(arguments):
-        options = commands.choices[words[0]]._option_string_actions
-        hints = [f'{word}{nearest(word, options)}' for word in more]
+        hints = [f'{word}{nearest(word, leaf._option_string_actions)}' for word in more]
         parser.error(f'unrecognized arguments: {" ".join(hints)}')
-    _check_texts(commands.choices[words[0]], arguments)
+    _check_texts(leaf, arguments)
     for name in _OUTPUTS:
         given = getattr(arguments, name, None)
         path = getattr(arguments, f'default_{name}', None) if given is None else given

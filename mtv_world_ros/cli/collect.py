@@ -46,7 +46,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         type=int,
         default=2,
         metavar='N',
-        help='how many of ten episodes of a task miss their grasp; 5 for mtv-world calibrate',
+        help='how many of ten episodes of a task miss their grasp; 5 for mtv-world fit success',
     )
     parser.add_argument(
         '--policies',
@@ -66,7 +66,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--pictures',
         choices=('all', 'first'),
         default='all',
-        help='first: render the first frame only, for foresight alone; fit-contact needs all',
+        help='first: render the first frame only, for foresight alone; fit contact needs all',
     )
     add_physics(parser)
     parser.add_argument('--seed', type=int, default=0)

@@ -38,12 +38,7 @@ again continues an interrupted run. Exit status: 1 if an episode could not be sc
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the commands."""
-    _add_evaluate(commands)
-    _add_report(commands)
-
-
-def _add_evaluate(commands: argparse._SubParsersAction) -> None:
+    """Add the command `evaluate`."""
     parser = commands.add_parser(
         'evaluate', help='score checkpoints on recorded episodes', epilog=_EPILOG
     )
@@ -280,7 +275,8 @@ def _score(
     )
 
 
-def _add_report(commands: argparse._SubParsersAction) -> None:
+def add_report(commands: argparse._SubParsersAction) -> None:
+    """Add the command `export report`."""
     parser = commands.add_parser(
         'report', help='write the HTML report of one or several evaluations again'
     )

@@ -1,34 +1,39 @@
-"""`mtv-world faults`: what can be wrong with a scripted policy."""
+"""`mtv-world rank --list-faults`: kinds of faults that scripted policies may have."""
 
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        'faults',
-        help="print the kinds of faults that scripted policies may have, and what each one's size "
-        'means',
-        description='Prints fault kinds: name and earlier name, family, split, typical and '
-        'largest size, and what the size means. A policy is called expert-NAME-SIZE.',
-    )
-    parser.add_argument(
-        'kinds',
-        nargs='?',
-        default='',
-        metavar='KINDS',
-        help='a split (train, calibrate, test), drawn:SEED, or comma-separated names; default: '
-        'all of the catalogue',
-    )
-    parser.set_defaults(handler=_faults)
+class ListFaults(argparse.Action):
+    """Option that prints fault kinds and ends the process.
+
+    A line has the name and the earlier one, family, split, typical and largest size; the next one
+    says what the size means. A policy is called expert-NAME-SIZE.
+    """
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: object, values: Any, *_: object
+    ) -> None:
+        """Print the kinds that were asked for."""
+        print_faults(values or '')
+        parser.exit()
 
 
-def _faults(arguments: argparse.Namespace) -> int:
+def print_faults(asked: str) -> None:
+    """Print fault kinds: name, family, split, sizes, and what the size means.
+
+    Args:
+        asked: a split (train, calibrate, test), drawn:SEED, or comma-separated names; empty = all
+            of the catalogue.
+
+    Raises:
+        ConfigError: there is no such kind.
+    """
     from mtv_world_ros.simulation.faults.catalogue import FAULTS, kind_named, kinds_named
 
-    names = kinds_named(arguments.kinds) if arguments.kinds else tuple(FAULTS)
+    names = kinds_named(asked) if asked else tuple(FAULTS)
     for kind in map(kind_named, names):
         fault = FAULTS[kind]
         typical, largest = (
@@ -38,4 +43,3 @@ def _faults(arguments: argparse.Namespace) -> int:
         called = f' ({fault.alias})' if fault.alias else ''
         print(f'{kind}{called}: {fault.family}, {fault.split}; {typical}, at most {largest}')
         print(f'    {fault.text}')
-    return 0

@@ -25,12 +25,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='say where objects go under the commands of an episode or a file, without a picture',
         description='Foresees what the commands of an episode, or of a YAML file with objects and '
         'joint positions, do to objects: in several futures, by contact alone. No checkpoint is '
-        'needed, any robot with a URDF will do; numbers of contact are those of fit-contact, or '
+        'needed, any robot with a URDF will do; numbers of contact are those of fit contact, or '
         'a guess, which is said.',
     )
     parser.add_argument('scene', type=Path, help='folder of an episode, or a YAML file')
     parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
-    parser.add_argument('--contact', metavar='DIR', help="that fit-contact wrote, or 'bundled'")
+    parser.add_argument('--contact', metavar='DIR', help="that fit contact wrote, or 'bundled'")
     parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
     parser.add_argument('--futures', type=int, default=16)
     parser.add_argument('--picture', type=Path, metavar='PNG', help='draw the first future')
@@ -74,7 +74,7 @@ def _foresight(arguments: argparse.Namespace) -> SolidForesight:
     robot = load_robot(robot_path(arguments.robot))
     threads, count = threads_each(1), {'num_motions': arguments.futures}
     if arguments.contact is None:
-        print("numbers of contact are guessed: 'fit-contact' finds them, '--contact' takes them")
+        print("numbers of contact are guessed: 'fit contact' finds them, '--contact' takes them")
         settings = first_settings(Arms(robot, None)).replace(**count)
         if arguments.scene.suffix not in _FILES:  # nothing is known of its table
             recording = read_contact(arguments.scene, robot, arguments.views)
@@ -86,7 +86,7 @@ def _foresight(arguments: argparse.Namespace) -> SolidForesight:
     if found is None:
         raise CheckpointError(
             f"'{arguments.contact}' holds no '{OBJECT_MOTION_FOLDER}/contact.json'; run "
-            "'mtv-world fit-contact' with '--out' of this folder"
+            "'mtv-world fit contact' with '--out' of this folder"
         )
     settings = found.settings.replace(**count)
     return SolidForesight(robot, found.response, settings, threads)

@@ -23,13 +23,8 @@ from mtv_world_ros.core.files import check_free
 GOOD_ENDS = ('done', 'max_chunks', 'stopped', 'max_seconds')
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the commands."""
-    _add_replay(commands)
-    _add_imagine(commands)
-
-
-def _add_replay(commands: argparse._SubParsersAction) -> None:
+def add_replay(commands: argparse._SubParsersAction) -> None:
+    """Add the command `replay`."""
     parser = commands.add_parser(
         'replay',
         help='play an episode into ROS topics, or imagine it offline (MCAP to MCAP)',
@@ -84,7 +79,8 @@ def _play(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _add_imagine(commands: argparse._SubParsersAction) -> None:
+def add_imagine(commands: argparse._SubParsersAction) -> None:
+    """Add the command `imagine`."""
     parser = commands.add_parser(
         'imagine', help='run a policy for whole episodes in the world model, over ROS topics'
     )

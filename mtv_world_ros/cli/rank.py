@@ -11,6 +11,7 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.cli.faults import ListFaults
 from mtv_world_ros.cli.physics_option import add_physics, physics_text
 from mtv_world_ros.cli.shared_options import (
     add_options,
@@ -40,8 +41,8 @@ was stopped.
 """
 _EPILOG = """\
 A scripted policy is `expert`, followed by faults with their sizes, e.g.
-expert-joint_noise-0.03-gripper_delay-0.3; mtv-world faults prints all kinds. By default one
-denoising step. Logs of the policy servers that a file starts go to DIR/logs.
+expert-joint_noise-0.03-gripper_delay-0.3; mtv-world rank --list-faults prints all kinds. By
+default one denoising step. Logs of the policy servers that a file starts go to DIR/logs.
 """
 
 
@@ -52,6 +53,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='rank policies in imagination, and compare with the simulator',
         description=_DESCRIPTION,
         epilog=_EPILOG,
+    )
+    parser.add_argument(
+        '--list-faults',
+        action=ListFaults,
+        nargs='?',
+        metavar='KINDS',
+        help='print fault kinds and what their sizes mean, then exit: those of a split (train, '
+        'calibrate, test), of drawn:SEED, or comma-separated names; default: all',
     )
     policies = parser.add_mutually_exclusive_group()
     policies.add_argument(

@@ -80,7 +80,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--doctor',
         type=Path,
         metavar='DIR',
-        help='what mtv-world doctor wrote about these episodes; those are left out of which the '
+        help='what mtv-world check wrote about these episodes; those are left out of which the '
         'recording or a view that is trained on is broken',
     )
     add_options(parser, 'describer segmenter dtype')
@@ -197,7 +197,7 @@ def found_broken(report: Path, paths: Sequence[Path], views: Sequence[str]) -> d
     """Returns why episodes are broken, by path.
 
     Args:
-        report: folder that `mtv-world doctor` wrote.
+        report: folder that `mtv-world check` wrote.
         paths: of the episodes.
         views: names of those that are trained on; others may be broken.
 
@@ -213,14 +213,14 @@ def found_broken(report: Path, paths: Sequence[Path], views: Sequence[str]) -> d
         found = TypeAdapter(dict[str, dict[str, str]]).validate_python(read_json(report / BROKEN))
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"--doctor '{report}': {BROKEN} cannot be read ({error}); mtv-world doctor FOLDER "
+            f"--doctor '{report}': {BROKEN} cannot be read ({error}); mtv-world check FOLDER "
             '--out DIR writes it'
         ) from error
     unchecked = [path.name for path in paths if path.name not in found]
     if unchecked:
         raise ConfigError(
             f"--doctor '{report}': {len(unchecked)} of the episodes were not checked, e.g. "
-            f"'{unchecked[0]}'; run mtv-world doctor on the folder again"
+            f"'{unchecked[0]}'; run mtv-world check on the folder again"
         )
     parts = {path: {n: t for n, t in found[path.name].items() if n in (*views, 'recording')}
              for path in paths}  # fmt: skip

@@ -774,10 +774,7 @@ def _info(bag: BagReader, instructions: Sequence[tuple[int, str]]) -> EpisodeInf
 
 def _estimate(path: Path, view: str) -> str:
     """What to do about a camera of unknown pose."""
-    return (
-        f'estimate it from the recording: mtv-world calibrate-camera {path} --view {view} '
-        '--no-guess'
-    )
+    return f'estimate it from the recording: mtv-world fit camera {path} --view {view} --no-guess'
 
 
 def _four(K: FloatArray) -> str:

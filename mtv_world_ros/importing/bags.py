@@ -325,7 +325,7 @@ def write_imported(
     commands = _commands(episode, robot, mapping)
     warnings = [*episode.warnings, *jumps([t for _, t in commands], robot)]
     warnings += [
-        f"view '{view}': {what} not known: mtv-world calibrate-camera {out.parent} --view {view} "
+        f"view '{view}': {what} not known: mtv-world fit camera {out.parent} --view {view} "
         '--click points.html'
         for view, what in episode.unknown.items()
     ]

@@ -2,7 +2,7 @@
 
 Layout as in huggingface/lerobot 0.4 (`src/lerobot/datasets/utils.py`, `lerobot_dataset.py`): files
 of one episode each, which the format allows. Beside it stands a mapping, with which
-`import-dataset` reads the dataset back.
+`import lerobot` reads the dataset back.
 """
 
 from __future__ import annotations

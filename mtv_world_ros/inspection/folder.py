@@ -126,7 +126,7 @@ def _focal_findings(known: dict[str, dict[str, CameraModel]]) -> list[Finding]:
                 suspicious(
                     f"view '{view}': the focal length of {', '.join(others)} differs from that of "
                     'the other episodes: another camera, or an estimate of one episode alone '
-                    '(mtv-world calibrate-camera FOLDER --focal estimate takes all)'
+                    '(mtv-world fit camera FOLDER --focal estimate takes all)'
                 )
             )
     return found
@@ -190,7 +190,7 @@ def _with_places(
             findings.append(
                 suspicious(
                     f'{text}, but {pairs}: one calibration for all is wrong (mtv-world '
-                    'calibrate-camera FOLDER)'
+                    'fit camera FOLDER)'
                 )
             )
         else:

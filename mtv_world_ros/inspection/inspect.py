@@ -62,7 +62,7 @@ from mtv_world_ros.robot.shape import (
 _MOVES = (
     'calibration not checked against the images: the camera moves by itself, with the poses of /tf'
 )
-_UNKNOWN = '{0} not known: mtv-world calibrate-camera FOLDER --view {1}'
+_UNKNOWN = '{0} not known: mtv-world fit camera FOLDER --view {1}'
 Checked = tuple[dict[str, str], list[Finding]]
 #: share of the frames in which at least one tool should be in the image
 _LEAST_IN_IMAGE = 0.5
@@ -298,7 +298,7 @@ class Inspector:
         text = (
             f'the robot is drawn {distance:.1f} px beside the moving pixels (they are at '
             f'{x:+.1f}, {y:+.1f}): check K, T_mount_camera and the tool offset (`mtv-world '
-            'calibrate-camera` estimates the pose)'
+            'fit camera` estimates the pose)'
         )
         if residual.match <= residual.match_here * (1 + _BETTER_PLACE):
             return []

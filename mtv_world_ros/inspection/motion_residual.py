@@ -116,7 +116,7 @@ def measure_residual(
     """
     if camera.mount_link in moving_links(robot):
         return MotionResidual(
-            reason=f"the camera moves with '{camera.mount_link}' (`mtv-world calibrate-camera` "
+            reason=f"the camera moves with '{camera.mount_link}' (`mtv-world fit camera` "
             'estimates its pose: compare)'
         )
     pairs = _pairs(track.stamps_ns, joints, search.max_pairs)

@@ -1,6 +1,6 @@
 """Files of a checkpoint's foresight: the arms' response and the contact settings.
 
-A folder holds `arm_response.json`, of `mtv-world fit-contact`, and `contact.json`.
+A folder holds `arm_response.json`, of `mtv-world fit contact`, and `contact.json`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CONTACT_FILE, RESPONSE_FILE = 'contact.json', 'arm_response.json'
 
 
 def load_foresight(folder: Path, robot: RobotModel, threads: int = 1) -> SolidForesight | None:
-    """Reads the files of `fit-contact`; None = no foresight, verdicts rest on frames alone.
+    """Reads the files of `fit contact`; None = no foresight, verdicts rest on frames alone.
 
     Args:
         folder: that it wrote.
@@ -52,7 +52,7 @@ def load_response(folder: Path, robot: RobotModel) -> ArmResponse | None:
     except KeyError as error:
         raise CheckpointError(
             f"'{file}' has no {error}, which robot '{robot.name}' has; run 'mtv-world "
-            "fit-contact' with episodes of this robot"
+            "fit contact' with episodes of this robot"
         ) from error
     except (OSError, ValueError, TypeError) as error:
         raise CheckpointError(f"'{file}' cannot be used: {error}; fit it anew") from error

@@ -103,7 +103,7 @@ class SolidForesight:
         word = 'higher' if table > told else 'lower'
         note = (
             f'the table seems {1e3 * abs(table - told):.0f} mm {word} than contact.json has it; '
-            'corrected for this episode (mtv-world fit-contact finds it)'
+            'corrected for this episode (mtv-world fit contact finds it)'
         )
         return replace(found, foresight=self._on_table(table), note=note)
 

@@ -1,4 +1,4 @@
-"""What `mtv-world calibrate` keeps with a checkpoint: the fitted logistic, the trusted horizon."""
+"""Fits that `mtv-world fit success` stores with a checkpoint: logistic and trusted horizon."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Weights(Schema):
 
 
 class Calibration(Weights):
-    """Weights that `mtv-world calibrate` fitted.
+    """Weights that `mtv-world fit success` fitted.
 
     Attributes:
         observed: for frames that were seen, not imagined, of the same episodes; None = as for
@@ -260,7 +260,7 @@ def load_fit(folder: Path, kind: type[Model], *, of_pictures: bool = False) -> M
     Arguments as in `fit_path`.
 
     Raises:
-        CheckpointError: the file is not what `mtv-world calibrate` writes.
+        CheckpointError: the file is not what `mtv-world fit success` writes.
     """
     path = fit_path(folder, kind, of_pictures=of_pictures)
     if not path.is_file():
@@ -269,6 +269,6 @@ def load_fit(folder: Path, kind: type[Model], *, of_pictures: bool = False) -> M
         return kind(**read_json(path))
     except (OSError, ValueError, TypeError, ConfigError) as error:
         raise CheckpointError(
-            f"'{path}' cannot be used: {error}; run 'mtv-world calibrate {path.parent} DATASET "
+            f"'{path}' cannot be used: {error}; run 'mtv-world fit success {path.parent} DATASET "
             "--out DIR' again, or delete the file"
         ) from error

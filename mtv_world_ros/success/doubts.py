@@ -68,7 +68,7 @@ class PhysicsWatch:
             return ''
         return (
             f'{SAYS}: {count} of the last {of} executed chunks in which an object moved ended '
-            'where no future foresaw it; run mtv-world fit-contact on recordings of this place'
+            'where no future foresaw it; run mtv-world fit contact on recordings of this place'
         )
 
     @property
@@ -124,8 +124,8 @@ def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
 
 
 #: how an estimate that rests on nothing is mended
-_CALIBRATE = 'mtv-world calibrate CHECKPOINT EPISODES on episodes of known outcome'
-_FIT = 'mtv-world fit-contact RECORDINGS --checkpoint CHECKPOINT on recordings of this robot'
+_CALIBRATE = 'mtv-world fit success CHECKPOINT EPISODES on episodes of known outcome'
+_FIT = 'mtv-world fit contact RECORDINGS --checkpoint CHECKPOINT on recordings of this robot'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -67,7 +67,7 @@ def load_base(
     if folder is None:
         raise TrainingError(
             'this preset trains on top of a checkpoint; give --init FOLDER, which '
-            "'mtv-world import-weights' makes of public weights"
+            "'mtv-world import wan' makes of public weights"
         )
     loaded = load_trained_model(Checkpoint.open(folder), dtype=dtype)
     _check_transformer(config, layout, loaded.transformer, folder)

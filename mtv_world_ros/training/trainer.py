@@ -181,7 +181,7 @@ class Trainer:
         elif loaded.object_motion is not None and self.processes.is_main:
             tqdm.write(
                 f"what foresees objects in '{folder}' is left out: it is of robot "
-                f"'{theirs.robot}' with {len(theirs.spec.views)} views; run fit-contact"
+                f"'{theirs.robot}' with {len(theirs.spec.views)} views; run fit contact"
             )
         given = loaded.transformer.state_dict()
         try:
@@ -358,7 +358,7 @@ class Trainer:
             return save_adapter(
                 self.weights.worker, folder, weights=averages, card=card, control=self.control
             )
-        # what `fit-contact` put there stays
+        # what `fit contact` put there stays
         mine = folder / OBJECT_MOTION_FOLDER
         parts = TrainedModel(
             transformer=self.weights.averaged(),

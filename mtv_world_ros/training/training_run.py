@@ -157,7 +157,7 @@ def check_recording(recording: Recording, robot: RobotModel) -> None:
         if share > _MOST_FROZEN:
             raise EpisodeError(
                 f"view '{view}': {share:.0%} of the frames in which joints move are the same as "
-                'the one before: frozen, or no view of this robot (see mtv-world doctor)'
+                'the one before: frozen, or no view of this robot (see mtv-world check)'
             )
 
 
@@ -174,7 +174,7 @@ def _check_arm_is_seen(recording: Recording, robot: RobotModel) -> None:
             raise EpisodeError(
                 f"view '{camera.view}' never sees the arm, by its calibration: no joint is ever "
                 'in the picture; leave the view out with --views, or calibrate it anew '
-                '(mtv-world calibrate-camera)'
+                '(mtv-world fit camera)'
             )
 
 

@@ -187,7 +187,7 @@ def _judged(camera: CameraModel, found: _Found) -> CameraFit:
     if not np.isfinite(found.offset):
         text = (
             f"camera '{camera.view}' does not show the arm where joint states and calibration put "
-            'it, nor near; calibrate it again (mtv-world calibrate-camera), see mtv-world doctor'
+            'it, nor near; calibrate it again (mtv-world fit camera), see mtv-world check'
         )
         return CameraFit(view=camera.view, status='refused', T_given_found=np.eye(4), text=text)
     off_m = float(np.linalg.norm(found.T[:3, 3]))
@@ -201,7 +201,7 @@ def _judged(camera: CameraModel, found: _Found) -> CameraFit:
     elif found.offset < _LARGE:
         status, text = 'corrected', f'{says}; corrected for this episode'
     else:
-        status, text = 'refused', f'{says}; calibrate it again (mtv-world calibrate-camera)'
+        status, text = 'refused', f'{says}; calibrate it again (mtv-world fit camera)'
     return CameraFit(
         view=camera.view,
         status=status,

@@ -4,7 +4,7 @@ import shutil
 import pytest
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.cli.calibrate import result_kinds
+from mtv_world_ros.cli.fits.success import result_kinds
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, PolicyError
 from mtv_world_ros.data import splits
 from mtv_world_ros.data.episode_reader import list_episodes
@@ -139,7 +139,7 @@ def test_episodes_that_are_called_alike_have_kinds_of_their_own(policy_dataset):
     ('command', 'what'),
     [
         (['train', '{set}', '--out', '{out}'], 'training'),
-        (['calibrate', 'bundled', '{set}', '--no-store', '--out', '{out}'], 'calibration'),
+        (['fit', 'success', 'bundled', '{set}', '--no-store', '--out', '{out}'], 'calibration'),
     ],
 )
 def test_a_test_kind_in_a_training_or_calibration_set_is_refused(

@@ -33,6 +33,7 @@ import pytest
 import yaml
 
 from mtv_world_ros.cli import main, make_parser
+from mtv_world_ros.cli.commands import COMMANDS
 from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.simulation.opengl import missing_opengl
 
@@ -176,15 +177,16 @@ BLOCKS = [block for page, text in TEXTS.items() for block in blocks_of(page, tex
 
 
 def parsers() -> dict[str, argparse.ArgumentParser]:
-    """Parsers of `mtv-world`'s commands; none takes abbreviations here."""
-    (commands,) = (
-        action
-        for action in make_parser()._actions
-        if isinstance(action, argparse._SubParsersAction)
-    )
-    for parser in commands.choices.values():
+    """Parsers of `mtv-world`'s commands, of one word or two; none takes abbreviations here."""
+    found = {}
+    for name in COMMANDS:
+        parser = make_parser(name)
+        for word in name.split():
+            (action,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+            parser = action.choices[word]
         parser.allow_abbrev = False
-    return dict(commands.choices)
+        found[name] = parser
+    return found
 
 
 def check(block: Block) -> None:
@@ -212,11 +214,12 @@ def check_mtv_world(words: Sequence[str]) -> bool:
     if words[0] == '--help':
         return True
     known = parsers()
-    assert words[0] in known, f"'mtv-world {words[0]}' is none of {list(known)}"
+    name = next((n for n in (words[0], ' '.join(words[:2])) if n in known), '')
+    assert name, f"'mtv-world {' '.join(words[:2])}' is none of {list(known)}"
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
-            arguments, more = known[words[0]].parse_known_args(words[1:])
+            arguments, more = known[name].parse_known_args(words[len(name.split()) :])
     except SystemExit as end:
         assert end.code == 0, said.getvalue()
         return True
@@ -424,14 +427,14 @@ def test_options_and_commands_in_the_text_exist(page):
     for code in _CODE.findall(TEXTS[page]):
         words = code.split()
         if words[:1] == ['mtv-world'] and len(words) > 1 and words[1].isidentifier():
-            assert words[1] in parsers(), code
+            assert words[1] in {name.split()[0] for name in COMMANDS}, code
         options = {word for word in re.findall(r'--[a-z][\w-]*', code) if words[0] != 'pip'}
         assert options <= known | FOREIGN_OPTIONS, code
 
 
-def test_every_command_is_in_the_readme():
-    for command in parsers():
-        assert re.search(rf'`(mtv-world )?{command}[ `]', TEXTS['README.md']), command
+@pytest.mark.parametrize('command', COMMANDS)
+def test_every_command_stands_on_a_page(command):
+    assert any(f'mtv-world {command}' in text for text in TEXTS.values())
 
 
 # --- running ------------------------------------------------------------------------------------

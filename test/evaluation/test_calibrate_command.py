@@ -1,4 +1,4 @@
-"""What `mtv-world calibrate` ends with where an episode cannot be scored."""
+"""What `mtv-world fit success` ends with where an episode cannot be scored."""
 
 import json
 import shutil
@@ -41,7 +41,7 @@ def test_an_episode_that_fails_is_named_and_in_the_exit_status(tmp_path, capsys)
     copy(data / 'good0', 'success')
     garbage = shutil.copytree(DEMO, data / 'garbage')
     next(garbage.glob('*.mcap')).write_bytes(b'no recording at all')
-    command = ['calibrate', 'bundled', str(data), '--out', str(out), '--no-store']
+    command = ['fit', 'success', 'bundled', str(data), '--out', str(out), '--no-store']
     command += ['--steps', '1', '--threads', '1', '--segmenter', 'colour']
     assert main(command) == 1
     first, last = (line for line in capsys.readouterr().err.splitlines() if 'mtv-world: ' in line)

@@ -401,7 +401,7 @@ def test_broken_calibration_says_what_to_do(tmp_path, change, message):
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
     with pytest.raises(CheckpointError, match=message) as caught:
         load_fit(tmp_path, Calibration)
-    assert 'mtv-world calibrate' in str(caught.value)
+    assert 'mtv-world fit success' in str(caught.value)
 
 
 def test_calibration_does_not_hold_for_another_segmenter_or_task():

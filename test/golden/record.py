@@ -190,8 +190,8 @@ def _policies() -> list[str]:
 def helps() -> dict[str, list[str]]:
     """The help of every command."""
     whole = command('--help')
-    names = re.findall(r'^ {4}([a-z-]+)(?: |$)', whole, re.MULTILINE)
-    shown = {'': whole} | {name: command(name, '--help') for name in names}
+    names = import_module(f'{PACKAGE}.cli.commands').COMMANDS
+    shown = {'': whole} | {name: command(*name.split(), '--help') for name in names}
     return {name: text.split('\n') for name, text in shown.items()}
 
 

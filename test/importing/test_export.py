@@ -20,14 +20,15 @@ DEMO = share_path('resource', 'demo_episode')
 @pytest.fixture(scope='module')
 def exported(tmp_path_factory):
     out = tmp_path_factory.mktemp('exported') / 'dataset'
-    assert main(['export-dataset', str(DEMO), '--out', str(out), '--fps', '5']) == 0
+    assert main(['export', 'lerobot', str(DEMO), '--out', str(out), '--fps', '5']) == 0
     return out
 
 
 def test_what_was_exported_is_imported_again(exported, tmp_path):
     mapping = str(exported / 'meta/mapping.yaml')
     assert (
-        main(['import-dataset', str(exported), '--mapping', mapping, '--out', str(tmp_path)]) == 0
+        main(['import', 'lerobot', str(exported), '--mapping', mapping, '--out', str(tmp_path)])
+        == 0
     )
     (path,) = tmp_path.glob('episode_*')
     before, after = read_episode(DEMO), read_episode(path)
@@ -72,15 +73,17 @@ def test_metadata_and_statistics_are_of_the_rows(exported):
 
 
 def test_nothing_is_replaced_or_left_behind(exported, tmp_path, capsys):
-    assert main(['export-dataset', str(DEMO), '--out', str(exported)]) == 1
-    assert main(['export-dataset', str(tmp_path), '--out', str(tmp_path / 'new')]) == 1
+    assert main(['export', 'lerobot', str(DEMO), '--out', str(exported)]) == 1
+    assert main(['export', 'lerobot', str(tmp_path), '--out', str(tmp_path / 'new')]) == 1
     assert 'there is no episode to export' in capsys.readouterr().err
-    assert main(['export-dataset', str(DEMO), '--out', str(tmp_path / 'new'), '--fps', '0']) == 1
+    assert (
+        main(['export', 'lerobot', str(DEMO), '--out', str(tmp_path / 'new'), '--fps', '0']) == 1
+    )
     assert not list(tmp_path.iterdir())
 
 
 def test_an_episode_of_another_robot_is_named(tmp_path, capsys):
-    command = ['export-dataset', str(DEMO), '--robot', 'franka', '--out', str(tmp_path / 'out')]
+    command = ['export', 'lerobot', str(DEMO), '--robot', 'franka', '--out', str(tmp_path / 'out')]
     assert main(command) == 1
     assert f"mtv-world: episode '{DEMO}': joints ['panda_joint1', " in capsys.readouterr().err
 
@@ -88,11 +91,11 @@ def test_an_episode_of_another_robot_is_named(tmp_path, capsys):
 def test_small_png_images_are_imported_again_without_loss(tmp_path):
     out = tmp_path / 'dataset'
     wanted = ['--fps', '5', '--size', '95x72', '--images']
-    assert main(['export-dataset', str(DEMO), '--out', str(out), *wanted]) == 0
+    assert main(['export', 'lerobot', str(DEMO), '--out', str(out), *wanted]) == 0
     assert not (out / 'videos').exists()
     mapping = str(out / 'meta/mapping.yaml')
     again = tmp_path / 'again'
-    assert main(['import-dataset', str(out), '--mapping', mapping, '--out', str(again)]) == 0
+    assert main(['import', 'lerobot', str(out), '--mapping', mapping, '--out', str(again)]) == 0
     (path,) = again.glob('episode_*')
     before, after = read_episode(DEMO), read_episode(path)
     for view in before.views:
@@ -109,13 +112,13 @@ def test_small_png_images_are_imported_again_without_loss(tmp_path):
 @pytest.mark.parametrize('size', ['96', '0x72', '96x', 'small'])
 def test_a_wrong_size_is_refused(size, tmp_path, capsys):
     out = str(tmp_path / 'new')
-    assert main(['export-dataset', str(DEMO), '--out', out, '--size', size]) == 1
+    assert main(['export', 'lerobot', str(DEMO), '--out', out, '--size', size]) == 1
     assert f"--size is '{size}'; it must be WIDTHxHEIGHT" in capsys.readouterr().err
 
 
 def test_several_paths_are_one_data_set(tmp_path, capsys):
     out = tmp_path / 'set'
-    command = ['export-dataset', str(DEMO), str(DEMO), '--out', str(out), '--fps', '2']
+    command = ['export', 'lerobot', str(DEMO), str(DEMO), '--out', str(out), '--fps', '2']
     assert main([*command, '--size', '64x48', '--images']) == 0
     assert '2 episodes' in capsys.readouterr().out
     assert len(LeRobotDataset(out).episodes) == 2

@@ -90,7 +90,7 @@ def test_boxes_teach_from_the_frame_in_which_they_are_drawn(
 ):
     """`--objects`, and the page with the first frame of each episode."""
     mapping, page = make_mapping(), tmp_path / 'boxes.html'
-    command = ['import-dataset', str(datasets(kind)), '--mapping', str(mapping), '--out']
+    command = ['import', 'lerobot', str(datasets(kind)), '--mapping', str(mapping), '--out']
     assert main([*command, str(tmp_path / 'out'), '--click', str(page)]) == 0
     assert page.read_text().count('data-seconds="0.0"') == 2 and not (tmp_path / 'out').exists()
     box = [0.3, 10, 10, 30, 30]
@@ -169,7 +169,7 @@ def test_a_failed_episode_is_named_and_the_rest_goes_on(
 ):
     root, video, data = broken_dataset
     out, mapping = tmp_path / 'out', make_mapping()
-    arguments = ['import-dataset', str(root), '--mapping', str(mapping), '--out', str(out)]
+    arguments = ['import', 'lerobot', str(root), '--mapping', str(mapping), '--out', str(out)]
     assert main(arguments) == 1
     said = capsys.readouterr()
     assert '1 made, 0 kept, 1 failed' in said.out
@@ -288,7 +288,7 @@ def test_a_stale_video_index_is_the_reason(is_there, datasets, make_mapping, tmp
 
 @pytest.mark.slow
 def test_bars_with_the_time_left_are_drawn_on_a_terminal_only(datasets, make_mapping, tmp_path):
-    command = ['import-dataset', str(datasets('v2.1')), '--mapping', str(make_mapping())]
+    command = ['import', 'lerobot', str(datasets('v2.1')), '--mapping', str(make_mapping())]
     words = [sys.executable, '-m', 'mtv_world_ros.cli', *command]
     main_end, process_end = os.openpty()
     termios.tcsetwinsize(process_end, (24, 100))
@@ -341,7 +341,7 @@ def test_columns_that_are_named_like_the_joints_need_no_mapping(
     robot = robot.replace('joint: gripper', 'joint: gripper.pos').replace('2}', '200}')
     robot = robot.replace('upper: 0.04', 'upper: 200').replace('lower: -2', 'lower: -200')
     (folder / 'robot.yaml').write_text(robot)
-    command = ['import-dataset', str(datasets('v3.0')), '--out', str(tmp_path / 'out')]
+    command = ['import', 'lerobot', str(datasets('v3.0')), '--out', str(tmp_path / 'out')]
     assert main(command) == 1
     assert 'give --mapping' in capsys.readouterr().err
     files = ['--robot', str(folder / 'robot.yaml')]

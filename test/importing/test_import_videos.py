@@ -1,4 +1,4 @@
-"""`mtv-world import-videos`: frames, joints, poses and what is wrong, against what was written."""
+"""`mtv-world import videos`: frames, joints, poses and what is wrong, against what was written."""
 
 import csv
 import json
@@ -70,11 +70,11 @@ def test_frame_k_belongs_to_row_k_and_the_camera_is_marked(tmp_path, franka, pos
     write_raw(tmp_path / 'raw', 'b', positions)
     file = mapping(tmp_path / 'm.yaml', franka, range(7), 7)
     out = tmp_path / 'data'
-    assert main(['import-videos', str(tmp_path / 'raw'), '--mapping', str(file),
+    assert main(['import', 'videos', str(tmp_path / 'raw'), '--mapping', str(file),
                  '--out', str(out)]) == 0  # fmt: skip
     said = capsys.readouterr()
     assert 'a: 2.2 s; frames: front 12' in said.out and '2 made' in said.out
-    unknown = "a, b: view 'front': pose and intrinsics not known: mtv-world calibrate-camera "
+    unknown = "a, b: view 'front': pose and intrinsics not known: mtv-world fit camera "
     assert f'{unknown}{out} --view front --click points.html' in said.err  # once for both
     episode = read_episode(out / 'b', robot=franka, unknown_mount=franka.base_link)
     assert episode.unknown == {'front': 'pose and intrinsics'}
@@ -87,7 +87,7 @@ def test_frame_k_belongs_to_row_k_and_the_camera_is_marked(tmp_path, franka, pos
     start, first = episode.trajectories[0]
     assert start == states.stamps_ns[0]
     np.testing.assert_allclose(first.positions[0], positions[1], atol=1e-9)
-    assert main(['import-videos', str(tmp_path / 'raw'), '--mapping', str(file),
+    assert main(['import', 'videos', str(tmp_path / 'raw'), '--mapping', str(file),
                  '--out', str(out)]) == 0  # fmt: skip
     assert '0 made, 2 kept' in capsys.readouterr().out
 
@@ -96,7 +96,7 @@ def test_a_csv_file_has_times_and_names(tmp_path, franka, positions):
     write_raw(tmp_path / 'raw', 'a', positions, as_csv=True)
     file = mapping(tmp_path / 'm.yaml', franka, [f'q{k}' for k in range(7)], 'grip', fps=None,
                    time='t', rows='rows/{name}.csv', instruction='wave')  # fmt: skip
-    assert main(['import-videos', str(tmp_path / 'raw'), '--mapping', str(file),
+    assert main(['import', 'videos', str(tmp_path / 'raw'), '--mapping', str(file),
                  '--out', str(tmp_path / 'data')]) == 0  # fmt: skip
     episode = read_episode(tmp_path / 'data' / 'a', with_cameras=False)
     np.testing.assert_allclose(episode.joint_states.positions, positions, atol=1e-9)
@@ -116,7 +116,7 @@ def test_tool_poses_become_joints_and_what_is_left_is_told(tmp_path, franka, pos
                             'link': 'panda_hand'}},
     }  # fmt: skip
     file = mapping(tmp_path / 'm.yaml', franka, range(7), 7, state=state)
-    command = ['import-videos', str(tmp_path / 'raw'), '--mapping', str(file)]
+    command = ['import', 'videos', str(tmp_path / 'raw'), '--mapping', str(file)]
     assert main([*command, '--out', str(tmp_path / 'data')]) == 0
     assert '0 of 12 poses out of reach' in capsys.readouterr().err
     found = read_episode(tmp_path / 'data' / 'a', with_cameras=False).joint_states.positions
@@ -153,7 +153,7 @@ def yaw_pitch_roll(R):
 def test_what_is_wrong_is_named(tmp_path, franka, positions, capsys, change, said):
     write_raw(tmp_path / 'raw', 'a', positions)
     file = mapping(tmp_path / 'm.yaml', franka, range(7), 7, **change)
-    assert main(['import-videos', str(tmp_path / 'raw'), '--mapping', str(file),
+    assert main(['import', 'videos', str(tmp_path / 'raw'), '--mapping', str(file),
                  '--out', str(tmp_path / 'data')]) == 1  # fmt: skip
     assert said in capsys.readouterr().err
 
@@ -161,7 +161,7 @@ def test_what_is_wrong_is_named(tmp_path, franka, positions, capsys, change, sai
 def test_a_video_that_is_shorter_is_told(tmp_path, franka, positions, capsys):
     write_raw(tmp_path / 'raw', 'a', positions, frames=ROWS - 3)
     file = mapping(tmp_path / 'm.yaml', franka, range(7), 7)
-    assert main(['import-videos', str(tmp_path / 'raw'), '--mapping', str(file),
+    assert main(['import', 'videos', str(tmp_path / 'raw'), '--mapping', str(file),
                  '--out', str(tmp_path / 'data')]) == 0  # fmt: skip
     assert '9 frames and 12 rows' in capsys.readouterr().err
     episode = read_episode(tmp_path / 'data' / 'a', with_cameras=False)

@@ -18,7 +18,7 @@ def test_lerobot_reads_an_export(tmp_path, monkeypatch):
     module = pytest.importorskip('lerobot.datasets.lerobot_dataset', reason=reason)
     episode, out = str(share_path('resource', 'demo_episode')), tmp_path / 'out'
     size = 'x'.join(map(str, SIZE))
-    assert main(['export-dataset', episode, '--out', str(out), '--images', '--size', size]) == 0
+    assert main(['export', 'lerobot', episode, '--out', str(out), '--images', '--size', size]) == 0
     earlier = {'observation.images.low': [-0.1, 0.0], 'action': [0.0, 0.1, 0.2]}
     data = module.LeRobotDataset('local/demo', root=out, delta_timestamps=earlier)
     assert (len(data), data.num_episodes, data.fps) == (NUM_ROWS, 1, 10)

@@ -68,7 +68,7 @@ def boxes(folder, rows=((0.0, 28, 58, 56, 82),), *, view='front', recording='a',
 
 
 def import_videos(folder, out='data', *more):
-    return main(['import-videos', str(folder / 'raw'), '--mapping', str(folder / 'lab.yaml'),
+    return main(['import', 'videos', str(folder / 'raw'), '--mapping', str(folder / 'lab.yaml'),
                  '--objects', str(folder / 'objects.yaml'),
                  '--out', str(folder / out), *more])  # fmt: skip
 
@@ -112,24 +112,24 @@ def test_other_boxes_leave_what_was_imported_with_the_first_ones(raw, capsys):
 
 
 def test_boxes_for_episodes_without_objects_leave_nothing_behind(raw, capsys):
-    main(['import-videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml'),
+    main(['import', 'videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml'),
           '--out', str(raw / 'data')])  # fmt: skip
     boxes(raw)
     assert import_videos(raw) == 1
     said = capsys.readouterr().err
-    assert 'imported without --objects' in said and f'import-bag {raw / "data"}' in said
+    assert 'imported without --objects' in said and f'import bag {raw / "data"}' in said
     assert not (raw / 'data' / 'objects.safetensors').exists()
 
 
 def test_imported_episodes_get_masks_by_a_second_import(raw, capsys):
-    """After `calibrate-camera --apply`, say: nothing has to be calibrated again."""
+    """After `fit camera --apply`, say: nothing has to be calibrated again."""
     boxes(raw)
     (raw / 'lab.yaml').write_text((raw / 'lab.yaml').read_text().replace('objects:\n- mug\n', ''))
-    main(['import-videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml'),
+    main(['import', 'videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml'),
           '--out', str(raw / 'data')])  # fmt: skip
     capsys.readouterr()
     robot = raw / 'data' / 'robot' / 'robot.yaml'
-    assert main(['import-bag', str(raw / 'data'), '--robot', str(robot), '--objects',
+    assert main(['import', 'bag', str(raw / 'data'), '--robot', str(robot), '--objects',
                  str(raw / 'objects.yaml'), '--out', str(raw / 'named')]) == 0  # fmt: skip
     said = capsys.readouterr().out
     assert 'seen: mug in front 100%' in said
@@ -177,7 +177,7 @@ def test_masks_by_other_examples_are_told_apart_by_doctor(raw, capsys):
     shutil.rmtree(raw / 'one' / 'b')
     (raw / 'two' / 'b').rename(raw / 'one' / 'b')
     capsys.readouterr()
-    main(['doctor', str(raw / 'one'), '--robot', str(raw / 'one' / 'robot' / 'robot.yaml'),
+    main(['check', str(raw / 'one'), '--robot', str(raw / 'one' / 'robot' / 'robot.yaml'),
           '--out', str(raw / 'report')])  # fmt: skip
     said = capsys.readouterr().out
     names = re.search(
@@ -192,7 +192,7 @@ def test_doctor_names_an_object_that_is_hardly_seen(raw, capsys):
     (raw / 'lab.yaml').write_text((raw / 'lab.yaml').read_text().replace('- mug', '- red thing'))
     assert import_videos(raw) == 0
     capsys.readouterr()
-    main(['doctor', str(raw / 'data' / 'a'), '--robot', str(raw / 'data/robot/robot.yaml'),
+    main(['check', str(raw / 'data' / 'a'), '--robot', str(raw / 'data/robot/robot.yaml'),
           '--out', str(raw / 'report')])  # fmt: skip
     assert "object 'red thing' is found in 0% of the frames" in capsys.readouterr().out
 
@@ -216,7 +216,7 @@ HTMLAnchorElement.prototype.click = function() { window.saved = this.href; };
 @pytest.fixture
 def page(raw, capsys):
     file = raw / 'boxes.html'
-    assert main(['import-videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml'),
+    assert main(['import', 'videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml'),
                  '--out', str(raw / 'data'), '--click', str(file)]) == 0  # fmt: skip
     said = capsys.readouterr().out
     assert f'page: {file}' in said and 'nothing was imported' in said
@@ -259,13 +259,13 @@ def test_what_it_saves_is_what_the_import_takes(page, raw, capsys):
     assert row == pytest.approx((0, 28, 58, 56, 82), abs=0.2)
     assert drawn['front']['b'].keys() == {'cup'}
     assert drawn['front']['b']['cup'][0][3:] == (160, 120)
-    command = ['import-videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml')]
+    command = ['import', 'videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml')]
     assert main([*command, '--objects', str(file), '--out', str(raw / 'data')]) == 0
     assert 'object mug: found by its colours' in capsys.readouterr().out
 
 
 def test_the_page_and_the_file_at_once_are_refused(raw, capsys):
-    command = ['import-videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml')]
+    command = ['import', 'videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml')]
     more = ['--click', str(raw / 'p.html'), '--objects', str(raw / 'o.yaml')]
     assert main([*command, '--out', str(raw / 'data'), *more]) == 1
     assert 'give one' in capsys.readouterr().err and not (raw / 'p.html').exists()

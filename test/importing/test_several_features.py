@@ -143,7 +143,7 @@ def test_split_features_need_no_mapping_where_columns_are_named_like_joints(
     root, folder = split(copy(), parts), make_mapping().parent
     files = ['--robot', str(folder / 'robot.yaml'), '--calibration',
              str(folder / 'calibration.yaml'), '--out', str(tmp_path / 'out')]  # fmt: skip
-    assert main(['import-dataset', str(root), *files]) == 0
+    assert main(['import', 'lerobot', str(root), *files]) == 0
     check(tmp_path / 'out/episode_000000', 0, 12)
 
 

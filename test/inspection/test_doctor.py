@@ -1,4 +1,4 @@
-"""`mtv-world doctor` on the bundled episode: it passes, and each thing broken in it is found."""
+"""`mtv-world check` on the bundled episode: it passes, and each thing broken in it is found."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -63,7 +63,7 @@ def texts(section):
 
 @pytest.mark.slow
 def test_the_command_passes_a_good_recording_and_writes_report_and_pictures(tmp_path, capsys):
-    status = main(['doctor', str(share_path('resource', 'demo_episode')), '--out', str(tmp_path)])
+    status = main(['check', str(share_path('resource', 'demo_episode')), '--out', str(tmp_path)])
     report = (tmp_path / 'report.md').read_text()
     assert status == 0, report
     assert report.startswith('# ok: demo_episode')

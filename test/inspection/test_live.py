@@ -1,4 +1,4 @@
-"""`mtv-world doctor --live` records what a player publishes, over the real middleware."""
+"""`mtv-world check --live` records what a player publishes, over the real middleware."""
 
 import os
 import signal

@@ -231,7 +231,7 @@ def test_the_command_prints_what_became_of_every_part(videox, tmp_path, capsys):
     sections = {'transformer': TRANSFORMER, 'autoencoder': AUTOENCODER, 'scheduler': SCHEDULER}
     preset.write_text(yaml.safe_dump({**sections, 'video': video}))
     out = tmp_path / 'out'
-    assert main(['import-weights', str(videox), '--preset', str(preset), '--out', str(out)]) == 0
+    assert main(['import', 'wan', str(videox), '--preset', str(preset), '--out', str(out)]) == 0
     printed = capsys.readouterr().out
     assert 'transformer: 89 tensors, 0.0 M parameters (BF16)' in printed
     assert 'new, zero: view_embedding' in printed
@@ -240,5 +240,5 @@ def test_the_command_prints_what_became_of_every_part(videox, tmp_path, capsys):
         'The robotic arm picks up objects'
     )
     (videox / WEIGHTS).unlink()
-    assert main(['import-weights', str(videox), '--out', str(tmp_path / 'other')]) == 1
+    assert main(['import', 'wan', str(videox), '--out', str(tmp_path / 'other')]) == 1
     assert 'holds no transformer: expected a folder transformer/' in capsys.readouterr().err

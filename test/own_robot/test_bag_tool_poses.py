@@ -1,4 +1,4 @@
-"""`mtv-world import-bag` of recordings whose commands are poses of the tool."""
+"""`mtv-world import bag` of recordings whose commands are poses of the tool."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def run(folder, robot, positions, more, **tool):
     bag = record(folder / 'wave', robot, bag_cameras(), positions, frames=frames, more=more)
     mapping = {**MAPPING, 'tools': {'arm': {'topic': 'target', **tool}}}
     (folder / 'bag.yaml').write_text(yaml.safe_dump(mapping))
-    command = ['import-bag', str(bag), '--topics', str(folder / 'bag.yaml')]
+    command = ['import', 'bag', str(bag), '--topics', str(folder / 'bag.yaml')]
     status = main([*command, '--robot', str(robot.file), '--out', str(folder / 'out')])
     return status, folder / 'out' / 'wave'
 

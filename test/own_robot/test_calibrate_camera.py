@@ -1,4 +1,4 @@
-"""`mtv-world calibrate-camera` against the pose that the pictures were drawn with."""
+"""`mtv-world fit camera` against the pose that the pictures were drawn with."""
 
 from dataclasses import replace
 import shutil
@@ -33,7 +33,7 @@ def test_a_fixed_camera_is_found_from_a_guess_in_a_part_of_the_recording(tmp_pat
         recorded_as={'door': guess},
     )  # fmt: skip
     out = tmp_path / 'found.yaml'
-    command = ['calibrate-camera', str(path), '--view', 'door', '--robot', str(robot.file)]
+    command = ['fit', 'camera', str(path), '--view', 'door', '--robot', str(robot.file)]
     assert main([*command, '--between', '0,4', '--out', str(out)]) == 0
     printed = capsys.readouterr().out
     assert 'standard error' in printed and 'the guess was' in printed
@@ -130,7 +130,7 @@ def wrist(tmp_path_factory):
 def test_a_camera_on_the_arm_is_found(wrist, tmp_path, capsys, options):
     robot, palm, path = wrist
     out = tmp_path / 'found.yaml'
-    command = ['calibrate-camera', str(path), '--view', 'palm', '--robot', str(robot.file)]
+    command = ['fit', 'camera', str(path), '--view', 'palm', '--robot', str(robot.file)]
     assert main([*command, *options, '--out', str(out)]) == 0
     assert 'points of the scene tracked' in capsys.readouterr().out
     found = load_calibration(out)['palm']
@@ -146,7 +146,7 @@ def test_a_camera_without_any_calibration_is_found(wrist, tmp_path):
     shutil.copytree(path, bag)
     (bag / 'calibration.yaml').unlink()
     out = tmp_path / 'found.yaml'
-    command = ['calibrate-camera', str(bag), '--view', 'palm', '--robot', str(robot.file)]
+    command = ['fit', 'camera', str(bag), '--view', 'palm', '--robot', str(robot.file)]
     assert main([*command, '--out', str(out)]) == 1  # no guess in the recording
     assert main([*command, '--no-guess', '--mount-link', 'hand', '--out', str(out)]) == 0
     mm, degrees = difference(
@@ -157,7 +157,7 @@ def test_a_camera_without_any_calibration_is_found(wrist, tmp_path):
 
 def test_a_guess_is_of_the_recorded_link(wrist, tmp_path, capsys):
     robot, _, path = wrist
-    command = ['calibrate-camera', str(path), '--view', 'palm', '--robot', str(robot.file)]
+    command = ['fit', 'camera', str(path), '--view', 'palm', '--robot', str(robot.file)]
     assert main([*command, '--mount-link', 'jib', '--out', str(tmp_path / 'a.yaml')]) == 1
     assert 'give --no-guess' in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""`mtv-world doctor FOLDER`: each kind of bad recording is named, with its episode."""
+"""`mtv-world check FOLDER`: each kind of bad recording is named, with its episode."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -271,7 +271,7 @@ def test_the_command_writes_a_table_and_a_picture(folder, tmp_path, capsys):
     few.mkdir()
     for name in ('good0', 'frozen'):
         (few / name).symlink_to(data / name)
-    command = ['doctor', str(few), '--robot', str(robot.file), '--out', str(tmp_path / 'report')]
+    command = ['check', str(few), '--robot', str(robot.file), '--out', str(tmp_path / 'report')]
     assert main(command) == 1
     printed = capsys.readouterr().out
     assert 'good0' in printed and 'frozen' in printed and 'broken: see' in printed

@@ -28,7 +28,7 @@ def recorded(tmp_path_factory):
 
 
 def doctor(robot, path, out, *options):
-    return main(['doctor', str(path), '--robot', str(robot.file), '--out', str(out), *options])
+    return main(['check', str(path), '--robot', str(robot.file), '--out', str(out), *options])
 
 
 def test_links_that_move_are_those_beyond_a_joint(recorded):
@@ -59,7 +59,7 @@ def test_what_was_not_checked_has_an_exit_status_of_its_own(recorded, tmp_path, 
     shutil.copytree(robot.file.parent, tmp_path / 'crane')
     (tmp_path / 'crane' / 'meshes' / 'hand.stl').unlink()
     status = main(
-        ['doctor', str(path), '--robot', str(tmp_path / 'crane' / 'crane.yaml'), '--views', 'door']
+        ['check', str(path), '--robot', str(tmp_path / 'crane' / 'crane.yaml'), '--views', 'door']
         + ['--out', str(tmp_path)]
     )
     printed = capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""`mtv-world import-bag`: a robot's own bags, with TF, its description and no commands."""
+"""`mtv-world import bag`: a robot's own bags, with TF, its description and no commands."""
 
 from dataclasses import replace
 import re
@@ -41,7 +41,7 @@ def make_bag(robot, scene, tmp_path):
 
 def run(folder, *bags, mapping=MAPPING, more=()):
     (folder / 'bag.yaml').write_text(yaml.safe_dump(mapping))
-    command = ['import-bag', *map(str, bags), '--topics', str(folder / 'bag.yaml')]
+    command = ['import', 'bag', *map(str, bags), '--topics', str(folder / 'bag.yaml')]
     return main([*command, '--out', str(folder / 'out'), *more])
 
 
@@ -219,9 +219,7 @@ def test_bags_are_read_as_they_are_with_the_mapping(make_bag, tmp_path, capsys):
     assert run(tmp_path, bag) == 0
     mapping = tmp_path / 'out' / 'mapping.yaml'
     assert load_bag_mapping(mapping).robot == str(tmp_path / 'out' / 'robot' / 'robot.yaml')
-    status = main(
-        ['doctor', str(bag), '--topics', str(mapping), '--out', str(tmp_path / 'doctor')]
-    )
+    status = main(['check', str(bag), '--topics', str(mapping), '--out', str(tmp_path / 'doctor')])
     printed = capsys.readouterr().out
     assert status == 3, printed  # the description has a mesh that no bag carries
     assert 'not checked' in printed and 'hand.stl' in printed

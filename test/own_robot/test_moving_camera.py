@@ -69,7 +69,7 @@ def truth():
 
 def imported(bag, *more):
     out = bag.parent / 'out'
-    assert main(['import-bag', str(bag), '--topics', str(bag.parent / 'bag.yaml'), '--out',
+    assert main(['import', 'bag', str(bag), '--topics', str(bag.parent / 'bag.yaml'), '--out',
                  str(out), *more]) == 0  # fmt: skip
     return out / 'wave'
 
@@ -129,7 +129,7 @@ def test_a_gap_in_tf_is_named(robot, tmp_path, bag, capsys):
     poses = cart_poses()
     poses[8:20, :3, :3] = np.nan  # no poses: twelve images at 10 Hz
     broken = record_cart(tmp_path / 'gap', robot, poses)
-    command = ['import-bag', str(broken), '--topics', str(tmp_path / 'bag.yaml')]
+    command = ['import', 'bag', str(broken), '--topics', str(tmp_path / 'bag.yaml')]
     assert main([*command, '--out', str(tmp_path / 'out')]) == 1
     assert (
         "no transform from 'plinth' to 'ceiling' within 0.5 s before and after 12 of 30 images"
@@ -148,10 +148,10 @@ def test_a_camera_on_a_calibration_file_does_not_move(bag, robot):
 def test_what_takes_one_pose_of_a_camera_refuses_it(bag, robot, capsys, tmp_path):
     path = imported(bag)
     out = str(tmp_path / 'cameras.yaml')
-    command = ['calibrate-camera', str(path), '--view', 'door', '--robot', str(robot.file)]
+    command = ['fit', 'camera', str(path), '--view', 'door', '--robot', str(robot.file)]
     assert main([*command, '--out', out]) == 1
     assert "the camera of view 'door' moves by itself" in capsys.readouterr().err
-    command = ['export-dataset', str(path), '--robot', str(robot.file), '--fps', str(FPS)]
+    command = ['export', 'lerobot', str(path), '--robot', str(robot.file), '--fps', str(FPS)]
     assert main([*command, '--out', str(tmp_path / 'set')]) == 1
     assert "the camera of view 'door' moves by itself" in capsys.readouterr().err
 
@@ -189,7 +189,7 @@ def test_without_tf_the_joint_is_named(panning, tmp_path, capsys):
         make_positions(1.0),
         recorded_as={'door': on_ceiling},
     )
-    command = ['doctor', str(path), '--robot', str(panning.file), '--out', str(tmp_path / 'out')]
+    command = ['check', str(path), '--robot', str(panning.file), '--out', str(tmp_path / 'out')]
     assert main(command) == 1
     printed = capsys.readouterr().err
     assert "the camera of view 'door' is on link 'ceiling', which joint 'pan' moves" in printed

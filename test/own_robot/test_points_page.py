@@ -29,7 +29,7 @@ def page(tmp_path, capsys):
         write_episode(tmp_path / 'data' / f'e{number}', robot, {'door': make_cameras()['door']},
                       make_positions(2.0, seed=number))  # fmt: skip
     file = tmp_path / 'points.html'
-    command = ['calibrate-camera', str(tmp_path / 'data'), '--view', 'door']
+    command = ['fit', 'camera', str(tmp_path / 'data'), '--view', 'door']
     assert main([*command, '--robot', str(robot.file), '--click', str(file)]) == 0
     assert f'page: {file}' in capsys.readouterr().out
     return file

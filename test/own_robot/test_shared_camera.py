@@ -1,4 +1,4 @@
-"""`mtv-world calibrate-camera` of several recordings against the cameras they were drawn with."""
+"""`mtv-world fit camera` of several recordings against the cameras they were drawn with."""
 
 from dataclasses import replace
 import re
@@ -73,7 +73,7 @@ def test_a_turned_camera_is_another_place_and_its_turn_is_measured(recorded):
 @pytest.mark.slow
 def test_poses_by_place_and_the_focal_length_are_found_from_a_guess(recorded, tmp_path, capsys):
     robot, true, paths = recorded
-    command = ['calibrate-camera', *map(str, paths), '--view', 'door', '--robot', str(robot.file)]
+    command = ['fit', 'camera', *map(str, paths), '--view', 'door', '--robot', str(robot.file)]
     out = tmp_path / 'door.yaml'
     assert main([*command, '--focal', 'estimate', '--out', str(out)]) == 0
     printed = capsys.readouterr().out
@@ -94,7 +94,7 @@ def test_seen_points_start_a_search_where_nothing_is_known(recorded, tmp_path, c
     for path in paths:
         (path / 'calibration.yaml').rename(path / 'guess.yaml')
     try:
-        with pytest.raises(CalibrationError, match='calibrate-camera'):
+        with pytest.raises(CalibrationError, match='fit camera'):
             read_episode(paths[0])
         rows = {}
         for number, path in enumerate(paths):
@@ -104,7 +104,7 @@ def test_seen_points_start_a_search_where_nothing_is_known(recorded, tmp_path, c
             rows[path.name] = [[k / 10, *seen[k].tolist()] for k in (5, 20, 35)]
         file = tmp_path / 'points.yaml'
         file.write_text(yaml.safe_dump({'door': rows}))
-        command = ['calibrate-camera', str(data), '--view', 'door', '--robot', str(robot.file)]
+        command = ['fit', 'camera', str(data), '--view', 'door', '--robot', str(robot.file)]
         more = ['--points', str(file), '--focal', 'estimate', '--apply']
         assert main([*command, *more, '--out', str(tmp_path / 'seen.yaml')]) == 0
         within = re.search(r'within ([\d.]+) px', capsys.readouterr().out)
@@ -132,7 +132,7 @@ def test_a_seen_point_that_contradicts_the_others_is_named(is_wrong, recorded, t
         rows[path.name] = [[k / 10, *seen[k].tolist()] for k in (3, 11, 19, 27, 35)]
     file = tmp_path / 'points.yaml'
     file.write_text(yaml.safe_dump({'door': rows}))
-    command = ['calibrate-camera', *map(str, paths), '--view', 'door', '--robot', str(robot.file)]
+    command = ['fit', 'camera', *map(str, paths), '--view', 'door', '--robot', str(robot.file)]
     more = ['--points', str(file), '--focal', 'estimate', '--out', str(tmp_path / 'door.yaml')]
     assert main([*command, *more]) == 0
     printed = capsys.readouterr().out
@@ -169,7 +169,7 @@ def test_a_wide_lens_that_bends_is_estimated(is_estimated, tmp_path, capsys, mon
         rows[path.name] = [[k / 10, *seen[k].tolist()] for k in inside]
     file, out = tmp_path / 'points.yaml', tmp_path / 'door.yaml'
     file.write_text(yaml.safe_dump({'door': rows}))
-    command = ['calibrate-camera', str(tmp_path / 'data'), '--view', 'door']
+    command = ['fit', 'camera', str(tmp_path / 'data'), '--view', 'door']
     more = ['--robot', str(robot.file), '--points', str(file), '--out', str(out)]
     assert main([*command, *more, '--focal', 'estimate']) == 0
     found = load_calibration(out)['door']
@@ -187,7 +187,7 @@ def test_a_wide_lens_that_bends_is_estimated(is_estimated, tmp_path, capsys, mon
 def test_points_that_are_none_are_named(recorded, tmp_path, capsys):
     robot, _, paths = recorded
     file = tmp_path / 'points.yaml'
-    command = ['calibrate-camera', str(paths[0]), '--view', 'door', '--robot', str(robot.file)]
+    command = ['fit', 'camera', str(paths[0]), '--view', 'door', '--robot', str(robot.file)]
     for text, said in (
         ('door: {e0: [[0, 1, 2]]}', "1 points of view 'door'; 4 or more"),
         ('door: {e0: [[0, 1]]}', 'not three numbers'),
@@ -200,7 +200,7 @@ def test_points_that_are_none_are_named(recorded, tmp_path, capsys):
 
 def test_one_focal_length_is_of_two_views_or_more(recorded, capsys):
     _, _, paths = recorded
-    assert main(['calibrate-camera', str(paths[0]), '--view', 'door', '--same-focal']) == 1
+    assert main(['fit', 'camera', str(paths[0]), '--view', 'door', '--same-focal']) == 1
     assert 'at least two views' in capsys.readouterr().err
-    assert main(['calibrate-camera', str(paths[0]), '--view', ',']) == 1
+    assert main(['fit', 'camera', str(paths[0]), '--view', ',']) == 1
     assert 'at least a view' in capsys.readouterr().err

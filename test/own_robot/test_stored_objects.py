@@ -67,7 +67,7 @@ def ask(tmp_path, monkeypatch):
 def run(bag, *more):
     folder = bag.parent
     (folder / 'bag.yaml').write_text(yaml.safe_dump({**MAPPING, 'instruction': 'tidy up'}))
-    command = ['import-bag', str(bag), '--topics', str(folder / 'bag.yaml')]
+    command = ['import', 'bag', str(bag), '--topics', str(folder / 'bag.yaml')]
     return main([*command, '--out', str(folder / 'out'), *map(str, more)])
 
 

@@ -35,22 +35,22 @@ def test_unknown_poses_and_intrinsics_are_imported_and_marked(bag, tmp_path, cap
     more = MAPPING | {'views': views}
     assert run(tmp_path, bag, mapping=more, more=['--out', str(tmp_path / 'blind')]) == 0
     printed = capsys.readouterr()
-    clicks = f'mtv-world calibrate-camera {tmp_path / "blind"} --view door --click points.html'
+    clicks = f'mtv-world fit camera {tmp_path / "blind"} --view door --click points.html'
     assert f"view 'door': pose not known: {clicks}" in printed.err
     assert "view 'palm': pose and intrinsics not known" in printed.err
     assert 'wave: 1.9 s; frames: door 20, palm 20' in printed.out
     assert 'cameras not known: door, palm' in printed.out
     episode = tmp_path / 'blind' / 'wave'
-    with pytest.raises(CalibrationError, match=rf'calibrate-camera {episode} --view door'):
+    with pytest.raises(CalibrationError, match=rf'fit camera {episode} --view door'):
         read_episode(episode)
     blind = read_episode(episode, unknown_mount='plinth')
     assert blind.unknown == {'door': 'pose', 'palm': 'pose and intrinsics'}
     assert blind.cameras['door'].K[0, 0] == 300  # of the CameraInfo, which was kept
     report = ['--out', str(tmp_path / 'report')]
     robot = str(tmp_path / 'blind' / 'robot' / 'robot.yaml')
-    assert main(['doctor', str(episode), '--robot', robot, *report]) == 3  # not checked, not ok
+    assert main(['check', str(episode), '--robot', robot, *report]) == 3  # not checked, not ok
     printed = capsys.readouterr().out
-    assert 'pose not known: mtv-world calibrate-camera FOLDER --view door' in printed
+    assert 'pose not known: mtv-world fit camera FOLDER --view door' in printed
 
 
 @pytest.mark.slow
@@ -59,7 +59,7 @@ def test_a_mapping_may_have_more_views_than_are_asked_for(bag, tmp_path, capsys)
     mapping = load_bag_mapping(tmp_path / 'out' / 'mapping.yaml')
     assert read_episode(bag, views=['door'], mapping=mapping).views == ('door',)
     asked = ['--topics', str(tmp_path / 'out' / 'mapping.yaml'), '--views', 'door']
-    main(['doctor', str(bag), *asked, '--out', str(tmp_path / 'report')])
+    main(['check', str(bag), *asked, '--out', str(tmp_path / 'report')])
     printed = capsys.readouterr()
     assert 'neither a view' not in printed.err and 'door' in printed.out
 

@@ -39,7 +39,7 @@ SMALL = {
     'train': ['--threads', '1', *TINY],
     'evaluate': ['--no-ceiling', '--actions', 'true', '--steps=1', '--threads=1', '--no-report'],
     'imagine': ['--max-chunks', '2', '--threads', '1'],
-    'fit-contact': ['--motions', '2', '--threads', '1'],
+    'fit contact': ['--motions', '2', '--threads', '1'],
 }
 #: as the page has it for a first try, from the bundled weights, and smaller
 FIRST_TRY = [
@@ -70,7 +70,7 @@ class Nod:
         )
 """
 #: exit status of `doctor`: the camera on the hand cannot be checked
-STATUS = {'doctor': 3}
+STATUS = {'check': 3}
 
 
 #: a block on the floor beside the robot [m]: its corners, and a colour that no tile has
@@ -128,9 +128,20 @@ class Node:
         return self._process.wait(60)
 
 
+def name_of(words):
+    """Name of the command of a line: one word or two."""
+    return ' '.join(words[1:3] if words[1] in ('import', 'fit', 'export') else words[1:2])
+
+
 def run_in_process(words):
     """Runs a command that talks to the node from a process of its own; returns what it said."""
-    command = [sys.executable, '-m', 'mtv_world_ros.cli', *words[1:], *SMALL.get(words[1], [])]
+    command = [
+        sys.executable,
+        '-m',
+        'mtv_world_ros.cli',
+        *words[1:],
+        *SMALL.get(name_of(words), []),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, f'{words}: {done.stdout}{done.stderr}'
     return done.stdout + done.stderr
@@ -141,7 +152,7 @@ def at_the_desk(desk, monkeypatch):
     """Commands run there, and find the policy's module."""
     monkeypatch.chdir(desk)
     monkeypatch.syspath_prepend(desk)
-    packages = [str(desk), str(PAGE.parents[0]), os.environ.get('PYTHONPATH', '')]
+    packages = [str(desk), str(PAGE.parents[1]), os.environ.get('PYTHONPATH', '')]
     monkeypatch.setenv('PYTHONPATH', os.pathsep.join(filter(None, packages)))
     monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
@@ -156,12 +167,12 @@ def of_ros(words):
 def test_the_page_leads_from_a_urdf_to_predictions(at_the_desk, capsys):
     done = []
     for words in (words for words in lines() if not of_ros(words)):
-        command = words[1]
+        command = name_of(words)
         status = main([*words[1:], *SMALL.get(command, [])])
         said = capsys.readouterr()
         assert status == STATUS.get(command, 0), f'{words}: {said.out}{said.err}'
         done.append(command)
-    assert done == ['robot', 'import-bag', 'doctor', 'train', 'evaluate', 'replay']
+    assert done == ['robot', 'import bag', 'check', 'train', 'evaluate', 'replay']
     assert (at_the_desk / 'out' / 'mine' / 'metrics.json').is_file()
 
 
@@ -215,8 +226,8 @@ def test_the_page_leads_from_videos_to_a_contact_sheet(lab, monkeypatch, capsys)
     assert len(told) <= 8
     for words in told:
         more = FIRST_TRY if words[1] == 'train' else []
-        if words[1] in ('evaluate', 'fit-contact'):
-            more = [word for word in SMALL[words[1]] if word != '--no-report']
+        if name_of(words) in ('evaluate', 'fit contact'):
+            more = [word for word in SMALL[name_of(words)] if word != '--no-report']
         status = main([*words[1:], *more])
         said = capsys.readouterr()
         assert status == 0, f'{words}: {said.out}{said.err}'

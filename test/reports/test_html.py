@@ -195,7 +195,7 @@ def test_verdict_tells_a_model_that_obeys_from_one_that_does_not(
 
 def test_report_is_made_again_without_the_model(held, page, tmp_path, capsys):
     path = tmp_path / 'again.html'
-    assert main(['report', str(held), '--out', str(path)]) == 0
+    assert main(['export', 'report', str(held), '--out', str(path)]) == 0
     assert str(path) in capsys.readouterr().out
     assert path.read_bytes() == (held / 'report.html').read_bytes()
     assert path.stat().st_size < 2_000_000
@@ -229,7 +229,7 @@ def test_folder_of_several_checkpoints_is_one_report(make_pipeline, episodes, he
 
 
 def test_folder_without_evaluation_is_an_error(tmp_path, capsys):
-    assert main(['report', str(tmp_path)]) == 1
+    assert main(['export', 'report', str(tmp_path)]) == 1
     assert 'mtv-world evaluate CHECKPOINT' in capsys.readouterr().err
     (tmp_path / 'metrics.json').write_text('{"episodes": []}')
     with pytest.raises(ConfigError, match='overall'):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from mtv_world_ros.cli.own_robot import describe
+from mtv_world_ros.cli.robot import describe
 from mtv_world_ros.core.data_types import JointTrajectory
 from mtv_world_ros.core.errors import ConfigError, RobotError, TrajectoryError
 from mtv_world_ros.importing.convert import jumps

@@ -161,7 +161,7 @@ def _read_card(folder: Path) -> Any:
 
 
 def make_calibration(folder: Path) -> None:
-    """What `mtv-world calibrate` stores."""
+    """What `mtv-world fit success` stores."""
     for name in ('success_calibration.json', 'horizon.json'):
         shutil.copy(share_path('resource', 'checkpoint', name), folder)
 

@@ -72,9 +72,9 @@ COMMANDS: dict[str, Callable[[Path, Path], list[str]]] = {
         'collect', '--task', TASK, '--episodes', '2', '--workers', '2', *SIZE,
         '--out', str(out / 'set')],
     'import-bag': lambda given, out: [
-        'import-bag', str(given / 'set'), '--robot', 'yam_bimanual', '--out', str(out / 'set')],
+        'import', 'bag', str(given / 'set'), '--robot', 'yam_bimanual', '--out', str(out / 'set')],
     'export-dataset': lambda given, out: [
-        'export-dataset', str(given / 'set'), '--out', str(out / 'dataset')],
+        'export', 'lerobot', str(given / 'set'), '--out', str(out / 'dataset')],
     'train': lambda given, out: [
         'train', str(given / 'set'), '--out', str(out / 'run'), '--dtype', 'float32',
         '--threads', '1', '--save-every', '5',
@@ -83,14 +83,14 @@ COMMANDS: dict[str, Callable[[Path, Path], list[str]]] = {
         'evaluate', 'bundled', str(given / 'set'), '--split', 'all', '--actions', 'true',
         '--no-ceiling', '--out', str(out / 'evaluation'), *ONE_STEP],
     'calibrate': lambda given, out: [
-        'calibrate', str(out / 'checkpoint'), str(given / 'copies'), '--split', 'all',
+        'fit', 'success', str(out / 'checkpoint'), str(given / 'copies'), '--split', 'all',
         '--out', str(out / 'calibration'), *ONE_STEP],
     'rank': lambda given, out: [
         'rank', '--policies', 'expert,expert-miss-0.5', '--tasks', TASK, '--episodes', '1',
         '--max-chunks', '1', '--out', str(out / 'ranking'), *ONE_STEP],
     'fit-contact': lambda given, out: [
-        'fit-contact', str(given / 'set'), '--episodes', '2', '--motions', '2', '--threads', '1',
-        '--out', str(out / 'contact')],
+        'fit', 'contact', str(given / 'set'), '--episodes', '2', '--motions', '2',
+        '--threads', '1', '--out', str(out / 'contact')],
     'imagine': lambda given, out: [
         'imagine', '--policy', 'recorded', '--episodes', str(next((given / 'set').glob('*_0*'))),
         '--max-chunks', '2', '--out', str(out / 'imagined'), *ONE_STEP],

@@ -28,19 +28,19 @@ SETTINGS = settings(2)
 
 #: command -> its words, of the folder on the full disk
 WRITERS: dict[str, Callable[[Path], list[str]]] = {
-    'doctor': lambda out: ['doctor', str(EPISODE), '--out', str(out / 'doctor')],
+    'doctor': lambda out: ['check', str(EPISODE), '--out', str(out / 'doctor')],
     'robot': lambda out: ['robot', str(URDF), '--out', str(out / 'a.yaml')],
     'robot picture': lambda out: ['robot', 'yam_bimanual', '--picture', str(out / 'a.png')],
     'calibrate-camera': lambda out: [
-        'calibrate-camera', str(EPISODE), '--view', 'low', '--out', str(out / 'camera.yaml')],
+        'fit', 'camera', str(EPISODE), '--view', 'low', '--out', str(out / 'camera.yaml')],
     'replay': lambda out: ['replay', str(EPISODE), '--offline', '--out', str(out / 'replay')],
     'train': lambda out: [
         'train', str(EPISODE.parent), '--out', str(out / 'run'), '--dtype', 'float32',
         '--threads', '1', *SETTINGS],
     'export-dataset': lambda out: [
-        'export-dataset', str(EPISODE), '--out', str(out / 'dataset')],
+        'export', 'lerobot', str(EPISODE), '--out', str(out / 'dataset')],
     'import-bag': lambda out: [
-        'import-bag', str(EPISODE), '--robot', 'yam_bimanual', '--out', str(out / 'episodes')],
+        'import', 'bag', str(EPISODE), '--robot', 'yam_bimanual', '--out', str(out / 'episodes')],
     'view': lambda out: ['view', str(EPISODE), '--save', str(out / 'a.rrd')],
     'recover': lambda out: ['recover', str(EPISODE), '--out', str(out / 'bag')],
     'collect': lambda out: [
@@ -49,7 +49,7 @@ WRITERS: dict[str, Callable[[Path], list[str]]] = {
         'evaluate', 'bundled', str(EPISODE.parent), '--actions', 'true', '--no-ceiling',
         '--out', str(out / 'evaluation'), *ONE_STEP],
     'calibrate': lambda out: [
-        'calibrate', 'bundled', str(EPISODE.parent), '--no-store',
+        'fit', 'success', 'bundled', str(EPISODE.parent), '--no-store',
         '--out', str(out / 'calibration'), *ONE_STEP],
     'rank': lambda out: [
         'rank', '--policies', 'expert,expert-miss-0.5', '--tasks', 'stack_blocks_two',
@@ -100,8 +100,8 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[s
 
 def _dataset(folder: Path) -> list[str]:
     """Makes a LeRobot dataset; the command that imports it."""
-    assert main(['export-dataset', str(EPISODE), '--out', str(folder)]) == 0
-    return ['import-dataset', str(folder), '--mapping', str(folder / 'meta' / 'mapping.yaml')]
+    assert main(['export', 'lerobot', str(EPISODE), '--out', str(folder)]) == 0
+    return ['import', 'lerobot', str(folder), '--mapping', str(folder / 'meta' / 'mapping.yaml')]
 
 
 def _weights(folder: Path) -> list[str]:
@@ -110,14 +110,14 @@ def _weights(folder: Path) -> list[str]:
     preset, video = folder / 'tiny.yaml', {'num_frames': 4, 'width': 32, 'height': 32}
     sections = {'transformer': TRANSFORMER, 'autoencoder': AUTOENCODER, 'scheduler': SCHEDULER}
     preset.write_text(yaml.safe_dump({**sections, 'video': video}))
-    return ['import-weights', str(public), '--preset', str(preset)]
+    return ['import', 'wan', str(public), '--preset', str(preset)]
 
 
 def _evaluation(folder: Path) -> list[str]:
     """Evaluates without a report; the command that writes it."""
     words = ['--actions', 'true', '--no-ceiling', '--no-report', '--out', str(folder), *ONE_STEP]
     assert main(['evaluate', 'bundled', str(EPISODE.parent), *words]) == 0
-    return ['report', str(folder)]
+    return ['export', 'report', str(folder)]
 
 
 #: what makes the input of a command on another disk and returns the command, and the output's name

@@ -121,7 +121,7 @@ def test_public_weights_with_a_value_that_is_no_number_are_not_imported(tmp_path
     sections = {'transformer': TRANSFORMER, 'autoencoder': AUTOENCODER, 'scheduler': SCHEDULER}
     video = {'num_frames': 4, 'width': 32, 'height': 32}
     (tmp_path / 'tiny.yaml').write_text(yaml.safe_dump({**sections, 'video': video}))
-    words = ['import-weights', str(public), '--preset', str(tmp_path / 'tiny.yaml'), '--out']
+    words = ['import', 'wan', str(public), '--preset', str(tmp_path / 'tiny.yaml'), '--out']
     assert main([*words, str(tmp_path / 'whole')]) == 0
     files = sorted(public.rglob('*.safetensors'))
     assert len(files) == 4

@@ -105,7 +105,7 @@ def test_collect_records_another_robot_with_its_views(tmp_path, opengl):
     assert episode.joint_states.joint_names == bundled('franka').joint_names
     text = (out / 'README.md').read_text()
     assert '--robot franka' in text and 'The robot `franka` in MuJoCo' in text
-    assert main(['doctor', str(out / 'place_cup_plate_00000'), '--out', str(tmp_path / 'd')]) == 3
+    assert main(['check', str(out / 'place_cup_plate_00000'), '--out', str(tmp_path / 'd')]) == 3
 
 
 def test_a_robot_without_a_workcell_is_refused(robot):

@@ -19,7 +19,7 @@ from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.success.calibration import CALIBRATION
 from mtv_world_ros.success.doubts import Grounds
 
-FOUND = ContactOrigin(by='mtv-world fit-contact', recordings=8, telling=3)
+FOUND = ContactOrigin(by='mtv-world fit contact', recordings=8, telling=3)
 GUESSED = 'numbers of contact (contact.json) were never fitted on recordings'
 
 
@@ -37,10 +37,10 @@ def estimate(foreseen: float, *, is_calibrated: bool = False) -> SuccessEstimate
 @pytest.mark.parametrize(
     ('contact', 'is_calibrated', 'foreseen', 'says'),
     [
-        ('guessed', False, -0.5, 'run mtv-world fit-contact'),  # of a checkpoint without any fit
-        ('', False, nan, 'run mtv-world calibrate'),  # pictures alone, which nothing vouches for
-        ('guessed', False, nan, 'run mtv-world calibrate'),
-        ('guessed', True, -0.5, 'run mtv-world fit-contact'),  # calibrated for something else
+        ('guessed', False, -0.5, 'run mtv-world fit contact'),  # of a checkpoint without any fit
+        ('', False, nan, 'run mtv-world fit success'),  # pictures alone, which nothing vouches for
+        ('guessed', False, nan, 'run mtv-world fit success'),
+        ('guessed', True, -0.5, 'run mtv-world fit contact'),  # calibrated for something else
         ('guessed', True, nan, ''),
         ('', True, nan, ''),
     ],
@@ -139,7 +139,7 @@ def test_the_bundled_model_has_grounds():
     assert Pipeline.load(num_threads=1, segmenter='colour').grounds == Grounds()
 
 
-@pytest.mark.parametrize(('foresight', 'mends'), [(True, 'fit-contact'), (False, 'calibrate')])
+@pytest.mark.parametrize(('foresight', 'mends'), [(True, 'fit contact'), (False, 'fit success')])
 def test_imagined_frames_abstain_and_recorded_ones_do_not(own, foresight, mends):
     """With the bundled weights and guessed numbers, on the bundled episode, which succeeds."""
     folder = own / 'object_motion'

@@ -108,7 +108,7 @@ def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
 
 @pytest.fixture
 def report(tmp_path):
-    """A report of `mtv-world doctor`: one view of `b` is broken, and the whole of `c`."""
+    """A report of `mtv-world check`: one view of `b` is broken, and the whole of `c`."""
     broken = {'a': {}, 'b': {'wrist': 'mirrored'}, 'c': {'recording': 'degrees', 'low': 'frozen'}}
     (tmp_path / BROKEN).write_text(json.dumps(broken))
     return tmp_path
@@ -132,7 +132,7 @@ def test_a_report_of_other_episodes_is_refused(report):
         (report / BROKEN).write_text(text)
         with pytest.raises(ConfigError, match='cannot be read'):
             found_broken(report, [Path('data/a')], ('low',))
-    with pytest.raises(ConfigError, match='mtv-world doctor FOLDER --out DIR writes it'):
+    with pytest.raises(ConfigError, match='mtv-world check FOLDER --out DIR writes it'):
         found_broken(report / 'nothing', [Path('data/a')], ('low',))
 
 

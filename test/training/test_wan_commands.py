@@ -37,7 +37,7 @@ def recipe(tmp_path_factory, episode) -> dict[str, Path]:
     preset, said = tiny_preset(folder), StringIO()
     public = write_videox(folder / 'public', dtype=torch.float32)
     with redirect_stdout(said):
-        imported = ['import-weights', str(public), '--preset', str(preset)]
+        imported = ['import', 'wan', str(public), '--preset', str(preset)]
         assert main([*imported, '--out', str(folder / 'base')]) == 0
         # the command that it prints, with the data set and the folder filled in
         words = shlex.split(said.getvalue().partition('train it with: ')[2])[1:]

@@ -22,10 +22,10 @@ def written(tmp_path_factory):
     pytest.importorskip('pyarrow', reason='pyarrow is not installed (pip install .[import])')
     out = tmp_path_factory.mktemp('written')
     dataset, predictions = out / 'dataset', out / 'predictions'
-    assert main(['export-dataset', str(DEMO), '--out', str(dataset), '--fps', '5']) == 0
+    assert main(['export', 'lerobot', str(DEMO), '--out', str(dataset), '--fps', '5']) == 0
     assert main(['replay', str(DEMO), '--offline', '--steps', '1', '--out', str(predictions)]) == 0
     mapping = str(dataset / 'meta/mapping.yaml')
-    command = ['import-dataset', str(dataset), '--mapping', mapping]
+    command = ['import', 'lerobot', str(dataset), '--mapping', mapping]
     assert main([*command, '--out', str(out / 'imported')]) == 0
     return out
 

@@ -93,7 +93,7 @@ def test_large_errors_refuse_the_verdict(scenes):
         statuses += [fit.status for fit in check.fits if fit.status != 'unchecked']
         for camera, fit in zip(told, check.fits, strict=True):
             if fit.status == 'refused':
-                assert 'calibrate-camera' in check.refusal and camera.view in check.refusal
+                assert 'fit camera' in check.refusal and camera.view in check.refusal
     assert statuses.count('refused') >= 4 and 'fits' not in statuses
 
 

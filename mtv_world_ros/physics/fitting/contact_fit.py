@@ -405,7 +405,7 @@ def fit_contact(
             'are too narrow'
         )
     origin = ContactOrigin(
-        by='mtv-world fit-contact',
+        by='mtv-world fit contact',
         recordings=len(recordings),
         telling=hold.count,
     )

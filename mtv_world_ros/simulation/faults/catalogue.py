@@ -126,7 +126,7 @@ class _Catalogue(dict[str, FaultKind]):
 #: kinds by name
 FAULTS: Mapping[str, FaultKind] = _Catalogue(_read())
 _NAMES = {name: kind for kind, fault in FAULTS.items() for name in (kind, fault.alias)}
-_ALL = f"the {len(FAULTS)} kinds that 'mtv-world faults' prints"
+_ALL = f"the {len(FAULTS)} kinds that 'mtv-world rank --list-faults' prints"
 
 
 def kind_named(name: str) -> str:

@@ -202,11 +202,11 @@ def test_drawn_faults_change_the_plan_and_a_size_of_none_does_not(expert, seed):
 
 
 def test_the_command_prints_kinds(capsys):
-    assert main(['faults', 'high,drawn_5_0']) == 0
+    assert main(['rank', '--list-faults', 'high,drawn_5_0']) == 0
     said = capsys.readouterr().out
     assert 'grasp_height (high): height, train; 0.02 m, at most 0.1 m' in said
     assert 'drawn_5_0: drawn, test; 1, at most 3' in said
-    assert main(['faults', 'hihg']) == 1
+    assert main(['rank', '--list-faults', 'hihg']) == 1
     assert "did you mean 'high'" in capsys.readouterr().err
 
 

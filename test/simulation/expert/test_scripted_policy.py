@@ -69,7 +69,7 @@ def test_names_and_variants_are_the_same_thing():
     ('name', 'says'),
     [
         ('exprt', r"'exprt' is no scripted policy \(did you mean 'expert'\?\).*joint_noise-0.02"),
-        ('expert-noise', "'expert-noise' is no scripted policy; .*mtv-world faults"),
+        ('expert-noise', "'expert-noise' is no scripted policy; .*mtv-world rank --list-faults"),
         ('expert-nois-0.1', r"unknown fault 'nois' \(did you mean 'noise'\?\); known are the 162"),
         ('expert-miss-0.1-miss-0.2', "fault 'miss' is given twice"),
         ('expert-miss-1.5', "'miss' is 1.5; it must be 0 to 1"),

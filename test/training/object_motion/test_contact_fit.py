@@ -147,7 +147,7 @@ def test_numbers_that_make_up_for_each_other_are_within_their_intervals(
     )
     assert not by_name['grip_friction'].apart
     assert 'not told apart from the other numbers by these' in str(by_name['grip_friction'])
-    assert found.fitted == ContactOrigin(by='mtv-world fit-contact', recordings=3, telling=3)
+    assert found.fitted == ContactOrigin(by='mtv-world fit contact', recordings=3, telling=3)
     # futures differ by what is not known once the others are
     assert found.spread.grip < 0.5 * np.log(
         by_name['grip_friction'].high / by_name['grip_friction'].low
@@ -241,7 +241,7 @@ def test_fingers_begin_as_their_joints_follow(robot, response):
 def test_the_command_writes_what_a_checkpoint_foresees_with(checkpoint, capsys, monkeypatch):
     monkeypatch.setattr(contact_fit, '_DRAWS', 8)
     monkeypatch.setattr(contact_fit, '_ROUNDS', 1)
-    words = ['fit-contact', str(DEMO), '--checkpoint', str(checkpoint), '--motions', '2']
+    words = ['fit', 'contact', str(DEMO), '--checkpoint', str(checkpoint), '--motions', '2']
     assert main(words) != 0
     assert '--overwrite' in capsys.readouterr().err
     assert main([*words, '--overwrite']) == 0
@@ -262,7 +262,7 @@ def test_how_arms_follow_is_found_where_a_checkpoint_does_not_know(
     monkeypatch.setattr(contact_fit, '_CANDIDATES', 4)
     monkeypatch.setattr(contact_fit, '_DRAWS', 4)
     monkeypatch.setattr(contact_fit, '_ROUNDS', 1)
-    assert main(['fit-contact', str(DEMO), '--out', str(tmp_path / 'new')]) == 0
+    assert main(['fit', 'contact', str(DEMO), '--out', str(tmp_path / 'new')]) == 0
     told = capsys.readouterr().out
     assert 'how 14 joints follow commands was not found' in told and 'one episode' in told
     assert 'draws decide' in told and 'intervals are too narrow' in told  # of four draws

@@ -1,4 +1,4 @@
-"""`mtv-world fit-contact`."""
+"""`mtv-world fit contact`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mtv_world_ros.core.files import check_free, check_output
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
-        'fit-contact',
+        'contact',
         help='find how arms follow, friction, weight and grip: what foresight is told',
         description='Finds how arms follow their commands and how late they do, how high the '
         'table is, how fingers grip, what rubs and how heavy objects are: the numbers under which '

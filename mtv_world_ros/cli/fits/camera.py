@@ -1,274 +1,43 @@
-"""`mtv-world robot`, `doctor` and `calibrate-camera`: a robot, its recordings, its cameras."""
+"""`mtv-world fit camera`: the pose of a camera, from recordings in which the arm moves."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-import json
 from math import isfinite
 from pathlib import Path
 import re
-import sys
-import tempfile
 from typing import TYPE_CHECKING
 
-from mtv_world_ros.cli.calibrate_camera import (
+from mtv_world_ros.cli.fits.several_cameras import (
     calibrate_shared,
     is_shared,
     read_for_checks,
     robot_file,
 )
 from mtv_world_ros.cli.shared_options import add_options, names
-from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+from mtv_world_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from mtv_world_ros.core.data_types import CameraModel, FloatArray
     from mtv_world_ros.data.episode import Episode, JointStates, Track
     from mtv_world_ros.inspection.camera_pose import CameraEstimate
     from mtv_world_ros.inspection.clocks import JointTrack
-    from mtv_world_ros.inspection.inspect import Inspector
-    from mtv_world_ros.inspection.inspection_report import Inspection
     from mtv_world_ros.robot.model import RobotModel
 
-#: exit status by verdict; 2 is argparse's
-_STATUS = {'ok': 0, 'not checked': 3, 'suspicious': 1, 'broken': 1}
+
+#: standard error beyond which another recording is recommended [mm]
+_ROUGH_MM = 50.0
+
+
+#: correlation of drawn and seen motion below which a pose may be a wrong one: of five recorded
+#: tasks, those with .67, .76 and .82 ended 130 to 350 mm off, those with .86 and .91 10 and 21 mm
+GOOD_MATCH = 0.85
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the commands."""
-    _add_robot(commands)
-    _add_doctor(commands)
-    _add_calibrate_camera(commands)
-
-
-def _add_robot(commands: argparse._SubParsersAction) -> None:
+    """Add the command."""
     parser = commands.add_parser(
-        'robot',
-        help='print a robot, draw it, and make its YAML from a URDF',
-        epilog='Of a URDF, arms, tools, fingers and base link are guessed and written to a YAML: '
-        'look at the picture, correct the YAML where the guess is wrong, and call it again with '
-        'the YAML.',
-    )
-    parser.add_argument('file', help='URDF, robot YAML, or name of a bundled robot')
-    parser.add_argument(
-        '--out', type=Path, help='YAML to write (of a URDF); default: beside the URDF'
-    )
-    parser.add_argument('--picture', type=Path, help='PNG to draw; default: out/robot/<name>.png')
-    parser.set_defaults(handler=_robot, default_picture=Path('out/robot'))
-
-
-def _robot(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.robot.file import load_robot, robot_path
-    from mtv_world_ros.robot.shape import load_shape
-
-    path = Path(arguments.file)
-    guessed: Path | None = None
-    if path.suffix in ('.urdf', '.xml'):
-        path = guessed = _write_guess(path, arguments.out or path.with_suffix('.yaml'))
-    elif path.suffix == '.xacro':
-        raise ConfigError(f"'{path}' is a xacro file; expand it first: xacro {path} > robot.urdf")
-    elif arguments.out is not None:
-        raise ConfigError('--out is for a URDF; a robot YAML is only read')
-    else:
-        path = robot_path(arguments.file)
-    try:
-        robot = load_robot(path)
-        shape = load_shape(robot)
-    except MtvWorldError:
-        if guessed is not None:  # or the next call would find a file that cannot be used
-            guessed.unlink()
-        raise
-    print(describe(robot))
-    print(f'shapes: {shape.source}')
-    print(*(f'missing: {name}\n' for name in shape.missing), sep='', end='')
-    print(*(f'{text}\n' for text in shape.replaced), sep='', end='')
-    print(*(f'suspicious: {text}\n' for text in shape.doubts), sep='', end='')
-    picture = arguments.picture or Path('out/robot') / f'{robot.name}.png'
-    _draw_robot(robot, picture)
-    print(f'robot file: {path}\npicture: {picture}')
-    return 0
-
-
-def _write_guess(urdf: Path, out: Path) -> Path:
-    import os
-
-    import yaml
-
-    from mtv_world_ros.core.files import write_whole
-    from mtv_world_ros.importing.robot_guess import guess_robot
-
-    if out.exists():
-        raise ConfigError(f"'{out}' exists; look at it with: mtv-world robot {out}")
-    guessed = guess_robot(urdf)
-    relative = os.path.relpath(urdf.resolve(), out.resolve().parent)
-    text = yaml.safe_dump({**guessed.values, 'urdf': relative}, sort_keys=False)
-    lines = [f'# {note}' for note in guessed.notes]
-    write_whole(out, '\n'.join(['# guessed by mtv-world robot:', *lines, text]))
-    print('\n'.join(f'guessed: {note}' for note in guessed.notes))
-    return out
-
-
-def describe(robot: RobotModel) -> str:
-    """Returns joints with limits, and tools, as text lines."""
-    import numpy as np
-
-    lines = [f"robot '{robot.name}', base link '{robot.base_link}'"]
-    rows = zip(robot.joint_names, robot.lower, robot.upper, robot.velocity_limits, strict=True)
-    for name, lower, upper, speed in rows:
-        limits = f'{lower:.4g} .. {upper:.4g}' if np.isfinite(lower) else 'turns without end'
-        fastest = f'at most {speed:.3g} a second' if np.isfinite(speed) else 'no speed limit given'
-        lines.append(f'  joint {name}: {limits}, {fastest}')
-    for tool in robot.tools:
-        x, y, z = (float(v) for v in tool.T_link_tool[:3, 3])
-        lines.append(f"  tool of '{tool.arm}': ({x:.4g}, {y:.4g}, {z:.4g}) m in '{tool.link}'")
-        if tool.gripper_joint:
-            lines.append(
-                f'    gripper {tool.gripper_joint}: closed at {tool.gripper_closed:.4g}, open at '
-                f'{tool.gripper_open:.4g}'
-            )
-    return '\n'.join(lines)
-
-
-def _draw_robot(robot: RobotModel, path: Path) -> None:
-    from mtv_world_ros.core.images import write_png
-    from mtv_world_ros.inspection.image_checks import robot_picture
-
-    write_png(path, robot_picture(robot))
-
-
-def _add_doctor(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        'doctor',
-        help='check calibration, joints, clocks and pictures of an episode, of all episodes of a '
-        'folder, or of running topics',
-        epilog='Exit status: 0 where everything was checked and is ok, 1 where something is '
-        'suspicious or broken, 3 where nothing wrong was found but not everything could be '
-        'checked.',
-    )
-    parser.add_argument('episode', type=Path, nargs='?', help='an episode, or a folder of them')
-    parser.add_argument('--live', action='store_true', help='check the running ROS topics')
-    parser.add_argument(
-        '--seconds', type=float, default=10.0, help='with --live: how long to record'
-    )
-    parser.add_argument(
-        '--views', type=names, help='comma-separated; default: all; needed with --live'
-    )
-    add_options(parser, 'source')
-    parser.add_argument('--robot', help="YAML, or a bundled robot; default: the episode's")
-    parser.add_argument('--out', type=Path, help='default: out/doctor/<episode>')
-    parser.set_defaults(handler=_doctor, default_out=Path('out/doctor'))
-
-
-def _doctor(arguments: argparse.Namespace) -> int:
-    if arguments.live == (arguments.episode is not None):
-        raise ConfigError('name an EPISODE, or give --live to check the running topics')
-    if not arguments.live:
-        paths = _episodes_in(arguments.episode)
-        if paths:
-            return _check_folder(arguments, paths)
-        return _check(arguments, arguments.episode, arguments.episode.name)
-    from mtv_world_ros.inspection.live import record_topics
-
-    if not arguments.views:
-        raise ConfigError('--live needs the names of the views: --views low,high')
-    if arguments.robot is None or arguments.calibration is None:
-        raise ConfigError('--live needs --robot and --calibration: topics do not carry them')
-    with tempfile.TemporaryDirectory(prefix='mtv_world_doctor_') as folder:
-        print(
-            f'recording {", ".join(arguments.views)} for {arguments.seconds:g} s', file=sys.stderr
-        )
-        bag = record_topics(arguments.views, Path(folder) / 'live', arguments.seconds)
-        return _check(arguments, bag, 'live')
-
-
-def _episodes_in(path: Path) -> list[Path]:
-    """Episodes of a folder that is none itself."""
-    from mtv_world_ros.data.episode_reader import list_episodes
-
-    found = list_episodes(path) if path.is_dir() else []
-    return [] if path in found else found
-
-
-def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
-    from tqdm import tqdm
-
-    from mtv_world_ros.core.files import write_whole
-    from mtv_world_ros.core.images import write_png
-    from mtv_world_ros.inspection.folder import (
-        broken_parts,
-        folder_markdown,
-        folder_picture,
-        folder_text,
-        inspect_folder,
-    )
-    from mtv_world_ros.inspection.inspect import load_inspector
-    from mtv_world_ros.inspection.inspection_report import BROKEN
-
-    file, source = robot_file(arguments, paths[0])
-    inspector = load_inspector(file)
-    found, pictures = inspect_folder(
-        tqdm(paths, unit='ep', disable=None),
-        inspector,
-        lambda path: read_for_checks(
-            path,
-            arguments.views,
-            source,
-            inspector.robot,
-            inspector.robot.base_link,
-            with_masks=True,
-        ),
-    )
-    out = arguments.out or Path('out/doctor') / arguments.episode.resolve().name
-    picture = folder_picture(pictures)
-    if picture is not None:
-        write_png(out / 'episodes.png', picture)
-    write_whole(out / 'report.md', folder_markdown(found, 'episodes.png'))
-    write_whole(out / BROKEN, json.dumps(broken_parts(found), indent=2))
-    print(folder_text(found))
-    print(f"{found.verdict}: see '{out / 'report.md'}'")
-    return _STATUS[found.verdict]
-
-
-def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
-    from functools import partial
-
-    from tqdm import tqdm
-
-    from mtv_world_ros.inspection.inspect import load_inspector
-    from mtv_world_ros.inspection.inspection_report import to_text
-
-    file, source = robot_file(arguments, path)
-    inspector = load_inspector(file)
-    robot = inspector.robot
-    episode = read_for_checks(
-        path, arguments.views, source, robot, robot.base_link, with_masks=True
-    )
-    bar = partial(tqdm, desc='comparing', unit='view', disable=None)
-    inspection = inspector.inspect(episode, bar)
-    out = arguments.out or Path('out/doctor') / name
-    _write_inspection(inspector, episode, inspection, out)
-    print(to_text(inspection))
-    print(f"{inspection.verdict}: see '{out / 'report.md'}'")
-    return _STATUS[inspection.verdict]
-
-
-def _write_inspection(
-    inspector: Inspector, episode: Episode, inspection: Inspection, out: Path
-) -> None:
-    from mtv_world_ros.core.files import write_whole
-    from mtv_world_ros.core.images import write_png
-    from mtv_world_ros.inspection.inspection_report import to_markdown
-
-    pictures = {}
-    for view in episode.views:
-        pictures[view] = f'{view}.png'
-        write_png(out / pictures[view], inspector.picture(episode, view))
-    write_whole(out / 'report.md', to_markdown(inspection, pictures))
-
-
-def _add_calibrate_camera(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        'calibrate-camera',
+        'camera',
         help='estimate where a camera is, fixed or on the arm, from a recording in which the arm '
         'moves',
         epilog='Intrinsics come from the recording; the pose there is the guess to start from. '
@@ -520,13 +289,6 @@ def _estimate_text(estimate: CameraEstimate) -> str:
         f'standard error {estimate.std_mm:.1f} mm and {estimate.std_deg:.2f} degrees ({meant})\n'
         f'{estimate.evidence}{_advice(estimate)}'
     )
-
-
-#: standard error beyond which another recording is recommended [mm]
-_ROUGH_MM = 50.0
-#: correlation of drawn and seen motion below which a pose may be a wrong one: of five recorded
-#: tasks, those with .67, .76 and .82 ended 130 to 350 mm off, those with .86 and .91 10 and 21 mm
-GOOD_MATCH = 0.85
 
 
 def is_doubtful(estimate: CameraEstimate) -> bool:

@@ -1,4 +1,4 @@
-"""`mtv-world calibrate-camera` of several recordings: moved cameras, focal length, points."""
+"""`mtv-world fit camera` of several recordings: moved cameras, focal length, points."""
 
 from __future__ import annotations
 

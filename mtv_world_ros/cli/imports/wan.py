@@ -1,4 +1,4 @@
-"""`mtv-world import-weights`."""
+"""`mtv-world import wan`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ELSEWHERE = ('autoencoder', 'text_encoder', 'image_encoder', 'tokenizer')
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
-        'import-weights',
+        'wan',
         help='convert public Wan 2.1 weights into a checkpoint',
         description='Makes a checkpoint of Wan2.1-Fun-V1.1-Control: every tensor is loaded, new '
         'and zero, or an error.',

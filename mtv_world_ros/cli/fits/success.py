@@ -1,4 +1,4 @@
-"""`mtv-world calibrate`."""
+"""`mtv-world fit success`."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ not be scored; it is not in the fit.
 def add(commands: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = commands.add_parser(
-        'calibrate',
+        'success',
         help="fit a checkpoint's success estimate to recorded outcomes",
         epilog=_EPILOG,
     )

@@ -1,0 +1,106 @@
+"""The table of commands, read without importing them, and names that commands had before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class CommandEntry:
+    """Place and purpose of a command.
+
+    Attributes:
+        module: module below `mtv_world_ros.cli` whose function `add` takes the subparsers.
+        help: one line for `mtv-world --help`.
+        section: heading under which `mtv-world --help` shows it.
+        function: name of the function that adds it.
+    """
+
+    module: str
+    help: str
+    section: str
+    function: str = 'add'
+
+
+#: headings of `mtv-world --help`, in its order
+SECTIONS = ('Look', 'Run', 'Learn', 'Judge', 'Prepare')
+
+#: command, of one word or two -> its entry, in the order of `mtv-world --help`
+COMMANDS = {
+    'demo': CommandEntry(
+        'demo.command', 'replay the bundled episode through the ROS node and score it', 'Look'
+    ),
+    'replay': CommandEntry(
+        'imagine', 'play an episode into ROS topics, or imagine it offline', 'Look', 'add_replay'
+    ),
+    'view': CommandEntry(
+        'view', 'show episodes, predictions, rankings or a running node in Rerun', 'Look'
+    ),
+    'imagine': CommandEntry(
+        'imagine', 'run a policy for whole episodes in the world model', 'Run', 'add_imagine'
+    ),
+    'foresee': CommandEntry(
+        'foresee', 'object motion under commands by physics alone, without a model', 'Run'
+    ),
+    'train': CommandEntry('train', 'train a world model on a folder of episodes', 'Learn'),
+    'fit contact': CommandEntry(
+        'fits.contact', 'how arms follow, friction, weight and grip, for the physics', 'Learn'
+    ),
+    'fit success': CommandEntry(
+        'fits.success', "a checkpoint's success estimate, to recorded outcomes", 'Learn'
+    ),
+    'fit camera': CommandEntry(
+        'fits.camera', 'the pose of a camera, from recordings in which the arm moves', 'Learn'
+    ),
+    'evaluate': CommandEntry('evaluate', 'score checkpoints on recorded episodes', 'Judge'),
+    'rank': CommandEntry(
+        'rank', 'rank policies in imagination, and compare with the simulator', 'Judge'
+    ),
+    'collect': CommandEntry('collect', 'record episodes of the simulated benchmark', 'Prepare'),
+    'robot': CommandEntry(
+        'robot', 'print a robot, draw it, and make its YAML from a URDF', 'Prepare'
+    ),
+    'check': CommandEntry(
+        'check', 'do calibration, joints, clocks and images of recordings fit together', 'Prepare'
+    ),
+    'import bag': CommandEntry(
+        'imports.bag', "a robot's own rosbag2 recordings become episodes", 'Prepare'
+    ),
+    'import lerobot': CommandEntry(
+        'imports.lerobot', 'a LeRobot data set (v2.0, v2.1, v3.0) becomes episodes', 'Prepare'
+    ),
+    'import videos': CommandEntry(
+        'imports.videos', 'video files with tables of joints or tool poses become episodes',
+        'Prepare',
+    ),
+    'import wan': CommandEntry(
+        'imports.wan', 'public Wan 2.1 weights become a checkpoint', 'Prepare'
+    ),
+    'recover': CommandEntry(
+        'recover', 'whole bags of recordings that were killed or cut off', 'Prepare'
+    ),
+    'export lerobot': CommandEntry(
+        'export_lerobot', 'episodes become a LeRobot data set (v3.0)', 'Prepare'
+    ),
+    'export report': CommandEntry(
+        'evaluate', 'the HTML report of evaluations, written again', 'Prepare', 'add_report'
+    ),
+}  # fmt: skip
+
+#: name that a command had before -> its words now
+RENAMED = {
+    'import-bag': ('import', 'bag'),
+    'import-dataset': ('import', 'lerobot'),
+    'import-videos': ('import', 'videos'),
+    'import-weights': ('import', 'wan'),
+    'export-dataset': ('export', 'lerobot'),
+    'report': ('export', 'report'),
+    'doctor': ('check',),
+    'calibrate': ('fit', 'success'),
+    'fit-contact': ('fit', 'contact'),
+    'calibrate-camera': ('fit', 'camera'),
+    'faults': ('rank', '--list-faults'),
+}
+
+#: commands that left -> the last version that has them
+REMOVED = {'distill': '0.1.0', 'train-motion': '0.1.0'}

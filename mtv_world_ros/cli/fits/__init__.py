@@ -1,0 +1,1 @@
+"""Commands that fit parameters to recordings: `mtv-world fit ...`."""

@@ -1,0 +1,1 @@
+"""Commands that import recordings and weights: `mtv-world import ...`."""

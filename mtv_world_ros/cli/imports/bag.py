@@ -1,0 +1,113 @@
+"""`mtv-world import bag`: a robot's own rosbag2 recordings become episodes."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mtv_world_ros.cli.imports.common import (
+    add_object_options,
+    import_status,
+    object_stage,
+    write_boxes_page,
+)
+
+if TYPE_CHECKING:
+    from mtv_world_ros.data.bag_mapping import BagMapping
+    from mtv_world_ros.data.episode import Episode
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        'bag',
+        help="convert a robot's own rosbag2 recordings into episodes",
+        epilog='config/datasets/bag.yaml describes the mapping file; without one, views are all '
+        'image topics. OUT also gets robot/ and mapping.yaml, which --topics takes elsewhere. '
+        'Call it again to continue: finished episodes are kept. Exit status: 1 if a bag failed.',
+    )
+    parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='or folder of bags')
+    parser.add_argument('--topics', type=Path, metavar='FILE', help='mapping: which topic is what')
+    parser.add_argument(
+        '--robot', help="YAML, or a bundled robot; default: the mapping's, or /robot_description"
+    )
+    parser.add_argument(
+        '--action',
+        metavar='TOPIC',
+        help="of the commands, or 'state': the measured positions that follow; default: the "
+        "mapping's, or joint_trajectory",
+    )
+    parser.add_argument('--calibration', type=Path, help="default: the bags' TF and CameraInfo")
+    parser.add_argument('--out', type=Path, required=True)
+    add_object_options(parser)
+    parser.set_defaults(handler=_import_bag)
+
+
+def _import_bag(arguments: argparse.Namespace) -> int:
+    from tqdm import tqdm
+    import yaml
+
+    from mtv_world_ros.core.files import ROBOT_YAML, write_whole
+    from mtv_world_ros.data.bag_mapping import BagMapping, load_bag_mapping
+    from mtv_world_ros.data.episode_reader import read_episode
+    from mtv_world_ros.importing.bags import (
+        episode_name,
+        find_bags,
+        import_bags,
+        summary_line,
+        with_guessed_views,
+    )
+
+    mapping = BagMapping() if arguments.topics is None else load_bag_mapping(arguments.topics)
+    if arguments.action:
+        mapping = mapping.replace(action=arguments.action)
+    bags = find_bags(arguments.bags)
+    mapping = with_guessed_views(mapping, bags[0])
+
+    def frames(bag: Path) -> Episode:
+        return read_episode(bag, views=list(mapping.views), mapping=mapping, with_cameras=False)
+
+    found = {episode_name(bag): bag for bag in bags}
+    if arguments.click:
+        return write_boxes_page(arguments, found, frames, mapping.objects)
+    robot = _robot_of_bags(arguments, mapping, bags[0])
+    summary = import_bags(
+        bags,
+        arguments.out,
+        mapping,
+        robot,
+        calibration=arguments.calibration,
+        stage=object_stage(arguments, found, frames),
+        progress=lambda paths: tqdm(paths, unit='bag', disable=None),
+    )
+    values = mapping.replace(robot='robot/robot.yaml').model_dump(
+        mode='json', exclude_defaults=True
+    )
+    write_whole(arguments.out / 'mapping.yaml', yaml.safe_dump(values, sort_keys=False))
+    for view, row in mapping.views.items():
+        print(f'view {view}: {mapping.topic(row.image)}')
+    for part in summary.made:
+        place = arguments.out / part.name
+        print(summary_line(place, objects=bool(arguments.segmenter or arguments.objects)))
+    status = import_status(summary, str)
+    print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
+    return status
+
+
+def _robot_of_bags(arguments: argparse.Namespace, mapping: BagMapping, bag: Path) -> Path:
+    """The robot's YAML; that of the first bag's `/robot_description` is written into OUT."""
+    from mtv_world_ros.importing.bags import described_robot
+    from mtv_world_ros.robot.file import robot_path
+
+    name = arguments.robot or mapping.robot
+    if name:
+        return robot_path(name)
+    folder = arguments.out / 'robot'
+    if (folder / 'robot.yaml').is_file():  # confirmed or corrected since the last call
+        return folder / 'robot.yaml'
+    file, notes = described_robot(bag, mapping, folder)
+    for note in notes:
+        print(f'guessed: {note}')
+    print(f'look at it with: mtv-world robot {file}')
+    return file

@@ -1,0 +1,108 @@
+"""`mtv-world robot`: print a robot, draw it, and make its YAML from a URDF."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+
+if TYPE_CHECKING:
+    from mtv_world_ros.robot.model import RobotModel
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        'robot',
+        help='print a robot, draw it, and make its YAML from a URDF',
+        epilog='Of a URDF, arms, tools, fingers and base link are guessed and written to a YAML: '
+        'look at the picture, correct the YAML where the guess is wrong, and call it again with '
+        'the YAML.',
+    )
+    parser.add_argument('file', help='URDF, robot YAML, or name of a bundled robot')
+    parser.add_argument(
+        '--out', type=Path, help='YAML to write (of a URDF); default: beside the URDF'
+    )
+    parser.add_argument('--picture', type=Path, help='PNG to draw; default: out/robot/<name>.png')
+    parser.set_defaults(handler=_robot, default_picture=Path('out/robot'))
+
+
+def _robot(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.robot.file import load_robot, robot_path
+    from mtv_world_ros.robot.shape import load_shape
+
+    path = Path(arguments.file)
+    guessed: Path | None = None
+    if path.suffix in ('.urdf', '.xml'):
+        path = guessed = _write_guess(path, arguments.out or path.with_suffix('.yaml'))
+    elif path.suffix == '.xacro':
+        raise ConfigError(f"'{path}' is a xacro file; expand it first: xacro {path} > robot.urdf")
+    elif arguments.out is not None:
+        raise ConfigError('--out is for a URDF; a robot YAML is only read')
+    else:
+        path = robot_path(arguments.file)
+    try:
+        robot = load_robot(path)
+        shape = load_shape(robot)
+    except MtvWorldError:
+        if guessed is not None:  # or the next call would find a file that cannot be used
+            guessed.unlink()
+        raise
+    print(describe(robot))
+    print(f'shapes: {shape.source}')
+    print(*(f'missing: {name}\n' for name in shape.missing), sep='', end='')
+    print(*(f'{text}\n' for text in shape.replaced), sep='', end='')
+    print(*(f'suspicious: {text}\n' for text in shape.doubts), sep='', end='')
+    picture = arguments.picture or Path('out/robot') / f'{robot.name}.png'
+    _draw_robot(robot, picture)
+    print(f'robot file: {path}\npicture: {picture}')
+    return 0
+
+
+def _write_guess(urdf: Path, out: Path) -> Path:
+    import os
+
+    import yaml
+
+    from mtv_world_ros.core.files import write_whole
+    from mtv_world_ros.importing.robot_guess import guess_robot
+
+    if out.exists():
+        raise ConfigError(f"'{out}' exists; look at it with: mtv-world robot {out}")
+    guessed = guess_robot(urdf)
+    relative = os.path.relpath(urdf.resolve(), out.resolve().parent)
+    text = yaml.safe_dump({**guessed.values, 'urdf': relative}, sort_keys=False)
+    lines = [f'# {note}' for note in guessed.notes]
+    write_whole(out, '\n'.join(['# guessed by mtv-world robot:', *lines, text]))
+    print('\n'.join(f'guessed: {note}' for note in guessed.notes))
+    return out
+
+
+def describe(robot: RobotModel) -> str:
+    """Returns joints with limits, and tools, as text lines."""
+    import numpy as np
+
+    lines = [f"robot '{robot.name}', base link '{robot.base_link}'"]
+    rows = zip(robot.joint_names, robot.lower, robot.upper, robot.velocity_limits, strict=True)
+    for name, lower, upper, speed in rows:
+        limits = f'{lower:.4g} .. {upper:.4g}' if np.isfinite(lower) else 'turns without end'
+        fastest = f'at most {speed:.3g} a second' if np.isfinite(speed) else 'no speed limit given'
+        lines.append(f'  joint {name}: {limits}, {fastest}')
+    for tool in robot.tools:
+        x, y, z = (float(v) for v in tool.T_link_tool[:3, 3])
+        lines.append(f"  tool of '{tool.arm}': ({x:.4g}, {y:.4g}, {z:.4g}) m in '{tool.link}'")
+        if tool.gripper_joint:
+            lines.append(
+                f'    gripper {tool.gripper_joint}: closed at {tool.gripper_closed:.4g}, open at '
+                f'{tool.gripper_open:.4g}'
+            )
+    return '\n'.join(lines)
+
+
+def _draw_robot(robot: RobotModel, path: Path) -> None:
+    from mtv_world_ros.core.images import write_png
+    from mtv_world_ros.inspection.image_checks import robot_picture
+
+    write_png(path, robot_picture(robot))
