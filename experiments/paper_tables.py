@@ -7,7 +7,7 @@ makes the data of the fifteen tasks (half of the episodes for training, half for
 commands and with those of another episode, and writes `tables.md` after each row. The same command
 goes on where it was stopped. Rows, seeds and weights for FID and FVD may be added later.
 
-Table 2 needs real recordings as `mtv-world import-videos`, `import-bag` or `import-dataset` makes
+Table 2 needs real recordings as `mtv-world import videos`, `import bag` or `import lerobot` makes
 them: `--real data/lab --real-view ext1 --real-segmenter data/lab/objects.safetensors`.
 """
 

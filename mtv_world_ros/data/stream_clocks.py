@@ -477,7 +477,7 @@ def _refuse_steps(
     raise ClockBreakError(
         f'the clocks of {names} jump {", ".join(texts)} (stamps against receive times): simulated '
         'time that started over, or a clock that was set. These are '
-        f'{len(ends) - 1} recordings; mtv-world import-bag makes an episode of each.{left_out}',
+        f'{len(ends) - 1} recordings; mtv-world import bag makes an episode of each.{left_out}',
         windows,
     )
 
