@@ -252,3 +252,42 @@ def test_a_video_that_is_off_its_rows_is_shifted_and_named(
         track = read_episode(tmp_path / f'out/episode_{number:06d}', with_cameras=False)
         shown = [float(np.asarray(frame).mean()) for frame in track.images['front'].frames]
         np.testing.assert_allclose(shown, 20 + 16 * np.arange(count) + 3 * number, atol=3)
+
+
+#: weights of red and blue in the luma, and the numbers of FFmpeg's colour spaces
+MATRICES = {'601': (0.299, 0.114, 5), '709': (0.2126, 0.0722, 1), '2020': (0.2627, 0.0593, 9)}
+
+
+def yuv(rgb, red, blue, is_full):
+    """Return Y, Cb and Cr of 8 bits, by the definition of the recommendations."""
+    r, g, b = np.array(rgb) / 255
+    y = red * r + (1 - red - blue) * g + blue * b
+    u, v = (b - y) / 2 / (1 - blue), (r - y) / 2 / (1 - red)
+    scaled = (255 * y, 128 + 255 * u, 128 + 255 * v)
+    if not is_full:
+        scaled = (16 + 219 * y, 128 + 224 * u, 128 + 224 * v)
+    return np.rint(scaled)
+
+
+@pytest.mark.parametrize('is_full', [False, True], ids=['limited', 'full'])
+@pytest.mark.parametrize('name', MATRICES)
+def test_colours_follow_the_colour_space_of_the_video(tmp_path, name, is_full):
+    red, blue, number = MATRICES[name]
+    colours = [(200, 30, 30), (30, 160, 60)]
+    planes = np.zeros((3, 48, 64), np.uint8)
+    planes[:, :, :32] = yuv(colours[0], red, blue, is_full)[:, None, None]
+    planes[:, :, 32:] = yuv(colours[1], red, blue, is_full)[:, None, None]
+    path, base = tmp_path / 'a.mkv', Fraction(1, FPS)
+    with av.open(str(path), 'w') as container:
+        stream = container.add_stream('ffv1', rate=FPS)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, 'yuv444p'
+        stream.codec_context.colorspace = number
+        stream.codec_context.color_range = 2 if is_full else 1
+        for k in range(2):
+            frame = av.VideoFrame.from_ndarray(planes, format='yuv444p')
+            frame.colorspace, frame.color_range = number, 2 if is_full else 1
+            frame.pts, frame.time_base = k, base
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    frames = VideoFileFrames(path)
+    np.testing.assert_allclose(frames[1][24, [16, 48]], colours, atol=2)
