@@ -46,7 +46,7 @@ class TrainingLog:
             unit='step',
             disable=None if active else True,  # None: on a terminal only
         )
-        self._started = time.time()
+        self._started = time.monotonic()
         self._steps, self._seconds, self._waited = 0, 0.0, 0.0
         if active:
             self._file = _cut(folder / 'log.jsonl', step).open('a')
@@ -75,7 +75,7 @@ class TrainingLog:
             'learning_rate': report.learning_rate,
             'grad_norm': round(report.grad_norm, 4),
             **self._speed(),
-            'seconds': round(time.time() - self._started, 1),
+            'seconds': round(time.monotonic() - self._started, 1),
         }
         self.write(report.step, row)
 

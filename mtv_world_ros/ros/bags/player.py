@@ -41,6 +41,8 @@ _WINDOW_NS = 2 * NANO
 #: topics whose last message late subscribers get
 _STATES = ('instruction', 'tf_static', 'robot_description')
 _CLOCK_PERIOD_NS = 10_000_000
+#: a change of the system clock against the monotonic one that is a step, not a drift [ns]
+_CLOCK_STEP_NS = 50_000_000
 #: connections that do not change for this long are complete [s]
 _SETTLED_S = 0.5
 #: after this long it says what it waits for
@@ -50,29 +52,46 @@ ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
 
 @dataclass(slots=True)
 class Timeline:
-    """Maps bag time to wall time.
+    """Maps bag time to the monotonic clock, and that to stamps of the system clock.
+
+    A system clock that is set changes the stamps from then on, but not the pace.
 
     Attributes:
         bag_ns: bag time at which playing started [ns].
-        wall_ns: wall time at that moment, moved on by every pause [ns].
+        steady_ns: monotonic time at that moment, moved on by every pause [ns].
         rate: seconds of the bag a second.
+        offset_ns: system time minus monotonic time [ns].
     """
 
     bag_ns: int
-    wall_ns: int
+    steady_ns: int
     rate: float
+    offset_ns: int
+
+    @classmethod
+    def now(cls, bag_ns: int, rate: float) -> Timeline:
+        """Returns the timeline that has a bag time now."""
+        steady_ns = time.monotonic_ns()
+        return cls(bag_ns, steady_ns, rate, time.time_ns() - steady_ns)
 
     def due(self, bag_ns: int) -> int:
-        """Wall time at which a bag time is due [ns]."""
-        return self.wall_ns + round((bag_ns - self.bag_ns) / self.rate)
+        """Monotonic time at which a bag time is due [ns]."""
+        return self.steady_ns + round((bag_ns - self.bag_ns) / self.rate)
 
-    def bag_time(self, wall_ns: int) -> int:
-        """Bag time of a wall time [ns]."""
-        return self.bag_ns + round((wall_ns - self.wall_ns) * self.rate)
+    def bag_time(self, steady_ns: int) -> int:
+        """Bag time of a monotonic time [ns]."""
+        return self.bag_ns + round((steady_ns - self.steady_ns) * self.rate)
+
+    def stamp(self, bag_ns: int) -> int:
+        """Stamp of the system clock at which a bag time is due [ns]."""
+        offset_ns = time.time_ns() - time.monotonic_ns()
+        if abs(offset_ns - self.offset_ns) > _CLOCK_STEP_NS:
+            self.offset_ns = offset_ns
+        return self.due(bag_ns) + self.offset_ns
 
     def pause(self, duration_ns: int) -> None:
         """Delays everything after this moment."""
-        self.wall_ns += duration_ns
+        self.steady_ns += duration_ns
 
 
 class Player(Node):
@@ -185,7 +204,7 @@ class Player(Node):
         timeline = self._timeline = None
         for message in self._messages():
             if timeline is None:
-                timeline = Timeline(self._first_ns, time.time_ns(), self._options.rate)
+                timeline = Timeline.now(self._first_ns, self._options.rate)
                 self._timeline = timeline
             self._wait_until_due(timeline, message.stamp_ns)
             stamp_ns = self._publish(timeline, message)
@@ -207,7 +226,7 @@ class Player(Node):
 
     def _wait_until_due(self, timeline: Timeline, bag_ns: int) -> None:
         due_ns = timeline.due(bag_ns)
-        while (now_ns := time.time_ns()) < due_ns:
+        while (now_ns := time.monotonic_ns()) < due_ns:
             self._publish_clock(min(bag_ns, timeline.bag_time(now_ns)))
             pause_ns = min(due_ns - now_ns, _CLOCK_PERIOD_NS)
             self._executor.spin_once(timeout_sec=pause_ns / NANO)
@@ -219,7 +238,7 @@ class Player(Node):
         if has_header(message.msgtype):
             stamp_ns = read_stamp(data)
             if stamp_ns and self._clock_output is None:
-                stamp_ns += timeline.due(message.stamp_ns) - message.stamp_ns
+                stamp_ns += timeline.stamp(message.stamp_ns) - message.stamp_ns
                 data = with_stamp(data, stamp_ns)
         self._outputs[message.topic].publish(data)
         self._counts['messages'] += 1
@@ -236,7 +255,7 @@ class Player(Node):
         """In lock-step, advances the clock until the frames of the last answer are published."""
         end_s = time.monotonic() + self._options.answer_timeout
         while self._unpublished and self._timeline is not None and time.monotonic() < end_s:
-            self._publish_clock(self._timeline.bag_time(time.time_ns()))
+            self._publish_clock(self._timeline.bag_time(time.monotonic_ns()))
             self._executor.spin_once(timeout_sec=_CLOCK_PERIOD_NS / NANO)
 
     def _publish_clock(self, bag_ns: int) -> None:
@@ -256,7 +275,7 @@ class Player(Node):
 
     def _wait_for_answer(self, timeline: Timeline, bag_ns: int, stamp_ns: int) -> None:
         """Pauses the bag until the node reports the end of the trajectory."""
-        begin_ns, seen = time.time_ns(), len(self._ends)
+        begin_ns, seen = time.monotonic_ns(), len(self._ends)
         end_s = time.monotonic() + self._options.answer_timeout
         answer: dict[str, str] | None = None
         while answer is None and time.monotonic() < end_s:
@@ -266,7 +285,7 @@ class Player(Node):
                 (e for e in self._ends[seen:] if e.get('trajectory_stamp_ns') == str(stamp_ns)),
                 None,
             )
-        timeline.pause(time.time_ns() - begin_ns)
+        timeline.pause(time.monotonic_ns() - begin_ns)
         state = 'unanswered' if answer is None else answer['state']
         self._counts[state] += 1
         self.get_logger().info(f'trajectory is answered: {state}')
