@@ -69,6 +69,8 @@ setup(
         'describe': ['httpx2>=2.16', 'openai>=3.52,<4'],
         # Segmenters with public weights: MM-Grounding-DINO with SAM 2, SAM 3.
         'vision': ['transformers>=5.23,<6'],
+        # Imagination as an environment of Gymnasium.
+        'gym': ['gymnasium>=1.0'],
         # Intervals, fits and charts of evaluate, calibrate, rank and report; PSNR and SSIM.
         'evaluate': ['matplotlib>=3.6', 'torchmetrics>=1.8'],
         # Wan 2.1: umT5, CLIP and LoRA adapters.

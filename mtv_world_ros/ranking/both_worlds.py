@@ -13,9 +13,9 @@ import numpy as np
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.images import resize_frames
 from mtv_world_ros.ranking.rollout_jobs import COMMANDS_PART, OBJECTS_PART, WorldComparison
-from mtv_world_ros.ranking.worlds import SeenChunk
 from mtv_world_ros.rollout.prediction import Prediction
 from mtv_world_ros.rollout.rollout import ObservedChunk
+from mtv_world_ros.simulation.simulated_world import SeenChunk
 from mtv_world_ros.success.estimator import verdict
 from mtv_world_ros.viewing.rollout_clips import make_clip
 from mtv_world_ros.viewing.scored_rollout import StoredRollout

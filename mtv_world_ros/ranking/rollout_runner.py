@@ -19,18 +19,13 @@ from mtv_world_ros.ranking.both_worlds import BothWorlds
 from mtv_world_ros.ranking.flips import last_frames_png, OBJECTS, objects_png
 from mtv_world_ros.ranking.no_picture_rule import judge_without_pictures
 from mtv_world_ros.ranking.rollout_jobs import Job, Result, StoredEstimate
-from mtv_world_ros.ranking.worlds import (
-    ImaginedWorld,
-    PolicyRun,
-    run_policy,
-    SimulatedWorld,
-    World,
-)
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.rollout import Rollout
+from mtv_world_ros.rollout.world import ImaginedWorld, PolicyRun, run_policy, World
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
+from mtv_world_ros.simulation.simulated_world import SimulatedWorld
 from mtv_world_ros.simulation.simulator import SimEpisode
 
 #: (policy, task, seed, expert) -> policy; has to be picklable for several processes
@@ -94,8 +89,9 @@ class RolloutRunner:
     def simulate(self, job: Job) -> SimulatedRollout:
         """Returns what a policy reached in the simulator."""
         policy = self.config.make_policy(job.policy, job.task, job.seed, self._expert)
-        world = SimulatedWorld(self._sim, self.pipeline.spec.fps, job.seed, job.task)
-        run = self._run(policy, world, world.instruction, job)
+        spec = self.pipeline.spec
+        world = SimulatedWorld(self._sim, job.task, fps=spec.fps, chunk_s=spec.chunk_seconds)
+        run = self._run(policy, world, job)
         ever, final = world.outcome()
         return SimulatedRollout(
             policy=policy,
@@ -114,9 +110,9 @@ class RolloutRunner:
         found = [observed.observe(chunk.frames, chunk.positions) for chunk in world.chunks]
         judging_s = time.perf_counter() - begun
         begun = time.perf_counter()
-        episode = self._begin(real, job, observed.names)  # a describer is asked once
-        imagined = ImaginedWorld(episode, world.start)
-        run = self._run(real.policy, imagined, real.instruction, job)
+        options = self._options(real, job, observed.names)  # a describer is asked once
+        imagined = ImaginedWorld(self.pipeline, world.start, options)
+        run = self._run(real.policy, imagined, job)
         imagining_s = time.perf_counter() - begun
         begun = time.perf_counter()
         pictures = self._pictures_alone(job, real, observed.names) or imagined.success
@@ -127,7 +123,7 @@ class RolloutRunner:
             observed=found,
             imagined=imagined.chunks,
         )
-        last = last_frames_png(observed.observation.frames, episode.observation.frames)
+        last = last_frames_png(observed.observation.frames, imagined.rollout.observation.frames)
         return Result(
             policy=job.policy,
             task=job.task,
@@ -167,9 +163,9 @@ class RolloutRunner:
         """The estimate of an episode in which no motion is foreseen; None = none ever is."""
         if self.pipeline.object_motion is None:
             return None
-        episode = self._begin(real, job, objects, self.pipeline.without_foresight())
-        world = ImaginedWorld(episode, real.world.start)
-        self._run(real.policy, world, real.instruction, job)
+        pipeline, options = self.pipeline.without_foresight(), self._options(real, job, objects)
+        world = ImaginedWorld(pipeline, real.world.start, options)
+        self._run(real.policy, world, job)
         return world.success
 
     def _judge_without_pictures(
@@ -184,31 +180,26 @@ class RolloutRunner:
             return StoredEstimate.stated(nan, f'abstains: {reason}')
         return StoredEstimate.stated(float(success), 'the no-picture rule')
 
-    def _begin(
-        self,
-        real: SimulatedRollout,
-        job: Job,
-        objects: tuple[str, ...] = (),
-        pipeline: Pipeline | None = None,
-    ) -> Rollout:
+    def _begin(self, real: SimulatedRollout, job: Job, objects: tuple[str, ...] = ()) -> Rollout:
         """An episode that begins with the simulator's first observation."""
-        return (pipeline or self.pipeline).begin(
-            real.world.start,
-            RolloutOptions(
-                instruction=real.instruction,
-                objects=objects,
-                seed=job.seed,
-                num_inference_steps=self.config.num_inference_steps,
-            ),
+        return self.pipeline.begin(real.world.start, self._options(real, job, objects))
+
+    def _options(
+        self, real: SimulatedRollout, job: Job, objects: tuple[str, ...]
+    ) -> RolloutOptions:
+        """Options of the rollouts that begin with the simulator's first observation."""
+        return RolloutOptions(
+            instruction=real.instruction,
+            objects=objects,
+            seed=job.seed,
+            num_inference_steps=self.config.num_inference_steps,
         )
 
-    def _run(self, policy: Policy, world: World, instruction: str, job: Job) -> PolicyRun:
-        policy.reset(seed=job.seed)
+    def _run(self, policy: Policy, world: World, job: Job) -> PolicyRun:
         return run_policy(
             policy,
             world,
-            instruction,
-            chunk_s=self.pipeline.spec.chunk_seconds,
+            seed=job.seed,
             max_chunks=self.config.max_chunks,
             hold=self.config.hold,
         )

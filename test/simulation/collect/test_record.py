@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.core.files import share_path
-from mtv_world_ros.ranking.worlds import SimulatedWorld
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.simulation.collect.record import RecordConfig, simulate
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
 from mtv_world_ros.simulation.opengl import missing_opengl
 from mtv_world_ros.simulation.randomize import RandomizationConfig
+from mtv_world_ros.simulation.simulated_world import SimulatedWorld
 from mtv_world_ros.simulation.simulator import SimEpisode
 from mtv_world_ros.simulation.tasks import task_named
 
@@ -36,10 +36,12 @@ def test_recorded_episodes_and_ranked_policies_are_carried_out_alike(name):
         variant=policy.variant,
     )
     config = RandomizationConfig(width=96, height=72)
-    world = SimulatedWorld(SimEpisode(robot, expert.home, config), 10.0, SEED, TASK)
+    sim = SimEpisode(robot, expert.home, config)
+    world = SimulatedWorld(sim, TASK, fps=10.0, chunk_s=1.6)
     policy.reset(seed=SEED)
-    while (answer := policy.act(world.observation)) is not None:
-        world.execute(answer)
+    observation = world.reset(seed=SEED)
+    while (answer := policy.act(observation)) is not None:
+        observation = world.step(answer)
     ranked = np.concatenate(world.commands)
     both = min(len(ranked), len(take.commands.positions) - 1)
     assert both > 200

@@ -4,7 +4,7 @@ import pytest
 from mtv_world_ros.core.data_types import JointTrajectory, Observation
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.policies.policy import first_part
-from mtv_world_ros.ranking.worlds import End, run_policy
+from mtv_world_ros.rollout.world import End, run_policy
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -28,6 +28,9 @@ class _Policy:
     def __init__(self, num_answers):
         self.stamps, self._left = [], num_answers
 
+    def reset(self, *, seed):
+        self.stamps = []
+
     def act(self, observation, instruction):
         self.stamps.append((observation.stamp_ns - START_NS) / 1e9)
         self._left -= 1
@@ -35,20 +38,26 @@ class _Policy:
 
 
 class _World:
+    instruction, chunk_s = 'go', 1.2
+
     def __init__(self, verdicts=()):
         self.executed, self._verdicts = [], iter(verdicts)
-        self.observation = _observation()
 
-    def execute(self, answer):
+    def reset(self, *, seed):
+        self.observation = _observation()
+        return self.observation
+
+    def step(self, answer):
         self.executed.append(float(answer.times[-1]))
         self.observation = _observation(self.observation.stamp_ns + round(answer.times[-1] * 1e9))
+        return self.observation
 
     def is_done(self):
         return next(self._verdicts)
 
 
 def _run(policy, world, max_chunks, **more):
-    return run_policy(policy, world, 'go', chunk_s=1.2, max_chunks=max_chunks, **more)
+    return run_policy(policy, world, max_chunks=max_chunks, **more)
 
 
 def test_the_policy_sees_what_its_answer_led_to_and_ends_the_episode():
