@@ -126,7 +126,7 @@ def test_tool_poses_become_joints_and_what_is_left_is_told(tmp_path, franka, pos
     assert np.abs(np.diff(found, axis=0)).max() < 0.2  # no jump to another posture
     states[:, 0] += 2.0
     write_raw(tmp_path / 'off', 'a', positions, states=states.tolist())
-    command[1] = str(tmp_path / 'off')
+    command[2] = str(tmp_path / 'off')
     assert main([*command, '--out', str(tmp_path / 'far')]) == 1
     assert 'out of reach' in capsys.readouterr().err
 
