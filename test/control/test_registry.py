@@ -11,9 +11,15 @@ import sys
 import numpy as np
 import pytest
 
+from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.cli import main
 from mtv_world_ros.control import registry
-from mtv_world_ros.control.control import ControlInputs, ControlOptions, InputLayout
+from mtv_world_ros.control.control import (
+    ControlInputs,
+    ControlOptions,
+    ControlScene,
+    InputLayout,
+)
 from mtv_world_ros.control.registry import (
     check_control_name,
     control_class,
@@ -177,3 +183,43 @@ def test_any_control_trains_and_predicts(control, outside, tmp_path, robot):
         frames.append(chunk.video.frames)
     assert frames[0].shape == (2, 16, 40, 48, 3)
     assert not np.array_equal(*frames)
+
+
+def test_the_control_of_the_page_can_be_used(robot, tmp_path, monkeypatch):
+    """The file that docs/architecture.md shows."""
+    page = share_path('docs', 'architecture.md').read_text()
+    block = page.partition('## A control of your own')[2].partition('```python\n')[2]
+    (tmp_path / 'control_of_the_page.py').write_text(block.partition('```')[0])
+    monkeypatch.syspath_prepend(tmp_path)
+    control = create_control('control_of_the_page:Gripper', options(robot))
+    sys.modules.pop('control_of_the_page')
+    motion = Motion.of(robot, (), np.stack([robot.lower, robot.upper]))
+    scene = ControlScene(
+        motion=motion, times=np.arange(2.0), start_frames=np.zeros((0, 4, 4, 3), np.uint8)
+    )
+    inputs = control.make(scene)
+    control.layout.check(inputs, 'Gripper')
+    np.testing.assert_allclose(inputs.frame, motion.openings.T)
+    assert inputs.num_frames == 1
+
+
+def test_the_preset_paper_draws_trails_and_first_masks_and_is_small_otherwise():
+    paper, small = (load_training_config(name).model_dump() for name in ('paper', 'small'))
+    drawn = paper.pop('rendering')
+    assert [drawn[key] for key in ('link_width_m', 'finger_width_m')] == [None, None]
+    assert not drawn['object_motion'] and not drawn['arm_pictures']
+    assert paper['video']['control'] == 'trajectory_video' and paper['video']['object_mask']
+    assert paper == {key: value for key, value in small.items() if key != 'rendering'}
+
+
+@pytest.mark.parametrize(
+    ('change', 'kinds'),
+    [
+        ({'video.views': ['low']}, {'views': ('low',)}),
+        ({'video.object_mask': False}, {'object_mask': False}),
+        ({'video.control': 'policy2vec'}, {'control': 'policy2vec'}),
+    ],
+)
+def test_each_ablation_and_baseline_is_one_value_away(change, kinds):
+    card = load_training_config('paper', change).card({})
+    assert {key: getattr(card, key) for key in kinds} == kinds
