@@ -74,7 +74,7 @@ def test_a_name_that_was_taken_meanwhile_is_respected(tmp_path):
     (tmp_path / 'episode' / 'mine').write_text('')
     with pytest.raises(EpisodeError, match='exists already'):
         writer.close()
-    assert list((tmp_path / 'episode').iterdir()) == []
+    assert [left.name for left in (tmp_path / 'episode').iterdir()] == ['mine']
     assert [left.name for left in tmp_path.iterdir()] == ['episode']
 
 
