@@ -97,6 +97,7 @@ class Limits:
         joint_names: in a message.
         trajectory_points: in a message.
         instruction_characters: of an instruction.
+        table_values: numbers and texts in the columns that are read of a parquet file.
         answer_bytes: of an answer of a policy server or of a language model.
         array_bytes: of an array in an answer, and of all arrays in a file, inflated.
     """
@@ -118,6 +119,7 @@ class Limits:
     joint_names: int = 1_000
     trajectory_points: int = 20_000
     instruction_characters: int = 4_000
+    table_values: int = 200_000_000
     answer_bytes: int = 64 * 2**20
     array_bytes: int = 256 * 2**20
 

@@ -13,6 +13,7 @@ import os
 from pathlib import Path
 import re
 import shutil
+import stat
 import sys
 import tempfile
 from typing import Any
@@ -186,6 +187,24 @@ def check_room(folder: Path, num_bytes: int) -> None:
     if free < num_bytes:
         text = f'{os.strerror(errno.ENOSPC)}: {free} bytes are free, {num_bytes} are needed'
         raise OSError(errno.ENOSPC, text, str(folder))
+
+
+def copy_folder(source: Path, target: Path) -> None:
+    """Copy a folder's regular files, and what links in it stand for.
+
+    Raises:
+        OSError: a file cannot be read, or is a device or a pipe, which may have no end.
+    """
+    shutil.copytree(source, target, copy_function=_copy_regular)
+
+
+def _copy_regular(source: str, target: str) -> None:
+    descriptor = os.open(source, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with open(descriptor, 'rb') as read:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, 'it is no regular file', source)
+        with open(target, 'wb') as written:
+            shutil.copyfileobj(read, written, 2**24)
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:

@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.core.bounded_input import (
+    check_limit,
     fill_template,
+    LimitError,
     parse_json,
     read_bytes,
     read_json,
@@ -34,6 +36,8 @@ _PNG_DEPTH = bytes([16, 0])
 _INFO = Path('meta/info.json')
 #: a video frame may be this share of the period away from its row
 _TIME_TOLERANCE = 0.25
+#: rows a second that no recording exceeds [Hz]
+_MOST_HZ = 10_000.0
 #: characters of a wrong value in an error
 _MOST_SHOWN = 120
 
@@ -93,6 +97,8 @@ class LeRobotDataset:
             )
         try:
             self.fps = float(info['fps'])
+            if not 0 < self.fps <= _MOST_HZ:
+                raise ValueError(f'fps is {self.fps:g}; it must be above 0, at most {_MOST_HZ:g}')
             self.features: dict[str, dict[str, Any]] = dict(info['features'])
             self._data_path = info['data_path']
             self._video_path = info.get('video_path') or ''
@@ -493,9 +499,29 @@ def _place(row: Mapping[str, Any], prefix: str) -> dict[str, int]:
 def _read_table(file: Path, **options: Any) -> Any:
     pyarrow, parquet = pyarrow_modules()
     try:
+        _check_table(parquet.read_metadata(file), file, options.get('columns'))
         return parquet.read_table(file, **options)
     except (OSError, pyarrow.ArrowException) as error:
         raise EpisodeError(f"cannot read '{file}': {' '.join(str(error).split())}") from error
+
+
+def _check_table(metadata: Any, file: Path, columns: Sequence[str] | None) -> None:
+    """Check how many values a table has: a few kilobytes may state billions of equal ones.
+
+    Raises:
+        EpisodeError: there are too many.
+    """
+    parts = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    count = sum(
+        column.num_values
+        for part in parts
+        for column in map(part.column, range(part.num_columns))
+        if columns is None or column.path_in_schema.partition('.')[0] in columns
+    )
+    try:
+        check_limit('table_values', count, f"'{file}'")
+    except LimitError as error:
+        raise EpisodeError(str(error)) from error
 
 
 def pyarrow_modules() -> tuple[Any, Any]:

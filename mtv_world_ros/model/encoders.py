@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from pathlib import Path
-import shutil
 from typing import Any
 
 import torch
@@ -13,6 +12,7 @@ import torch.nn.functional as F
 
 from mtv_world_ros.core.bounded_input import check_weights
 from mtv_world_ros.core.errors import CheckpointError
+from mtv_world_ros.core.files import copy_folder
 from mtv_world_ros.core.network_sizes import check_config_file
 from mtv_world_ros.model.tensor_files import import_transformers
 from mtv_world_ros.model.transformer.block import NUM_TEXT_TOKENS
@@ -87,7 +87,7 @@ class TextEncoder:
     def save(self, checkpoint: Path) -> None:
         """Copies its files into another checkpoint."""
         for name in FOLDERS:
-            shutil.copytree(self._checkpoint / name, checkpoint / name)
+            copy_folder(self._checkpoint / name, checkpoint / name)
 
 
 class ImageEncoder:
@@ -162,4 +162,4 @@ class ImageEncoder:
 
     def save(self, checkpoint: Path) -> None:
         """Copies its files into another checkpoint."""
-        shutil.copytree(self._source / _FOLDER, checkpoint / _FOLDER)
+        copy_folder(self._source / _FOLDER, checkpoint / _FOLDER)

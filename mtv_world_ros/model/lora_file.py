@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
+from functools import cache
 from math import sqrt
 from pathlib import Path
 import re
@@ -56,6 +57,12 @@ _PLAIN = {
 }
 
 
+#: characters of a pattern for the names of modules
+_LONGEST_PATTERN = 200
+#: signs of repetition in such a pattern
+_MOST_REPEATS = 3
+
+
 class Factors(NamedTuple):
     """Change of a module's weight: `scale * B @ A`; A (r, in), B (out, r)."""
 
@@ -77,8 +84,8 @@ class PeftSettings(Schema):
 
     r: Count
     lora_alpha: Number | None = None
-    rank_pattern: dict[str, Count] = Field(default_factory=dict)
-    alpha_pattern: dict[str, Number] = Field(default_factory=dict)
+    rank_pattern: dict[str, Count] = Field(default_factory=dict, max_length=10_000)
+    alpha_pattern: dict[str, Number] = Field(default_factory=dict, max_length=10_000)
     use_rslora: bool = False
 
     def scale(self, module: str, rank: int) -> float:
@@ -103,10 +110,32 @@ class PeftSettings(Schema):
 def _matching(pattern: Mapping[str, Any], module: str, default: Any) -> Any:
     """The value of the first pattern that matches, as peft matches them."""
     try:
-        found = (v for key, v in pattern.items() if re.match(rf'(.*\.)?({key})$', module))
+        found = (v for key, v in pattern.items() if _expression(key).match(module))
         return next(found, default)
     except re.error as error:
         raise ConfigError(f'a pattern is no regular expression: {error}') from error
+
+
+@cache
+def _expression(pattern: str) -> re.Pattern[str]:
+    """Return a pattern of peft's settings, which takes little time whatever it is matched with.
+
+    Raises:
+        ConfigError: the pattern is long, repeats a group, or repeats too often: a search may
+            take time that grows exponentially with the length of a name.
+    """
+    repeats = re.findall(r'(?<!\\)[*+{?]', pattern)
+    if len(pattern) > _LONGEST_PATTERN or len(repeats) > _MOST_REPEATS or ')' in _before(pattern):
+        raise ConfigError(
+            f"the pattern '{pattern[:_LONGEST_PATTERN]}' could take forever; write module names, "
+            f'with at most {_MOST_REPEATS} of * + ? {{ and none behind a group'
+        )
+    return re.compile(rf'(.*\.)?({pattern})$')
+
+
+def _before(pattern: str) -> list[str]:
+    """Return what stands before each sign of repetition."""
+    return re.findall(r'(.)[*+{?]', pattern)
 
 
 def read_lora(file: Path, transformer: nn.Module) -> dict[str, Factors]:

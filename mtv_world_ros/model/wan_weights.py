@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 import json
 from math import isqrt
 from pathlib import Path
-import shutil
 from typing import Any
 
 from safetensors.torch import save_file
@@ -15,7 +14,7 @@ import torch
 
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.errors import CheckpointError
-from mtv_world_ros.core.files import whole_folder
+from mtv_world_ros.core.files import copy_folder, whole_folder
 from mtv_world_ros.model import wan_keys
 from mtv_world_ros.model.card import CheckpointCard, ROBOT_FOLDER
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
@@ -191,7 +190,7 @@ def import_weights(
     sources = find_sources(Path(path), elsewhere or {})
     with whole_folder(out) as partial:
         reports = _import_parts(sources, partial, transformer, autoencoder, shard_bytes)
-        shutil.copytree(sources['tokenizer'], partial / 'tokenizer')
+        copy_folder(sources['tokenizer'], partial / 'tokenizer')
         build_scheduler(scheduler).save_pretrained(partial / 'scheduler')
         if robot is not None:
             save_robot(robot, partial / ROBOT_FOLDER)

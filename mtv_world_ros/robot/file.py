@@ -17,7 +17,7 @@ import pinocchio as pin
 from pydantic import Field, model_validator
 import yaml
 
-from mtv_world_ros.core.bounded_input import read_text
+from mtv_world_ros.core.bounded_input import check_limit, LimitError, read_text
 from mtv_world_ros.core.config import ListOf, Metres, Quaternion, read_yaml, Schema, validated
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import ConfigError, RobotError
@@ -267,7 +267,10 @@ def load_robot(path: Path | str) -> RobotModel:
         base = file.base_link or base
     else:
         base = file.base_link or 'base'
-        model = _from_dh(file, base)
+        try:
+            model = _from_dh(file, base)
+        except LimitError as error:
+            raise RobotError(f"'{path}': {error}") from error
     joints = file.joints or _movable(model, {mimic.joint for mimic in mimics})
     pose_keys = set(PoseEntry.model_fields)
     return RobotModel(
@@ -546,7 +549,11 @@ def _from_dh(file: RobotFile, base: str) -> pin.Model:
     model = pin.Model()
     model.name = file.name
     model.addFrame(pin.Frame(base, 0, 0, pin.SE3.Identity(), pin.FrameType.BODY))
+    check_limit(
+        'urdf_links', sum(len(arm.joints) for arm in file.dh or ()), f"robot '{file.name}'"
+    )
     for arm in file.dh or ():
+        check_limit('chain_links', len(arm.joints), f"arm '{arm.arm}'")
         _add_dh_arm(model, arm)
     return model
 

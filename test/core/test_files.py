@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from mtv_world_ros.core.files import recover_folder, whole_folder, write_whole
+from mtv_world_ros.core.files import copy_folder, recover_folder, whole_folder, write_whole
 
 #: number of a process that never is: above the kernel's greatest (4194304)
 NO_PROCESS = 9999999
@@ -205,3 +205,19 @@ def test_who_may_read_is_what_the_umask_says(tmp_path, umask, mode):
     folders = {name: found for name, found in modes.items() if name in ('x', 'bag')}
     assert folders == {'x': mode, 'bag': mode}
     assert all(found == mode & 0o666 for name, found in modes.items() if name not in folders)
+
+
+def test_copies_of_folders_hold_regular_files_alone(tmp_path):
+    source = tmp_path / 'source'
+    (source / 'inside').mkdir(parents=True)
+    (tmp_path / 'blob').write_text('of a cache')
+    (source / 'inside' / 'link').symlink_to(tmp_path / 'blob')
+    copy_folder(source, tmp_path / 'copy')
+    copied = tmp_path / 'copy' / 'inside' / 'link'
+    assert copied.read_text() == 'of a cache' and not copied.is_symlink()
+    for name, place in (('endless', '/dev/zero'), ('waits', None)):
+        bad = tmp_path / name
+        bad.mkdir()
+        (bad / 'x').symlink_to(place) if place else os.mkfifo(bad / 'x')
+        with pytest.raises(OSError, match='regular file|named pipe'):
+            copy_folder(bad, tmp_path / f'{name}_copy')

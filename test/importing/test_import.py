@@ -22,7 +22,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, MtvWorldError
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.importing.convert import import_dataset
-from mtv_world_ros.importing.lerobot import frames_at
+from mtv_world_ros.importing.lerobot import frames_at, LeRobotDataset
 from mtv_world_ros.vision.segmenters.examples import ObjectExamples
 
 START_NS = 1_000_000_000
@@ -403,3 +403,24 @@ def test_reports_9_and_10_times_of_hardware_find_their_frames_or_are_named(write
     with pytest.raises(EpisodeError, match='3 frames are missing'):
         more = np.append(times, times[-1] + period * np.arange(1, 4))
         list(frames_at(tmp_path / 'v.mp4', more, period / 4))
+
+
+def test_a_table_of_too_many_values_is_refused_before_it_is_read(datasets, monkeypatch):
+    """A file of 20 kB may state hundreds of millions of equal rows."""
+    dataset = LeRobotDataset(datasets('v3.0'))
+    entry = dataset.episodes[0]
+    count = parquet.read_metadata(entry.data_file).num_rows * 3  # with frame and episode index
+    monkeypatch.setenv('MTV_WORLD_MAX_TABLE_VALUES', str(count))
+    dataset.rows(entry, ['timestamp'])
+    monkeypatch.setenv('MTV_WORLD_MAX_TABLE_VALUES', str(count - 1))
+    with pytest.raises(EpisodeError, match=rf'has {count} values; at most .*TABLE_VALUES'):
+        dataset.rows(entry, ['timestamp'])
+
+
+@pytest.mark.parametrize('fps', [0, -5, 1e-400, 1e6, float('nan'), 'x', None])
+def test_a_rate_that_no_recording_has_is_named(datasets, fps, tmp_path):
+    folder = shutil.copytree(datasets('v2.1'), tmp_path / 'x')
+    info = json.loads((folder / 'meta/info.json').read_text()) | {'fps': fps}
+    (folder / 'meta/info.json').write_text(json.dumps(info))
+    with pytest.raises(EpisodeError, match='fps is|float|convert'):
+        LeRobotDataset(folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+import time
 from typing import Any
 
 from diffusers import WanPipeline
@@ -15,8 +16,9 @@ from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
 
-from mtv_world_ros.core.errors import CheckpointError
+from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.model.lora import Adapters
+from mtv_world_ros.model.lora_file import PeftSettings
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.adapter import TARGETS
 from test.support.wan_files import DIM, FFN, LAYERS
@@ -37,6 +39,23 @@ SETTINGS = {
         'alpha_pattern': {'attn1.to_v': 5},
     },
 }
+
+
+@pytest.mark.parametrize(
+    'pattern', ['(a+)+', '(.*)*b', '(a|a)*', '.*.*.*.*x', 'x' * 300, '(a?){30}', r'(\w+\.)+q']
+)
+def test_a_pattern_that_could_take_forever_is_refused_in_time(pattern):
+    settings = PeftSettings(r=4, lora_alpha=1.0, rank_pattern={pattern: 4})
+    begin_s = time.perf_counter()
+    with pytest.raises(ConfigError, match='could take forever'):
+        settings.scale('a' * 60, 4)
+    assert time.perf_counter() - begin_s < 0.5
+
+
+@pytest.mark.parametrize('pattern', ['to_q', r'blocks\.\d+\.to_q', r'.*attn[12].*', r'a\+b'])
+def test_patterns_that_people_write_are_matched(pattern):
+    settings = PeftSettings(r=4, lora_alpha=1.0, rank_pattern={pattern: 8})
+    assert settings.scale('other', 4) == 0.25
 
 
 def randomize(model: torch.nn.Module) -> None:

@@ -18,6 +18,7 @@ import cv2
 from mcap.writer import CompressionType, Writer
 import msgpack
 import numpy as np
+import yaml
 import zstandard
 
 from mtv_world_ros.core.files import share_path
@@ -34,8 +35,6 @@ def calibration(text: str, instead: str) -> bytes:
 
 def calibrated(**values: Any) -> bytes:
     """One camera with some values of its own."""
-    import yaml
-
     view = {
         'width': 96,
         'height': 72,
@@ -221,6 +220,15 @@ def nested(count: int) -> str:
     return '<a>' * count + '</a>' * count
 
 
+def arm_of(count: int) -> bytes:
+    """A Denavit-Hartenberg table of joints in a row."""
+    row = {'a': 0.1, 'alpha': 0.0, 'd': 0.0, 'lower': -1.0, 'upper': 1.0}
+    joints = [{'joint': f'j{n}', **row} for n in range(count)]
+    tools = [{'arm': 'a', 'link': 'j0_link'}]
+    values = {'name': 'r', 'dh': [{'arm': 'a', 'joints': joints}], 'tools': tools}
+    return yaml.safe_dump(values, default_flow_style=True).encode()
+
+
 def entity_bomb() -> bytes:
     """Ten levels of ten entities."""
     rows = ''.join(f'<!ENTITY a{n + 1} "{f"&a{n};" * 10}">' for n in range(10))
@@ -266,6 +274,9 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
         lambda: b'<COLLADA>' + b'<node>' * 100_000 + b'</node>' * 100_000 + b'</COLLADA>',
     ),
     'COLLADA whose entities laugh': ('COLLADA', entity_bomb),
+    'fps 0': ('LeRobot v2.1', lambda: altered('LeRobot v2.1', rb'"fps": [\d.]+', b'"fps": 0')),
+    'arm of 2,100 joints': ('robot', lambda: arm_of(2_100)),
+    'arm of 250 joints': ('robot', lambda: arm_of(250)),
     'data path of 3 GB': (
         'LeRobot v2.1',
         lambda: altered('LeRobot v2.1', rb'\{episode_index:06d\}', b'{episode_index:>3000000000}'),
