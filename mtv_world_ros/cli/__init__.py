@@ -25,6 +25,7 @@ from types import ModuleType  # noqa: E402
 from typing import Any  # noqa: E402
 
 from mtv_world_ros.cli.commands import (  # noqa: E402
+    ADVANCED_OPTIONS,
     COMMANDS,
     REMOVED,
     RENAMED,
@@ -95,10 +96,21 @@ def make_parser(*wanted: str) -> argparse.ArgumentParser:
             made = commands.add_parser(group, help=_GROUPS[group])
             groups[group] = made.add_subparsers(required=True, metavar=group.upper())
         module = import_module(f'mtv_world_ros.cli.{COMMANDS[name].module}')
-        getattr(module, COMMANDS[name].function)(groups.get(group, commands))
+        place = groups.get(group, commands)
+        getattr(module, COMMANDS[name].function)(place)
+        _separate_advanced(place.choices[last])
     if not wanted:
         _add_others(commands)
     return parser
+
+
+def _separate_advanced(parser: argparse.ArgumentParser) -> None:
+    """Show the options that few users need last in a parser's help."""
+    common = parser._optionals._group_actions
+    rare = [action for action in common if ADVANCED_OPTIONS & {*action.option_strings}]
+    if rare:
+        parser._optionals._group_actions = [a for a in common if a not in rare]
+        parser.add_argument_group('advanced options')._group_actions.extend(rare)
 
 
 def _add_others(commands: argparse._SubParsersAction) -> None:

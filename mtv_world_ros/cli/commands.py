@@ -102,5 +102,40 @@ RENAMED = {
     'faults': ('rank', '--list-faults'),
 }
 
+#: options that few users need; `--help` shows them last, under a heading of their own
+ADVANCED_OPTIONS = frozenset(
+    {
+        '--adapter',
+        '--between',
+        '--cache',
+        '--data-workers',
+        '--describer',
+        '--dtype',
+        '--fid-weights',
+        '--fvd-weights',
+        '--held-out-episodes',
+        '--latent-cache',
+        '--max-chunks',
+        '--motions',
+        '--no-camera-check',
+        '--no-ceiling',
+        '--no-clips',
+        '--no-report',
+        '--no-store',
+        '--no-video',
+        '--peak-tflops',
+        '--physics',
+        '--sample-every',
+        '--save-every',
+        '--save-minutes',
+        '--serving',
+        '--sheets',
+        '--steps',
+        '--threads',
+        '--true-episodes',
+        '--truth',
+    }
+)
+
 #: commands that left -> the last version that has them
 REMOVED = {'distill': '0.1.0', 'train-motion': '0.1.0'}

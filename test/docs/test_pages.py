@@ -67,7 +67,7 @@ TERMS = re.compile(
 
 @pytest.mark.parametrize('page', sorted((ROOT / 'docs').glob('*.md')), ids=lambda page: page.stem)
 def test_terms_are_linked_to_the_glossary_where_a_page_uses_them_first(page):
-    if page.stem in ('glossary', 'parameters'):
+    if page.stem in ('glossary', 'parameters', 'commands'):
         return
     text = re.sub(r'```.*?```|<!--.*?-->', '', page.read_text(), flags=re.S)
     used = TERMS.search(text)
@@ -76,10 +76,20 @@ def test_terms_are_linked_to_the_glossary_where_a_page_uses_them_first(page):
         assert 'glossary.md' in text[:line_end], f'{used[0]} is not explained'
 
 
-def test_every_page_is_linked_from_the_readme():
-    readme = (ROOT / 'README.md').read_text()
+def test_every_page_is_linked_from_the_index():
+    index = (ROOT / 'docs' / 'index.md').read_text()
     for page in (ROOT / 'docs').glob('*.md'):
-        assert f'(docs/{page.name})' in readme, page.name
+        assert f'({page.name})' in index or page.name == 'index.md', page.name
+
+
+def test_the_reference_of_commands_is_what_the_commands_say():
+    spec = importlib.util.spec_from_file_location('pages', ROOT / 'docs' / 'command_pages.py')
+    assert spec is not None
+    assert spec.loader is not None
+    pages = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(pages)
+    written = (ROOT / 'docs' / 'commands.md').read_text()
+    assert written == pages.page(), 'write it again: python docs/command_pages.py'
 
 
 def test_the_index_of_benchmarks_has_every_page():
