@@ -244,7 +244,7 @@ def check_plausible(request: Any, robot: Any) -> None:
     Raises:
         AssertionError: no robot and no camera is like that.
     """
-    trajectory, observation = request.trajectory, request.scene.observation
+    trajectory, observation = request.plan.trajectory, request.scene.observation
     names = trajectory.joint_names
     assert 0 < len(names) <= len(set(names)) <= 14, 'joint names'
     assert set(names) <= set(robot.joint_names), 'joint names of another robot'
