@@ -13,7 +13,7 @@ from rclpy.utilities import remove_ros_args
 
 from mtv_world_ros.data.bag.reader import BagMessage
 from mtv_world_ros.ros.messages.conversions import has_header, message_class, read_stamp
-from mtv_world_ros.ros.qos_profiles import best_offer
+from mtv_world_ros.ros.qos_profiles import best_offer, QosWatch
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.viewing import rerun_log
 from mtv_world_ros.viewing.streams import shown_as, Streams, take
@@ -47,10 +47,12 @@ class LiveViewer(Node):
         self._shown = Streams()
         self._begin_ns = self._last_ns = 0
         self._num_refused = 0
+        self._watch = QosWatch(self)
         self.create_timer(_LOOK_PERIOD_S, self._look)
 
     def _look(self) -> None:
         """Subscribes to new topics; of raw and compressed images of one view to the latter."""
+        self._watch.refresh()
         found = dict(self.get_topic_names_and_types())
         for topic in sorted(found, key=lambda topic: (not topic.endswith('compressed'), topic)):
             kind = shown_as(topic, found[topic][0])

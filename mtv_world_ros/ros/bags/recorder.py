@@ -26,7 +26,7 @@ from mtv_world_ros.ros.messages.conversions import (
     MIN_STAMPED_BYTES,
     read_stamp,
 )
-from mtv_world_ros.ros.qos_profiles import best_offer
+from mtv_world_ros.ros.qos_profiles import best_offer, QosWatch
 from mtv_world_ros.ros.run_node import run
 
 #: messages kept while the disk is busy
@@ -77,6 +77,7 @@ class Recorder(Node):
         self._last_stamp_ns = 0
         self.last_message_s = 0.0
         self._stopping = False
+        self._watch = QosWatch(self)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -142,6 +143,7 @@ class Recorder(Node):
         if self._writer is not None and time.monotonic() > self._next_flush_s:
             self._next_flush_s = time.monotonic() + _FLUSH_PERIOD_S
             self._writer.flush()
+            self._watch.refresh()
         if time.monotonic() > self._announced_s + self.silent_after_s:
             self._name_silent()
 

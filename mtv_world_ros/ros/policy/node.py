@@ -28,7 +28,7 @@ from mtv_world_ros.ros.messages.conversions import make_header, to_trajectory_me
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.policy.loop import PolicyLoop, PolicySettings, PredictedFrames
 from mtv_world_ros.ros.policy.policy_thread import Actor
-from mtv_world_ros.ros.qos_profiles import LATCHED
+from mtv_world_ros.ros.qos_profiles import LATCHED, QosWatch
 from mtv_world_ros.ros.receive_paths import SERVICES
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
@@ -90,6 +90,7 @@ class PolicyNode(Node):
         self._instruction = self.create_publisher(String, 'instruction', LATCHED)
         self.create_service(Trigger, '~/start', self._on_start)
         self.create_service(Trigger, '~/stop', self._on_stop)
+        self._watch = QosWatch(self)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_TICK_S, self._guarded(self._loop.tick), clock=steady)
         self.create_timer(settings.diagnostics_period_s, self._on_period, clock=steady)
@@ -199,6 +200,7 @@ class PolicyNode(Node):
     def _on_period(self) -> None:
         for subscription in self._cameras:
             subscription.refresh()
+        self._watch.refresh()
         self._publish_diagnostics()
 
     def _publish_diagnostics(self) -> None:
@@ -209,8 +211,12 @@ class PolicyNode(Node):
             'num_chunks': self._loop.num_chunks,
             'policies': num_policies,
         }
-        others = f'{num_policies} publishers of joint trajectories, this should be the only one'
-        self._status.publish_diagnostics(state, others if num_policies > 1 else '')
+        warnings = list(self._watch.mismatches)
+        if num_policies > 1:
+            warnings.append(
+                f'{num_policies} publishers of joint trajectories, this should be the only one'
+            )
+        self._status.publish_diagnostics(state, ' | '.join(warnings))
 
     def _guarded(self, handle: Callable[..., None]) -> Callable[..., None]:
         def callback(*arguments: Any) -> None:

@@ -19,6 +19,7 @@ from mtv_world_ros.cameras.camera_info import RECTIFIED
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.node_events import NodeEvents
+from mtv_world_ros.ros.qos_profiles import QosWatch
 from mtv_world_ros.ros.receive_paths import PATHS, SERVICES
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 
@@ -72,6 +73,7 @@ class Inputs:
             default='reliable',
         )
         self._all.append(self._plans)
+        self._watch = QosWatch(node)
         urgent = [node.resolve_topic_name(topic) for topic in ('joint_trajectory', 'joint_states')]
         self._paths = {f'receive_path.{topic}': PATHS.of(topic) for topic in urgent}
 
@@ -79,6 +81,11 @@ class Inputs:
         """Looks at the publishers again; to be called now and then."""
         for subscription in self._all:
             subscription.refresh()
+        self._watch.refresh()
+
+    def mismatches(self) -> list[str]:
+        """Peers of which nothing is received, or that receive nothing, for their QoS."""
+        return self._watch.mismatches
 
     def unpublished(self) -> list[str]:
         """Topics of observations that nobody publishes."""

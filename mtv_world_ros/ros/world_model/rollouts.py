@@ -275,6 +275,9 @@ class Rollouts:
         """What the node needs and does not get; in imagine mode only to begin."""
         if self._description is not None and self._description.problem:
             return [self._description.problem]
+        return [*self._inputs.mismatches(), *self._missing_inputs()]
+
+    def _missing_inputs(self) -> Sequence[str]:
         if self._maker.imagine and self._worker.last_scene is not None:
             return []
         silent = [f'nobody publishes {topic}' for topic in self._inputs.unpublished()]

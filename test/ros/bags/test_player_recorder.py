@@ -238,6 +238,7 @@ def test_recorder_leaves_no_half_written_folder(launch, tmp_path):
     assert "nobody publishes ['/silence']" in said
     assert list(tmp_path.iterdir()) == []
     out.mkdir()
+    (out / 'mine').touch()
     code, said = finish(launch('recorder', out, '/silence'))
     assert code == 1 and 'exists already' in said and 'Traceback' not in said
 
