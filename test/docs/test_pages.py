@@ -22,9 +22,9 @@ from mtv_world_ros.ranking.policy_list import load_policy_list
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.success.relations import KINDS
 from mtv_world_ros.success.task import load_task
+from test.support.tables import table
 
 ROOT = Path(__file__).resolve().parents[2]
-MOST_WORDS = 1350
 #: of the robot that docs/robots.md describes
 URDF = """
 <robot name="my_robot">
@@ -37,17 +37,6 @@ URDF = """
     <axis xyz="0 1 0"/><limit lower="0" upper="0.04" effort="1" velocity="1"/></joint>
 </robot>
 """
-
-
-def test_the_readme_is_short():
-    assert len((ROOT / 'README.md').read_text().split()) <= MOST_WORDS
-
-
-def test_results_are_few_and_short():
-    words = (ROOT / 'docs' / 'results.md').read_text().split()
-    tables = [line for line in (ROOT / 'docs' / 'results.md').open() if line.startswith('|--')]
-    assert len(words) <= 1350 and len(tables) == 1
-    assert len(list((ROOT / 'experiments' / 'results').glob('*.md'))) <= 20
 
 
 def test_the_readme_and_the_results_page_have_the_same_table():
@@ -65,7 +54,7 @@ TERMS = re.compile(
 )
 
 
-@pytest.mark.parametrize('page', sorted((ROOT / 'docs').glob('*.md')), ids=lambda page: page.stem)
+@table('page', sorted((ROOT / 'docs').glob('*.md')))
 def test_terms_are_linked_to_the_glossary_where_a_page_uses_them_first(page):
     if page.stem in ('glossary', 'parameters', 'commands'):
         return

@@ -36,6 +36,7 @@ from mtv_world_ros.cli import main, make_parser
 from mtv_world_ros.cli.commands import COMMANDS
 from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.simulation.opengl import missing_opengl
+from test.support.tables import table
 
 ROOT = Path(__file__).resolve().parents[2]
 #: what a block may need; those with a function are run where it returns nothing
@@ -366,13 +367,13 @@ PROGRAMS: dict[str, Callable[[Sequence[str]], bool]] = {
 }
 
 
-@pytest.mark.parametrize('block', BLOCKS, ids=str)
+@table('block', BLOCKS)
 def test_lines_are_right(block):
     check(block)
 
 
-@pytest.mark.parametrize(
-    ('text', 'message'),
+@table(
+    'text, message',
     [
         ('mtv-world train data/sim --out x --presett small', 'unrecognized arguments'),
         ('mtv-world train data/sim --out x --epis 3', 'unrecognized arguments'),
@@ -407,7 +408,7 @@ def test_what_a_block_needs_must_be_a_known_word():
         check(block)
 
 
-@pytest.mark.parametrize('page', TEXTS)
+@table('page', TEXTS)
 def test_commands_stand_in_blocks_marked_bash(page):
     for number, language, lines, _ in fences(TEXTS[page]):
         assert language in LANGUAGES, f'{page}:{number}: a block of {language or "no language"}'
@@ -419,7 +420,7 @@ def test_commands_stand_in_blocks_marked_bash(page):
     assert not indented
 
 
-@pytest.mark.parametrize('page', TEXTS)
+@table('page', TEXTS)
 def test_options_and_commands_in_the_text_exist(page):
     known = {option for parser in parsers().values() for option in parser._option_string_actions}
     shared = [PLAYER, *(ROOT / 'experiments').glob('*.py')]
@@ -545,7 +546,7 @@ def test_a_pattern_is_not_like_everything():
     assert not is_like('rate 1', 'rate ?') and not is_like('a b', 'a')
 
 
-@pytest.mark.parametrize('block', [b for b in BLOCKS if not b.obstacle()], ids=str)
+@table('block', [b for b in BLOCKS if not b.obstacle()])
 def test_a_page_says_what_comes_of_lines_that_are_run(block):
     programs = {command[0] for command in block.commands()} - {'source', 'cd', 'export'}
     assert block.shows or block.makes or block.printed or not programs

@@ -39,6 +39,7 @@ from mtv_world_ros.success.calibration import (
     save_fit,
 )
 from mtv_world_ros.success.estimator import capped
+from test.support.tables import table
 
 
 def judgements(probabilities, outcomes):
@@ -141,7 +142,7 @@ def test_logistic_needs_rows_and_a_penalty():
         fit_logistic(np.zeros((2, 2)), np.zeros(2, bool), l2=0)
 
 
-@pytest.mark.parametrize('seed', range(40))
+@table('seed', range(40))
 def test_bounded_fit_is_at_the_minimum_that_scipys_slsqp_finds(seed):
     """Random data sets, every other one against the prior."""
     rng = np.random.default_rng(seed)

@@ -250,6 +250,7 @@ def test_what_it_saves_is_what_the_import_takes(page, raw, capsys):
         )
         browser.run("document.getElementById('save').dispatchEvent(new MouseEvent('click')); 0")
         saved = browser.run('window.saved')
+        browser.keep('boxes_page')
     finally:
         browser.close()
     file = raw / 'objects.yaml'

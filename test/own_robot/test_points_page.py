@@ -81,6 +81,7 @@ def test_a_click_is_corrected_and_a_frame_that_lacks_a_finger_tip_is_not_saved(p
             "document.getElementById('count').textContent, document.querySelectorAll('i').length]"
         )
         saved = browser.run('saved()')
+        browser.keep('points_page')
     finally:
         browser.close()
     assert told == f'{count - 1} points, 1 frames lack a finger tip' and marks == 2 * count - 1

@@ -20,6 +20,7 @@ from mtv_world_ros.core.errors import PolicyError
 from mtv_world_ros.policies.lerobot_client import read_actions
 from mtv_world_ros.policies.openpi_client import pack, unpack
 from mtv_world_ros.policies.timed_actions import read_timed_actions
+from test.support.tables import table
 
 
 @pytest.fixture(autouse=True)
@@ -114,7 +115,7 @@ def test_the_hash_bomb_is_one():
     assert pickle.loads(nested_hash(2)) == {((1, 1), (1, 1)): 1}  # noqa: S301
 
 
-@pytest.mark.parametrize('seed', range(20))
+@table('seed', range(20))
 def test_mutated_answers_end_in_an_answer_or_a_refusal(as_lerobot, seed):
     rng = np.random.default_rng(seed)
     actions = [TimedAction(0.0, n, torch.full((3,), float(n))) for n in range(3)]

@@ -185,6 +185,7 @@ def test_the_page_plays_and_filters_rollouts_in_a_browser(ranked, tmp_path):
         browser.choose('verdict', 'all')
         assert [text.split(' · ')[0] for text in browser.shown()] == ['expert-stop-0.3']
         width, seconds = browser.play(1)
+        browser.keep('ranking_report')
         assert width > 300 and seconds > 0
     finally:
         browser.close()

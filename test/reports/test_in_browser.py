@@ -55,6 +55,7 @@ def test_episodes_are_filtered_and_played(browser, make_pipeline, episodes, orac
     width, seconds = browser.play()
     assert width > 300 and seconds > 0
     browser.choose('view', 'all')
+    browser.keep('evaluation_report')
     assert '3 shown' in browser.run(
         "getComputedStyle(document.querySelector('.count'), '::after').content + "
         "document.querySelectorAll('.card').length + ' shown'"

@@ -16,6 +16,7 @@ import pytest
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.files import share_path
+from test.support.tables import table
 
 DEMO = share_path('resource', 'demo_episode')
 BAG = next(DEMO.glob('*.mcap'))
@@ -190,7 +191,7 @@ def test_a_path_that_is_none_is_refused(
     assert not [path for path in left if path.name != '.lock' and path.suffix != '.log'], left
 
 
-@pytest.mark.parametrize('name', COMMANDS)
+@table('name', COMMANDS)
 def test_an_empty_path_is_not_the_present_folder(
     name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -207,8 +208,8 @@ def test_an_empty_path_is_not_the_present_folder(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ('words', 'option'),
+@table(
+    'words, option',
     [
         (['foresee', str(DEMO), '--picture='], '--picture'),
         (['collect', '--episodes', '1', '--out', ''], '--out'),

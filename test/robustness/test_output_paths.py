@@ -11,7 +11,7 @@ import sys
 import time
 
 import pytest
-from test_commands import AT, COMMANDS, DEMO, OUT
+from test.robustness.test_commands import AT, COMMANDS, DEMO, OUT
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import ConfigError

@@ -18,6 +18,7 @@ from mtv_world_ros.simulation.shapes import SHAPES
 from mtv_world_ros.simulation.simulator import SimEpisode
 from mtv_world_ros.simulation.tasks import TASKS
 from mtv_world_ros.simulation.workcell import workcell_of
+from test.support.tables import table
 
 
 @pytest.fixture
@@ -98,7 +99,7 @@ def test_projected_block_corners_bound_the_rendered_mask(robot, expert, opengl):
     assert seen >= 12
 
 
-@pytest.mark.parametrize('name', SHAPES)
+@table('name', SHAPES)
 def test_every_shape_fills_its_bounding_box_and_rests_on_the_table(robot, expert, scene, name):
     mujoco, shape = load_mujoco(rendering=False), SHAPES[name]
     item = replace(

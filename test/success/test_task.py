@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from mtv_world_ros.simulation.workcell import workcell_of
 from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
+from test.support.tables import table
 
 WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml')))
 LEFT = """
@@ -62,8 +64,7 @@ def test_bundled_tasks_are_matched_from_the_instruction(bundled):
     assert match_task(tasks, 'polish the bottle') is None
 
 
-@pytest.mark.parametrize('name', [task.name for task in tasks_named('all')])
-@pytest.mark.parametrize('seed', [1, 2, 3])
+@table('name, seed', product([task.name for task in tasks_named('all')], (1, 2, 3)))
 def test_every_task_of_the_simulator_is_known_by_what_it_says(bundled, name, seed):
     task = task_named(name)
     scene = draw_scene(task, np.random.default_rng(seed), WORKCELL)

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 NAMES = ('chromium', 'chromium-browser', 'google-chrome')
+SCREENSHOTS = Path(__file__).resolve().parents[2] / 'out' / 'screenshots'
 #: a busy machine takes long
 TIMEOUT_S = 240.0
 
@@ -35,6 +36,9 @@ class Browser:
         self._in, ours_out = os.pipe()
         flags = ['--headless=new', '--no-sandbox', '--disable-gpu', '--mute-audio']
         flags += ['--remote-debugging-pipe', f'--user-data-dir={folder}', '--no-first-run']
+        # no page of a test needs the network, and the browser itself shall not try it
+        flags += ['--disable-quic', '--disable-background-networking']
+        flags += ['--disable-component-update', '--disable-sync']
         flags += ['--window-size=1300,1000', '--enable-unsafe-swiftshader', '--use-gl=angle']
 
         def connect() -> None:  # it reads file 3 and writes file 4
@@ -124,6 +128,11 @@ class Browser:
     def picture(self, path: Path) -> None:
         """Writes what is to be seen as a PNG."""
         path.write_bytes(base64.b64decode(self.call('Page.captureScreenshot')['data']))
+
+    def keep(self, name: str) -> None:
+        """Writes what is to be seen to `out/screenshots`, for people to look at."""
+        SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+        self.picture(SCREENSHOTS / f'{name}.png')
 
     def close(self) -> None:
         """Ends it."""

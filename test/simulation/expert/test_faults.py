@@ -29,6 +29,7 @@ from mtv_world_ros.simulation.faults.catalogue import (
     SPLITS,
 )
 from mtv_world_ros.simulation.faults.variant_faults import WayPointFaults, with_faults
+from test.support.tables import table
 
 SEED, TASK = 4, 'place_block_a2b_left'
 #: seed, number of commands, mean, deviation and middle row of the positions, by policy
@@ -52,8 +53,21 @@ def applied(name: str, stops: list[WayPoint], objects, seed: int = 0) -> list[Wa
     return faults.applied(stops, faults.draws(0.0, objects))
 
 
-@pytest.mark.parametrize('name', [name for name in RECORDED if name != 'expert'])
+KINDS = [name for name in RECORDED if name != 'expert']
+
+
+@table('name', KINDS[::10])
+def test_a_tenth_of_the_kinds_gives_the_plans_that_their_own_functions_gave(expert, name):
+    check_plan(expert, name)
+
+
+@pytest.mark.slow
+@table('name', KINDS)
 def test_every_kind_gives_the_plan_that_its_own_function_gave(expert, name):
+    check_plan(expert, name)
+
+
+def check_plan(expert, name):
     """Recorded by `test/golden/record.py` at v0.1.0, where each kind was a function of its own."""
     seed, num_commands, *wanted = RECORDED[name]
     at, usual = (plan(expert, one, 'stack_blocks_two', seed) for one in (name, 'expert'))
@@ -121,7 +135,7 @@ def test_faults_of_two_arms_are_refused_of_one(expert):
             with_faults(one, variant, franka, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize('kind', [k for k, fault in FAULTS.items() if 'gripper' in fault.needs])
+@table('kind', [k for k, fault in FAULTS.items() if 'gripper' in fault.needs])
 def test_faults_of_a_gripper_are_refused_of_a_robot_without_one(expert, kind):
     robot = expert.robot
     bare = RobotModel(
@@ -449,7 +463,7 @@ def test_an_arm_that_crowds_another_still_does_what_it_has_to_do(expert, kind):
     np.testing.assert_array_equal(*lasts)
 
 
-@pytest.mark.parametrize('kind', [kind for kind, fault in FAULTS.items() if fault.size.none == 0])
+@table('kind', [kind for kind, fault in FAULTS.items() if fault.size.none == 0])
 def test_sizes_out_of_range_are_refused(kind):
     largest = FAULTS[kind].size.largest
     assert parse_variant(f'expert-{kind}-{largest:g}').size(kind) == largest

@@ -1,5 +1,6 @@
 import ast
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from mtv_world_ros.vision.segmenters.grounding import (
     stated_normalisation,
     SYMMETRIC,
 )
+from test.support.tables import table
 
 
 def frame(height, width, seed=0):
@@ -57,8 +59,10 @@ def test_detector_edges_are_the_published_ones():
     assert (size['shortest_edge'], size['longest_edge']) == DINO_EDGES
 
 
-@pytest.mark.parametrize('height', [48, 72, 480, 799, 800, 801, 1200])
-@pytest.mark.parametrize('width', [64, 96, 640, 800, 1333, 1500])
+@table(
+    'height, width',
+    product((48, 72, 480, 799, 800, 801, 1200), (64, 96, 640, 800, 1333, 1500)),
+)
 def test_size_follows_detrs_rule(height, width):
     assert size_with_edges(height, width, (800, 1333)) == tuple(
         get_size_with_aspect_ratio((height, width), 800, 1333)
