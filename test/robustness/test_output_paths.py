@@ -11,12 +11,12 @@ import sys
 import time
 
 import pytest
-from test.robustness.test_commands import AT, COMMANDS, DEMO, OUT
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import check_output
 from mtv_world_ros.data.bag.writer import BagWriter
+from test.robustness.test_commands import AT, COMMANDS, DEMO, OUT
 
 #: longest time until it is said, once a process runs [s]
 MOST_S = 1.0
