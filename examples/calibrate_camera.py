@@ -11,14 +11,18 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros import read_episode
-from mtv_world_ros.cameras.calibration_file import save_calibration
-from mtv_world_ros.core.files import check_free, share_path
-from mtv_world_ros.inspection.camera_pose import difference
-from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
-from mtv_world_ros.inspection.clocks import JointTrack
-from mtv_world_ros.robot.file import load_robot, robot_path
-from mtv_world_ros.robot.shape import load_shape
+from mtv_world_ros import (
+    check_free,
+    FixedCamera,
+    JointTrack,
+    load_robot,
+    load_shape,
+    pose_difference,
+    read_episode,
+    robot_path,
+    save_calibration,
+    share_path,
+)
 
 parser = argparse.ArgumentParser()
 parser.add_argument(
@@ -38,7 +42,7 @@ assert episode.joint_states is not None
 joints = JointTrack(episode.joint_states, robot)
 fixed = FixedCamera(episode.images[options.view], recorded, robot, load_shape(robot).parts, joints)
 found = fixed.estimate(guess=True, seed=0)
-mm, degrees = difference(recorded.T_mount_camera, found.camera.T_mount_camera)
+mm, degrees = pose_difference(recorded.T_mount_camera, found.camera.T_mount_camera)
 print(f'{options.view}: {mm:.1f} mm and {degrees:.2f} degrees from the recorded pose')
 save_calibration(options.out, {options.view: found.camera})
 print(f'written: {options.out}')

@@ -12,12 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.cameras.calibration_file import load_calibration
-from mtv_world_ros.cameras.motion import Motion
-from mtv_world_ros.control.trajectory_video import render_trajectory_video, TrajectoryVideoConfig
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.viewing.video import write_video
+from mtv_world_ros import (
+    load_calibration,
+    load_robot,
+    Motion,
+    render_trajectory_video,
+    share_path,
+    TrajectoryVideoConfig,
+    write_video,
+)
 
 parser = argparse.ArgumentParser()
 parser.add_argument('--out', type=Path, default=Path('out/examples'))

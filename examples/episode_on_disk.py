@@ -12,12 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros import read_episode
-from mtv_world_ros.cameras.calibration_file import load_calibration
-from mtv_world_ros.core.data_types import JointTrajectory
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.data.episode_writer import EpisodeWriter
-from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros import (
+    EpisodeWriter,
+    JointTrajectory,
+    load_calibration,
+    load_robot,
+    read_episode,
+    share_path,
+)
 
 parser = argparse.ArgumentParser()
 parser.add_argument('--out', type=Path, default=Path('out/examples/episode'))

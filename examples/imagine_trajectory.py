@@ -12,11 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros import Pipeline
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.data.recording import commands_from, load_recording
-from mtv_world_ros.rollout.options import RolloutOptions
-from mtv_world_ros.viewing.video import write_video
+from mtv_world_ros import (
+    commands_from,
+    load_recording,
+    Pipeline,
+    RolloutOptions,
+    share_path,
+    write_video,
+)
 
 parser = argparse.ArgumentParser()
 parser.add_argument(

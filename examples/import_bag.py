@@ -11,11 +11,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros import read_episode
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.data.bag_mapping import BagMapping
-from mtv_world_ros.importing.bags import import_bags, with_guessed_views
-from mtv_world_ros.robot.file import robot_path
+from mtv_world_ros import (
+    BagMapping,
+    import_bags,
+    read_episode,
+    robot_path,
+    share_path,
+    with_guessed_views,
+)
 
 parser = argparse.ArgumentParser()
 parser.add_argument('bag', type=Path, nargs='?', default=share_path('resource', 'demo_episode'))

@@ -10,9 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mtv_world_ros import judge, Pipeline
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.data.recording import load_recording
+from mtv_world_ros import judge, load_recording, Pipeline, share_path
 
 parser = argparse.ArgumentParser()
 parser.add_argument(

@@ -15,9 +15,7 @@ import shutil
 import numpy as np
 import yaml
 
-from mtv_world_ros.core.files import check_free, share_path
-from mtv_world_ros.importing.robot_guess import guess_robot
-from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros import check_free, guess_robot, load_robot, share_path
 
 parser = argparse.ArgumentParser()
 parser.add_argument(

@@ -15,10 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mtv_world_ros import judge, Pipeline
-from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.data.recording import load_recording
+from mtv_world_ros import judge, load_recording, ObjectMasks, Pipeline, share_path
 
 #: hues of OpenCV, 0 .. 179, around which a colour is
 HUES = {'red': 0, 'yellow': 28, 'green': 60, 'blue': 110, 'purple': 140, 'pink': 165}
@@ -31,10 +28,10 @@ class HueSegmenter:
 
     def segment(
         self,
-        frames: ByteArray,
+        frames: np.ndarray,
         names: tuple[str, ...],
-        first_masks: BoolArray | None = None,
-        first_frames: ByteArray | None = None,
+        first_masks: np.ndarray | None = None,
+        first_frames: np.ndarray | None = None,
     ) -> ObjectMasks:
         """Returns (V, O, T, H, W) masks of (V, T, H, W, 3) uint8 RGB frames."""
         del first_masks, first_frames  # every frame is looked at by itself

@@ -14,12 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros import Pipeline
-from mtv_world_ros.control.control import ControlInputs
-from mtv_world_ros.core.data_types import ByteArray, WorldModelSpec
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.data.recording import commands_from, load_recording
-from mtv_world_ros.rollout.options import RolloutOptions
+from mtv_world_ros import (
+    commands_from,
+    ControlInputs,
+    load_recording,
+    Pipeline,
+    RolloutOptions,
+    share_path,
+    WorldModelSpec,
+)
 
 
 @dataclass(frozen=True)
@@ -29,8 +32,8 @@ class HeldFrame:
     spec: WorldModelSpec
 
     def predict(
-        self, start_frame: ByteArray, control: ControlInputs, **options: object
-    ) -> ByteArray:
+        self, start_frame: np.ndarray, control: ControlInputs, **options: object
+    ) -> np.ndarray:
         """Returns (V, T, H, W, 3) uint8 RGB frames: the (V, H, W, 3) start frame, T times."""
         del control, options  # positions, seed, steps, ...: see `WorldModel`
         return np.repeat(start_frame[:, None], self.spec.num_frames, axis=1)

@@ -12,11 +12,15 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from mtv_world_ros import Pipeline
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.policies.policy import RecordedPolicy
-from mtv_world_ros.rollout.options import RolloutOptions
+from mtv_world_ros import (
+    ImaginedWorld,
+    load_recording,
+    Pipeline,
+    RecordedPolicy,
+    RolloutOptions,
+    run_policy,
+    share_path,
+)
 
 parser = argparse.ArgumentParser()
 parser.add_argument(
@@ -37,15 +41,12 @@ policies = {
     'never grasps': RecordedPolicy(replace(commands, positions=positions), hold_s=0.6),
 }
 
+options_of_rollouts = RolloutOptions(instruction=recording.instruction)
+world = ImaginedWorld(pipeline, recording.observation(0), options_of_rollouts)
 found = {}
 for name, policy in policies.items():
-    policy.reset(seed=0)
-    episode = pipeline.begin(
-        recording.observation(0), RolloutOptions(instruction=recording.instruction, seed=0)
-    )
-    while (answer := policy.act(episode.observation, recording.instruction)) is not None:
-        for prediction in episode.extend(answer):
-            found[name] = prediction.success.probability
+    run_policy(policy, world, seed=0)
+    found[name] = world.success.probability if world.success else 0.0
 
 for name, probability in sorted(found.items(), key=lambda item: -item[1]):
     print(f'{name:<12} success {probability:.2f}')

@@ -13,11 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros import Pipeline
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.data.recording import commands_from, load_recording
-from mtv_world_ros.rollout.options import RolloutOptions
-from mtv_world_ros.vision.jaccard import jaccard
+from mtv_world_ros import (
+    commands_from,
+    jaccard,
+    load_recording,
+    Pipeline,
+    RolloutOptions,
+    share_path,
+)
 
 parser = argparse.ArgumentParser()
 parser.add_argument(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
 import subprocess
 import sys
 
@@ -35,3 +37,17 @@ def test_old_names_work_and_name_the_new_one():
     with pytest.warns(DeprecationWarning, match=r'mtv_world_ros\.Pipeline\.load'):
         load = mtv_world_ros.load_pipeline
     assert load == mtv_world_ros.Pipeline.load
+
+
+EXAMPLES = sorted((Path(__file__).parents[1] / 'examples').glob('*.py'))
+
+
+@pytest.mark.parametrize('example', EXAMPLES, ids=lambda path: path.stem)
+def test_examples_import_public_names_from_the_top_alone(example):
+    imports = [
+        node for node in ast.walk(ast.parse(example.read_text()))
+        if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('mtv_world_ros')
+    ]  # fmt: skip
+    assert {node.module for node in imports} == {'mtv_world_ros'}
+    public = {*mtv_world_ros.__all__, 'WorldEnv'}
+    assert {alias.name for node in imports for alias in node.names} <= public

@@ -278,7 +278,7 @@ def judge(pipeline: Pipeline, recording: Recording) -> SuccessEstimate:
     """Returns the success estimate at the end of a recorded episode.
 
     Args:
-        pipeline: finds the objects and judges; see `load_pipeline`.
+        pipeline: finds the objects and judges; see `Pipeline.load`.
         recording: V views on the model's clock, e.g. of `load_recording(path, pipeline.spec,
             pipeline.robot)`.
 

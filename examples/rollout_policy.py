@@ -1,6 +1,6 @@
 """Lets a policy act in the world model: it sees predicted frames and answers with commands.
 
-    python examples/policy_in_imagination.py [EPISODE]
+    python examples/rollout_policy.py [EPISODE]
 
 The policy here only moves one arm to and fro. Put your own into `act`.
 """
@@ -12,11 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros import Pipeline
-from mtv_world_ros.core.data_types import JointTrajectory, Observation
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.rollout.options import RolloutOptions
+from mtv_world_ros import (
+    ImaginedWorld,
+    JointTrajectory,
+    load_recording,
+    Observation,
+    Pipeline,
+    Prediction,
+    RolloutOptions,
+    run_policy,
+    share_path,
+)
 
 NUM_CHUNKS = 3
 
@@ -53,18 +59,22 @@ options = parser.parse_args()
 
 pipeline = Pipeline.load('bundled')
 recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
-observation = recording.observation(0)
-policy = SwingingPolicy(pipeline.robot.joint_names)
-policy.reset(seed=0)
 
-episode = pipeline.begin(observation, RolloutOptions(instruction=recording.instruction, seed=0))
-for _ in range(NUM_CHUNKS):
-    answer = policy.act(episode.observation, recording.instruction)
-    if answer is None:
-        break
-    for prediction in episode.extend(answer):
-        success = prediction.success
-        print(
-            f'{prediction.imagined_seconds:.1f} s imagined: '
-            f'success {success.probability:.2f}; {success.reasons[0]}'
-        )
+
+def tell(prediction: Prediction) -> None:
+    """Prints the estimate at the end of a chunk."""
+    success = prediction.success
+    print(
+        f'{prediction.imagined_seconds:.1f} s imagined: '
+        f'success {success.probability:.2f}; {success.reasons[0]}'
+    )
+
+
+world = ImaginedWorld(
+    pipeline,
+    recording.observation(0),
+    RolloutOptions(instruction=recording.instruction),
+    on_chunk=tell,
+)
+run = run_policy(SwingingPolicy(pipeline.robot.joint_names), world, max_chunks=NUM_CHUNKS)
+print(f'{run.num_chunks} answers; it ended because: {run.end}')
