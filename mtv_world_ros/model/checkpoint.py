@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from mtv_world_ros.control.control import Control, ControlOptions
-from mtv_world_ros.control.registry import load_control
+from mtv_world_ros.control.registry import CONTROL_FILE, load_control
 from mtv_world_ros.core.data_types import WorldModelSpec
 from mtv_world_ros.core.errors import CalibrationError, CheckpointError, ConfigError, nearest
 from mtv_world_ros.core.files import content_digest, ROBOT_YAML, share_path
 from mtv_world_ros.model.card import (
+    ADAPTER_FOLDER,
     CAMERAS,
+    CARD,
     CheckpointCard,
     OBJECT_MOTION_FOLDER,
     read_card,
@@ -39,11 +41,13 @@ class Checkpoint:
         name: name or path as it was given.
         folder: the folder.
         card: contents of its `world_model.json`.
+        adapter: LoRA adapter that is used with it, in place of its own; None = its own, if any.
     """
 
     name: str
     folder: Path
     card: CheckpointCard
+    adapter: Path | None = None
 
     @classmethod
     def open(cls, name: str | Path | Checkpoint = BUNDLED) -> Checkpoint:
@@ -56,6 +60,23 @@ class Checkpoint:
             return name
         folder = checkpoint_folder(name)
         return cls(name=str(name), folder=folder, card=read_card(folder))
+
+    def with_adapter(self, adapter: Path | None) -> Checkpoint:
+        """Returns the checkpoint with an adapter, whose control counts where its card names one.
+
+        Args:
+            adapter: folder or file; None = the checkpoint's own adapter, if it has one.
+
+        Raises:
+            CheckpointError: the adapter's card cannot be used.
+        """
+        used = adapter
+        if used is None and (self.folder / ADAPTER_FOLDER).is_dir():
+            used = self.folder / ADAPTER_FOLDER
+        if used is None or not (used / CARD).is_file():
+            return replace(self, adapter=adapter)
+        card = self.card.replace(control=read_card(used).control)
+        return replace(self, adapter=used, card=card)
 
     def __str__(self) -> str:
         return self.name
@@ -135,7 +156,10 @@ class Checkpoint:
             ConfigError: no such control, or it cannot be imported or created.
             CheckpointError: what it was fitted to cannot be read.
         """
-        return load_control(self.card.control, control_options(self.card, robot), self.folder)
+        options, folder = control_options(self.card, robot), self.folder
+        if self.adapter is not None and (self.adapter / CONTROL_FILE).is_file():
+            folder = self.adapter
+        return load_control(self.card.control, options, folder)
 
     def can_foresee(self, robot: RobotModel) -> bool:
         """Returns whether it foresees object motion and was trained to see it."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
+from mtv_world_ros.control.control import InputLayout, VIDEO_ONLY
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.runtime import check_device, choose_dtype, set_num_threads
 from mtv_world_ros.model.serving import ServingOptions
@@ -19,9 +19,12 @@ def load_world_model(
     dtype: str = 'auto',
     num_threads: int = 0,
     serving: str = '',
-    adapter: Path | None = None,
+    layout: InputLayout = VIDEO_ONLY,
 ) -> DiffusionWorldModel:
-    """Returns the world model of a checkpoint. Arguments as in `Pipeline.load`.
+    """Returns the world model of a checkpoint.
+
+    Device, number format, threads and serving options are those of `Pipeline.load`; the adapter is
+    the checkpoint's, and the layout has the inputs of its control.
 
     Raises:
         CheckpointError: a part is missing or wrong.
@@ -32,6 +35,9 @@ def load_world_model(
     set_num_threads(num_threads)
     number_format = choose_dtype(dtype, device)
     loaded = load_trained_model(checkpoint, dtype=number_format)
-    if adapter is not None:
-        loaded = replace(loaded, adapter=adapter)
+    if checkpoint.adapter is not None:
+        loaded = replace(loaded, adapter=checkpoint.adapter, card=checkpoint.card)
+        inputs = layout.transformer_arguments()
+        if inputs and loaded.transformer.control_tokens is None:  # the adapter brings the weights
+            loaded.transformer.add_control_inputs(**inputs)
     return DiffusionWorldModel(loaded, device=device, dtype=number_format, serving=options)

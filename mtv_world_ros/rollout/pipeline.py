@@ -178,17 +178,17 @@ class Pipeline:
         from mtv_world_ros.model.loading import load_world_model
         from mtv_world_ros.physics.checkpoint_files import load_foresight
 
-        opened = Checkpoint.open(checkpoint)
+        opened = Checkpoint.open(checkpoint).with_adapter(adapter)
+        model, motion = opened.load_robot(robot), None
+        control = opened.load_control(model)
         world_model = load_world_model(
             opened,
             device=device,
             dtype=dtype,
             num_threads=num_threads,
             serving=serving,
-            adapter=adapter,
+            layout=control.layout,
         )
-        model, motion = opened.load_robot(robot), None
-        control = opened.load_control(model)
         _check_inputs(opened.card.control, control, world_model.transformer.config)
         foresees = control.shows_objects and opened.object_motion is not None
         if foresight and foresees and opened.object_motion is not None:

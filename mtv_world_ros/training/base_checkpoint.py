@@ -70,6 +70,10 @@ def load_base(
             "'mtv-world import wan' makes of public weights"
         )
     loaded = load_trained_model(Checkpoint.open(folder), dtype=dtype)
+    digest, inputs = _digest(loaded.transformer), layout.transformer_arguments()
+    if inputs and loaded.transformer.control_tokens is None:
+        torch.manual_seed(seed)
+        loaded.transformer.add_control_inputs(**inputs)
     _check_transformer(config, layout, loaded.transformer, folder)
     _check_card(config, loaded.card, folder)
     autoencoder = place(loaded.autoencoder, device, dtype).eval().requires_grad_(False)
@@ -78,7 +82,6 @@ def load_base(
     if loaded.text_encoder is not None and loaded.image_encoder is not None:
         text = loaded.text_encoder.encode(loaded.card.prompt, device).clone()
         image = loaded.image_encoder.to(device, dtype)
-    digest = _digest(loaded.transformer)
     if config.lora.rank:
         torch.manual_seed(seed)
         add_adapter(loaded.transformer, rank=config.lora.rank, alpha=config.lora.alpha)
@@ -112,7 +115,9 @@ def _check_card(config: TrainingConfig, card: CheckpointCard, folder: Path) -> N
     mine = config.card({}).plain()
     rendering = TrajectoryVideoConfig(**card.rendering).model_dump()
     theirs = {**card.plain(), 'rendering': rendering}
-    for name in (*SHARED_KEYS, 'rendering', 'history'):
+    # an adapter brings its own control, in its card
+    names = {*SHARED_KEYS, 'rendering', 'history'} - {'control'}
+    for name in sorted(names):
         held, wanted = theirs.get(name), mine.get(name)
         if _plain(held) != _plain(wanted):
             section = f'video.{name}' if name in SHARED_KEYS else name

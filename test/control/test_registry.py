@@ -153,6 +153,7 @@ def test_an_entry_point_registers_a_control(outside, monkeypatch, robot):
     assert create_control('tool_pixels', options(robot)).layout.names == ('frame',)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('control', ['somebodys_control:ToolPixels', *list(CONTROLS)[1:]])
 def test_any_control_trains_and_predicts(control, outside, tmp_path, robot):
     """By the command, on the bundled episode; other plans give other frames."""

@@ -11,13 +11,16 @@ import pytest
 from safetensors.torch import load_file
 import torch
 
+from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.cli import main
-from mtv_world_ros.control.control import ControlInputs
+from mtv_world_ros.control.control import ControlInputs, ControlScene
 from mtv_world_ros.core.errors import CheckpointError, TrainingError
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.model.lora import BESIDE_FILE
 from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.model.world_model import DiffusionWorldModel
+from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.training.base_checkpoint import load_base
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import (
@@ -95,6 +98,43 @@ def test_the_command_trains_an_adapter_that_changes_the_prediction(
     assert np.abs(predict(model, clips.frames[:, :5]).astype(int) - plain).max() > 0
     model.use_adapter(None)
     np.testing.assert_array_equal(predict(model, clips.frames[:, :5]), plain)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('control', ['ee_mlp', 'fast_tokens'])
+def test_an_adapter_brings_its_own_control(preset, base, episode, clips, robot, tmp_path, control):
+    """A base of the paper's control is trained and served with a baseline's."""
+    command = ['train', str(episode.parent), '--preset', str(preset), '--init', str(base)]
+    options = ['--dtype', 'float32', '--threads', '1', '--set', f'video.control={control}']
+    steps = ['--set', 'optimizer.steps=1', '--set', 'transformer.frames_per_token=4']
+    assert main([*command, '--out', str(tmp_path), *options, *steps]) == 0
+    adapter = tmp_path / 'adapter'
+    assert (adapter / 'control.json').is_file()
+    assert any(name.startswith('control_tokens') for name in load_file(adapter / BESIDE_FILE))
+    pipeline = Pipeline.load(base, adapter=adapter, dtype='float32', num_threads=1)
+    assert pipeline.control.layout.names == ('frame' if control == 'ee_mlp' else 'context',)
+    frames = []
+    for shift in (0.0, 0.05):
+        positions = np.linspace(clips.positions[0], clips.positions[0] + shift, 5)
+        motion = Motion.of(robot, clips.cameras, positions)
+        start = clips.frames[:, 0]
+        scene = ControlScene(motion=motion, times=np.arange(5) / 5, start_frames=start)
+        inputs = pipeline.control.make(scene)
+        assert inputs.video is None
+        frames.append(
+            pipeline.world_model.predict(
+                clips.frames[:, 0],
+                inputs,
+                positions=positions,
+                seed=0,
+                num_inference_steps=1,
+                should_stop=lambda: False,
+            )
+        )
+    assert not np.array_equal(*frames)
+    plain = Pipeline.load(base, dtype='float32', num_threads=1)
+    with pytest.raises(CheckpointError, match=f"'control' {control}"):
+        plain.world_model.use_adapter(adapter)
 
 
 @pytest.mark.slow

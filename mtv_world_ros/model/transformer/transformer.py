@@ -154,17 +154,45 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         # last, so that a seed gives all controls the same weights of what they share
         self.control_tokens: ControlTokens | None = None
         if context_input is not None or frame_input is not None:
-            self.control_tokens = ControlTokens(
-                context=context_input,
-                frame=frame_input,
-                dim=dim,
-                frames_per_token=frames_per_token,
-                num_prompt_tokens=0 if self.with_text else num_prompt_tokens,
-            )
-            for block in self.blocks:
-                block.attn2.set_processor(ContextAttnProcessor())
+            self._build_control_tokens(context_input, frame_input)
         elif not self.with_text:
             without_cross_attention(self.blocks)
+
+    def add_control_inputs(
+        self,
+        context_input: dict[str, Any] | None = None,
+        frame_input: dict[str, Any] | None = None,
+    ) -> None:
+        """Adds inputs of a control to a model with text; other weights stay as they are.
+
+        Args:
+            context_input: fields of `control.ContextInput`; None = no such input.
+            frame_input: fields of `control.FrameInput`; None = no such input.
+
+        Raises:
+            CheckpointError: the model has no cross-attention, or other control inputs already.
+        """
+        if not self.with_text or self.control_tokens is not None:
+            reason = 'other control inputs' if self.control_tokens else 'no cross-attention'
+            raise CheckpointError(
+                f'the transformer has {reason}: train a model of this control from the start'
+            )
+        self._build_control_tokens(context_input, frame_input)
+        self.register_to_config(context_input=context_input, frame_input=frame_input)
+
+    def _build_control_tokens(
+        self, context_input: dict[str, Any] | None, frame_input: dict[str, Any] | None
+    ) -> None:
+        config: Any = self.config
+        self.control_tokens = ControlTokens(
+            context=context_input,
+            frame=frame_input,
+            dim=config['num_attention_heads'] * config['attention_head_dim'],
+            frames_per_token=config['frames_per_token'],
+            num_prompt_tokens=0 if self.with_text else config['num_prompt_tokens'],
+        )
+        for block in self.blocks:
+            block.attn2.set_processor(ContextAttnProcessor())
 
     def _build_conv_stem(
         self,

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from mtv_world_ros.cameras.silhouettes import draw_silhouettes
-from mtv_world_ros.control.trajectory_video import TrajectoryVideo
+from mtv_world_ros.control.trajectory_video import TrajectoryVideo, UNFORESEEN_GREY
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.data.recordings import cut_clip
+from mtv_world_ros.data.recordings import Clip, cut_clip
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.clip_controls import ControlMaker
@@ -105,3 +105,66 @@ def test_arms_are_those_of_the_frame_that_a_clip_starts_from(robot):
         inside = outlines[:, at]
         same = (control[:, 0] == clip[:, 0]).all(axis=-1)
         assert same[inside].mean() > 0.6 and not control[:, 0][~inside].all(axis=-1).mean() > 0.05
+
+
+def test_a_model_of_both_kinds_sees_foreseen_objects_or_masks_on_a_grey_canvas(robot):
+    """Half of the clips each; without foresight the pipeline draws the second kind."""
+    config = load_training_config(
+        'small',
+        {
+            'rendering.object_motion': True,
+            'rendering.foreseen_ratio': 0.5,
+            'augment.start_noise': 0.0,
+            'augment.colour_permutation': 0.0,
+            'optimizer.batch_size': 40,
+        },
+    )
+    recording = load_recording(share_path('resource', 'demo_episode'), config.spec, robot)
+    source = BatchSource([recording], config, robot=robot, segmenter=ColourSegmenter(), seed=0)
+    video = source.batch(0).inputs.video
+    controls = source.controls
+    source.close()
+    assert video is not None
+    is_grey = [(drawn == UNFORESEEN_GREY).all(-1).mean() > 0.5 for drawn in video.numpy()]
+    # binomial: 40 draws of 0.5, within four standard deviations
+    assert 20 - 13 <= sum(is_grey) <= 20 + 13
+    clip = cut_clip(recording, 0, config.spec)
+    masks = drawn_by(controls, clip, recording.names, foresees=False)
+    bare = drawn_by(controls, clip, recording.names, foresees=False, object_mask=False)
+    paper = drawn_by(controls, clip, recording.names, object_motion=False)
+    trails = drawn_by(controls, clip, recording.names, object_motion=False, object_mask=False)
+    assert (drawn_by(controls, clip, recording.names) == 0).all(-1).mean() > 0.5
+    # fills have the same colours on the grey canvas as in the paper's on black
+    filled = paper.any(-1) & ~trails.any(-1)
+    assert filled.mean() > 0.005
+    np.testing.assert_array_equal(masks[filled], paper[filled])
+    assert (bare[filled] == UNFORESEEN_GREY).all()
+
+
+def drawn_by(
+    controls: ControlMaker,
+    clip: Clip,
+    names: tuple[str, ...],
+    *,
+    foresees: bool = True,
+    object_mask: bool = True,
+    **rendering: object,
+) -> np.ndarray:
+    """Frames of a clip with other settings of the drawing."""
+    assert isinstance(controls.control, TrajectoryVideo)
+    config = controls.control.config.replace(**rendering)
+    control = replace(controls.control, config=config, object_mask=object_mask)
+    video = replace(controls, control=control).make(clip, names, foresees=foresees).video
+    assert video is not None
+    return video
+
+
+def test_without_a_share_of_masks_none_are_drawn(robot):
+    config = load_training_config('small', {'rendering.object_motion': True})
+    recording = load_recording(share_path('resource', 'demo_episode'), config.spec, robot)
+    clip = cut_clip(recording, 0, config.spec)
+    control = TrajectoryVideo(config=config.rendering)
+    maker = ControlMaker(robot=robot, segmenter=ColourSegmenter(), control=control)
+    found = drawn_by(maker, clip, recording.names, foresees=False)
+    blind = drawn_by(maker, clip, recording.names, object_mask=False)
+    np.testing.assert_array_equal(found, blind)
