@@ -38,8 +38,8 @@ class NodeEvents(Protocol):
         """Takes the instruction."""
         ...
 
-    def on_plan(self, plan: JointTrajectoryMsg | Goal) -> None:
-        """Takes a plan of the topic or of the action."""
+    def on_plan(self, plan: JointTrajectoryMsg | Goal, transport_s: float = 0.0) -> None:
+        """Takes a plan of the topic or of the action, and how long it was under way [s]."""
         ...
 
     def on_robot(self, robot: RobotModel) -> None:

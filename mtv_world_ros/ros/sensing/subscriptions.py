@@ -18,6 +18,7 @@ from trajectory_msgs.msg import JointTrajectory
 from mtv_world_ros.cameras.camera_info import RECTIFIED
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.ros import parameters
+from mtv_world_ros.ros.messages.conversions import NANO
 from mtv_world_ros.ros.node_events import NodeEvents
 from mtv_world_ros.ros.qos_profiles import QosWatch
 from mtv_world_ros.ros.receive_paths import PATHS, SERVICES
@@ -63,7 +64,11 @@ class Inputs:
         self._all = [*self._observations]
         instruction = events.guarded(events.on_instruction)
         self._all.append(MatchedSubscription(node, String, 'instruction', instruction, depth=1))
-        handle = events.guarded(events.on_plan)
+        take = events.guarded(events.on_plan)
+
+        def handle(message: JointTrajectory, info: Mapping[str, int]) -> None:
+            take(message, (info['received_timestamp'] - info['source_timestamp']) / NANO)
+
         self._plans = MatchedSubscription(
             node,
             JointTrajectory,
@@ -143,7 +148,7 @@ class MatchedSubscription:
         node: owner.
         kind: message type.
         topic: relative or absolute name.
-        callback: gets the messages.
+        callback: gets the messages; a callback of two arguments, rclpy's information, too.
         depth: messages kept.
         default: `match`, or `reliable`, `best_effort` for a plain subscription.
     """
@@ -153,7 +158,7 @@ class MatchedSubscription:
         node: Node,
         kind: Any,
         topic: str,
-        callback: Callable[[Any], None],
+        callback: Callable[..., None],
         *,
         depth: int,
         default: str = 'match',

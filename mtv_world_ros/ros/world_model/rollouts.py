@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 import time
+from typing import NamedTuple
 
 import numpy as np
 from rclpy.clock import JumpThreshold
@@ -140,8 +141,42 @@ class RequestMaker:
 #: the first plan of an imagined episode may come this long before what it answers [s]: a lost
 #: message without a next one comes again after the sender's heartbeat, by default every 3 s
 _EARLY_S = 5.0
+#: a plan that is under way for longer was lost and sent again [s]
+_LATE_S = 0.5
 #: what a node makes and can destroy
 _ENTITIES = ('publisher', 'subscription', 'service', 'timer', 'guard_condition')
+
+
+class _Arrived(NamedTuple):
+    """A plan that waits.
+
+    Attributes:
+        received_s: when it came [s], of `time.monotonic`.
+        plan: of the topic or the action.
+        transport_s: how long it was under way [s].
+    """
+
+    received_s: float
+    plan: JointTrajectoryMsg | Goal
+    transport_s: float
+
+    @property
+    def message(self) -> JointTrajectoryMsg:
+        """The plan as the topic has it."""
+        return self.plan.message if isinstance(self.plan, Goal) else self.plan
+
+
+def _with_delay(error: Exception, transport_s: float) -> Exception:
+    """Returns the rejection of a stale plan with the delay that the middleware made."""
+    is_stale = isinstance(error, Rejection) and error.reason is Reason.TRAJECTORY_STALE
+    if not is_stale or transport_s < _LATE_S:
+        return error
+    return Rejection(
+        Reason.TRAJECTORY_STALE,
+        f'{error}. It was received {transport_s:.3f} s after it was published: lost and sent '
+        "again, unless the clocks of two machines differ; see 'Plans arrive late' in "
+        'docs/troubleshooting.md',
+    )
 
 
 class Rollouts:
@@ -218,7 +253,7 @@ class Rollouts:
         self._worker.doubt = lambda: self._fidelity.watch.doubt
         undo.callback(self._fidelity.close)
         self._publisher = PredictionPublisher(node, self._spec, self._robot.joint_names, self)
-        self._arrived: deque[tuple[float, JointTrajectoryMsg | Goal]] = deque()
+        self._arrived: deque[_Arrived] = deque()
         self._arrivals = node.create_guard_condition(self.start_waiting)
         self._results = node.create_guard_condition(self._publish_results)
         self._inputs = Inputs(
@@ -331,14 +366,14 @@ class Rollouts:
             check_limit('instruction_characters', len(message.data), 'the instruction')
         self._maker.instruction = message.data
 
-    def on_plan(self, plan: JointTrajectoryMsg | Goal) -> None:
+    def on_plan(self, plan: JointTrajectoryMsg | Goal, transport_s: float = 0.0) -> None:
         """Queues a plan, so that images that came with it are stored before it is checked."""
-        self._arrived.append((time.monotonic(), plan))
+        self._arrived.append(_Arrived(time.monotonic(), plan, transport_s))
         self._arrivals.trigger()
 
     def start_waiting(self) -> None:
         """Starts the plans that wait, up to one that is early."""
-        while self._arrived and not (self._is_active and self._is_early(*self._arrived[0])):
+        while self._arrived and not (self._is_active and self._is_early(self._arrived[0])):
             self.guarded(self._start_rollout)(self._arrived.popleft())
 
     def _look_again(self) -> None:
@@ -346,24 +381,22 @@ class Rollouts:
         if self._arrived:
             self._arrivals.trigger()
 
-    def _is_early(self, received_s: float, plan: JointTrajectoryMsg | Goal) -> bool:
+    def _is_early(self, arrived: _Arrived) -> bool:
         """Whether the first plan of an imagined episode arrived before its observation.
 
         Nothing orders topics: a policy may answer before this node receives the start.
         """
         if not self._maker.imagine or self._worker.last_scene is not None or self._worker.busy:
             return False
-        message = plan.message if isinstance(plan, Goal) else plan
-        is_behind = self._buffer.newest_stamp_ns < to_ns(message.header.stamp)
+        is_behind = self._buffer.newest_stamp_ns < to_ns(arrived.message.header.stamp)
         now_ns = self._node.get_clock().now().nanoseconds
-        return time.monotonic() - received_s < _EARLY_S and (
+        return time.monotonic() - arrived.received_s < _EARLY_S and (
             is_behind or bool(self._buffer.problems(now_ns))
         )
 
-    def _start_rollout(self, arrived: tuple[float, JointTrajectoryMsg | Goal]) -> None:
-        received_s, plan = arrived
-        goal = plan if isinstance(plan, Goal) else None
-        message = plan.message if isinstance(plan, Goal) else plan
+    def _start_rollout(self, arrived: _Arrived) -> None:
+        goal = arrived.plan if isinstance(arrived.plan, Goal) else None
+        message = arrived.message
         self._reporter.count('trajectories_received')
         now_ns = self._node.get_clock().now().nanoseconds
         try:
@@ -375,10 +408,11 @@ class Rollouts:
                 self._description.check()
             if goal is not None:
                 goal.check(self._robot.joint_names)
-            request = self._maker.make(message, now_ns, received_s)
+            request = self._maker.make(message, now_ns, arrived.received_s)
             self._extrinsics.show(request.scene)
             self._worker.submit(self._fidelity.replan(request))
-        except Exception as error:  # one answer a plan, whatever is wrong with it
+        except Exception as raised:  # one answer a plan, whatever is wrong with it
+            error = _with_delay(raised, arrived.transport_s)
             self._reporter.reject_trajectory(error, to_ns(message.header.stamp))
             if goal is not None and self._action is not None:
                 self._action.refused(goal, error)

@@ -144,6 +144,17 @@ def test_refuses_a_trajectory_of_another_time(node, client, offset_ns, reason, t
     expect_goes_on(client)
 
 
+@pytest.mark.parametrize(('transport_s', 'is_said'), [(0.004, False), (2.9, True)])
+def test_a_stale_plan_that_was_sent_again_says_so(node, client, ros, transport_s, is_said):
+    client.send_scene()
+    client.spin_for(0.1)
+    since, late_ns = len(client.report_values()), client.now_ns() - 3_000_000_000
+    node.node._rollouts.on_plan(ros.make_trajectory(stamp_ns=late_ns), transport_s)
+    ended = client.next_end(since)
+    assert ended['reason'] == 'trajectory_stale'
+    assert ('2.900 s after it was published: lost and sent again' in ended['text']) == is_said
+
+
 BAD_IMAGES = {
     'encoding': ('image_encoding', {'encoding': 'yuv420'}),
     'depth': ('image_encoding', {'encoding': '16UC1'}),
