@@ -22,12 +22,14 @@ from mtv_world_ros.robot.model import RobotModel
 
 #: what can touch what: solids are bit 0, each arm has a bit of its own
 SOLIDS = 1
-#: of drives of joints of which nothing was found: natural frequency [rad/s], damping [s]
-_STIFF, _DAMPED_S = 40.0, 0.05
-#: no finger whose drive is not known presses with more [N/m]
-_STIFFEST = 1000.0
-#: fingers that move by less per unit of their joint do not grip [m]
-_LEAST_TRAVEL = 1e-4
+#: natural frequency of the drive of a joint that was not fitted [rad/s]
+DEFAULT_FREQUENCY_RAD_S = 40.0
+#: damping time of the drive of a joint that was not fitted [s]
+DEFAULT_DAMPING_S = 0.05
+#: largest stiffness of the drive of a finger that was not fitted [N/m]
+MAX_FINGER_STIFFNESS_N_M = 1000.0
+#: smallest travel of a gripping finger per unit of its joint [m]
+MIN_FINGER_TRAVEL_M = 1e-4
 #: radius of the patch in which a finger touches; it resists turning [m]
 PATCH_M = 0.01
 _SHAPES = {
@@ -40,7 +42,7 @@ _SHAPES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drives:
-    """What moves D degrees of freedom: each is `multiplier * joint + offset`.
+    """Coupling of D degrees of freedom to joints: each is `multiplier * joint + offset`.
 
     Attributes:
         names: of the degrees of freedom.
@@ -208,7 +210,7 @@ class Arms:
         return geom
 
     def _is_finger(self, joint: int, link: str) -> bool:
-        """Whether a part touches with the friction of grips.
+        """Return whether a part touches with the friction of grips.
 
         Those that a gripper's joints move; of a gripper that moves one jaw the hand is the other.
         """
@@ -260,20 +262,20 @@ class Arms:
         count = np.bincount(columns, minlength=len(robot.joint_names))
         multipliers = np.array([followers[n][1] for n in names])
         unit = {
-            'stiffness': _STIFF**2 * mass,
-            'damping': _STIFF**2 * mass * _DAMPED_S,
+            'stiffness': DEFAULT_FREQUENCY_RAD_S**2 * mass,
+            'damping': DEFAULT_FREQUENCY_RAD_S**2 * mass * DEFAULT_DAMPING_S,
             'armature': np.zeros(len(mass)),
-            'lead': np.full(len(mass), _DAMPED_S),
+            'lead': np.full(len(mass), DEFAULT_DAMPING_S),
         }
         for joint, way in travels.items():
             column = robot.joint_names.index(joint)
             effort = model.effortLimit[model.joints[model.getJointId(joint)].idx_v]
             stiffness = 2 * effort / (robot.upper[column] - robot.lower[column])
             if np.isfinite(stiffness) and stiffness > 0:  # largest force at half the travel
-                stiffness = min(stiffness, 2 * _STIFFEST * way**2)
+                stiffness = min(stiffness, 2 * MAX_FINGER_STIFFNESS_N_M * way**2)
                 unit['stiffness'][column] = stiffness
-                unit['damping'][column] = stiffness * _DAMPED_S
-                unit['armature'][column] = stiffness / _STIFF**2
+                unit['damping'][column] = stiffness * DEFAULT_DAMPING_S
+                unit['armature'][column] = stiffness / DEFAULT_FREQUENCY_RAD_S**2
         known = np.zeros(len(mass), np.bool_)
         if response is not None:
             known = response.compliance > 0
@@ -296,14 +298,15 @@ class Arms:
             columns=columns,
             multipliers=multipliers,
             offsets=np.array([followers[n][2] for n in names]),
-            fingers=np.abs(way) > _LEAST_TRAVEL,
+            fingers=np.abs(way) > MIN_FINGER_TRAVEL_M,
             travels=way,
             **numbers,
         )
         unknown = [robot.joint_names[j] for j in np.flatnonzero(~known)]
         note = (
             f'how {len(unknown)} joints follow commands was not found '
-            f'({", ".join(unknown[:2])}, ...): they are taken to follow within {_DAMPED_S:g} s'
+            f'({", ".join(unknown[:2])}, ...): they are taken to follow within '
+            f'{DEFAULT_DAMPING_S:g} s'
         )
         return drives, (note,) if unknown else ()
 

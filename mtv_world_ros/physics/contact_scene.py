@@ -21,19 +21,30 @@ from mtv_world_ros.physics.solids import Solid
 
 #: of the engine [s]
 STEP_S = 0.004
-#: what is at least this wide, and wider than high by this factor, is hollow: a dish, a tray [m]
-_DISH_M, _DISH_RATIO = 0.06, 1.5
-#: thickness of the floor of what is hollow; walls end so far above the bottom [m]
-_FLOOR_M, _LIFT_M = 0.006, 0.0005
-#: round walls are so many boxes
-_SIDES = 16
-#: nothing is thinner [m]
-_LEAST_M = 1e-3
-_LEAST_KG = 0.01
-#: contacts give way within so many steps; friction is stiffer than they by this factor
-_SOFT_STEPS, _STIFF_FRICTION = 2.5, 10.0
-_ITERATIONS, _TOLERANCE = 30, 1e-7
-_BOX, _CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
+#: smallest width of a dish or tray, which is hollow [m]
+MIN_DISH_WIDTH_M = 0.06
+#: smallest ratio of width to height of a dish or tray
+MIN_DISH_RATIO = 1.5
+#: thickness of the bottom of a hollow solid [m]
+DISH_BOTTOM_M = 0.006
+#: gap between the lower edge of a wall and the ground [m]
+WALL_GAP_M = 0.0005
+#: number of boxes that approximate a round wall
+NUM_WALL_BOXES = 16
+#: smallest thickness of a simulated part [m]
+MIN_THICKNESS_M = 1e-3
+#: smallest mass of a simulated part [kg]
+MIN_MASS_KG = 0.01
+#: time constant of contacts, in steps of the engine (MuJoCo: solref)
+CONTACT_TIME_STEPS = 2.5
+#: stiffness of friction as a multiple of the contacts' (MuJoCo: impratio)
+FRICTION_STIFFNESS_RATIO = 10.0
+#: largest number of iterations of the constraint solver
+SOLVER_ITERATIONS = 30
+#: termination tolerance of the constraint solver
+SOLVER_TOLERANCE = 1e-7
+_BOX = mujoco.mjtGeom.mjGEOM_BOX
+_CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,7 +183,7 @@ def kind_of(solid: Solid) -> str:
     """Returns of what pieces a solid is made."""
     wide, long, high = map(float, solid.size)
     across = min(wide, long)
-    if across > _DISH_M and across > _DISH_RATIO * high:
+    if across > MIN_DISH_WIDTH_M and across > MIN_DISH_RATIO * high:
         return 'dish' if solid.is_round else 'tray'
     if solid.is_round:
         return 'cup' if solid.is_open else 'cylinder'
@@ -184,13 +195,13 @@ def _empty_spec() -> Any:
     spec = mujoco.MjSpec()
     option = spec.option
     option.timestep, option.integrator = STEP_S, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, _STIFF_FRICTION
-    option.iterations, option.tolerance = _ITERATIONS, _TOLERANCE
+    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, FRICTION_STIFFNESS_RATIO
+    option.iterations, option.tolerance = SOLVER_ITERATIONS, SOLVER_TOLERANCE
     # sizes change after the trees of boxes were built; what diverges is looked at, not reset
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.compiler.balanceinertia, spec.compiler.degree = True, False
-    soft = [_SOFT_STEPS * STEP_S, 1.0]
+    soft = [CONTACT_TIME_STEPS * STEP_S, 1.0]
     spec.default.geom.solref = soft
     spec.default.joint.solref_limit = soft
     spec.default.equality.solref = soft
@@ -252,8 +263,8 @@ def _inertia_of(pieces: Sequence[_Piece]) -> tuple[float, FloatArray, FloatArray
 
 
 def _pieces(solid: Solid, settings: ContactSettings, kind: str) -> list[_Piece]:
-    """Of the kind that it was found as: of another size in a future, it still is that."""
-    wide, long, high = (max(float(extent), _LEAST_M) for extent in solid.size)
+    """Return the kind of a solid; it does not change with its size in a future."""
+    wide, long, high = (max(float(extent), MIN_THICKNESS_M) for extent in solid.size)
     density = settings.density
     if kind == 'tray':
         return _tray(wide, long, high, settings)
@@ -261,7 +272,7 @@ def _pieces(solid: Solid, settings: ContactSettings, kind: str) -> list[_Piece]:
         rim = settings.rim_m if kind == 'dish' else settings.wall_m
         return _vessel(wide, high, rim, density)
     volume = wide * long * high * (np.pi / 4 if solid.is_round else 1.0)
-    mass, at = max(volume * density, _LEAST_KG), (0.0, 0.0, 0.0)
+    mass, at = max(volume * density, MIN_MASS_KG), (0.0, 0.0, 0.0)
     if solid.is_round:
         return [_Piece(size=(wide / 2, high / 2, 0.0), at=at, mass=mass, is_round=True)]
     return [_Piece(size=(wide / 2, long / 2, high / 2), at=at, mass=mass)]
@@ -270,19 +281,19 @@ def _pieces(solid: Solid, settings: ContactSettings, kind: str) -> list[_Piece]:
 def _vessel(wide: float, high: float, rim: float, density: float) -> list[_Piece]:
     """Round and open at the top."""
     rim = min(rim, wide / 2)
-    middle, half = (wide - rim) / 2, max(high - _LIFT_M, _LEAST_M) / 2
-    wall = (rim / 2, float(middle * np.tan(np.pi / _SIDES)) * 1.02, half)
+    middle, half = (wide - rim) / 2, max(high - WALL_GAP_M, MIN_THICKNESS_M) / 2
+    wall = (rim / 2, float(middle * np.tan(np.pi / NUM_WALL_BOXES)) * 1.02, half)
     floor = _Piece(
-        size=(middle, _FLOOR_M / 2, 0.0),
-        at=(0.0, 0.0, (_FLOOR_M - high) / 2),
-        mass=np.pi * middle**2 * _FLOOR_M * density,
+        size=(middle, DISH_BOTTOM_M / 2, 0.0),
+        at=(0.0, 0.0, (DISH_BOTTOM_M - high) / 2),
+        mass=np.pi * middle**2 * DISH_BOTTOM_M * density,
         is_round=True,
     )
-    turns = np.arange(_SIDES) * 2 * np.pi / _SIDES
+    turns = np.arange(NUM_WALL_BOXES) * 2 * np.pi / NUM_WALL_BOXES
     return [floor] + [
         _Piece(
             size=wall,
-            at=(middle * np.cos(turn), middle * np.sin(turn), _LIFT_M / 2),
+            at=(middle * np.cos(turn), middle * np.sin(turn), WALL_GAP_M / 2),
             mass=8 * float(np.prod(wall)) * density,
             yaw=float(turn),
         )
@@ -293,18 +304,18 @@ def _vessel(wide: float, high: float, rim: float, density: float) -> list[_Piece
 def _tray(wide: float, long: float, high: float, settings: ContactSettings) -> list[_Piece]:
     """A box without a lid; it is heavy below."""
     x, y, wall = wide / 2, long / 2, min(settings.wall_m, wide / 2, long / 2) / 2
-    half = max(high - _LIFT_M, _LEAST_M) / 2
+    half = max(high - WALL_GAP_M, MIN_THICKNESS_M) / 2
     walls = (
         ((wall, y, half), (x - wall, 0.0)),
         ((wall, y, half), (wall - x, 0.0)),
         ((x, wall, half), (0.0, y - wall)),
         ((x, wall, half), (0.0, wall - y)),
     )
-    floor = (x, y, _FLOOR_M / 2)
+    floor = (x, y, DISH_BOTTOM_M / 2)
     return [
-        _Piece(size=floor, at=(0.0, 0.0, (_FLOOR_M - high) / 2), mass=0.9 * settings.tray_kg)
+        _Piece(size=floor, at=(0.0, 0.0, (DISH_BOTTOM_M - high) / 2), mass=0.9 * settings.tray_kg)
     ] + [
-        _Piece(size=size, at=(*at, _LIFT_M / 2), mass=0.025 * settings.tray_kg)
+        _Piece(size=size, at=(*at, WALL_GAP_M / 2), mass=0.025 * settings.tray_kg)
         for size, at in walls
     ]
 

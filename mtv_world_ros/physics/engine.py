@@ -22,24 +22,58 @@ from mtv_world_ros.physics.drive_inputs import ArmsState, CoursePlanner, FreeMot
 from mtv_world_ros.physics.futures import Future
 from mtv_world_ros.physics.mujoco_import import mujoco, Rollout
 
-#: slower solids are at rest [rad/s], [m/s]; arms that are nearer to their way are on it
-_REST_RAD_S, _REST_M_S = 0.02, 0.002
-_ON_WAY, _ON_WAY_SPEED = 1e-3, 0.02
-#: what comes as near to a solid may touch it [m]
-_NEAR_M = 0.015
-#: fingers that come as near to the table may touch it [m]
-_NEAR_TABLE_M = 0.002
-#: rows for which all is still before arms only pass by
-_STILL_ROWS = 1
-#: what no object does on a table: places [m], speeds [m/s], [rad/s]
-_FAR_M, _FAST_M_S, _FAST_RAD_S = 3.0, 20.0, 1000.0
-#: the last net, as wall time depends on what else runs: a plan may take so many times as long as
-#: what it shows, and so long more [s]
-_SLOW, _LEAST_CAP_S = 20.0, 60.0
-#: constraints (three a contact) from which steps take so long that they are computed in pieces, of
-#: which work is counted; which are those of objects that cannot all be where they were found; and
-#: which a future may have in the mean over a plan
-_CROWDED, _OVERLAPPING, _MOST_TOUCHES = 300, 1500, 400
+
+@dataclass(frozen=True, slots=True)
+class SleepSettings:
+    """Limits below which solids and arms are not simulated.
+
+    Attributes:
+        max_angular_speed_rad_s: a slower solid is at rest.
+        max_linear_speed_m_s: a slower solid is at rest.
+        tracking_tolerance: largest distance of a joint from its free motion [rad or m].
+        tracking_speed_tolerance: largest difference of its speed [rad/s or m/s].
+        num_still_rows: rows without motion before arms only pass by.
+    """
+
+    max_angular_speed_rad_s: float = 0.02
+    max_linear_speed_m_s: float = 0.002
+    tracking_tolerance: float = 1e-3
+    tracking_speed_tolerance: float = 0.02
+    num_still_rows: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class DivergenceLimits:
+    """Values beyond which the simulation of a future is treated as diverged.
+
+    Attributes:
+        max_distance_m: distance of an object from the origin.
+        max_linear_speed_m_s: speed of an object.
+        max_angular_speed_rad_s: angular speed of an object.
+        overlapping_constraints: constraints of objects that cannot all be where they were found.
+        max_mean_constraints: mean number of constraints of a future over a plan.
+    """
+
+    max_distance_m: float = 3.0
+    max_linear_speed_m_s: float = 20.0
+    max_angular_speed_rad_s: float = 1000.0
+    overlapping_constraints: int = 1500
+    max_mean_constraints: int = 400
+
+
+_SLEEP = SleepSettings()
+_LIMITS = DivergenceLimits()
+#: distance at which contact between an arm and a solid is simulated [m]
+CONTACT_RANGE_M = 0.015
+#: distance at which contact between a finger and the table is simulated [m]
+TABLE_CONTACT_RANGE_M = 0.002
+#: wall-clock limit of one plan: SLOWDOWN_LIMIT times its duration plus EXTRA_S; a safeguard only,
+#: because wall time depends on the load of the machine
+SLOWDOWN_LIMIT = 20.0
+EXTRA_S = 60.0
+#: constraints (three a contact) from which a step is slow, so that it is computed in pieces whose
+#: work is counted
+CROWDED_CONSTRAINTS = 300
 
 logger = logging.getLogger(__name__)
 
@@ -177,7 +211,7 @@ class Batch:
         return BatchState(
             physics=physics,
             arms=self._planner.begin(positions),
-            still=np.full(len(physics), _STILL_ROWS),
+            still=np.full(len(physics), _SLEEP.num_still_rows),
         )
 
     def advance(
@@ -203,7 +237,7 @@ class Batch:
         courses = [course.late(delay, state.last) for delay in self._delays]
         rows = (len(commands) - 1) // every
         run = _Run(self._scene, self.futures, courses, every * SUBSTEPS, state)
-        cap_s = time.monotonic() + _SLOW * rows * every * PERIOD_S + _LEAST_CAP_S
+        cap_s = time.monotonic() + SLOWDOWN_LIMIT * rows * every * PERIOD_S + EXTRA_S
 
         def check() -> None:
             if should_stop():
@@ -236,7 +270,7 @@ class Batch:
         crowded = np.zeros(len(moving), np.bool_)
         for place, number in enumerate(moving):
             check()  # of many futures of many parts the counting takes long itself
-            crowded[place] = self._constraints(run, number) > _CROWDED
+            crowded[place] = self._constraints(run, number) > CROWDED_CONSTRAINTS
         self._compute(run, moving[~crowded], controls[~crowded])
         few = self._engine.threads
         slow, goals = moving[crowded], controls[crowded]
@@ -282,7 +316,7 @@ class Batch:
         return targets + self.futures[number].zeros
 
     def _is_clear(self, run: _Run, number: int, row: int) -> bool:
-        """Whether the arms pass by all solids in a row."""
+        """True if the arms pass by all solids in a row."""
         last = run.first_step(row + 1)
         steps = [*range(run.first_step(row), last, 2 * SUBSTEPS), last]
         where = run.courses[number].positions[steps] + self.futures[number].zeros
@@ -316,15 +350,15 @@ class _Run:
         return self.physics[number, 1 : 1 + self._scene.model.nq]
 
     def may_pass(self, number: int, row: int) -> bool:
-        """Whether all is at rest, and the arms are where they go in free air."""
-        if self.still[number] < _STILL_ROWS:
+        """True if all solids are at rest and the arms move as in free air."""
+        if self.still[number] < _SLEEP.num_still_rows:
             return False
         course, step, scene = self.courses[number], self.first_step(row), self._scene
         off = self.qpos(number)[scene.arm_qpos] - self._futures[number].zeros
         speeds = self.physics[number, 1 + scene.model.nq :][scene.arm_dofs]
         return bool(
-            (np.abs(off - course.positions[step]) < _ON_WAY).all()
-            and (np.abs(speeds - course.velocities[step]) < _ON_WAY_SPEED).all()
+            (np.abs(off - course.positions[step]) < _SLEEP.tracking_tolerance).all()
+            and (np.abs(speeds - course.velocities[step]) < _SLEEP.tracking_speed_tolerance).all()
         )
 
     def take(self, moving: np.ndarray, states: FloatArray) -> None:
@@ -340,9 +374,9 @@ class _Run:
     def charge(self, number: int, constraints: int, steps: int) -> None:
         """Counts what steps of a crowded future cost; it is lost where that is too much."""
         self._spent[number] += constraints * steps
-        if constraints > _OVERLAPPING:
+        if constraints > _LIMITS.overlapping_constraints:
             self.lost[number] = 'objects overlap: more touches than things on a table can have'
-        elif self._spent[number] > _MOST_TOUCHES * len(self.courses[0].controls):
+        elif self._spent[number] > _LIMITS.max_mean_constraints * len(self.courses[0].controls):
             self.lost[number] = 'more touches, for longer, than can be foreseen in time'
 
     def lose_all(self, why: str) -> None:
@@ -390,23 +424,28 @@ class _Run:
 
     def _at_rest(self, physics: FloatArray) -> bool:
         ways, turns = self._speeds(physics)
-        return bool((np.abs(ways) < _REST_M_S).all() and (np.abs(turns) < _REST_RAD_S).all())
+        return bool(
+            (np.abs(ways) < _SLEEP.max_linear_speed_m_s).all()
+            and (np.abs(turns) < _SLEEP.max_angular_speed_rad_s).all()
+        )
 
     def _implausible(self, physics: FloatArray) -> str:
-        """Why nothing can be so; empty = it can."""
+        """Return the reason why the simulation diverged; empty if it did not."""
         if not np.isfinite(physics).all():
             return 'the engine diverged'
         ways, turns = self._speeds(physics)
         places = physics[1 + self._scene.solid_qpos[:, None] + np.arange(3)]
-        if (np.abs(places) > _FAR_M).any():
+        if (np.abs(places) > _LIMITS.max_distance_m).any():
             return 'an object left the table for good'
-        if (np.abs(ways) > _FAST_M_S).any() or (np.abs(turns) > _FAST_RAD_S).any():
+        if (np.abs(ways) > _LIMITS.max_linear_speed_m_s).any() or (
+            np.abs(turns) > _LIMITS.max_angular_speed_rad_s
+        ).any():
             return 'an object became faster than anything on a table'
         return ''
 
 
 class _Nearby:
-    """Tells whether arms come near solids, or fingers to the table."""
+    """Test whether arms come near solids, or fingers near the table."""
 
     def __init__(self, scene: CompiledScene, model: Any) -> None:
         self._scene, self._model = scene, model.__copy__()
@@ -417,11 +456,14 @@ class _Nearby:
         self._model.geom_conaffinity[:] = np.where(of_solids, 2, 0)
         # the table, where arms touch it
         self._model.geom_conaffinity[0] = 4 if model.geom_conaffinity[0] < 0 else 0
-        self._model.geom_margin[of_solids], self._model.geom_margin[0] = _NEAR_M, _NEAR_TABLE_M
+        self._model.geom_margin[of_solids], self._model.geom_margin[0] = (
+            CONTACT_RANGE_M,
+            TABLE_CONTACT_RANGE_M,
+        )
         self._data = mujoco.MjData(self._model)
 
     def is_clear(self, qpos: FloatArray, arms: FloatArray) -> bool:
-        """Whether arms at (T, D) are clear of solids that are where `qpos` has them."""
+        """Return whether arms at (T, D) are clear of the solids at `qpos`."""
         model, data = self._model, self._data
         data.qpos[:] = qpos
         for positions in arms:

@@ -29,12 +29,17 @@ STEP_S = COMMANDS_A_STEP * PERIOD_S
 _ENOUGH = 0.5
 #: solids that reach into each other by more were not found well [m]
 _OVERLAP_M = 0.01
-#: solids whose bottoms differ by less stand on one table; it is where the numbers of contact say
-#: if it is as near, and corrected if it is no further away [m]
-_LEVEL_M, _SAME_TABLE_M, _NEAR_TABLE_M = 0.004, 0.003, 0.03
-#: a table of unknown height is looked for so far under the middle of objects, in so many fits [m]
-_HALF_M, _FITS = 0.02, 3
-#: what is further from the robot's base was not found on its table [m]
+#: largest height difference of the bottoms of solids that stand on one table [m]
+LEVEL_TOLERANCE_M = 0.004
+#: largest distance from the fitted table height at which that height is kept [m]
+SAME_TABLE_M = 0.003
+#: largest distance from the fitted table height that is corrected; beyond it is an error [m]
+MAX_TABLE_CORRECTION_M = 0.03
+#: depth below the middle of objects at which the search for an unknown table begins [m]
+TABLE_SEARCH_DEPTH_M = 0.02
+#: number of fits of that search
+NUM_TABLE_FITS = 3
+#: largest distance of a table from the robot's base [m]
 _TABLE_REACH_M = 2.0
 
 
@@ -65,7 +70,7 @@ class SolidForesight:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was assumed of the robot, in words."""
+        """Assumptions about the robot, in words."""
         return self.engine.arms.notes
 
     def with_robot(self, robot: RobotModel) -> SolidForesight:
@@ -94,7 +99,7 @@ class SolidForesight:
             return here._found(*given, unknown)
         found, told = self._found(*given, unknown), self.settings.table_m
         table = _table_under(found.solids)
-        if not _SAME_TABLE_M < abs(table - told) < _NEAR_TABLE_M:
+        if not SAME_TABLE_M < abs(table - told) < MAX_TABLE_CORRECTION_M:
             return found
         # solids are drawn to the table that they are fitted on
         found = self._on_table(table)._found(*given, unknown)
@@ -108,7 +113,7 @@ class SolidForesight:
         return replace(found, foresight=self._on_table(table), note=note)
 
     def _on_table(self, height: float) -> SolidForesight:
-        """The same on a table of another height [m]."""
+        """Return this foresight for a table of another height [m]."""
         other = copy.copy(self)
         other.settings = self.settings.model_copy(update={'table_m': height})
         return other
@@ -206,7 +211,7 @@ class TrackedSolids:
 
     @property
     def commands_a_step(self) -> int:
-        """How many joint positions `advance` takes a step: what is quick counts as well."""
+        """Number of joint positions that `advance` takes per step."""
         return COMMANDS_A_STEP
 
     @property
@@ -235,7 +240,7 @@ class TrackedSolids:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why nothing is foreseen, or what speaks against it, in words."""
+        """Reasons why no motion is foreseen, and doubts about it, in words."""
         doubts = (*dict.fromkeys(self.doubts.values()), *([self.note] if self.note else ()))
         if self.state is None or not self.state.lost:
             return doubts
@@ -330,7 +335,15 @@ def table_in(
     """
     points = locate_all(cameras, poses, centroids(masks))
     bottoms = [
-        bottom_of(masks[:, item], point, cameras, poses, names[item], point[2] - _HALF_M, _FITS)
+        bottom_of(
+            masks[:, item],
+            point,
+            cameras,
+            poses,
+            names[item],
+            point[2] - TABLE_SEARCH_DEPTH_M,
+            NUM_TABLE_FITS,
+        )
         for item, point in enumerate(points)
         if np.isfinite(point).all()
     ]
@@ -338,7 +351,7 @@ def table_in(
 
 
 def _too_many(state: BatchState, count: int) -> bool:
-    """Whether too few of the futures remain for a verdict."""
+    """True if too few futures remain for a verdict."""
     return len(state.lost) > (1 - _ENOUGH) * count
 
 
@@ -350,14 +363,14 @@ def _upright(solid: Solid) -> FloatArray:
 def _table_under(solids: Sequence[Solid | None]) -> float:
     """Height of the table that the lowest solids stand on [m]; NaN = one alone does not tell."""
     bottoms = np.array([solid.bottom for solid in solids if solid is not None])
-    level = bottoms[bottoms < bottoms.min(initial=np.inf) + _LEVEL_M]
+    level = bottoms[bottoms < bottoms.min(initial=np.inf) + LEVEL_TOLERANCE_M]
     return float(level.mean()) if len(level) > 1 else float('nan')
 
 
 def _doubts(
     names: Sequence[str], masks: BoolArray, solids: Sequence[Solid | None], table: float
 ) -> dict[int, str]:
-    """What of the objects cannot be so, in words that name them."""
+    """Return contradictions between the objects, in words that name them."""
     doubts: dict[int, str] = {}
     seen = masks.any((-2, -1)).sum(0)
     for number, (name, solid) in enumerate(zip(names, solids, strict=True)):
@@ -365,7 +378,7 @@ def _doubts(
             doubts[number] = f"'{name}' is seen by one view alone: where it is is not known"
         elif solid is not None and np.abs(solid.centre[:2]).max() > _TABLE_REACH_M:
             doubts[number] = f"'{name}' seems to lie off the table"
-        elif solid is not None and solid.bottom < table - _NEAR_TABLE_M:
+        elif solid is not None and solid.bottom < table - MAX_TABLE_CORRECTION_M:
             depth = 1e3 * (table - solid.bottom)
             doubts[number] = f"'{name}' seems to lie {depth:.0f} mm below the table"
     known = [(n, s) for n, s in enumerate(solids) if s is not None]
@@ -378,7 +391,7 @@ def _doubts(
 
 
 def _floats(solid: Solid, others: Sequence[Solid], table: float) -> float:
-    """How far above the table a solid is on which nothing holds it [m]; 0 = it stands."""
+    """Return the height of an unsupported solid above the table [m]; 0 if it stands."""
     height = solid.bottom - table
     if height < 3 * STANDS_M or any(_apart(solid, other) < 0 for other in others):
         return 0.0
@@ -386,7 +399,7 @@ def _floats(solid: Solid, others: Sequence[Solid], table: float) -> float:
 
 
 def _overlap(one: Solid, other: Solid) -> bool:
-    """Whether solids reach into each other, and neither stands in or on the other."""
+    """Return whether solids overlap and neither stands in or on the other."""
     depth = -_apart(one, other)
     tops = [solid.centre[2] + solid.size[2] / 2 for solid in (one, other)]
     bottoms = [solid.bottom for solid in (one, other)]

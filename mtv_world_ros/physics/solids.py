@@ -23,31 +23,40 @@ from mtv_world_ros.core.transforms import about_z
 #: directions in the image along which outlines are compared
 _ANGLES = np.linspace(0, 2 * np.pi, 48, endpoint=False)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
-#: a pixel reaches this far beyond its centre, along each of them [px]
+#: half extent of a pixel along each direction [px]
 _PIXEL = np.abs(_DIRECTIONS).sum(1) / 2
-#: corners of outlines, for a size of 1
-_ROUND, _SQUARE = _DIRECTIONS / 2, np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
-#: initial yaw angles [rad]; least size [m]; standard deviation of the height of what stands [m]
-_TURNS, _LEAST_M, _STANDS_M = (0.0, 0.4, 0.8, 1.2), 0.008, 0.002
-#: factor by which the cost of a box must be below that of a cylinder, which has two parameters
-#: less, and that of a larger turn below that of a smaller one
-_BETTER = 0.9
-#: further initial yaw angles where a solid was moved [rad]
-_FURTHER = (0.5, -0.5, 1.0, -1.0)
-#: a solid is found again where masks reach beyond it by no more than this, or so much more than
-#: they did when it was whole [px]; and where this share of its outline is as near to theirs
-_FOUND_PX, _FOUND, _SHOWN = 1.0, 1.5, 0.4
-#: a mask that fills less than this share of the outline that it filled before is partly hidden
-_WHOLE = 0.9
+#: corners of the outline of a cylinder of size 1
+_ROUND = _DIRECTIONS / 2
+#: corners of the outline of a box of size 1
+_SQUARE = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
+#: initial yaw angles of a fit [rad]
+YAW_GUESSES_RAD = (0.0, 0.4, 0.8, 1.2)
+#: smallest extent of a solid [m]
+MIN_SIZE_M = 0.008
+#: prior standard deviation of the height of a standing solid [m]
+STANDING_HEIGHT_STD_M = 0.002
+#: largest ratio of the cost of a box to that of a cylinder (two parameters fewer) at which the box
+#: is chosen, and of the cost of a larger turn to that of a smaller one
+MAX_COST_RATIO = 0.9
+#: further initial yaw angles of a solid that was moved [rad]
+MOVED_YAW_GUESSES_RAD = (0.5, -0.5, 1.0, -1.0)
+#: largest overhang of masks beyond the outline of a solid that is found again [px]
+MAX_OVERHANG_PX = 1.0
+#: the same limit as a multiple of the overhang when the solid was whole
+MAX_OVERHANG_RATIO = 1.5
+#: smallest fraction of the outline that lies as near to the masks
+MIN_VISIBLE_FRACTION = 0.4
+#: fill of the outline, relative to the fill before, below which a mask is partly hidden
+MIN_FILL_RATIO = 0.9
 #: largest residual of a solid that has not moved [px]
 _STAYED_PX = 1.0
 _MAX_EVALUATIONS = 60
-#: what is fitted: a cylinder, and boxes of several turns
-_OUTLINES = ((_ROUND, (None,)), (_SQUARE, _TURNS))
+#: outlines that are fitted: a cylinder, and boxes of several turns
+_OUTLINES = ((_ROUND, (None,)), (_SQUARE, YAW_GUESSES_RAD))
 #: residual below which no other initial turn is tried [px]
 _EXACT_PX = 0.35
-#: parts of a mask that are smaller than this share of its largest one are not the object's
-_PART = 0.2
+#: smallest area of a part of a mask, as a fraction of its largest part
+MIN_PART_FRACTION = 0.2
 #: relative step of finite differences
 _DIFFERENCE = float(np.sqrt(np.finfo(float).eps))
 #: names of boxes, and of vessels: hollow and open at the top
@@ -95,7 +104,7 @@ def is_vessel(name: str) -> bool:
 
 
 def is_box(name: str) -> bool:
-    """Tells whether what is called so has edges, which small masks hardly show."""
+    """Return whether an object of this name has edges, which small masks hardly show."""
     return _BOX.search(name.lower()) is not None
 
 
@@ -159,10 +168,10 @@ def fit_solid(
     outlines = _Outlines.of(masks, cameras, poses)
 
     def residuals(numbers: FloatArray, outline: FloatArray) -> FloatArray:
-        stands = (numbers[..., -1:] - floor) / _STANDS_M
+        stands = (numbers[..., -1:] - floor) / STANDING_HEIGHT_STD_M
         return np.concatenate([outlines.residuals(_in_space(numbers, outline)), stands], -1)
 
-    height = max(2 * (float(point[2]) - floor), 2 * _LEAST_M)
+    height = max(2 * (float(point[2]) - floor), 2 * MIN_SIZE_M)
     best = None
     for outline, turns in _OUTLINES[is_box:]:
         for turn in turns:
@@ -170,7 +179,7 @@ def fit_solid(
             given = np.array([point[0], point[1], *first])
             sizes = slice(2 if turn is None else 3, -1)
             least = np.full(len(given), -np.inf)
-            least[sizes] = _LEAST_M
+            least[sizes] = MIN_SIZE_M
             found = _least_squares(
                 partial(residuals, outline=outline),
                 given,
@@ -179,7 +188,7 @@ def fit_solid(
                 loss='soft_l1',
             )
             is_round = best is not None and best[1].is_round
-            if best is None or found.cost < best[0] * (_BETTER if is_round else 1.0):
+            if best is None or found.cost < best[0] * (MAX_COST_RATIO if is_round else 1.0):
                 error = float(np.sqrt(np.mean(found.fun[:-1] ** 2)))
                 best = found.cost, _solid(found.x, turn is None, error)
             if turn is not None and best[1].error_px < _EXACT_PX:
@@ -231,25 +240,27 @@ def find_solid(
     for centre, turn in _starts(solid, likely):
         given = [] if solid.is_round else [solid.yaw + turn]
         given = np.array([*centre[:2], *given, max(centre[2] - height / 2, floor)])
-        least = [*[-np.inf] * (len(given) - 1), floor - _STANDS_M]
+        least = [*[-np.inf] * (len(given) - 1), floor - STANDING_HEIGHT_STD_M]
         scale = [0.01, 0.01, *([] if solid.is_round else [0.1]), 0.01]
         found = _least_squares(
             residuals, given, bounds=(least, np.inf), x_scale=scale, loss='cauchy'
         )
         # a square looks the same after a quarter turn: the smallest turn is taken
-        if best is None or found.cost < _BETTER * best.cost:
+        if best is None or found.cost < MAX_COST_RATIO * best.cost:
             best = found
         if np.abs(found.fun).max() < _STAYED_PX:
             break
     assert best is not None
     error = float(np.sqrt(np.mean(np.minimum(best.fun, 0.0) ** 2)))
-    enough = max(_FOUND_PX, _FOUND * solid.error_px)
-    if error > enough or np.mean(np.abs(best.fun) < enough) < _SHOWN:
+    enough = max(MAX_OVERHANG_PX, MAX_OVERHANG_RATIO * solid.error_px)
+    if error > enough or np.mean(np.abs(best.fun) < enough) < MIN_VISIBLE_FRACTION:
         return None
     now = _solid(np.concatenate([best.x[:-1], size, best.x[-1:]]), solid.is_round, error)
     now = replace(now, is_open=solid.is_open)
     fills = _fills(now, masks, cameras, poses)
-    return replace(now, fills=solid.fills, is_hidden=bool((fills < _WHOLE * solid.fills).any()))
+    return replace(
+        now, fills=solid.fills, is_hidden=bool((fills < MIN_FILL_RATIO * solid.fills).any())
+    )
 
 
 def _at_size(
@@ -265,7 +276,7 @@ def _at_size(
     fills = _fills(solid, mask[None], [camera], [pose])
     if not fills[0] or not solid.fills[view]:
         return np.full(3, np.nan)
-    # so many times as near as where it was
+    # nearer than the old place by this factor
     nearer = np.sqrt(fills[0] / solid.fills[view])
     ray = unproject(camera, centroids(mask)) @ pose[:3, :3].T
     return np.asarray(pose[:3, 3] + ray / (ray @ pose[:3, 2]) * float(depth) / nearer)
@@ -296,13 +307,13 @@ def _starts(solid: Solid, point: FloatArray) -> Iterator[tuple[FloatArray, float
     """Initial guesses: where it was, then where it is seen, with several yaw angles."""
     yield solid.centre, 0.0
     if np.isfinite(point).all():
-        for turn in (0.0,) if solid.is_round else (0.0, *_FURTHER):
+        for turn in (0.0,) if solid.is_round else (0.0, *MOVED_YAW_GUESSES_RAD):
             yield point, turn
 
 
 @dataclass(frozen=True, slots=True)
 class _Outlines:
-    """Those of masks in the views that see something of them.
+    """Return the masks of the views that see a part of the object.
 
     Attributes:
         views: camera and T_base_camera of each.
@@ -372,10 +383,12 @@ def _corners(mask: BoolArray) -> FloatArray:
     """(N, 2) of the hull of its parts but small ones, which belong to what looks alike."""
     _, parts, sizes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     areas = sizes[1:, cv2.CC_STAT_AREA]
-    rows, columns = np.nonzero(np.isin(parts, 1 + np.flatnonzero(areas >= _PART * areas.max())))
+    rows, columns = np.nonzero(
+        np.isin(parts, 1 + np.flatnonzero(areas >= MIN_PART_FRACTION * areas.max()))
+    )
     return cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32))[:, 0].astype(float)
 
 
 def _reach(points: FloatArray) -> FloatArray:
-    """How far points (..., N, 2) reach along each direction [px]."""
+    """Return the extent of points (..., N, 2) along each direction [px]."""
     return (points @ _DIRECTIONS.T).max(-2)

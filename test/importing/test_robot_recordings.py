@@ -1,4 +1,4 @@
-"""Bags with one oddity that real robots record: what import-bag and the reader make of them."""
+"""Bags with one oddity that real robots record: what import bag and the reader make of them."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def run(tmp_path, capsys):
         views = {view: f'/{view}/image_raw' for view in VIEWS}
         file.write_text(yaml.safe_dump({'robot': 'franka', 'views': views, **mapping}))
         out = str(tmp_path / 'out')
-        status = main(['import-bag', str(bag), '--topics', str(file), '--out', out, *more])
+        status = main(['import', 'bag', str(bag), '--topics', str(file), '--out', out, *more])
         printed = capsys.readouterr()
         return status, printed.out + printed.err
 
@@ -162,7 +162,7 @@ def test_a_recording_whose_clocks_jump_becomes_two_episodes(record, run, tmp_pat
         np.testing.assert_allclose(episode.joint_states.positions[:, 0], wanted[:, 0], atol=1e-9)
     status, said = run(bag, outcome='success')
     assert '0 made, 2 kept, 0 failed' in said
-    with pytest.raises(ClockBreakError, match='mtv-world import-bag makes an episode of each'):
+    with pytest.raises(ClockBreakError, match='mtv-world import bag makes an episode of each'):
         read_episode(bag)
 
 

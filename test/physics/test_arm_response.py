@@ -192,7 +192,7 @@ def test_a_response_is_read_again_by_joint_and_refused_for_another_robot(tmp_pat
     read = load_response(tmp_path, robot)
     assert read is not None and read.lead[robot.joint_names.index('left_joint1')] == 0.5
     assert read.floor == 0.012 and read.as_json()['floor'] == 0.012
-    with pytest.raises(CheckpointError, match="which robot 'franka' has; run 'mtv-world fit-c"):
+    with pytest.raises(CheckpointError, match="which robot 'franka' has; run 'mtv-world fit c"):
         load_response(tmp_path, robot_of('franka'))
     for wrong in ('much', -1.0):
         values['left_joint1']['lead'] = wrong

@@ -120,7 +120,7 @@ def test_a_late_future_does_the_same_later(lift):
 
 @pytest.mark.parametrize('is_crowded', [False, True])
 def test_it_stops_within_50_ms(lift, monkeypatch, is_crowded):
-    monkeypatch.setattr(engine_module, '_CROWDED', 40)
+    monkeypatch.setattr(engine_module, 'CROWDED_CONSTRAINTS', 40)
     solids = cluttered(6) if is_crowded else (BLOCK, AWAY)
     batch = batch_of(lift, *solids, num_motions=64)
     batch.advance(picking(0.2), 5)  # all is compiled
@@ -165,7 +165,7 @@ def test_crowded_futures_are_computed_in_pieces_that_depend_on_nothing_else(lift
         return run(self, models, data, states, controls)
 
     monkeypatch.setattr(Engine, 'run', counted)
-    monkeypatch.setattr(engine_module, '_CROWDED', 40)
+    monkeypatch.setattr(engine_module, 'CROWDED_CONSTRAINTS', 40)
     found = []
     for threads in (1, 2):
         asked.clear()
@@ -178,7 +178,7 @@ def test_crowded_futures_are_computed_in_pieces_that_depend_on_nothing_else(lift
 
 
 def test_crowded_futures_have_an_end_that_no_clock_decides(lift, monkeypatch):
-    monkeypatch.setattr(engine_module, '_CROWDED', 40)
+    monkeypatch.setattr(engine_module, 'CROWDED_CONSTRAINTS', 40)
     monkeypatch.setattr(engine_module, '_MOST_TOUCHES', 20)
     lost = []
     for _ in range(2):

@@ -133,7 +133,7 @@ def test_every_command_says_it_before_any_work(command, place, tmp_path, monkeyp
 
 @pytest.mark.parametrize(
     'words',
-    [f'doctor {DEMO}', 'robot yam_bimanual', f'calibrate-camera {DEMO} --view low',
+    [f'check {DEMO}', 'robot yam_bimanual', f'fit camera {DEMO} --view low',
      f'replay {DEMO} --offline', 'demo', f'imagine --episodes {DEMO}'],
 )  # fmt: skip
 def test_where_results_go_by_default_is_looked_at_as_well(words, monkeypatch, capsys):

@@ -246,7 +246,7 @@ def test_a_base_of_another_kind_is_refused(config, base, section, changes, messa
 
 
 def test_without_a_base_the_command_to_make_one_is_named(config, episode, robot, tmp_path):
-    with pytest.raises(TrainingError, match=r'--init FOLDER.*import-weights'):
+    with pytest.raises(TrainingError, match=r'--init FOLDER.*import wan'):
         train(
             TrainingRun(config=config, dataset=episode.parent, out=tmp_path),
             robot=robot,
