@@ -13,7 +13,7 @@ from mtv_world_ros.physics import engine as engine_module
 from mtv_world_ros.physics.arms import Arms
 from mtv_world_ros.physics.contact_settings import ContactSpread
 from mtv_world_ros.physics.drive_inputs import SUBSTEPS
-from mtv_world_ros.physics.engine import Engine
+from mtv_world_ros.physics.engine import DivergenceLimits, Engine
 from mtv_world_ros.physics.futures import draw_futures
 from mtv_world_ros.physics.solid_foresight import SolidForesight, TrackedSolids
 from mtv_world_ros.physics.solids import Solid
@@ -179,7 +179,8 @@ def test_crowded_futures_are_computed_in_pieces_that_depend_on_nothing_else(lift
 
 def test_crowded_futures_have_an_end_that_no_clock_decides(lift, monkeypatch):
     monkeypatch.setattr(engine_module, 'CROWDED_CONSTRAINTS', 40)
-    monkeypatch.setattr(engine_module, '_MOST_TOUCHES', 20)
+    limits = DivergenceLimits(max_mean_constraints=20)
+    monkeypatch.setattr(engine_module, '_LIMITS', limits)
     lost = []
     for _ in range(2):
         one = tracked(lift, *cluttered(3))
