@@ -220,8 +220,8 @@ def test_the_page_leads_from_videos_to_a_contact_sheet(lab, monkeypatch, capsys)
     folder, cameras = lab
     monkeypatch.chdir(folder)
     monkeypatch.setattr(joint_camera, '_STAGES', joint_camera._STAGES[:2])  # the last is finer
-    monkeypatch.setattr(contact_fit, '_DRAWS', 8)
-    monkeypatch.setattr(contact_fit, '_ROUNDS', 1)
+    fit = contact_fit.ContactFitSettings(num_draws=8, num_rounds=1)
+    monkeypatch.setattr(contact_fit, '_FIT', fit)
     told = lines(of_videos=True)
     assert len(told) <= 8
     for words in told:

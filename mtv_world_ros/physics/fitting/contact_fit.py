@@ -43,16 +43,31 @@ from mtv_world_ros.physics.solids import bottom_of, fit_solid, is_box, is_vessel
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.resample import nearest_rows
 
-#: a gripper that is commanded to close by more than this share of its travel may touch something
-_CLOSES = 0.02
-#: errors of grippers above this share of their travel are as bad: they touch something
-_MOST = 0.15
-#: candidates of a round, and the factors within which they are drawn
-_CANDIDATES, _FINGER_FACTORS = 48, (10.0, 3.0, 1.5, 1.2)
-#: episodes that are looked at, and shortest ones [periods]
-_MOST_EPISODES, _SHORTEST = 12, 10
-#: fingers swing if that explains at least this share of the errors
-_EXPLAINS = 0.25
+
+@dataclass(frozen=True, slots=True)
+class FingerFitSettings:
+    """Settings of the fit of finger drives to grippers that touch nothing.
+
+    Attributes:
+        min_closing_fraction: a gripper that closes by a larger fraction of its travel may touch.
+        max_error_fraction: errors beyond this fraction of the travel count the same: contact.
+        num_candidates: candidates drawn in each round.
+        search_factors: range of each round, as a factor around the best value so far.
+        max_episodes: number of episodes that are used, spread evenly.
+        min_periods: shortest usable part of an episode [control periods].
+        min_explained_fraction: smallest explained fraction of the errors at which fingers swing.
+    """
+
+    min_closing_fraction: float = 0.02
+    max_error_fraction: float = 0.15
+    num_candidates: int = 48
+    search_factors: tuple[float, ...] = (10.0, 3.0, 1.5, 1.2)
+    max_episodes: int = 12
+    min_periods: int = 10
+    min_explained_fraction: float = 0.25
+
+
+_FINGERS = FingerFitSettings()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +92,10 @@ class FreeGrippers:
                 continue
             column = robot.joint_names.index(tool.gripper_joint)
             travel = abs(tool.gripper_open - tool.gripper_closed)
-            moved = np.abs(positions[:, column] - positions[0, column]) > _CLOSES * travel
+            moved = (
+                np.abs(positions[:, column] - positions[0, column])
+                > _FINGERS.min_closing_fraction * travel
+            )
             count = int(moved.argmax()) if moved.any() else len(moved)
             known[:count, column] = recorded[:count, column]
             last = max(last, count)
@@ -92,9 +110,9 @@ def fit_fingers(
     The search begins at the settings. Where swinging fingers explain little, they are returned as
     they were, and fingers do not swing.
     """
-    known = [one for one in grippers if len(one.positions) >= _SHORTEST]
+    known = [one for one in grippers if len(one.positions) >= _FINGERS.min_periods]
     known = [one for one in known if np.isfinite(one.recorded).any()]
-    known = known[:: max(1, len(known) // _MOST_EPISODES)][:_MOST_EPISODES]
+    known = known[:: max(1, len(known) // _FINGERS.max_episodes)][: _FINGERS.max_episodes]
     if not known:
         return settings
     scene = CompiledScene.compiled(arms, ())
@@ -102,8 +120,8 @@ def fit_fingers(
     rng = np.random.default_rng(3)
     names = ('finger_stiffness', 'finger_damping', 'finger_mass_kg')
     best, least = swinging, np.inf
-    for factor in _FINGER_FACTORS:
-        drawn = rng.uniform(-1, 1, size=(_CANDIDATES, 3))
+    for factor in _FINGERS.search_factors:
+        drawn = rng.uniform(-1, 1, size=(_FINGERS.num_candidates, 3))
         drawn[0] = 0.0
         middle = np.array([getattr(best, name) for name in names])
         for numbers in (middle * factor**drawn).tolist():
@@ -112,7 +130,11 @@ def fit_fingers(
             if loss < least:
                 best, least = tried, loss
     geared = settings.model_copy(update={'fingers_swing': False})
-    return best if least < (1 - _EXPLAINS) * _loss(scene, geared, known) else settings
+    return (
+        best
+        if least < (1 - _FINGERS.min_explained_fraction) * _loss(scene, geared, known)
+        else settings
+    )
 
 
 def _loss(
@@ -121,7 +143,7 @@ def _loss(
     grippers: Sequence[FreeGrippers],
     most: float = np.inf,
 ) -> float:
-    """How far grippers report to be from where they are expected, in their travels.
+    """Return the mean gripper position error, as a fraction of the gripper's travel.
 
     Recordings after those that make it more than `most` are not looked at.
     """
@@ -137,18 +159,20 @@ def _loss(
                 column = names.index(tool.gripper_joint)
                 travel = abs(tool.gripper_open - tool.gripper_closed)
                 off = np.abs(expected[:, column] - one.recorded[:, column]) / travel
-                loss += float(np.nansum(np.minimum(off, _MOST)))
+                loss += float(np.nansum(np.minimum(off, _FINGERS.max_error_fraction)))
     return loss
 
 
-#: what is drawn, and as how large it may be thought before: factors are of the first settings
+#: range of each sampled parameter, where the prior begins
 RANGES = {
     'grip_friction': (0.03, 3.0),
     'table_friction': (0.15, 2.5),
     'density': (60.0, 3000.0),
     'finger_stiffness': (0.2, 3.0),
 }
+#: parameters whose range is a factor of the first settings
 _FACTORS = frozenset({'finger_stiffness'})
+#: names of parameters in messages
 _WORDS = {
     'grip_friction': 'friction of fingers',
     'table_friction': 'friction of all else',
@@ -159,49 +183,80 @@ _WORDS = {
     'camera_m': 'cameras see objects elsewhere by [m]',
     'hold': 'friction x stiffness of fingers / density: whether things slip [N m^2/kg]',
 }
-#: exponents of numbers that make up for each other: an object slips where this product is small
+#: exponents of the product that decides whether an object slips
 _HOLD = {'grip_friction': 1, 'finger_stiffness': 1, 'density': -1}
-#: how far settings usually are from the first ones, as the deviation of a logarithm
-_USUAL = 1.0
-#: draws of a round, and rounds
-_DRAWS, _ROUNDS = 64, 3
-#: draws worth fewer alike ones do not show how uncertain a number is. Where they are worth
-#: fewer than enough, or than a share of all, the likelihood counts less, down to a share
-_FEW, _ENOUGH, _ENOUGH_SHARE, _LEAST_COUNTS = 5.0, 16.0, 1 / 8, 0.01
-#: numbers whose interval is so many times wider than if the others were known are not told apart
-_APART = 2.0
-#: an object this far from where it was foreseen is about as unlikely as it gets [m]; farther ones
-#: may be lost by the masks
-_NEAR_M, _LOST_M = 0.008, 0.1
-#: later draws lie as wide as what is likely, times this; deviation of a logarithm, at least
-_WIDER, _LEAST = 1.3, 0.08
-#: an episode says something of a number whose low and high values differ by this likelihood
-_SAYS = 0.5
-#: delays that are tried [s]
+#: delays of commands that are tried [s]
 _DELAYS = np.arange(0.0, 0.31, PERIOD_S)
-#: masks of larger objects have no common middle in two views [m]
-_SMALL_M = 0.1
-#: outlines of masks are no more exact than this, however many there are [m]
-_EXACT_M = 0.0005
-#: heights that differ by more are of several tables [m]
-_ONE_TABLE_M = 0.03
-#: commands that are as near to measured positions are these [rad or m]; then fingers are told to
-#: close further, by a share of their travel
-_SAME_RAD, _SQUEEZE = 1e-6, 0.1
-#: recordings whose table is looked for
-_MOST_TABLES = 8
-#: objects of which less is shown than this share of the first frame's are hidden in part
-_SHOWN = 0.85
-#: slower joints do not show a delay [rad/s or m/s]
-_MOVES = 0.1
-_RESAMPLED, _SEED = 400, 5
-#: spreads in futures are no smaller and no larger: other scenes are not quite as these
-_LEAST_SPREAD, _MOST_SPREAD = 0.1, 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class ContactFitSettings:
+    """Settings of the importance sampling of contact parameters.
+
+    Attributes:
+        prior_log_std: prior standard deviation of the logarithm of a parameter.
+        num_draws: draws of a round.
+        num_rounds: rounds; each draws around the posterior of the one before.
+        proposal_scale: width of the next round's draws as a multiple of the posterior's.
+        proposal_min_log_std: smallest standard deviation of the next round's draws.
+        min_effective_draws: effective draws below which an interval is not stated.
+        enough_effective_draws: effective draws below which the likelihood is tempered.
+        enough_fraction: the same limit as a fraction of all draws.
+        min_temper: smallest exponent of the tempered likelihood.
+        max_width_ratio: a parameter whose interval is wider by this factor than with the others
+            known is not told apart from them.
+        position_scale_m: scale of the heavy-tailed distribution of position errors [m].
+        lost_distance_m: larger errors count the same, because masks may have lost the object [m].
+        min_log_likelihood_gap: smallest difference between low and high values of a parameter at
+            which a recording informs it.
+        max_small_size_m: largest object whose masks have a common middle in two views [m].
+        outline_error_m: error of outlines that does not shrink with their number [m].
+        max_table_spread_m: larger differences of heights are of several tables [m].
+        max_tables: number of recordings whose table is searched.
+        same_command_tolerance: commands this near to the measured positions are these [rad or m].
+        squeeze_fraction: extra closing of fingers where commands are measured positions, as a
+            fraction of their travel.
+        min_visible_fraction: smallest shown area of an unhidden object, relative to frame 0.
+        min_joint_speed: slowest joint that shows a delay [rad/s or m/s].
+        num_resamples: bootstrap samples of intervals over recordings.
+        seed: seed of draws and resamples.
+        min_spread: smallest spread of a parameter over futures: other scenes differ [log].
+        max_spread: largest spread of a parameter over futures [log].
+    """
+
+    prior_log_std: float = 1.0
+    num_draws: int = 64
+    num_rounds: int = 3
+    proposal_scale: float = 1.3
+    proposal_min_log_std: float = 0.08
+    min_effective_draws: float = 5.0
+    enough_effective_draws: float = 16.0
+    enough_fraction: float = 1 / 8
+    min_temper: float = 0.01
+    max_width_ratio: float = 2.0
+    position_scale_m: float = 0.008
+    lost_distance_m: float = 0.1
+    min_log_likelihood_gap: float = 0.5
+    max_small_size_m: float = 0.1
+    outline_error_m: float = 0.0005
+    max_table_spread_m: float = 0.03
+    max_tables: int = 8
+    same_command_tolerance: float = 1e-6
+    squeeze_fraction: float = 0.1
+    min_visible_fraction: float = 0.85
+    min_joint_speed: float = 0.1
+    num_resamples: int = 400
+    seed: int = 5
+    min_spread: float = 0.1
+    max_spread: float = 0.8
+
+
+_FIT = ContactFitSettings()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContactRecording:
-    """What an episode says about contact.
+    """Motion of objects in an episode, and the commands that caused it.
 
     Attributes:
         names: of O objects.
@@ -301,7 +356,7 @@ def _unhidden(episode: Episode, views: Sequence[str], num_rows: int) -> BoolArra
         )
         areas.append(each[nearest_rows(track.stamps_ns, wanted)][:, :count])
     shown = np.stack(areas)
-    return np.asarray((shown >= _SHOWN * shown[:, :1]).all(axis=0))
+    return np.asarray((shown >= _FIT.min_visible_fraction * shown[:, :1]).all(axis=0))
 
 
 def read_recordings(
@@ -392,14 +447,14 @@ def fit_contact(
         'finger_damping': first.finger_damping * stiffer,
     }
     spreads = {
-        key: float(np.clip(one.spread, _LEAST_SPREAD, _MOST_SPREAD))
+        key: float(np.clip(one.spread, _FIT.min_spread, _FIT.max_spread))
         for key, one in zip(('grip', 'friction', 'weight', 'force'), found, strict=True)
     }
     spread = first.spread.model_copy(update=spreads)
     for one in (*found, hold):
         report(str(one))
     deciding = _effective_draws(weights)
-    if deciding < _FEW:
+    if deciding < _FIT.min_effective_draws:
         report(
             f'{deciding:.1f} draws decide: these numbers are likely together, but their intervals '
             'are too narrow'
@@ -426,26 +481,28 @@ def settings_of_place(
         report: is told what differs.
     """
     changed: dict[str, bool | float] = {}
-    each = recordings[:: max(1, len(recordings) // _MOST_TABLES)]
+    each = recordings[:: max(1, len(recordings) // _FIT.max_tables)]
     heights = np.array([recording.table() for recording in each])
     heights = heights[np.isfinite(heights)]
-    if len(heights) and np.ptp(heights) > _ONE_TABLE_M:
+    if len(heights) and np.ptp(heights) > _FIT.max_table_spread_m:
         changed['table_varies'] = True
         report(
             f'tables are between {heights.min():.3f} and {heights.max():.3f} m high: each is '
             'looked for in the first frame'
         )
-    if all(np.allclose(r.positions, r.recorded, atol=_SAME_RAD) for r in recordings):
-        changed['squeeze'] = _SQUEEZE
+    if all(
+        np.allclose(r.positions, r.recorded, atol=_FIT.same_command_tolerance) for r in recordings
+    ):
+        changed['squeeze'] = _FIT.squeeze_fraction
         report(
             'commands are measured positions, which stop at what is held: grippers close further '
-            f'by {_SQUEEZE:.0%} of their travel'
+            f'by {_FIT.squeeze_fraction:.0%} of their travel'
         )
     return first.model_copy(update=changed)
 
 
 def _scales(first: ContactSettings) -> dict[str, float]:
-    """What a drawn number is multiplied by."""
+    """Return the scale factor of each sampled parameter."""
     return {name: getattr(first, name) if name in _FACTORS else 1.0 for name in RANGES}
 
 
@@ -461,12 +518,14 @@ def _populations(
     uniform = -float(np.log(high - low).sum())
     middle = np.log([1.0 if n in _FACTORS else getattr(first, n) for n in RANGES])
     drawn = qmc.scale(
-        qmc.Sobol(len(RANGES), rng=np.random.default_rng(_SEED)).random(_DRAWS), low, high
+        qmc.Sobol(len(RANGES), rng=np.random.default_rng(_FIT.seed)).random(_FIT.num_draws),
+        low,
+        high,
     )
     draws, likelihoods = np.zeros((0, len(RANGES))), np.zeros((0, len(trials)))
     proposals: list[tuple[FloatArray, FloatArray] | None] = [None]
-    weights, steps = np.zeros(0), iter(progress(range(_ROUNDS * len(trials))))
-    for number in range(_ROUNDS):
+    weights, steps = np.zeros(0), iter(progress(range(_FIT.num_rounds * len(trials))))
+    for number in range(_FIT.num_rounds):
         draws = np.concatenate([draws, drawn])
         settings = [_settings(first, one) for one in drawn]
         rows = np.stack(
@@ -481,16 +540,16 @@ def _populations(
             for one in proposals
         ]
         mixture = np.logaddexp.reduce(densities, axis=0) - np.log(len(proposals))
-        usual = -(((draws - middle) / _USUAL) ** 2).sum(-1) / 2
+        usual = -(((draws - middle) / _FIT.prior_log_std) ** 2).sum(-1) / 2
         weights, counts = _weights(likelihoods.sum(-1), usual - mixture)
-        mean, wide = weights @ draws, _WIDER**2 * _covariance(draws, weights)
-        wide += _LEAST**2 * np.eye(len(mean))
+        mean, wide = weights @ draws, _FIT.proposal_scale**2 * _covariance(draws, weights)
+        wide += _FIT.proposal_min_log_std**2 * np.eye(len(mean))
         tempered = '' if counts == 1 else f', {counts:.2g} of the likelihood counted'
         worth = f'worth {_effective_draws(weights):.1f} alike'
         report(f'round {number + 1}: {len(draws)} draws, {worth}{tempered}')
         proposals.append((mean, wide))
-        rng = np.random.default_rng((_SEED, number))
-        drawn = np.clip(rng.multivariate_normal(mean, wide, _DRAWS), low, high)
+        rng = np.random.default_rng((_FIT.seed, number))
+        drawn = np.clip(rng.multivariate_normal(mean, wide, _FIT.num_draws), low, high)
     return draws, likelihoods, weights
 
 
@@ -501,9 +560,9 @@ def _weights(likelihoods: FloatArray, others: FloatArray) -> tuple[FloatArray, f
     few draws would decide. So as much of it counts as leaves enough draws (tempering).
     `likelihoods` and `others`, all that weighs besides, are logarithms (N,).
     """
-    enough = min(_ENOUGH, _ENOUGH_SHARE * len(likelihoods))
+    enough = min(_FIT.enough_effective_draws, _FIT.enough_fraction * len(likelihoods))
     weights, share = np.zeros(0), 1.0
-    for share in np.geomspace(1, _LEAST_COUNTS, 40):
+    for share in np.geomspace(1, _FIT.min_temper, 40):
         logs = share * likelihoods + others
         weights = np.exp(logs - logs.max())
         weights /= weights.sum()
@@ -551,7 +610,7 @@ def _finding(
     weights: FloatArray,
     conditional: float | None = None,
 ) -> FittedNumber:
-    """What draws of a number say of it.
+    """Return the posterior of a parameter from its draws.
 
     Args:
         name: of the number.
@@ -565,10 +624,11 @@ def _finding(
     middle = weights @ values
     low, high = np.interp((0.05, 0.95), shares, values[order])
     spread = float(np.sqrt(weights @ (values - middle) ** 2))
-    thirds = np.quantile(values[:_DRAWS], (1 / 3, 2 / 3))
-    ends = [likelihoods[:_DRAWS][part].mean(0) for part in
-            (values[:_DRAWS] <= thirds[0], values[:_DRAWS] >= thirds[1])]  # fmt: skip
-    count = int((np.abs(ends[0] - ends[1]) > _SAYS).sum())
+    first = values[: _FIT.num_draws]
+    thirds = np.quantile(first, (1 / 3, 2 / 3))
+    parts = (first <= thirds[0], first >= thirds[1])
+    ends = [likelihoods[: _FIT.num_draws][part].mean(0) for part in parts]
+    count = int((np.abs(ends[0] - ends[1]) > _FIT.min_log_likelihood_gap).sum())
     low, middle, high = np.exp([low, middle, high]).tolist()
     return FittedNumber(
         name=name,
@@ -578,7 +638,7 @@ def _finding(
         spread=spread if conditional is None else conditional,
         count=count,
         of=likelihoods.shape[1],
-        apart=conditional is None or bool(spread < _APART * conditional),
+        apart=conditional is None or bool(spread < _FIT.max_width_ratio * conditional),
     )
 
 
@@ -622,7 +682,7 @@ class _Trial:
     def likelihoods(self, engine: Engine, settings: Sequence[ContactSettings]) -> FloatArray:
         """Returns (N,) log likelihoods of where masks show the objects."""
         still = np.zeros(len(engine.arms.drives.names))
-        drawn = np.random.default_rng(_SEED).normal(size=(len(settings), 3))
+        drawn = np.random.default_rng(_FIT.seed).normal(size=(len(settings), 3))
         futures = []
         for one, draw in zip(settings, drawn, strict=True):
             # where the cameras see all of it is not known: each draw has a shift of its own
@@ -638,12 +698,14 @@ class _Trial:
         late = slice(rows // 2, rows)
         foreseen = motion.points[:, late] - motion.points[:, :1]
         away = np.linalg.norm(foreseen - self.displacements[late], axis=-1)
-        away = np.minimum(away, _LOST_M)
-        unlikely = np.log1p((away / _NEAR_M) ** 2)
+        away = np.minimum(away, _FIT.lost_distance_m)
+        unlikely = np.log1p((away / _FIT.position_scale_m) ** 2)
         known = np.isfinite(self.displacements[late]).all(-1)
         counted = np.where(known, np.nan_to_num(unlikely), 0.0).sum(1)
         found = -(counted / np.maximum(known.sum(0), 1)).sum(-1)
-        found[list(state.lost)] = -np.log1p((_LOST_M / _NEAR_M) ** 2) * len(self.solids)
+        found[list(state.lost)] = -np.log1p(
+            (_FIT.lost_distance_m / _FIT.position_scale_m) ** 2
+        ) * len(self.solids)
         return found
 
 
@@ -663,7 +725,7 @@ def _delay_errors(recording: ContactRecording, arms: Arms) -> FloatArray:
         free = replace(arms.response, floor=None)
         expected = free.follow(arms.robot, recording.positions)[0]
     speeds = np.abs(np.gradient(expected, PERIOD_S, axis=0))
-    moving = speeds > _MOVES
+    moving = speeds > _FIT.min_joint_speed
     errors = []
     for delay in np.rint(_DELAYS / PERIOD_S).astype(int):
         late = np.concatenate([np.repeat(expected[:1], delay, 0), expected])[: len(expected)]
@@ -702,14 +764,14 @@ def _ray_gaps(frame: FirstFrame) -> list[float]:
         # each ray passes the point between them at half the gap
         own = (CENTROID_NOISE_PX / max(place.residual_px, CENTROID_NOISE_PX)) ** 2
         gap = 2 * place.sigma_m * np.sqrt(1 - own)
-        gaps.append(gap if edge < _SMALL_M else np.nan)
+        gaps.append(gap if edge < _FIT.max_small_size_m else np.nan)
     return gaps
 
 
 def find_table(recordings: Sequence[ContactRecording]) -> FittedNumber:
     """Returns the height at which what stands on a table ends below."""
     bottoms = []
-    for recording in recordings[:: max(1, len(recordings) // _MOST_TABLES)]:
+    for recording in recordings[:: max(1, len(recordings) // _FIT.max_tables)]:
         frame, points = recording.frame, recording.frame.points()
         for item, name in enumerate(recording.names):
             seen = frame.masks[:, item], points[item], frame.cameras, frame.poses
@@ -717,7 +779,9 @@ def find_table(recordings: Sequence[ContactRecording]) -> FittedNumber:
     known = np.array(bottoms)[np.isfinite(bottoms)]
     # the middle one: some stand in others
     found = _resampled('table_m', known, len(bottoms), 'objects', np.median)
-    return replace(found, low=found.low - _EXACT_M, high=found.high + _EXACT_M)
+    return replace(
+        found, low=found.low - _FIT.outline_error_m, high=found.high + _FIT.outline_error_m
+    )
 
 
 def _resampled(
@@ -734,8 +798,8 @@ def _resampled(
     if not len(known):
         nothing = dict.fromkeys(('value', 'low', 'high', 'spread'), 0.0)
         return FittedNumber(name=name, count=0, of=of, counted=counted, **nothing)
-    rng = np.random.default_rng(_SEED)
-    rows = rng.integers(0, len(known), (_RESAMPLED, len(known)))
+    rng = np.random.default_rng(_FIT.seed)
+    rows = rng.integers(0, len(known), (_FIT.num_resamples, len(known)))
     found = np.array([middle(known[row]) for row in rows])
     low, high = np.quantile(found, (0.05, 0.95))
     return FittedNumber(
@@ -751,7 +815,7 @@ def _resampled(
 
 
 def _lowest(errors: FloatArray, values: FloatArray) -> float:
-    """Where errors (N,) are least, between the values by a parabola."""
+    """Return the minimum of a sampled error curve (N,), refined by a parabola."""
     at = int(errors.argmin())
     if not 0 < at < len(values) - 1:
         return float(values[at])

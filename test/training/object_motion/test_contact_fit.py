@@ -94,8 +94,8 @@ def test_slippery_fingers_are_unlikely_where_a_block_was_carried(
 @pytest.mark.slow
 def test_the_search_finds_what_made_the_motions(robot, response, settings, recording, monkeypatch):
     """Recordings made by foresight itself under known numbers, in place of real ones."""
-    monkeypatch.setattr(contact_fit, '_DRAWS', 32)
-    monkeypatch.setattr(contact_fit, '_ROUNDS', 2)
+    fit = contact_fit.ContactFitSettings(num_draws=32, num_rounds=2)
+    monkeypatch.setattr(contact_fit, '_FIT', fit)
     truth = settings.model_copy(update={'grip_friction': 0.05, 'num_motions': 1})
     frame = recording.frame
     tracked = SolidForesight(robot, response, truth).find(
@@ -125,7 +125,8 @@ def test_numbers_that_make_up_for_each_other_are_within_their_intervals(
     robot, response, settings, recording, monkeypatch
 ):
     """Recordings of a slip, made by foresight itself under known numbers."""
-    monkeypatch.setattr(contact_fit, '_DRAWS', 32)
+    fit = contact_fit.ContactFitSettings(num_draws=32)
+    monkeypatch.setattr(contact_fit, '_FIT', fit)
     numbers = {'grip_friction': 0.4, 'density': 900.0}
     numbers['finger_stiffness'] = 0.4 * settings.finger_stiffness
     truth = settings.model_copy(update={**numbers, 'num_motions': 1})
@@ -239,8 +240,8 @@ def test_fingers_begin_as_their_joints_follow(robot, response):
 
 
 def test_the_command_writes_what_a_checkpoint_foresees_with(checkpoint, capsys, monkeypatch):
-    monkeypatch.setattr(contact_fit, '_DRAWS', 8)
-    monkeypatch.setattr(contact_fit, '_ROUNDS', 1)
+    fit = contact_fit.ContactFitSettings(num_draws=8, num_rounds=1)
+    monkeypatch.setattr(contact_fit, '_FIT', fit)
     words = ['fit', 'contact', str(DEMO), '--checkpoint', str(checkpoint), '--motions', '2']
     assert main(words) != 0
     assert '--overwrite' in capsys.readouterr().err
@@ -259,9 +260,10 @@ def test_how_arms_follow_is_found_where_a_checkpoint_does_not_know(
     tmp_path, robot, capsys, monkeypatch
 ):
     """Of one episode alone nothing is: defaults are taken, and said."""
-    monkeypatch.setattr(contact_fit, '_CANDIDATES', 4)
-    monkeypatch.setattr(contact_fit, '_DRAWS', 4)
-    monkeypatch.setattr(contact_fit, '_ROUNDS', 1)
+    fingers = contact_fit.FingerFitSettings(num_candidates=4)
+    fit = contact_fit.ContactFitSettings(num_draws=4, num_rounds=1)
+    monkeypatch.setattr(contact_fit, '_FINGERS', fingers)
+    monkeypatch.setattr(contact_fit, '_FIT', fit)
     assert main(['fit', 'contact', str(DEMO), '--out', str(tmp_path / 'new')]) == 0
     told = capsys.readouterr().out
     assert 'how 14 joints follow commands was not found' in told and 'one episode' in told

@@ -53,7 +53,8 @@ def test_a_gripper_that_closes_is_left_out_from_there_on(robot, response):
 
 @pytest.mark.slow
 def test_the_drives_of_fingers_are_found(robot, response, monkeypatch):
-    monkeypatch.setattr(contact_fit, '_CANDIDATES', 24)
+    fingers = contact_fit.FingerFitSettings(num_candidates=24)
+    monkeypatch.setattr(contact_fit, '_FINGERS', fingers)
     arms = Arms(robot, response)
     first = first_settings(arms)
     true = first.model_copy(update=TRUE | {'fingers_swing': True})
@@ -64,7 +65,8 @@ def test_the_drives_of_fingers_are_found(robot, response, monkeypatch):
 
 
 def test_fingers_that_report_no_swing_do_not_swing(robot, response, monkeypatch):
-    monkeypatch.setattr(contact_fit, '_CANDIDATES', 8)
+    fingers = contact_fit.FingerFitSettings(num_candidates=8)
+    monkeypatch.setattr(contact_fit, '_FINGERS', fingers)
     arms = Arms(robot, response)
     first = first_settings(arms)
     grippers = [recorded(arms, shaken(robot, seed), first) for seed in range(2)]
