@@ -232,7 +232,8 @@ class JointStates:
             positions=self.positions[rows],
         )
         matched = match_joints(track, robot)
-        return interpolated((stamps_ns - known[0]) * 1e-9, matched.times, matched.positions)
+        seconds = (stamps_ns - known[0]) * 1e-9
+        return interpolated(seconds, matched.times, matched.positions, robot.is_endless)
 
 
 class ObjectPoses(NamedTuple):

@@ -269,7 +269,7 @@ class _EpisodeReader:
     def _settle_clocks(self) -> None:
         """Bring stamps of images, joint states and commands onto one clock."""
         rows = self._senders()
-        streams = [stream for stream, _ in rows]
+        streams = [stream for stream, _, _ in rows]
         try:
             settled = settle_clocks(streams)
         except ClockBreakError as error:
@@ -278,14 +278,14 @@ class _EpisodeReader:
             raise EpisodeError(f"'{self.path}': {error}") from error
         self.warnings += dict.fromkeys(settled.notes)
         stamps = {topic: self._other_stamps(topic, settled.offset_s) for topic in self.received}
-        for (_, places), mended, kept in zip(
+        is_kept = {topic: np.ones(len(items), bool) for topic, items in self.received.items()}
+        for (_, topic, at), mended, kept in zip(
             rows, settled.stamps_ns, settled.is_kept, strict=True
         ):
-            for topic, at in places.items():
-                stamps[topic][at] = np.where(kept, mended, -1)
+            stamps[topic][at], is_kept[topic][at] = mended, kept
         for topic, items in self.received.items():
-            pairs = zip(stamps[topic].tolist(), items, strict=True)
-            self.received[topic] = [(stamp, item) for stamp, (_, item) in pairs if stamp >= 0]
+            each = zip(stamps[topic].tolist(), is_kept[topic].tolist(), items, strict=True)
+            self.received[topic] = [(stamp, item) for stamp, kept, (_, item) in each if kept]
 
     def _other_stamps(self, topic: str, offset_s: float) -> NDArray[np.int64]:
         """Stamps of a topic as they are; receive times on the clock of the others where 0."""
@@ -294,8 +294,8 @@ class _EpisodeReader:
         shift = round(offset_s * 1e9) if is_far else 0
         return np.where(stamps == 0, np.maximum(self.arrived[topic] + shift, 1), stamps)
 
-    def _senders(self) -> list[tuple[StampedStream, dict[str, NDArray[np.intp]]]]:
-        """Streams whose clocks are compared, and the rows of their topic that they are."""
+    def _senders(self) -> list[tuple[StampedStream, str, NDArray[np.intp]]]:
+        """Streams whose clocks are compared, their topics, and which of its messages they are."""
         keys = {names.image: view for view, names in self.topics.views.items()}
         keys |= {self.topics.joint_states: 'joint_states'}
         if self.mapping.action != STATE:
@@ -319,7 +319,7 @@ class _EpisodeReader:
                     spans_ns=None if None in spans else np.array(spans, np.int64),
                     use_received=key in self.mapping.received_times,
                 )
-                found.append((stream, {topic: at}))
+                found.append((stream, topic, at))
         return found
 
     def _check_shared(self, images: Mapping[str, Track], states: JointStates | None) -> None:

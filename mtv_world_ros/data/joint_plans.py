@@ -252,7 +252,7 @@ class _Measured:
     def at(self, stamp_ns: int, seconds: FloatArray) -> FloatArray:
         """(N, J) at times after a stamp [s]."""
         known = np.asarray((self._stamps - stamp_ns) * 1e-9, np.float64)
-        return interpolated(seconds, known, self._rows)
+        return interpolated(seconds, known, self._rows, self._robot.is_endless)
 
     def times(self, stamp_ns: int, begin_s: float, end_s: float) -> FloatArray:
         """Times of samples after a stamp [s], no denser than needed."""

@@ -105,7 +105,7 @@ class JointReach:
         self.settings = settings
         self.names = robot.joint_names
         ranges = robot.upper - robot.lower
-        self.is_endless = ~np.isfinite(ranges)
+        self.is_endless = robot.is_endless.copy()
         self.noise = np.minimum(settings.noise, settings.noise_of_range * ranges)
         given = np.isfinite(robot.velocity_limits) & (robot.velocity_limits > 0)
         limits = np.where(given, robot.velocity_limits, settings.default_speed)

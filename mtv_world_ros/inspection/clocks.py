@@ -12,7 +12,7 @@ from mtv_world_ros.core.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.data.episode import JointStates, Track
 from mtv_world_ros.inspection.inspection_report import broken, Finding, suspicious
 from mtv_world_ros.robot.model import RobotModel, Tool
-from mtv_world_ros.robot.resample import match_joints
+from mtv_world_ros.robot.resample import interpolated, match_joints
 
 Stamps = NDArray[np.int64]
 
@@ -205,12 +205,13 @@ class JointTrack:
             robot,
         )
         self.positions = matched.positions
+        self._is_endless = robot.is_endless
 
     def at(self, stamps_ns: NDArray[np.int64]) -> FloatArray:
         """(len(stamps_ns), J) positions; the first or last one beyond the ends."""
         wanted = np.asarray(stamps_ns - self.stamps_ns[0], float)
         have = np.asarray(self.stamps_ns - self.stamps_ns[0], float)
-        return np.stack([np.interp(wanted, have, c) for c in self.positions.T], axis=1)
+        return interpolated(wanted, have, self.positions, self._is_endless)
 
     def swapped(self, robot: RobotModel, tool: Tool) -> JointTrack:
         """The track with open and closed of a gripper swapped."""

@@ -150,6 +150,11 @@ class RobotModel:
             self._frame(link)
 
     @property
+    def is_endless(self) -> BoolArray:
+        """(J,) which of the commanded joints turn without end."""
+        return np.isinf(self.lower) & ~self.slides
+
+    @property
     def slides(self) -> BoolArray:
         """(J,) which of the commanded joints slide; the others turn."""
         joints = (self._joint(name).shortname() for name in self.joint_names)

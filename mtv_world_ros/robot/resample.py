@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 
 from mtv_world_ros.core.bounded_input import check_limit, LimitError
-from mtv_world_ros.core.data_types import FloatArray, JointTrajectory
+from mtv_world_ros.core.data_types import BoolArray, FloatArray, JointTrajectory
 from mtv_world_ros.core.errors import nearest, TrajectoryError
 from mtv_world_ros.robot.model import RobotModel
 
@@ -118,9 +118,30 @@ def resample(
     )
 
 
-def interpolated(wanted: FloatArray, times: FloatArray, rows: FloatArray) -> FloatArray:
-    """Returns rows (T, J) of increasing times (T,) at wanted ones (N,); held before and after."""
-    return np.stack([np.interp(wanted, times, column) for column in rows.T], axis=1)
+def interpolated(
+    wanted: FloatArray,
+    times: FloatArray,
+    rows: FloatArray,
+    is_endless: BoolArray | None = None,
+) -> FloatArray:
+    """Returns rows (T, J) of increasing times (T,) at wanted ones (N,); held before and after.
+
+    Args:
+        wanted: (N,) [s].
+        times: (T,) [s].
+        rows: (T, J) positions [rad or m].
+        is_endless: (J,) joints that turn without end. Drivers report these within a turn; between
+            +pi and -pi the short way is taken, and the turn of the nearer row is kept.
+    """
+    found = np.stack([np.interp(wanted, times, column) for column in rows.T], axis=1)
+    if is_endless is None or not is_endless.any():
+        return found
+    near = np.searchsorted((times[1:] + times[:-1]) / 2, wanted)
+    for joint in np.flatnonzero(is_endless):
+        turned = np.interp(wanted, times, np.unwrap(rows[:, joint]))
+        away = turned - rows[near, joint]
+        found[:, joint] = turned - 2 * np.pi * np.round(away / (2 * np.pi))
+    return found
 
 
 def cut_off(

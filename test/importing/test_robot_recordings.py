@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 import re
+import shutil
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,14 @@ import yaml
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.data_types import CameraModel, JointTrajectory
 from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.core.images import encode_jpeg
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.writer import BagWriter
+from mtv_world_ros.data.episode import JointStates
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.stream_clocks import ClockBreakError
+from mtv_world_ros.robot.file import load_robot
 
 NANO = 1_000_000_000
 START = 1_750_000_000 * NANO
@@ -282,3 +286,86 @@ def test_a_broken_clock_is_refused_by_every_reader(record):
     bag = record(lambda topic, s, stamp: stamp - 5 * NANO if 'front' in topic and s > 2 else stamp)
     with pytest.raises(EpisodeError, match="'/front/image_raw/compressed': its clock jumps by -5"):
         read_episode(bag)
+
+
+def test_18_a_joint_that_turns_without_end_goes_the_short_way_between_two_samples(tmp_path):
+    robot = load_robot(endless_robot(tmp_path))
+    rows = np.tile(HOME, (2, 1))
+    rows[:, 6] = 3.136, -3.141185307179586  # 6 mrad apart, as a driver reports within a turn
+    states = JointStates(
+        stamps_ns=np.array([START, START + 20_000_000]),
+        joint_names=tuple(JOINTS),
+        positions=rows,
+    )
+    at = states.at(np.array([START + 5_000_000, START + 10_000_000, START + 15_000_000]), robot)
+    np.testing.assert_allclose(at[:, 6], [3.1375, 3.139, 3.1405 - 2 * np.pi], atol=1e-6)
+    np.testing.assert_allclose(at[:, 5], HOME[5])
+
+
+def endless_robot(folder: Path) -> Path:
+    """Copy of the bundled robot whose last joint has no limits."""
+    robot = folder / 'franka'
+    shutil.copytree(share_path('config', 'robots', 'franka'), robot)
+    file = robot / 'franka.urdf'
+    begin, joint, end = file.read_text().partition('<joint name="panda_joint7" type="revolute">')
+    end = end.replace('lower="-2.8973" upper="2.8973" ', '', 1)
+    assert joint and 'lower' not in end.split('</joint>')[0]
+    file.write_text(begin + joint.replace('revolute', 'continuous') + end)
+    return robot / 'robot.yaml'
+
+
+@pytest.mark.parametrize(
+    ('begin', 'end', 'status', 'said'),
+    [
+        (1.95, 2.05, 0, '1 of 40 messages have wrong stamps and were left out, the first by -29'),
+        (1.95, 4.0, 1, "'/front/image_raw/compressed': its clock jumps by -29"),
+        (0.0, 4.0, 1, 'the stamps of the former are 29'),
+    ],
+    ids=['one', 'from then on', 'all'],
+)
+def test_19_stamps_beyond_31_bits_are_named(record, run, begin, end, status, said):
+    """3 142 000 000 s are a negative number of seconds in a ROS time."""
+    wrong = (3_142_000_000 - 2**32) * NANO
+    found, text = run(
+        record(
+            lambda topic, s, stamp: (
+                wrong + stamp - START if 'front/image' in topic and begin <= s < end else stamp
+            )
+        )
+    )
+    assert found == status, text
+    assert said in text
+
+
+def test_20_a_camera_whose_counter_starts_over_again_and_again_is_refused(record, run):
+    bag = record(
+        lambda topic, s, stamp: stamp - 4247 * NANO * int(s // 2) if 'front' in topic else stamp
+    )
+    status, said = run(bag)
+    assert status == 1
+    assert "'/front/image_raw/compressed': its clock jumps by -4247 s at 2.003 s" in said
+    assert run(bag, received_times=['front'])[0] == 0
+
+
+def test_21_a_camera_info_with_only_its_ones_is_not_calibrated(record, run):
+    def ones(topic, _seconds, message):
+        if topic == '/side/camera_info':
+            message.k = np.r_[np.zeros(8), 1.0]
+            message.p = np.r_[np.zeros(10), 1.0, 0.0]
+            message.distortion_model, message.d = 'rational_polynomial', np.zeros(8)
+
+    status, said = run(record(change=ones))
+    assert status == 0
+    assert "'/side/camera_info' is not calibrated (K[0] = 0)" in said
+
+
+def test_22_joints_of_a_simulator_that_are_not_the_robots_may_be_nan(record, run, tmp_path):
+    def mimic(topic, _seconds, message):
+        if topic == '/joint_states':
+            message.name.append('panda_finger_joint2_mimic')
+            message.position = np.append(message.position, np.nan)
+
+    status, said = run(record(change=mimic))
+    assert status == 0, said
+    assert 'not finite' not in said
+    assert len(read_episode(tmp_path / 'out' / 'bag').joint_states.stamps_ns) == 200
