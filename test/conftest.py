@@ -110,6 +110,29 @@ def response(robot: RobotModel) -> ArmResponse:
     return found
 
 
+@pytest.fixture(scope='session')
+def exported_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bundled episode as a LeRobot data set of 5 frames a second; it must not be changed."""
+    pytest.importorskip('pyarrow', reason='pyarrow is not installed (pip install .[import])')
+    from mtv_world_ros.cli import main
+
+    demo = str(share_path('resource', 'demo_episode'))
+    out = tmp_path_factory.mktemp('exported') / 'dataset'
+    assert main(['export', 'lerobot', demo, '--out', str(out), '--fps', '5']) == 0
+    return out
+
+
+@pytest.fixture(scope='session')
+def imported_demo(exported_demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the episode that comes of that data set; it must not be changed."""
+    from mtv_world_ros.cli import main
+
+    out, mapping = tmp_path_factory.mktemp('imported'), exported_demo / 'meta' / 'mapping.yaml'
+    words = ['import', 'lerobot', str(exported_demo), '--mapping', str(mapping)]
+    assert main([*words, '--out', str(out)]) == 0
+    return out
+
+
 @pytest.fixture(autouse=True, scope='module')
 def nothing_left_behind() -> Iterator[None]:
     """The next file of tests of the process finds it as this one did, whichever that is.

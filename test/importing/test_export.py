@@ -18,19 +18,12 @@ DEMO = share_path('resource', 'demo_episode')
 
 
 @pytest.fixture(scope='module')
-def exported(tmp_path_factory):
-    out = tmp_path_factory.mktemp('exported') / 'dataset'
-    assert main(['export', 'lerobot', str(DEMO), '--out', str(out), '--fps', '5']) == 0
-    return out
+def exported(exported_demo):
+    return exported_demo
 
 
-def test_what_was_exported_is_imported_again(exported, tmp_path):
-    mapping = str(exported / 'meta/mapping.yaml')
-    assert (
-        main(['import', 'lerobot', str(exported), '--mapping', mapping, '--out', str(tmp_path)])
-        == 0
-    )
-    (path,) = tmp_path.glob('episode_*')
+def test_what_was_exported_is_imported_again(imported_demo):
+    (path,) = imported_demo.glob('episode_*')
     before, after = read_episode(DEMO), read_episode(path)
     assert after.views == before.views
     assert after.info.outcome == before.info.outcome

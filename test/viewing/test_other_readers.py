@@ -17,23 +17,16 @@ DEMO = share_path('resource', 'demo_episode')
 
 
 @pytest.fixture(scope='module')
-def written(tmp_path_factory):
-    """A data set, predictions with their video, and an imported episode."""
-    pytest.importorskip('pyarrow', reason='pyarrow is not installed (pip install .[import])')
-    out = tmp_path_factory.mktemp('written')
-    dataset, predictions = out / 'dataset', out / 'predictions'
-    assert main(['export', 'lerobot', str(DEMO), '--out', str(dataset), '--fps', '5']) == 0
-    assert main(['replay', str(DEMO), '--offline', '--steps', '1', '--out', str(predictions)]) == 0
-    mapping = str(dataset / 'meta/mapping.yaml')
-    command = ['import', 'lerobot', str(dataset), '--mapping', mapping]
-    assert main([*command, '--out', str(out / 'imported')]) == 0
+def predictions(tmp_path_factory):
+    out = tmp_path_factory.mktemp('written') / 'predictions'
+    assert main(['replay', str(DEMO), '--offline', '--steps', '1', '--out', str(out)]) == 0
     return out
 
 
 @pytest.mark.slow
-def test_rerun_plays_every_video_without_a_transcoder(written):
+def test_rerun_plays_every_video_without_a_transcoder(predictions, exported_demo):
     """Its viewer leaves H.264 out whose frames are stored in another order than shown."""
-    videos = sorted(written.rglob('*.mp4'))
+    videos = sorted([*predictions.rglob('*.mp4'), *exported_demo.rglob('*.mp4')])
     assert {video.name for video in videos} >= {'comparison.mp4', 'file-000.mp4'}
     for video in videos:
         with av.open(str(video)) as container:
@@ -43,8 +36,8 @@ def test_rerun_plays_every_video_without_a_transcoder(written):
         assert len(asset.read_frame_timestamps_nanos()) == len(pts) > 1
 
 
-def test_rosbags_and_the_mcap_library_read_every_message(written):
-    episodes = [DEMO, written / 'predictions', *sorted((written / 'imported').glob('episode_*'))]
+def test_rosbags_and_the_mcap_library_read_every_message(predictions, imported_demo):
+    episodes = [DEMO, predictions, *sorted(imported_demo.glob('episode_*'))]
     for episode in episodes:
         with AnyReader([Path(episode)]) as reader:
             counts = {c.topic: c.msgcount for c in reader.connections}
