@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 import os
 from pathlib import Path
 import resource
@@ -47,9 +48,17 @@ def test_damaged_input_is_read_or_refused_with_a_reason(name, tmp_path) -> None:
         assert outcome in ('rejected', 'survived'), f'--seed {SEED} --case {case}: {outcome}'
 
 
+@cache
+def warm_up(kind: str) -> None:
+    """Reads a whole sample: what is imported and loaded for it is not what an accident takes."""
+    with tempfile.TemporaryDirectory() as folder:
+        fuzz.warm_up(KINDS[kind], KINDS[kind].samples(), Path(folder))
+
+
 @pytest.mark.parametrize('name', ACCIDENTS)
 def test_what_once_was_an_accident_is_refused_in_time(name, tmp_path) -> None:
     kind, make = ACCIDENTS[name]
+    warm_up(kind)
     data = make()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     outcome, _ = fuzz.attempt(KINDS[kind], data, tmp_path)
