@@ -55,7 +55,7 @@ def imported() -> dict[str, Callable[[], int]]:
     )
 
     def policy_main() -> int:
-        return policy.main(load=lambda _: lambda task, scene_seed: fake_policy.FakePolicy(task))
+        return policy.main(load=fake_policy.load)
 
     def node_main() -> int:
         return node.main(load=fake_world_model.load)

@@ -65,7 +65,7 @@ def _node(name: str) -> Any:
         # a domain of its own: tests of other processes look for nodes of the same names
         rclpy.init(args=['x', '--ros-args', '--log-level', 'FATAL'], domain_id=_DOMAIN)
     if name == 'policy':
-        return PolicyNode(load=lambda settings: None)  # type: ignore[arg-type,return-value]
+        return PolicyNode(load=lambda settings, robot: None)  # type: ignore[arg-type,return-value]
     node = WorldModelNode(load=lambda settings: wild_plans.bundled())
     node.start()
     return node
