@@ -71,7 +71,7 @@ kills: $(STAMP)  ## kill nodes, recorder and player at random moments (an hour);
 soak: $(STAMP)  ## 10,000 rollouts with faults (an hour); memory, threads, latency under out/soak/
 	$(BIN)/python -m test.robustness.soak
 
-attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, open ports, hostile paths (three hours)
+attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, open ports, hostile peers and paths (three hours)
 	@mkdir -p out
 	$(BIN)/python -m test.robustness.rate
 	$(BIN)/python -m test.robustness.default_client
@@ -82,6 +82,7 @@ attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy 
 	$(BIN)/python -m test.robustness.children
 	$(BIN)/python -m test.robustness.interrupts
 	$(BIN)/python -m test.robustness.listeners
+	$(BIN)/python -m test.robustness.hostile_peer
 	MTV_WORLD_ATTACKS=all $(BIN)/python -m pytest -q test/robustness/test_commands.py test/robustness/test_examples.py
 
 upstream:  ## show what libraries do otherwise than documented, and which work-around of ours each guards (minutes)

@@ -12,7 +12,9 @@ import importlib
 import multiprocessing
 from multiprocessing import resource_tracker
 import os
+from pathlib import Path
 import signal
+import tempfile
 import threading
 import time
 from typing import Any, Protocol, TypeVar
@@ -27,6 +29,9 @@ from mtv_world_ros.core.processes import STOPPED_S, StoppedProcesses
 _LOOK_S = 0.5
 #: a job that was running when this many actors of a Ray cluster died is not tried again
 MAX_LOST_ACTORS = 3
+#: variable that keeps a cluster which Ray starts by itself on the loopback address, if it is 0; by
+#: itself Ray does so on Windows and macOS alone
+_RAY_NETWORK = 'RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER'
 #: libraries that start threads read these when they are loaded
 _THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
@@ -273,6 +278,8 @@ def score_with_ray(
     """
     if workers < 1:
         raise ConfigError(f'workers is {workers}; it must be at least 1')
+    if not address and not _is_ray_at_hand():
+        os.environ.setdefault(_RAY_NETWORK, '0')
     ray = _ray()
     try:
         ray.init(address=address or None, log_to_driver=False, include_dashboard=False)
@@ -351,6 +358,12 @@ class _Actors:
                 f'all Ray workers died ({error}); what is done is kept: run the command again'
             ) from error
         tqdm.write(f'a Ray worker died; {self._num_left} go on')
+
+
+def _is_ray_at_hand() -> bool:
+    """True if Ray would use a running cluster: by `RAY_ADDRESS`, or the last one of this machine."""
+    folder = Path(os.environ.get('RAY_TMPDIR') or tempfile.gettempdir())
+    return 'RAY_ADDRESS' in os.environ or (folder / 'ray' / 'ray_current_cluster').is_file()
 
 
 def _ray() -> Any:

@@ -108,3 +108,27 @@ def test_without_ray_the_extra_is_named(make_scorer, monkeypatch):
 def test_less_than_one_worker_is_refused(make_scorer):
     with pytest.raises(ConfigError, match='workers is 0'):
         next(score_with_ray([1], make_scorer, 0))
+
+
+@pytest.mark.parametrize(
+    ('address', 'environment', 'is_local'),
+    [('', {}, True), ('192.0.2.1:6392', {}, False), ('', {'RAY_ADDRESS': '192.0.2.1:6392'}, False),
+     ('', {'AT_HAND': '1'}, False)],
+)  # fmt: skip
+def test_a_cluster_that_is_started_here_listens_on_this_machine_alone(
+    address, environment, is_local, make_scorer, monkeypatch, tmp_path
+):
+    """Ray 2.60 reads the variable when it is imported."""
+    monkeypatch.setitem(sys.modules, 'ray', None)
+    monkeypatch.setenv('RAY_TMPDIR', str(tmp_path))
+    monkeypatch.delenv('RAY_ADDRESS', raising=False)
+    monkeypatch.setenv('RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER', '1')
+    monkeypatch.delenv('RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER')
+    if environment.pop('AT_HAND', None):
+        (tmp_path / 'ray').mkdir()
+        (tmp_path / 'ray' / 'ray_current_cluster').write_text('192.0.2.1:6392')
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ConfigError, match='needs Ray'):
+        next(score_with_ray([(7, 9)], make_scorer, 1, address))
+    assert (os.environ.get('RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER') == '0') == is_local

@@ -65,7 +65,12 @@ def listening(pids: set[int]) -> set[tuple[str, int]]:
 
 def beyond_loopback(addresses: set[tuple[str, int]]) -> set[tuple[str, int]]:
     """Return the addresses that other machines may reach."""
-    return {one for one in addresses if not ipaddress.ip_address(one[0]).is_loopback}
+    return {one for one in addresses if not _is_loopback(one[0])}
+
+
+def _is_loopback(host: str) -> bool:
+    address = ipaddress.ip_address(host)
+    return (getattr(address, 'ipv4_mapped', None) or address).is_loopback
 
 
 def free_ports() -> int:
