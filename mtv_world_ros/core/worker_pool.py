@@ -361,7 +361,7 @@ class _Actors:
 
 
 def _is_ray_at_hand() -> bool:
-    """True if Ray would use a running cluster: by `RAY_ADDRESS`, or the last one of this machine."""
+    """True if Ray would use a running cluster: that of `RAY_ADDRESS`, or the last one here."""
     folder = Path(os.environ.get('RAY_TMPDIR') or tempfile.gettempdir())
     return 'RAY_ADDRESS' in os.environ or (folder / 'ray' / 'ray_current_cluster').is_file()
 

@@ -101,6 +101,7 @@ def test_ray_scores_as_processes_do(make_scorer):
 
 def test_without_ray_the_extra_is_named(make_scorer, monkeypatch):
     monkeypatch.setitem(sys.modules, 'ray', None)
+    monkeypatch.setenv('RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER', '0')  # is set, and given back
     with pytest.raises(ConfigError, match=r'mtv_world_ros\[rank\].*--workers'):
         next(score_with_ray([1], make_scorer, 1))
 
