@@ -67,7 +67,8 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
             'action': 'store_false',
             'help': 'foresee no object motion: the imagined frames alone decide. A model that was '
             "trained with the objects' first masks is shown them (the paper's method); one that "
-            'was trained with foreseen objects, as the bundled one, is shown none',
+            "was trained with foreseen objects, as bundled, is shown none. The paper's method on "
+            'simulated scenes is --checkpoint bundled-paper',
         },
         '--no-camera-check': {
             'dest': 'camera_check',

@@ -107,7 +107,8 @@ class Settings(NodeSettings):
     foresight: bool = at_start(
         True,
         'Foresee where objects go, where the checkpoint can; false = the imagined frames alone '
-        'decide, and the model is shown no objects that it was not trained with.',
+        "decide, and the model is shown no objects that it was not trained with (the paper's "
+        "method is the checkpoint 'bundled-paper').",
     )
     camera_check: bool = at_start(
         True,
