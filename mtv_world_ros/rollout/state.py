@@ -121,7 +121,8 @@ def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observati
     if observation.views != spec.views:
         raise ObservationError(
             f'the observation has views {list(observation.views)}, the model was trained on '
-            f'{list(spec.views)} in this order'
+            f'{list(spec.views)} in this order; give those alone, or train a model of your views '
+            'with mtv-world train --views'
         )
     if observation.frames.shape[1:3] == (spec.height, spec.width):
         return observation

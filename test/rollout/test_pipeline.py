@@ -614,6 +614,15 @@ def test_views_in_another_order_are_refused(pipeline, recording):
         pipeline.begin(turned)
 
 
+def test_two_views_for_a_model_of_one_are_refused(recording):
+    card = CARD.replace(views=('low',))
+    model = CountingWorldModel(replace(SPEC, views=('low',)))
+    pipeline = Pipeline.assemble(card, model, robot=YAM)
+    said = r"views \['low', 'high'\], the model was trained on \['low'\].*train --views"
+    with pytest.raises(ObservationError, match=said):
+        pipeline.begin(observe(recording))
+
+
 def test_positions_outside_the_limits_are_refused(pipeline, recording):
     good = commands(recording, 1.6)
     positions = good.positions.copy()
