@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -69,7 +70,7 @@ def lite_features() -> FrameFeatures:
 
 def write_features(evaluated: EvaluationSummary, features: FrameFeatures, file: Path) -> None:
     """Write the features of an evaluation's frames: predicted and real, by episode and view."""
-    held: dict[str, FloatArray] = {}
+    held: dict[str, Any] = {}
     for result in evaluated.results:
         rollout = evaluated.rollout(result.episode)
         if rollout is None:

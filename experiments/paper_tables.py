@@ -278,7 +278,8 @@ class PaperTables:
 
     def _overrides(self, row: Row) -> list[str]:
         """Settings of the preset that a row changes, the user's last."""
-        options, found = self.options, list(PAPER_RENDERING)
+        options = self.options
+        found: list[str] = [*PAPER_RENDERING]
         if row.is_real:
             robot = options.real_robot or options.real / 'robot' / 'robot.yaml'
             found += [*REAL_SETTINGS, f'video.robot={robot}', f'video.views=[{options.real_view}]']

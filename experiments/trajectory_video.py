@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from page import measure, parse_arguments, publish, table
 
+from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.control.trajectory_video import (
     arm_colour,
     object_colour,
@@ -131,9 +132,7 @@ def main() -> None:
                 ),
                 'render_trajectory_video': partial(
                     render_trajectory_video,
-                    cameras=cameras,
-                    robot=robot,
-                    positions=positions,
+                    motion=Motion.of(robot, cameras, positions),
                     times=times,
                     object_masks=masks,
                     config=config,

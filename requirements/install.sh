@@ -10,7 +10,7 @@ TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
 VENV=.venv
 case ${1-} in
     demo) EXTRAS=ros ;;
-    *) EXTRAS=dart,fast_tokens,gym,train,describe,vision,evaluate,import,wan,policies,rank,ros,view,test,lint,docs ;;
+    *) EXTRAS=dart,experiments,fast_tokens,gym,train,describe,vision,evaluate,import,wan,policies,rank,ros,view,test,lint,docs ;;
 esac
 
 say() { printf '%s\n' "$*" >&2; }

@@ -100,7 +100,8 @@ class FastTokens(Control):
 
 def quantise(actions: FloatArray) -> IntArray:
     """Return the (T, D) rounded coefficients of scaled actions (T, D), lowest frequency first."""
-    return np.rint(SCALE * dct(actions, axis=0, norm='ortho')).astype(np.int64)
+    coefficients = np.asarray(dct(actions, axis=0, norm='ortho'))
+    return np.rint(SCALE * coefficients).astype(np.int64)
 
 
 def dequantise(coefficients: IntArray) -> FloatArray:

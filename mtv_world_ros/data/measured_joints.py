@@ -368,7 +368,8 @@ def merge_joint_states(
         if found.text:
             warnings.append(found.text)
             stamps, table = stamps[~found.rows], table[~found.rows]
-    grippers = () if robot is None else tuple(tool.gripper_joint for tool in robot.tools)
+    tools = () if robot is None else robot.tools
+    grippers = tuple(tool.gripper_joint for tool in tools if tool.gripper_joint)
     _warn_of_repeats(topic, stamps, np.isfinite(table), warnings)
     stamps, table = _filled(topic, stamps, names, table, grippers, warnings)
     is_last = np.append(np.diff(stamps) > 0, True)[: len(stamps)]

@@ -67,7 +67,8 @@ class Presentation:
         Raises:
             EpisodeError: the frame is turned by something else than a multiple of 90 degrees.
         """
-        matrices = [d for d in frame.side_data if d.type == SideDataType.DISPLAYMATRIX]
+        entries: Any = frame.side_data
+        matrices = [d for d in entries if d.type == SideDataType.DISPLAYMATRIX]
         if not matrices:
             return cls(pixel_aspect=pixel_aspect)
         # a point (x, y) of the stored frame is shown at (a x + c y, b x + d y), 16.16 fixed point

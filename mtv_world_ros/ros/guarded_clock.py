@@ -18,7 +18,7 @@ def guard_clock(node: Node) -> None:
     rclpy raises on a negative one, which ends the executor, and with it the node. A second call
     changes nothing.
     """
-    source = node._time_source  # rclpy has no public way
+    source: Any = node._time_source  # rclpy has no public way
     if isinstance(source.clock_callback, _GuardedClock):
         return
     taken = source.clock_callback

@@ -71,5 +71,5 @@ def _motions(
             f'frames at {spec.fps} Hz; record longer ones or lower video.num_frames'
         )
     chosen = np.linspace(0, len(clips) - 1, min(len(clips), MAX_CLIPS)).round().astype(int)
-    cut = [cut_clip(*clips[index], spec) for index in chosen]
+    cut = [cut_clip(recording, start, spec) for recording, start in (clips[i] for i in chosen)]
     return [Motion.of(robot, clip.cameras, clip.positions) for clip in cut]

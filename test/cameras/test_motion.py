@@ -71,7 +71,7 @@ def test_arrays_are_read_only(yam, cameras, positions):
         with pytest.raises(ValueError, match='read-only'):
             array[...] = 0
     with pytest.raises(TypeError):
-        motion.links['elsewhere'] = np.eye(4)
+        motion.links['elsewhere'] = np.eye(4)  # pyright: ignore[reportIndexIssue]
 
 
 def test_wrong_shapes_and_unknown_links_are_refused(yam, cameras, positions):

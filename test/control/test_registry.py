@@ -200,6 +200,7 @@ def test_the_control_of_the_page_can_be_used(robot, tmp_path, monkeypatch):
     )
     inputs = control.make(scene)
     control.layout.check(inputs, 'Gripper')
+    assert inputs.frame is not None
     np.testing.assert_allclose(inputs.frame, motion.openings.T)
     assert inputs.num_frames == 1
 

@@ -104,12 +104,14 @@ def record(tmp_path):
             for seconds, topic, kind, message in sorted(
                 [*events(), *(more or [])], key=lambda event: event[0]
             ):
-                items = [message] if hasattr(message, 'header') else message.transforms
+                told: Any = message
+                items = [told] if hasattr(told, 'header') else told.transforms
                 stamps = [messages.header_stamp(item) for item in items]
                 edited = [edit(topic, seconds, stamp) for stamp in stamps]
-                if None in edited:
+                kept = [stamp for stamp in edited if stamp is not None]
+                if len(kept) < len(edited):
                     continue
-                for item, stamp in zip(items, edited, strict=True):
+                for item, stamp in zip(items, kept, strict=True):
                     item.header.stamp.sec, item.header.stamp.nanosec = divmod(stamp, NANO)
                 change(topic, seconds, message)
                 data = messages.serialize(kind, message)

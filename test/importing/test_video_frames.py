@@ -111,6 +111,7 @@ def test_chosen_frames_are_decoded_in_any_order(tmp_path):
     levels = [int(frames[k][24, 32, 0]) for k in (3, 0, 2, 1, -1)]
     np.testing.assert_allclose(levels, [170, 35, 95, 80, 170], atol=6)
     assert len(frames) == 4 and frames[1:3].shape == (2, 48, 64, 3)
+    assert frames.times is not None
     np.testing.assert_allclose(frames.times, [0.1, 0.4, 0.5, 1.0])
     with pytest.raises(IndexError):
         frames[4]

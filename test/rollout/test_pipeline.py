@@ -115,7 +115,9 @@ def draw(pipeline: Pipeline, motion: Motion, times: np.ndarray, masks: ObjectMas
         start_frames=np.zeros((len(motion.cameras), SPEC.height, SPEC.width, 3), np.uint8),
         masks=masks.masks[:, :, 0],
     )
-    return pipeline.control.make(scene).video
+    video = pipeline.control.make(scene).video
+    assert video is not None
+    return video
 
 
 def with_motion(world_model: CountingWorldModel, object_motion) -> Pipeline:

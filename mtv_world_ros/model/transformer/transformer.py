@@ -191,7 +191,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             frames_per_token=config['frames_per_token'],
             num_prompt_tokens=0 if self.with_text else config['num_prompt_tokens'],
         )
-        for block in self.blocks:
+        blocks: Any = self.blocks
+        for block in blocks:
             block.attn2.set_processor(ContextAttnProcessor())
 
     def _build_conv_stem(

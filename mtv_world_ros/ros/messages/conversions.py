@@ -129,7 +129,7 @@ def to_sample(message: JointState, joints: Collection[str] | None = None) -> Joi
         )
     with rejected_as(Reason.JOINT_STATE_INVALID):
         check_limit('joint_names', len(message.name), 'the joint state')
-    return read_sample(message.name, message.position, joints)
+    return read_sample(list(message.name), message.position, joints)
 
 
 def check_sample(sample: JointSample) -> None:

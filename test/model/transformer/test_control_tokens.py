@@ -141,6 +141,7 @@ def test_a_frames_cross_attention_sees_its_own_vector_alone(frame):
     sequence = torch.randn(1, views * slots * places, 24)
 
     def attended(vectors: torch.Tensor) -> torch.Tensor:
+        assert model.control_tokens is not None
         context = model.control_tokens(None, vectors, None, None, None, slots, views)
         assert context.by_slot.shape == (1, slots, 2, 24) and context.shared is None
         return attention(sequence, context).unflatten(1, (views, slots, places))
@@ -207,6 +208,7 @@ def test_one_vector_is_added_to_every_text_token():
     model, values = model_and_inputs('patch', 'added')
     given = values['control_context'][:, :1]
     text = torch.randn(1, 5, 24)
+    assert model.control_tokens is not None
     context = model.control_tokens(given, None, None, text, None, 5, 2)
     added = context.shared - text
     torch.testing.assert_close(added, added[:, :1].expand_as(added))
