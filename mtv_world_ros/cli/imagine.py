@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 import sys
+from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import (
     add_options,
@@ -18,6 +19,9 @@ from mtv_world_ros.cli.shared_options import (
 )
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.core.files import check_free
+
+if TYPE_CHECKING:
+    from mtv_world_ros.rollout.episode_viewer import EpisodeViewer
 
 #: ends of an episode that are no fault, as the node `policy` reports them
 GOOD_ENDS = ('done', 'max_chunks', 'stopped', 'max_seconds')
@@ -82,7 +86,7 @@ def _play(arguments: argparse.Namespace) -> int:
 def add_imagine(commands: argparse._SubParsersAction) -> None:
     """Add the command `imagine`."""
     parser = commands.add_parser(
-        'imagine', help='run a policy for whole episodes in the world model, over ROS topics'
+        'imagine', help='run a policy for whole episodes in the world model'
     )
     parser.add_argument(
         '--policy',
@@ -115,7 +119,6 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
 def _imagine(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.core.errors import ConfigError
     from mtv_world_ros.data.episode_reader import list_episodes
-    from mtv_world_ros.ros.launching import imagine_episodes, ImagineOptions
 
     (arguments.checkpoint,) = open_checkpoints(arguments.device, arguments.checkpoint)
     watch = watch_arguments(arguments)
@@ -128,26 +131,8 @@ def _imagine(arguments: argparse.Namespace) -> int:
             'give --episodes with recorded episodes to start from, or --live to start from the '
             f'cameras; --episodes has {len(episodes)}'
         )
-    options = ImagineOptions(
-        policy=arguments.policy,
-        episodes=tuple(episodes),
-        count=arguments.count,
-        start_s=arguments.start,
-        max_chunks=arguments.max_chunks,
-        max_seconds=arguments.max_seconds,
-        instruction=arguments.instruction,
-        seed=arguments.seed,
-        watch=watch and (*watch, '--by-episode'),
-        checkpoint=arguments.checkpoint.name,
-        robot=arguments.robot or '',
-        device=arguments.device,
-        num_threads=arguments.threads,
-        num_inference_steps=arguments.steps,
-        segmenter=arguments.segmenter,
-        describer=str(arguments.describer.absolute()) if arguments.describer else '',
-    )
-    results = imagine_episodes(
-        options, arguments.out, overwrite=arguments.overwrite, tell=partial(print, flush=True)
+    results = (
+        _from_cameras(arguments, watch) if arguments.live else _in_process(arguments, episodes)
     )
     from mtv_world_ros.viewing.sheets import write_pictures
 
@@ -158,13 +143,95 @@ def _imagine(arguments: argparse.Namespace) -> int:
     print('\n'.join(episode_table(results)))
     print(f'look at them: mtv-world view {arguments.out}')
     failed = [result for result in results if result['how'] not in GOOD_ENDS]
+    logs = f" (logs are in '{arguments.out / 'logs'}')" if arguments.live else ''
     for result in failed:
         why = str(result['text']).strip().splitlines() or ['no reason was given']
         sys.stderr.write(
-            f'mtv-world: episode {result["episode"]} failed: {result["how"]}: {why[-1]} '
-            f"(logs are in '{arguments.out / 'logs'}')\n"
+            f'mtv-world: episode {result["episode"]} failed: {result["how"]}: {why[-1]}{logs}\n'
         )
     return int(bool(failed))
+
+
+def _in_process(
+    arguments: argparse.Namespace, episodes: Sequence[Path]
+) -> Sequence[Mapping[str, object]]:
+    """Run the policy from recorded frames, in this process."""
+    from mtv_world_ros.core.errors import MtvWorldError
+    from mtv_world_ros.rollout.assembly import asked_describer
+    from mtv_world_ros.rollout.imagined_episodes import (
+        check_start,
+        EpisodeOptions,
+        imagine_episodes,
+    )
+
+    # a wrong name is an error here, before anything is loaded or removed
+    robot = arguments.checkpoint.load_robot(arguments.robot)
+    check_start(arguments.policy, robot, arguments.start, is_recorded=True)
+    for bag in sorted(arguments.out.glob('episode_*')):
+        check_free(bag, arguments.overwrite)
+    describer = asked_describer(arguments.describer)
+    pipeline = replace(pipeline_of(arguments), describer=describer)
+    viewer = _viewer(arguments)
+    options = EpisodeOptions(
+        policy=arguments.policy,
+        episodes=tuple(episodes),
+        count=arguments.count,
+        start_s=arguments.start,
+        max_chunks=arguments.max_chunks,
+        max_seconds=arguments.max_seconds,
+        instruction=arguments.instruction,
+        seed=arguments.seed,
+        num_inference_steps=arguments.steps,
+    )
+    watched = {'on_start': viewer.begin, 'on_chunk': viewer.add} if viewer else {}
+    results = imagine_episodes(
+        pipeline, options, arguments.out, overwrite=arguments.overwrite, **watched
+    )
+    if viewer:
+        try:
+            viewer.close()
+        except MtvWorldError as error:  # the episodes are there
+            sys.stderr.write(f'mtv-world: {error}\n')
+    return results
+
+
+def _viewer(arguments: argparse.Namespace) -> EpisodeViewer | None:
+    """The viewer of `--watch`; prints its address."""
+    if arguments.watch is None:
+        return None
+    from mtv_world_ros.rollout.episode_viewer import EpisodeViewer
+    from mtv_world_ros.viewing import rerun_log
+
+    watch, stream = arguments.watch, rerun_log.recording('imagine')
+    print(rerun_log.open_viewer(stream, None, watch.address, watch.file, False), flush=True)
+    return EpisodeViewer(stream, watch.file)
+
+
+def _from_cameras(
+    arguments: argparse.Namespace, watch: Sequence[str] | None
+) -> Sequence[Mapping[str, object]]:
+    """Run the policy from what the cameras show, over ROS topics."""
+    from mtv_world_ros.ros.launching import imagine_episodes, ImagineOptions
+
+    options = ImagineOptions(
+        policy=arguments.policy,
+        count=arguments.count,
+        max_chunks=arguments.max_chunks,
+        max_seconds=arguments.max_seconds,
+        instruction=arguments.instruction,
+        seed=arguments.seed,
+        watch=None if watch is None else (*watch, '--by-episode'),
+        checkpoint=arguments.checkpoint.name,
+        robot=arguments.robot or '',
+        device=arguments.device,
+        num_threads=arguments.threads,
+        num_inference_steps=arguments.steps,
+        segmenter=arguments.segmenter,
+        describer=str(arguments.describer.absolute()) if arguments.describer else '',
+    )
+    return imagine_episodes(
+        options, arguments.out, overwrite=arguments.overwrite, tell=partial(print, flush=True)
+    )
 
 
 def episode_table(results: Sequence[Mapping[str, object]]) -> list[str]:

@@ -10,23 +10,19 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from mtv_world_ros.core.data_types import FloatArray, JointTrajectory, Observation, SuccessEstimate
+from mtv_world_ros.core.data_types import Observation, SuccessEstimate
 from mtv_world_ros.core.errors import EpisodeError, MtvWorldError, ObservationError
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.observations import instruction_at, newest_observation
 from mtv_world_ros.data.recording import DEFAULT, frame_indices, Recording
 from mtv_world_ros.robot.plan import Plan
-from mtv_world_ros.robot.resample import match_joints
 from mtv_world_ros.rollout.observed_episode import ObservedEpisode
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.prediction import Prediction
-from mtv_world_ros.rollout.prediction_writer import ERROR, OK, PredictionWriter
-
-#: beyond these a trajectory is rejected, as by the node: age of the newest frames and joint states
-#: at its start, and time between the views' frames [s]
-IMAGE_AGE_S, JOINT_STATE_AGE_S, VIEW_SKEW_S = 0.5, 0.5, 0.05
+from mtv_world_ros.rollout.prediction_writer import chunk_values, ERROR, OK, PredictionWriter
 
 
 @dataclass(slots=True, kw_only=True)
@@ -129,7 +125,7 @@ def replay_offline(
         for index, (stamp, trajectory) in enumerate(episode.trajectories):
             until = starts[index + 1] if index + 1 < len(starts) else None
             try:
-                observation = observe(episode, pipeline, stamp)
+                observation = newest_observation(episode, spec.views, pipeline.robot, stamp)
                 before = starts[index - 1] if index else stamp
                 for seen in _seen_between(episode, pipeline, before, stamp):
                     observed.see(seen)
@@ -172,7 +168,7 @@ def _write_rollout(
         summary.video_s += count / fps
         last = chunk
         end_ns = chunk.stamp_ns + round(float(chunk.video.times[-1]) * 1e9)
-        writer.write_report(end_ns, OK, 'imagined', _chunk_values(chunk))
+        writer.write_report(end_ns, OK, 'imagined', chunk_values(chunk))
         if until is not None and end_ns >= until:
             break
     if last is not None:
@@ -195,83 +191,15 @@ def _write_observed(writer: PredictionWriter, episode: Episode, fps: float) -> N
             writer.write_observed(camera, int(known[index]), episode.images[view].frames[index])
 
 
-def _chunk_values(chunk: Prediction) -> dict[str, object]:
-    return {
-        'chunk': chunk.chunk,
-        'num_chunks': chunk.num_chunks,
-        'chunk_seed': chunk.seed,
-        'observation_stamp_ns': chunk.stamp_ns,
-        'success': chunk.success.probability,
-        'success_low': chunk.success.interval[0],
-        'success_high': chunk.success.interval[1],
-        'success_reasons': chunk.success.reasons,
-        **{f'stage_s.{stage}': seconds for stage, seconds in chunk.seconds.items()},
-    }
-
-
-def observe(episode: Episode, pipeline: Pipeline, stamp_ns: int) -> Observation:
-    """Returns what was seen last before a moment.
-
-    Raises:
-        ObservationError: nothing was seen yet, too long ago, or at different times by the views.
-    """
-    views = pipeline.spec.views
-    newest = [_last_before(episode.images[view].stamps_ns, stamp_ns) for view in views]
-    for view, index in zip(views, newest, strict=True):
-        if index < 0:
-            raise ObservationError(f"view '{view}' has no frame before the trajectory starts")
-    common = min(int(episode.images[v].stamps_ns[i]) for v, i in zip(views, newest, strict=True))
-    picked = [int(np.abs(episode.images[view].stamps_ns - common).argmin()) for view in views]
-    stamps = [int(episode.images[v].stamps_ns[i]) for v, i in zip(views, picked, strict=True)]
-    _check('the newest frames are', stamp_ns - min(stamps), IMAGE_AGE_S, 'old')
-    _check('the views are', max(stamps) - min(stamps), VIEW_SKEW_S, 'apart')
-    return Observation(
-        cameras=tuple(episode.camera(v, i) for v, i in zip(views, picked, strict=True)),
-        frames=np.stack([episode.images[v].frames[i] for v, i in zip(views, picked, strict=True)]),
-        positions=_positions(episode, pipeline, stamp_ns),
-        stamp_ns=min(stamps),
-    )
-
-
 def _seen_between(
     episode: Episode, pipeline: Pipeline, begin_ns: int, end_ns: int
 ) -> Iterator[Observation]:
     """What was seen between two moments, once a frame of the model."""
-    period_ns = round(1e9 / pipeline.spec.fps)
+    spec = pipeline.spec
+    period_ns = round(1e9 / spec.fps)
     for stamp_ns in range(begin_ns + period_ns, end_ns, period_ns):
         with suppress(ObservationError):
-            yield observe(episode, pipeline, stamp_ns)
-
-
-def _positions(episode: Episode, pipeline: Pipeline, stamp_ns: int) -> FloatArray:
-    states = episode.joint_states
-    index = -1 if states is None else _last_before(states.stamps_ns, stamp_ns)
-    if states is None or index < 0:
-        raise ObservationError('there are no joint_states before the trajectory starts')
-    age = stamp_ns - int(states.stamps_ns[index])
-    _check('the newest joint states are', age, JOINT_STATE_AGE_S, 'old')
-    row = JointTrajectory(
-        joint_names=states.joint_names,
-        times=np.zeros(1),
-        positions=states.positions[index][None],
-    )
-    return match_joints(row, pipeline.robot).positions[0]
-
-
-def _last_before(stamps_ns: np.ndarray, stamp_ns: int) -> int:
-    """Index of the last stamp not after a moment, -1 if there is none."""
-    return int(np.searchsorted(stamps_ns, stamp_ns, side='right')) - 1
-
-
-def _check(what: str, value_ns: int, limit_s: float, how: str) -> None:
-    if value_ns > limit_s * 1e9:
-        raise ObservationError(f'{what} {value_ns / 1e9:.3f} s {how}; allowed are {limit_s:g} s')
-
-
-def instruction_at(episode: Episode, stamp_ns: int) -> str:
-    """Returns the instruction that held at a moment, or the episode's."""
-    before = [text for stamp, text in episode.instructions if stamp <= stamp_ns]
-    return before[-1] if before else episode.info.instruction
+            yield newest_observation(episode, spec.views, pipeline.robot, stamp_ns)
 
 
 def judge(pipeline: Pipeline, recording: Recording) -> SuccessEstimate:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.core.data_types import ByteArray, CameraModel, ObjectMasks
+from mtv_world_ros.core.data_types import ByteArray, CameraModel, JointTrajectory, ObjectMasks
 from mtv_world_ros.core.images import encode_jpeg
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.writer import BagWriter
@@ -33,6 +33,7 @@ class PredictionWriter(BagWriter):
         path: folder to make; written beside and renamed when the block ends.
         joint_names: J names, in the robot's order.
         overwrite: replace an existing folder.
+        keep: keep what was recorded before an error, see `BagWriter`.
 
     Attributes:
         frame_stamps: of the frames that were recorded [ns].
@@ -44,8 +45,9 @@ class PredictionWriter(BagWriter):
         joint_names: Sequence[str],
         *,
         overwrite: bool = False,
+        keep: bool = False,
     ) -> None:
-        super().__init__(path, overwrite=overwrite)
+        super().__init__(path, overwrite=overwrite, keep=keep)
         self._joint_names = tuple(joint_names)
         self.frame_stamps: list[int] = []
 
@@ -69,6 +71,16 @@ class PredictionWriter(BagWriter):
     def write_observed(self, camera: CameraModel, stamp_ns: int, rgb: ByteArray) -> None:
         """Records what a camera really showed, (H, W, 3) uint8 RGB, under its own topic."""
         self._write_jpeg(f'/{camera.view}', camera, stamp_ns, rgb)
+
+    def write_plan(self, stamp_ns: int, trajectory: JointTrajectory) -> None:
+        """Records a policy's answer; its times count from the stamp."""
+        message = messages.make_joint_trajectory(stamp_ns, trajectory)
+        self.write_message('/joint_trajectory', messages.JOINT_TRAJECTORY, stamp_ns, message)
+
+    def write_instruction(self, stamp_ns: int, text: str) -> None:
+        """Records the instruction of an episode."""
+        message = messages.make(messages.STRING, data=text)
+        self.write_message('/instruction', messages.STRING, stamp_ns, message)
 
     def write_report(
         self, stamp_ns: int, level: int, text: str, values: Mapping[str, Any]
@@ -133,6 +145,21 @@ class PredictionWriter(BagWriter):
             f'object: {", ".join(prediction.masks.names)}',
         )
         self.write_message(f'{NODE}/jaccard', ARRAY, stamp_ns, _array(success.jaccard, labels))
+
+
+def chunk_values(chunk: Prediction) -> dict[str, object]:
+    """Return the keys and values of a predicted chunk in `~/report`."""
+    return {
+        'chunk': chunk.chunk,
+        'num_chunks': chunk.num_chunks,
+        'chunk_seed': chunk.seed,
+        'observation_stamp_ns': chunk.stamp_ns,
+        'success': chunk.success.probability,
+        'success_low': chunk.success.interval[0],
+        'success_high': chunk.success.interval[1],
+        'success_reasons': chunk.success.reasons,
+        **{f'stage_s.{stage}': seconds for stage, seconds in chunk.seconds.items()},
+    }
 
 
 def _array(values: np.ndarray, labels: Sequence[str]) -> Any:

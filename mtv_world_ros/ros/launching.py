@@ -8,35 +8,25 @@ from dataclasses import dataclass
 import os
 from pathlib import Path
 import re
-import shutil
 import subprocess
 import time
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
-from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.core.bounded_input import read_json
-from mtv_world_ros.core.data_types import CameraModel
-from mtv_world_ros.core.errors import ConfigError, EpisodeError
-from mtv_world_ros.core.files import check_free, check_room
+from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.core.processes import (
     how_it_ended,
     module_command,
-    private_domain,
     ros_arguments,
     start_process,
     stop_process,
     StoppedProcesses,
 )
-from mtv_world_ros.data.episode import CALIBRATION_FILE
 from mtv_world_ros.model.checkpoint import Checkpoint
-from mtv_world_ros.policies.policy import RecordedPolicySettings, ScriptedPolicySettings
-from mtv_world_ros.rollout.assembly import policy_settings
+from mtv_world_ros.rollout.imagined_episodes import check_start, clear_episodes
 
-#: of logs and bags, before anything is started
-ROOM_BYTES = 8 * 2**20
 #: the start images stay valid while the policy computes [s]
 _NO_AGE = 3600.0
 #: the address of its page, or its file
@@ -49,12 +39,10 @@ class ImagineOptions:
 
     Attributes:
         policy: YAML file, name of a bundled one, or a scripted policy such as `expert-miss-0.5`.
-        episodes: recorded episodes to start from, in turn; none = from the live cameras.
-        count: number of episodes; 0 = one for each recorded one.
-        start_s: time of the recorded frame to start from [s].
+        count: number of episodes; 0 = one.
         max_chunks: chunks an episode has at most; 0 = until the policy says it is over.
         max_seconds: an episode takes at most, on the wall [s].
-        instruction: empty = the recorded episode's.
+        instruction: text for the robot.
         seed: episode k uses seed + 1000 k.
         watch: arguments of a viewer that runs beside it; None = there is none.
         checkpoint, robot, device, num_threads, num_inference_steps, segmenter, describer: of the
@@ -62,9 +50,7 @@ class ImagineOptions:
     """
 
     policy: str
-    episodes: tuple[Path, ...]
     count: int = 0
-    start_s: float = 0.0
     max_chunks: int = 0
     max_seconds: float = 3600.0
     instruction: str = ''
@@ -102,10 +88,10 @@ def imagine_episodes(
         EpisodeError: a process failed; the message says what it said last and names its log.
         OSError: the disk is full.
     """
-    views = Checkpoint.open(options.checkpoint).card.spec.views
+    checkpoint = Checkpoint.open(options.checkpoint)
+    views, robot = checkpoint.spec.views, checkpoint.load_robot(options.robot or None)
     # a wrong name is an error here, before anything is removed
-    _check_policy(options)
-    check_same_cameras(options.episodes, views)
+    check_start(options.policy, robot, 0.0, is_recorded=False)
     watch = options.watch
     viewer = {} if watch is None else {'viewer': module_command('live_viewer', *watch)}
     commands = {
@@ -114,16 +100,12 @@ def imagine_episodes(
         'policy': _policy_command(options, views),
         'runner': _runner_command(options, views, out),
     }
-    check_room(out, ROOM_BYTES)
-    for bag in sorted(out.glob('episode_*')):
-        check_free(bag, overwrite)
-        shutil.rmtree(bag)
+    clear_episodes(out, overwrite=overwrite)
     logs = out / 'logs'
     logs.mkdir(parents=True, exist_ok=True)
-    (out / 'episodes.json').unlink(missing_ok=True)
-    environment = private_domain() if options.episodes else dict(os.environ)
+    environment = dict(os.environ)
     started: dict[str, subprocess.Popen[bytes]] = {}
-    count = options.count or len(options.episodes) or 1  # from live cameras one by default
+    count = options.count or 1
     try:
         for name, command in commands.items():
             started[name] = start_process(name, command, logs, environment)
@@ -143,50 +125,6 @@ def imagine_episodes(
         raise EpisodeError(
             f"what the episode runner wrote cannot be read: {error} (logs are in '{logs}')"
         ) from error
-
-
-def check_same_cameras(episodes: Sequence[Path], views: Sequence[str]) -> None:
-    """Refuses episodes of different camera poses: one node has one calibration for all.
-
-    Raises:
-        ConfigError: two differ.
-    """
-    first: dict[str, CameraModel] = {}
-    for episode in episodes:
-        file = episode / CALIBRATION_FILE
-        known = load_calibration(file) if file.is_file() else {}
-        for view in (view for view in views if view in known):
-            before = first.setdefault(view, known[view])
-            if not _same(before, known[view]):
-                raise ConfigError(
-                    f"'{episode}' and '{episodes[0]}' have different cameras of view '{view}', "
-                    'and one world model draws all of --episodes with one calibration: imagine '
-                    'them one by one (replay --offline and evaluate take each with its own)'
-                )
-
-
-def _same(a: CameraModel, b: CameraModel) -> bool:
-    return (
-        a.mount_link == b.mount_link
-        and np.allclose(a.T_mount_camera, b.T_mount_camera, atol=1e-6)
-        and np.allclose(a.K / a.width, b.K / b.width, atol=1e-6)
-    )
-
-
-def _check_policy(options: ImagineOptions) -> None:
-    robot = Checkpoint.open(options.checkpoint).load_robot(options.robot or None)
-    policy = policy_settings(options.policy, robot)
-    if isinstance(policy, RecordedPolicySettings) and not options.episodes:
-        raise ConfigError(
-            f"policy '{options.policy}' repeats what was commanded in a recorded episode: give "
-            '--episodes'
-        )
-    if isinstance(policy, ScriptedPolicySettings) and options.start_s > 0:
-        raise ConfigError(
-            f"policy '{options.policy}' plans for the scene as it is in the recording's first "
-            f'frame, --start is {options.start_s:g} s: leave --start out, or take --policy '
-            'recorded or one that looks at the pictures'
-        )
 
 
 def _viewer_said(viewer: subprocess.Popen[bytes], logs: Path) -> str:
@@ -229,11 +167,9 @@ def episodes_done(out: Path) -> int:
 
 def _common(options: ImagineOptions, views: Sequence[str]) -> dict[str, object]:
     """Parameters of both nodes."""
-    first = options.episodes[0] / CALIBRATION_FILE if options.episodes else None
     return {
         'checkpoint': options.checkpoint,
         'robot_file': options.robot,
-        'calibration_file': first.absolute() if first is not None and first.is_file() else '',
         'max_image_age_s': _NO_AGE,
         'max_joint_state_age_s': _NO_AGE,
         'diagnostics_period_s': 0.2,
@@ -268,11 +204,7 @@ def _policy_command(options: ImagineOptions, views: Sequence[str]) -> list[str]:
 def _runner_command(options: ImagineOptions, views: Sequence[str], out: Path) -> list[str]:
     arguments = [str(out), '--views', *views, '--count', str(options.count)]
     arguments += ['--seed', str(options.seed), '--max-chunks', str(options.max_chunks)]
-    arguments += ['--max-seconds', str(options.max_seconds), '--start', str(options.start_s)]
+    arguments += ['--max-seconds', str(options.max_seconds)]
     arguments += ['--instruction', options.instruction] if options.instruction else []
-    if options.episodes:
-        arguments += ['--episodes', *(str(path) for path in options.episodes)]
-    else:
-        arguments += ['--live']
-    arguments += ['--viewers', str(int(options.watch is not None))]
+    arguments += ['--live', '--viewers', str(int(options.watch is not None))]
     return module_command('episodes.episode_runner', *arguments)

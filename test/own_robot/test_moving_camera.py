@@ -11,13 +11,13 @@ from mtv_world_ros.core.data_types import WorldModelSpec
 from mtv_world_ros.core.transforms import inverse
 from mtv_world_ros.data.bag_mapping import load_source
 from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.observations import newest_observation
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data.recordings import cached_recording, cut_clip
 from mtv_world_ros.inspection.inspect import Inspector
 from mtv_world_ros.inspection.motion_residual import ResidualSearch
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.shape import load_shape
-from mtv_world_ros.rollout.offline import observe
 from test.support.bags import bag_cameras, grey_frames, MAPPING, record
 from test.support.crane import (
     FPS,
@@ -104,13 +104,8 @@ def test_clips_and_observations_have_the_camera_where_it_is(bag, robot, tmp_path
             np.testing.assert_array_equal(palm.T_mount_camera, recording.cameras[1].T_mount_camera)
     episode = read_episode(path)
 
-    class Pipeline:
-        pass
-
-    pipeline = Pipeline()
-    pipeline.spec, pipeline.robot = SPEC, robot
     stamp = int(episode.images['door'].stamps_ns[9])
-    seen = observe(episode, pipeline, stamp)
+    seen = newest_observation(episode, SPEC.views, robot, stamp)
     np.testing.assert_allclose(seen.cameras[0].T_mount_camera, truth()[9], atol=1e-6)
 
 

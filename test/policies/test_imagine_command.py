@@ -2,17 +2,18 @@
 
 from dataclasses import replace
 import json
+import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
 from mtv_world_ros.cli import main
 from mtv_world_ros.cli.imagine import episode_table
-from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import share_path
-from mtv_world_ros.ros.launching import check_same_cameras
+from mtv_world_ros.viewing.streams import read_streams
 
 DEMO = share_path('resource', 'demo_episode')
 
@@ -84,15 +85,29 @@ def test_the_success_rate_has_wilsons_interval(verdicts, said):
     assert lines[2].strip() == 'a' and lines[3].strip() == 'b'
 
 
-def test_episodes_with_other_cameras_are_refused_together(tmp_path):
-    """One node draws them all with one calibration, which would be wrong for the others."""
+@pytest.mark.slow
+def test_each_episode_has_cameras_of_its_own(tmp_path):
+    """The same recording, once with a camera that stands 20 mm elsewhere: its trails differ."""
+    paths = [shutil.copytree(DEMO, tmp_path / name) for name in ('a', 'b')]
     known = load_calibration(DEMO / 'calibration.yaml')
     T = known['low'].T_mount_camera.copy()
     T[0, 3] += 0.02
-    for name, low in (('a', known['low']), ('b', replace(known['low'], T_mount_camera=T))):
-        save_calibration(tmp_path / name / 'calibration.yaml', {**known, 'low': low})
-    both = [tmp_path / 'a', tmp_path / 'b']
-    check_same_cameras(both, ['high'])
-    check_same_cameras(both[:1] * 2, ['low', 'high'])
-    with pytest.raises(ConfigError, match=r"b' and .*a' have different cameras of view 'low'"):
-        check_same_cameras(both, ['low', 'high'])
+    moved = {**known, 'low': replace(known['low'], T_mount_camera=T)}
+    (paths[1] / 'calibration.yaml').unlink()
+    save_calibration(paths[1] / 'calibration.yaml', moved)
+    out, words = tmp_path / 'out', ('--steps', '1', '--max-chunks', '1', '--no-video')
+    episodes = ['--episodes', *map(str, paths), '--policy', 'recorded', '--out', str(out)]
+    assert main(['imagine', *episodes, *words]) == 0
+    first, second = (read_streams([out / f'episode_{k:05d}']).images for k in range(2))
+    differs = [
+        not np.array_equal(first['trajectory', view][4][1], second['trajectory', view][4][1])
+        for view in ('low', 'high')
+    ]
+    assert differs == [True, False]
+
+
+@pytest.mark.slow
+def test_an_episode_ends_after_its_longest_time_and_keeps_its_chunks(tmp_path):
+    assert run(tmp_path, 'recorded', '--steps', '1', '--max-seconds', '0.001', '--no-video') == 0
+    (episode,) = json.loads((tmp_path / 'episodes.json').read_text())
+    assert episode['how'] == 'max_seconds' and (tmp_path / 'episode_00000').is_dir()

@@ -12,7 +12,7 @@ from mtv_world_ros.ranking.policy_list import load_policy_list
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.resample import resample
 from mtv_world_ros.rollout.assembly import assemble_policy
-from mtv_world_ros.ros.launching import imagine_episodes, ImagineOptions
+from mtv_world_ros.rollout.imagined_episodes import check_start
 
 ROBOT = load_robot(robot_path('yam_bimanual'))
 COMMANDS = JointTrajectory(
@@ -73,12 +73,11 @@ def test_it_commands_what_the_episode_did():
     )
 
 
-def test_without_a_recording_it_says_where_one_is_given(tmp_path):
+def test_without_a_recording_it_says_where_one_is_given():
     with pytest.raises(PolicyError, match="give --episodes .* the parameter 'recording'"):
         assemble_policy('recorded', ROBOT)(EpisodeOrigin())
     with pytest.raises(ConfigError, match="policy 'recorded' repeats .* give --episodes"):
-        imagine_episodes(ImagineOptions(policy='recorded', episodes=()), tmp_path)
-    assert not list(tmp_path.iterdir())
+        check_start('recorded', ROBOT, 0.0, is_recorded=False)
 
 
 def test_a_ranking_refuses_it(tmp_path):
@@ -88,8 +87,6 @@ def test_a_ranking_refuses_it(tmp_path):
         load_policy_list(file, ROBOT)
 
 
-def test_a_scripted_policy_begins_where_its_plan_does(tmp_path):
-    options = ImagineOptions(policy='expert-miss-0.5', episodes=(tmp_path,), start_s=1.5)
+def test_a_scripted_policy_begins_where_its_plan_does():
     with pytest.raises(ConfigError, match=r"'expert-miss-0.5' plans .* --start is 1.5 s: leave"):
-        imagine_episodes(options, tmp_path / 'out')
-    assert not (tmp_path / 'out').exists()
+        check_start('expert-miss-0.5', ROBOT, 1.5, is_recorded=True)

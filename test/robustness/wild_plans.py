@@ -35,14 +35,16 @@ def bundled() -> Any:
 def first_scene() -> tuple[Any, str]:
     """What is seen where the bundled episode's first trajectory starts, and what is asked for."""
     from mtv_world_ros.data.episode_reader import read_episode
-    from mtv_world_ros.rollout.offline import instruction_at, observe
+    from mtv_world_ros.data.observations import instruction_at
 
     pipeline = bundled()
     episode = read_episode(
         share_path('resource', 'demo_episode'), views=pipeline.spec.views, with_masks=False
     )
+    from mtv_world_ros.data.observations import newest_observation
+
     stamp_ns = episode.trajectories[0][0]
-    observation = observe(episode, pipeline, stamp_ns)
+    observation = newest_observation(episode, pipeline.spec.views, pipeline.robot, stamp_ns)
     return observation, instruction_at(episode, stamp_ns)
 
 

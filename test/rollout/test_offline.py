@@ -6,10 +6,10 @@ import pytest
 
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.data import observations
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.rollout import offline
 from mtv_world_ros.rollout.offline import replay_offline
 
 START_NS, PERIOD_NS = 1_700_000_000_000_000_000, 100_000_000
@@ -127,7 +127,7 @@ def test_bad_trajectory_is_rejected_with_its_reason_and_the_next_is_imagined(
 
 
 def test_old_frames_are_rejected(make_pipeline, episodes, tmp_path, monkeypatch):
-    monkeypatch.setattr(offline, 'IMAGE_AGE_S', -1)
+    monkeypatch.setattr(observations, 'IMAGE_AGE_S', -1)
     with pytest.raises(EpisodeError, match='frames are 0.000 s old; allowed are -1 s'):
         replay(make_pipeline(), episodes[0], tmp_path / 'out')
 

@@ -23,7 +23,7 @@ from mtv_world_ros.core.processes import (
     StoppedProcesses,
 )
 from mtv_world_ros.data.bag.reader import BagReader
-from mtv_world_ros.ros.launching import ROOM_BYTES
+from mtv_world_ros.rollout.imagined_episodes import ROOM_BYTES
 
 STREAMS = ('predicted/image_raw', 'predicted/camera_info', 'trajectory/image_raw')
 TOPICS = ('predicted/joint_states', 'success', 'jaccard', 'report')

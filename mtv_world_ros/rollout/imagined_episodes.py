@@ -1,0 +1,371 @@
+"""Whole episodes of a policy in imagination, each as a bag, from recorded first frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+import json
+from math import isfinite, nan
+from pathlib import Path
+import shutil
+import time
+from typing import Any
+
+from tqdm import tqdm
+
+from mtv_world_ros.core.data_types import JointTrajectory, Observation
+from mtv_world_ros.core.errors import (
+    ConfigError,
+    ModelMemoryError,
+    MtvWorldError,
+    PolicyError,
+    RolloutPreempted,
+)
+from mtv_world_ros.core.files import check_free, check_room, write_whole
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.observations import observation_after
+from mtv_world_ros.policies.policy import (
+    EpisodeOrigin,
+    Policy,
+    RecordedPolicySettings,
+    ScriptedPolicySettings,
+)
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.plan import PlanLimits
+from mtv_world_ros.rollout.assembly import assemble_policy, policy_settings, PolicyMaker
+from mtv_world_ros.rollout.options import RolloutOptions
+from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.rollout.prediction import Prediction
+from mtv_world_ros.rollout.prediction_writer import chunk_values, ERROR, OK, PredictionWriter
+from mtv_world_ros.rollout.world import End, ImaginedWorld, run_policy
+from mtv_world_ros.success.estimator import verdict_word
+
+#: free space that the bags and reports need before anything is computed [bytes]
+ROOM_BYTES = 8 * 2**20
+#: distance between the seeds of two episodes
+SEED_STEP = 1000
+#: limits of the answers of a policy, as those of the node by default
+LIMITS = PlanLimits(max_horizon_s=60.0, may_omit_joints=True)
+_HOW = {End.POLICY: 'done', End.TIME_OUT: 'max_chunks'}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeOptions:
+    """Options of imagined episodes.
+
+    Attributes:
+        policy: YAML file, name of one in `config/policies`, or a scripted policy such as
+            `expert-miss-0.5`.
+        episodes: recorded episodes to start from, in turn.
+        count: number of episodes; 0 = one for each recorded one.
+        start_s: time of the recorded frame to start from [s].
+        max_chunks: number of answers after which an episode ends; 0 = the policy ends it.
+        max_seconds: longest time of an episode on the wall [s].
+        instruction: text for the robot; empty = the recorded episode's.
+        seed: episode k uses seed + 1000 k.
+        num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
+    """
+
+    policy: str
+    episodes: tuple[Path, ...]
+    count: int = 0
+    start_s: float = 0.0
+    max_chunks: int = 0
+    max_seconds: float = 3600.0
+    instruction: str = ''
+    seed: int = 0
+    num_inference_steps: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeStart:
+    """The recorded moment that an imagined episode starts from.
+
+    Attributes:
+        observation: frames at the cameras' size, and joint positions.
+        instruction: text for the robot; empty = not recorded.
+        origin: task, scene and recording, for policies that use them in place of pictures.
+    """
+
+    observation: Observation
+    instruction: str
+    origin: EpisodeOrigin
+
+
+def recorded_start(path: Path, pipeline: Pipeline, start_s: float = 0.0) -> EpisodeStart:
+    """Return a moment of a recorded episode.
+
+    Args:
+        path: rosbag2 folder.
+        pipeline: names the views and the joints.
+        start_s: time since the first frame of the first view [s].
+
+    Raises:
+        EpisodeError: the episode cannot be read, or ends before.
+        CalibrationError: a view is not calibrated.
+    """
+    views, robot = pipeline.spec.views, pipeline.robot
+    episode = read_episode(path, views=views, with_masks=False, robot=robot)
+    observation = observation_after(episode, views, robot, start_s)
+    info = episode.info
+    return EpisodeStart(
+        observation=observation,
+        instruction=info.instruction,
+        origin=EpisodeOrigin(
+            task=info.task,
+            scene_seed=-1 if info.seed is None else info.seed,
+            recording=str(path.absolute()),
+            recording_ns=observation.stamp_ns,
+        ),
+    )
+
+
+def check_start(policy: str, robot: RobotModel, start_s: float, *, is_recorded: bool) -> None:
+    """Check that a policy can start where it is to.
+
+    Args:
+        policy: name or file of the policy.
+        robot: the robot that it moves.
+        start_s: time of the recorded frame to start from [s].
+        is_recorded: whether the episodes start from recorded ones.
+
+    Raises:
+        ConfigError: it repeats a recording and there is none, or plans for its first frame.
+        PolicyError: there is no such policy.
+    """
+    settings = policy_settings(policy, robot)
+    if isinstance(settings, RecordedPolicySettings) and not is_recorded:
+        raise ConfigError(
+            f"policy '{policy}' repeats what was commanded in a recorded episode: give --episodes"
+        )
+    if isinstance(settings, ScriptedPolicySettings) and start_s > 0:
+        raise ConfigError(
+            f"policy '{policy}' plans for the scene as it is in the recording's first frame, "
+            f'--start is {start_s:g} s: leave --start out, or take --policy recorded or one that '
+            'looks at the pictures'
+        )
+
+
+def clear_episodes(out: Path, *, overwrite: bool) -> None:
+    """Remove the imagined episodes of an earlier run from a folder, and make it.
+
+    Raises:
+        ConfigError: there are some, and they are not to be overwritten.
+    """
+    check_room(out, ROOM_BYTES)
+    for bag in sorted(out.glob('episode_*')):
+        check_free(bag, overwrite)
+        shutil.rmtree(bag)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / 'episodes.json').unlink(missing_ok=True)
+
+
+def imagine_episodes(
+    pipeline: Pipeline,
+    options: EpisodeOptions,
+    out: Path,
+    *,
+    overwrite: bool = False,
+    on_start: Callable[[EpisodeStart], object] = lambda _: None,
+    on_chunk: Callable[[Prediction], object] = lambda _: None,
+) -> list[dict[str, Any]]:
+    """Run the episodes; `out` gets a bag for each, and `episodes.json`.
+
+    Args:
+        pipeline: imagines and judges.
+        options: policy, episodes and limits.
+        out: folder of the results.
+        overwrite: remove the episodes of an earlier run from it.
+        on_start: called at the start of each episode.
+        on_chunk: called with every chunk once it is ready.
+
+    Returns:
+        Contents of `episodes.json`, one entry for each episode that was begun.
+
+    Raises:
+        ConfigError: `out` holds episodes, and `overwrite` is not set; no such policy.
+        EpisodeError: a recorded episode cannot be used, or the disk is full.
+    """
+    check_start(options.policy, pipeline.robot, options.start_s, is_recorded=True)
+    clear_episodes(out, overwrite=overwrite)
+    make_policy = assemble_policy(options.policy, pipeline.robot)
+    count, results = options.count or len(options.episodes), list[dict[str, Any]]()
+    for number in tqdm(range(count), unit='ep', disable=None):
+        path = options.episodes[number % len(options.episodes)]
+        start = recorded_start(path, pipeline, options.start_s)
+        on_start(start)
+        run = _EpisodeRun(pipeline, options, number, start, out / f'episode_{number:05d}')
+        try:
+            run.imagine(make_policy, on_chunk)
+        finally:
+            results.append({**run.result(), 'start': str(path)})
+            write_whole(out / 'episodes.json', json.dumps(results, indent=2) + '\n')
+    return results
+
+
+class _EpisodeRun:
+    """One imagined episode and its bag.
+
+    Args:
+        pipeline: imagines and judges.
+        options: policy, episodes and limits.
+        number: number of the episode.
+        start: where it starts.
+        bag: folder of its bag.
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        options: EpisodeOptions,
+        number: int,
+        start: EpisodeStart,
+        bag: Path,
+    ) -> None:
+        self._pipeline, self._options, self._start, self._bag = pipeline, options, start, bag
+        self._number, self._seed = number, options.seed + SEED_STEP * number
+        self._begun_s = time.monotonic()
+        self._num_chunks, self._policy = 0, options.policy
+        self._last: Prediction | None = None
+        self._how, self._text = 'interrupted', 'it was stopped before its end'
+
+    def imagine(self, make: PolicyMaker, on_chunk: Callable[[Prediction], object]) -> None:
+        """Runs the policy until the episode ends; an error of the episode is its end."""
+        robot, seen = self._pipeline.robot, self._start.observation
+        instruction = self._options.instruction or self._start.instruction
+        with PredictionWriter(self._bag, robot.joint_names, keep=True) as writer:
+            writer.write_instruction(seen.stamp_ns, instruction)
+            for camera, frame in zip(seen.cameras, seen.frames, strict=True):
+                writer.write_observed(camera, seen.stamp_ns, frame)
+
+            def keep(prediction: Prediction) -> None:
+                self._last = prediction
+                writer.write_chunk(prediction)
+                end_ns = prediction.stamp_ns + round(float(prediction.video.times[-1]) * 1e9)
+                writer.write_report(end_ns, OK, 'imagined', chunk_values(prediction))
+                on_chunk(prediction)
+
+            options = RolloutOptions(
+                instruction=instruction,
+                num_inference_steps=self._options.num_inference_steps,
+                limits=LIMITS,
+                should_stop=self._is_late,
+            )
+            world = _RecordedWorld(self._pipeline, seen, options, keep, writer)
+            self._end(make, world)
+            if self._how not in ('done', 'max_chunks', 'max_seconds'):
+                values = {'how': self._how, 'text': self._text}
+                writer.write_report(world.observation.stamp_ns, ERROR, self._how, values)
+
+    def result(self) -> dict[str, Any]:
+        """Returns the entry of `episodes.json`; numbers are null where the estimate abstains."""
+        success = None if self._last is None else self._last.success
+        low, high = (nan, nan) if success is None else success.interval
+        probability = nan if success is None else success.probability
+        numbers = {'success': probability, 'success_low': low, 'success_high': high}
+        seconds = round(time.monotonic() - self._begun_s, 3)
+        return {
+            'episode': self._number,
+            'bag': str(self._bag),
+            'episode_s': seconds,
+            'total_s': seconds,
+            'how': self._how,
+            'text': self._text,
+            'policy': self._policy,
+            'task': self._start.origin.task,
+            'scene_seed': self._start.origin.scene_seed,
+            'seed': self._seed,
+            'num_chunks': self._num_chunks,
+            **{key: value if isfinite(value) else None for key, value in numbers.items()},
+            'verdict': verdict_word(probability),
+            'reasons': '' if success is None else '; '.join(success.reasons),
+        }
+
+    def _end(self, make: PolicyMaker, world: _RecordedWorld) -> None:
+        """Runs the episode; sets how it ended."""
+        try:
+            policy = make(self._start.origin)
+            self._policy = policy.name
+            run = run_policy(
+                _NamedErrors(policy), world, seed=self._seed, max_chunks=self._options.max_chunks
+            )
+            self._how, self._text = _HOW[run.end], ''
+        except RolloutPreempted:
+            limit = self._options.max_seconds
+            self._how, self._text = 'max_seconds', f'it took longer than {limit:g} s'
+        except PolicyError as error:
+            self._how, self._text = 'policy_failed', str(error)
+        except ModelMemoryError as error:
+            self._how, self._text = 'failed', str(error)
+        except MtvWorldError as error:
+            if world.is_recording_broken:
+                raise
+            self._how, self._text = 'rejected', str(error)
+        self._num_chunks = world.num_answers
+
+    def _is_late(self) -> bool:
+        return time.monotonic() - self._begun_s > self._options.max_seconds
+
+
+class _RecordedWorld(ImaginedWorld):
+    """Imagination whose answers and chunks are recorded.
+
+    Attributes:
+        num_answers: number of answers that were imagined.
+        is_recording_broken: whether the last error was one of the recording.
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        start: Observation,
+        options: RolloutOptions,
+        on_chunk: Callable[[Prediction], object],
+        writer: PredictionWriter,
+    ) -> None:
+        super().__init__(pipeline, start, options, self._keep)
+        self._take, self._writer = on_chunk, writer
+        self.num_answers, self.is_recording_broken = 0, False
+
+    def step(self, answer: JointTrajectory) -> Observation:
+        """Records and imagines an answer; returns the last predicted frames."""
+        self.is_recording_broken = True
+        self._writer.write_plan(self.observation.stamp_ns, answer)
+        self.is_recording_broken = False
+        seen = super().step(answer)
+        self.num_answers += 1
+        return seen
+
+    def _keep(self, prediction: Prediction) -> None:
+        self.is_recording_broken = True
+        self._take(prediction)
+        self.is_recording_broken = False
+
+
+class _NamedErrors:
+    """A policy whose errors of any kind are `PolicyError`s."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy, self.name = policy, policy.name
+
+    def reset(self, *, seed: int) -> None:
+        """Begins an episode."""
+        with _policy_errors():
+            self._policy.reset(seed=seed)
+
+    def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
+        """Returns the policy's answer."""
+        with _policy_errors():
+            return self._policy.act(observation, instruction)
+
+
+@contextmanager
+def _policy_errors() -> Iterator[None]:
+    """Turns what a policy raises into a `PolicyError`."""
+    try:
+        yield
+    except PolicyError:
+        raise
+    except Exception as error:  # a policy is a user's code
+        raise PolicyError(f'{type(error).__name__}: {error}') from error
