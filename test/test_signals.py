@@ -58,7 +58,7 @@ def test_ctrl_c_while_python_starts_ends_without_a_traceback(tmp_path: Path) -> 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_command_that_still_imports_ends_with_one_line(number, tmp_path):
-    status, said = stopped(tmp_path, 'yaml', number, 'mtv_world_ros.cli', 'replay', 'x')
+    status, said = stopped(tmp_path, 'platform', number, 'mtv_world_ros.cli', 'replay', 'x')
     assert status == 128 + number
     assert said == [f'mtv-world: stopped while starting ({signal.Signals(number).name})']
 

@@ -84,7 +84,7 @@ def test_a_checkpoint_beyond_the_bounds_takes_neither_time_nor_memory(
     tmp_path, part, field, value
 ):
     pytest.importorskip('torch')
-    from mtv_world_ros.model.checkpoint import BUNDLED, Checkpoint
+    from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.model.trained_model import load_trained_model
 
     folder = shutil.copytree(BUNDLED, tmp_path / 'checkpoint')

@@ -68,6 +68,7 @@ class TwoJoints:
     """As much of a robot as plans need."""
 
     joint_names = ('arm', 'gripper')
+    is_endless = np.array([False, False])
 
 
 def test_4_joints_that_a_plan_leaves_out_go_where_they_were_measured():

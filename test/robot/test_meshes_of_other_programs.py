@@ -209,8 +209,8 @@ def test_one_number_scales_all_axes(tmp_path):
 @pytest.mark.parametrize(
     'name',
     [
-        '/home/someone/ws/src/r_description/meshes/my arm.stl',
-        'file:///home/someone/ws/src/r_description/meshes/my%20arm.stl',
+        '/mnt/someone/ws/src/r_description/meshes/my arm.stl',
+        'file:///mnt/someone/ws/src/r_description/meshes/my%20arm.stl',
         'file://$(find r_description)/meshes/my arm.stl',
         'package://r_description\\meshes\\my arm.stl',
         'C:\\Users\\someone\\r\\meshes\\my arm.stl',
