@@ -188,6 +188,32 @@ def _open_regular(path: Path | str) -> Iterator[tuple[BinaryIO, int]]:
         yield file, status.st_size
 
 
+#: beginning of a file that is enough to tell a placeholder [bytes]
+_HEAD_BYTES = 512
+
+
+def placeholder(path: Path | str) -> str:
+    """Return what a file is that only stands in another one's place, and the remedy; else empty.
+
+    Repositories that were cloned without Git LFS hold pointers, and failed downloads HTML pages.
+    """
+    try:
+        with _open_regular(path) as (file, _):
+            return placeholder_content(file.read(_HEAD_BYTES))
+    except OSError:  # whoever reads it names that
+        return ''
+
+
+def placeholder_content(data: bytes) -> str:
+    """Return what the content of a file is that only stands in another one's place; else empty."""
+    head = data[:_HEAD_BYTES].lstrip().lower()
+    if head.startswith(b'version https://git-lfs.github.com/'):
+        return "is a pointer of Git LFS, not the file: run 'git lfs pull' in its repository"
+    if head.startswith((b'<!doctype html', b'<html')):
+        return 'is an HTML page, not the file: its download failed; fetch the file itself'
+    return ''
+
+
 def read_text(path: Path | str, limit: str) -> str:
     """Return the text of a regular file, in UTF-8, or UTF-16 with its mark; see `read_bytes`.
 

@@ -20,6 +20,7 @@ from mtv_world_ros.core.bounded_input import (
     fill_template,
     LimitError,
     parse_json,
+    placeholder,
     read_bytes,
     read_json,
     read_text,
@@ -440,6 +441,8 @@ class LeRobotDataset:
                 f"'{entry.data_file}': an image of '{feature}' is '{path}', which is not there, "
                 f"neither in '{self.root}' nor beside the table"
             )
+        if problem := placeholder(found):
+            raise EpisodeError(f"image '{found}' {problem}")
         try:
             return read_bytes(found, 'image_bytes')
         except (OSError, ValueError) as error:
@@ -502,7 +505,8 @@ def _read_table(file: Path, **options: Any) -> Any:
         _check_table(parquet.read_metadata(file), file, options.get('columns'))
         return parquet.read_table(file, **options)
     except (OSError, pyarrow.ArrowException) as error:
-        raise EpisodeError(f"cannot read '{file}': {' '.join(str(error).split())}") from error
+        reason = placeholder(file) or ' '.join(str(error).split())
+        raise EpisodeError(f"cannot read '{file}': {reason}") from error
 
 
 def _check_table(metadata: Any, file: Path, columns: Sequence[str] | None) -> None:

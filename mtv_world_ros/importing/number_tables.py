@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.core.bounded_input import parse_json, read_text
+from mtv_world_ros.core.bounded_input import parse_json, placeholder, read_bytes, read_text
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest
 
@@ -46,8 +46,14 @@ class NumberTable:
         """Check that all cells of some columns are finite numbers.
 
         Raises:
-            EpisodeError: names the first cell that is none.
+            EpisodeError: names the first cell that is none, or a name that several columns have.
         """
+        for column in columns:
+            if self.names and self.names.count(self.names[column]) > 1:
+                raise EpisodeError(
+                    f"'{self.path}' has several columns '{self.names[column]}'; give each its own "
+                    'name'
+                )
         wrong = ~np.isfinite(self.values[:, list(columns)])
         if not wrong.any():
             return
@@ -71,10 +77,12 @@ def read_table(path: Path, features: Sequence[str]) -> NumberTable:
     Raises:
         EpisodeError: the file is missing, or no such table.
     """
+    if problem := placeholder(path):
+        raise EpisodeError(f"'{path}' {problem}")
     try:
-        text = read_text(path, 'json_bytes')
+        text, notes = _read_text(path)
         if path.suffix.lower() != '.json':
-            return _read_csv(text, path)
+            return _read_csv(text, path, notes)
         keys = parse_json(text, str(path))
         if not isinstance(keys, Mapping):
             raise TypeError(f'it holds a {type(keys).__name__}, must be keys with lists')
@@ -102,7 +110,22 @@ def _json_columns(keys: Mapping[str, Any], feature: str, path: Path) -> FloatArr
     return table
 
 
-def _read_csv(text: str, path: Path) -> NumberTable:
+def _read_text(path: Path) -> tuple[str, list[str]]:
+    """Return the text of a table, and how it was read where it is not UTF-8.
+
+    Raises:
+        OSError, ValueError: see `read_text`; a spreadsheet is no text.
+    """
+    try:
+        return read_text(path, 'json_bytes'), []
+    except UnicodeDecodeError:
+        data = read_bytes(path, 'json_bytes')
+        if b'\0' in data:
+            raise ValueError('it is no text; export the spreadsheet as CSV') from None
+        return data.decode('cp1252', errors='replace'), ['its text is in Windows-1252']
+
+
+def _read_csv(text: str, path: Path, notes: list[str]) -> NumberTable:
     lines = [line for line in text.splitlines() if line.strip(' \t,;|')]
     if lines and lines[0].lower().startswith('sep='):  # written by spreadsheet programs
         lines = lines[1:]
@@ -113,16 +136,14 @@ def _read_csv(text: str, path: Path) -> NumberTable:
     names, rows = [names[k] for k in used], [[row[k] for k in used] for row in rows]
     if len(rows) < 2:
         raise EpisodeError(f"'{path}' has {len(rows)} rows of numbers, must have two or more")
-    doubled = sorted({name for name in names if name and names.count(name) > 1})
-    if doubled:
-        raise EpisodeError(f"'{path}' has several columns '{doubled[0]}'; give each its own name")
     values, cells, has_commas = _numbers(rows)
-    odd = [f'columns are separated by {SEPARATORS[separator]}'] if separator != ',' else []
+    odd = [*notes]
+    odd += [f'columns are separated by {SEPARATORS[separator]}'] if separator != ',' else []
     odd += ['numbers have a decimal comma'] if has_commas else []
-    notes = (f"'{path.name}': {' and '.join(odd)}; it was read that way",) if odd else ()
+    said = (f"'{path.name}': {' and '.join(odd)}; it was read that way",) if odd else ()
     keys = dict(zip(names, values.T, strict=True))
     return NumberTable(
-        path=path, values=values, names=tuple(names), keys=keys, notes=notes, cells=cells
+        path=path, values=values, names=tuple(names), keys=keys, notes=said, cells=cells
     )
 
 

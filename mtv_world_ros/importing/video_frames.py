@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtv_world_ros.core.bounded_input import check_limit
+from mtv_world_ros.core.bounded_input import check_limit, placeholder
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.core.errors import EpisodeError
 
@@ -211,7 +211,8 @@ def open_video(path: Path) -> Iterator[VideoStream]:
         with av.open(str(path)) as container:
             yield VideoStream(container, path)
     except (av.FFmpegError, OSError, ValueError) as error:  # names in it may be no UTF-8
-        raise EpisodeError(f"video '{path}' cannot be read: {error}") from error
+        reason = placeholder(path) or f'cannot be read: {error}'
+        raise EpisodeError(f"video '{path}' {reason}") from error
 
 
 def _rgb(frame: av.VideoFrame) -> ByteArray:

@@ -14,7 +14,7 @@ from typing import Any
 from safetensors import safe_open, SafetensorError
 from torch import Tensor
 
-from mtv_world_ros.core.bounded_input import check_finite, read_json
+from mtv_world_ros.core.bounded_input import check_finite, placeholder, read_json
 from mtv_world_ros.core.errors import CheckpointError, ConfigError
 
 PICKLES = ('.bin', '.pt', '.pth', '.ckpt', '.pkl')
@@ -142,7 +142,8 @@ def _opened(file: Path) -> Iterator[Any]:
         with safe_open(file, framework='pt') as handle:
             yield handle
     except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"'{file}' cannot be loaded: {error}") from error
+        reason = placeholder(file) or f'cannot be loaded: {error}'
+        raise CheckpointError(f"'{file}' {reason}") from error
 
 
 def _stored(file: Path, part: Any, name: str) -> StoredTensor:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from mtv_world_ros.core.bounded_input import read_bytes
+from mtv_world_ros.core.bounded_input import placeholder_content, read_bytes
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import RobotError
 from mtv_world_ros.core.files import write_whole
@@ -73,15 +73,15 @@ def _named_mesh(name: str, urdf: Path) -> Path | None:
 def _mesh_by_end(name: str, urdf: Path) -> Path | None:
     """Return the mesh near the URDF whose path ends as the name does; the longest end counts.
 
-    A file name alone counts beside the URDF only.
+    A file name alone counts beside the URDF only, and not for a mesh of a package.
     """
-    _, separator, path = name.rpartition('://')
+    scheme, separator, path = name.rpartition('://')
     text = unquote(path) if separator else path
     parts = [part for part in text.replace('\\', '/').split('/') if part not in ('', '.')]
     if not parts or '..' in parts:
         return None
     folders = urdf.resolve().parents[:_NUM_FOLDERS]
-    for start in range(len(parts)):
+    for start in range(len(parts) - (scheme == 'package')):
         end = parts[start:]
         for folder in folders if len(end) > 1 else folders[:1]:
             if found := _whatever_case(folder, end):
@@ -171,8 +171,6 @@ def load_mesh(path: Path) -> Mesh:
 #: types of mesh files; Assimp knows forty more, whose readers nobody has looked at here
 MESH_SUFFIXES = ('.stl', '.dae', '.obj', '.ply')
 _SUFFIXES = ', '.join(MESH_SUFFIXES)
-#: beginning of a file that is enough to tell what it is [bytes]
-_HEAD_BYTES = 512
 
 
 def _not_a_mesh(path: Path) -> str:
@@ -186,13 +184,10 @@ def _not_a_mesh(path: Path) -> str:
         return f'cannot be read: {error.strerror or error}'
     except ValueError as error:
         return f'is too large: {error}'
-    head = content[:_HEAD_BYTES].lstrip().lower()
-    if not head:
+    if not content.strip():
         return 'is empty'
-    if head.startswith(b'version https://git-lfs.github.com/'):
-        return "is a pointer of Git LFS, not the mesh: run 'git lfs pull' in its repository"
-    if head.startswith((b'<!doctype html', b'<html')):
-        return 'is an HTML page, not a mesh: its download failed; fetch the file itself'
+    if problem := placeholder_content(content):
+        return problem
     return _unreadable_xml(content) if suffix == '.dae' else ''
 
 

@@ -195,6 +195,17 @@ def lamp(folder: Path, geometry: str):
     return robot, load_shape(robot)
 
 
+def test_links_whose_size_does_not_fit_the_arm_are_suspicious(episode, inspector):
+    doubt = "link 'left_link2' is 300 m large and the arm 0.7 m long"
+    shape = replace(inspector.shape, doubts=(doubt,))
+    found = Inspector(inspector.robot, shape, QUICK)._recording(
+        episode, JointTrack(episode.joint_states, inspector.robot)
+    )
+    assert [(f.verdict, f.text) for f in found.findings if 'link2' in f.text] == [
+        ('suspicious', doubt)
+    ]
+
+
 def test_boxes_and_meshes_are_drawn_where_a_pinhole_sees_them(tmp_path):
     write_cuboid(tmp_path / 'cuboid.stl', np.array([0.4, 0.2, 0.2]))
     # looks down from 1.1 m on the top face at 0.2 m: 180 px focal length, 0.9 m away

@@ -114,8 +114,8 @@ def test_a_unit_that_is_no_length_is_named(tmp_path, meter):
     ('content', 'said'),
     [
         (b'', 'is empty'),
-        (LFS, "is a pointer of Git LFS, not the mesh: run 'git lfs pull'"),
-        (HTML, 'is an HTML page, not a mesh'),
+        (LFS, "is a pointer of Git LFS, not the file: run 'git lfs pull'"),
+        (HTML, 'is an HTML page, not the file'),
         (b'404: Not Found', 'cannot be read: '),
     ],
     ids=['empty', 'git_lfs', 'html', 'text'],
@@ -230,6 +230,13 @@ def test_a_mesh_with_a_path_of_another_machine_is_found_by_its_end_and_named(tmp
     assert len(shape.replaced) == 1 and "my arm.stl' was taken" in shape.replaced[0]
     assert save_robot(made.file, tmp_path / 'copy').notes == shape.replaced
     assert shape.replaced[0] in load_parts(made).notes
+
+
+def test_a_file_name_alone_counts_beside_the_urdf_but_not_for_a_package(tmp_path):
+    (tmp_path / 'arm.stl').write_bytes(stl(SIZE))
+    assert load_shape(robot(tmp_path, upper=mesh('/elsewhere/arm.stl'))).replaced
+    shape = load_shape(robot(tmp_path, upper=mesh('package://elsewhere/arm.stl')))
+    assert not shape.is_known and not shape.replaced
 
 
 @pytest.mark.parametrize('name', ['/elsewhere/other.stl', '/elsewhere/arm.stl', '../../arm.stl'])

@@ -20,7 +20,7 @@ from mcap.records import Channel, Metadata, Schema
 import yaml
 import zstandard
 
-from mtv_world_ros.core.bounded_input import limits, parse_yaml, PREFIX, read_bytes
+from mtv_world_ros.core.bounded_input import limits, parse_yaml, placeholder, PREFIX, read_bytes
 from mtv_world_ros.core.errors import EpisodeError
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -103,6 +103,8 @@ class BagReader:
         self.truncated, self.metadata = '', {}
         for file in self._files:
             self._schemas, self._channels = {}, {}
+            if problem := placeholder(file):
+                raise EpisodeError(f"'{file}' {problem}")
             try:
                 with _decompressed(file) as plain:
                     read = self._sqlite if plain.suffix == '.db3' else self._mcap
