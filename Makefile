@@ -71,9 +71,10 @@ kills: $(STAMP)  ## kill nodes, recorder and player at random moments (an hour);
 soak: $(STAMP)  ## 10,000 rollouts with faults (an hour); memory, threads, latency under out/soak/
 	$(BIN)/python -m test.robustness.soak
 
-attacks: $(STAMP)  ## plans at 10 Hz, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, open ports, hostile peers and paths (three hours)
+attacks: $(STAMP)  ## plans at 10 Hz, clients in default settings, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, open ports, hostile peers and paths (three hours)
 	@mkdir -p out
 	$(BIN)/python -m test.robustness.rate
+	$(BIN)/python -m test.robustness.node_inputs
 	$(BIN)/python -m test.robustness.default_client
 	$(BIN)/python -m test.robustness.default_client --cameras 3 --transports UDPv4
 	$(BIN)/python -m test.robustness.cycles --bundled

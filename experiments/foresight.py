@@ -49,6 +49,8 @@ PLAN_S, LONG_S, SCENE_HZ = 3.2, 9.6, 10.0
 #: plans a second, and how long they are [s]
 LINES = ((0.25, PLAN_S), (1.0, PLAN_S), (5.0, PLAN_S), (1.0, LONG_S))
 PACES = ('realtime', 'burst')
+#: environment variables by which a process gets Fast DDS settings
+FAST_DDS_SETTINGS = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS')
 ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
 
 
@@ -259,6 +261,8 @@ def main() -> int:
         more=more,
     )
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    for name in FAST_DDS_SETTINGS:  # the client is an ordinary one
+        os.environ.pop(name, None)
     with page.old_checkout() if options.old else nullcontext() as old:
         rows = measure(options, old)
     header = ['version', 'pace', 'plans a second', 'of [s]', 'load', 'plans', 'ended',

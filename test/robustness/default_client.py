@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 import json
 import os
@@ -57,6 +57,7 @@ from mtv_world_ros.ros.messages.conversions import (  # noqa: E402
 from mtv_world_ros.ros.messages.image_messages import to_compressed, to_image  # noqa: E402
 from mtv_world_ros.ros.parameters import Settings  # noqa: E402
 from mtv_world_ros.ros.world_model.loading import load_named_pipeline  # noqa: E402
+from test.support.ros_domain import claim_domain  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 EPISODE = share_path('resource', 'demo_episode')
@@ -333,7 +334,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         {'cameras': show_cameras, 'viewer': view}[options.role](options)
         return 0
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
+    os.environ['ROS_DOMAIN_ID'] = str(claim_domain())
     environment = {**os.environ, 'PYTHONPATH': str(options.node), 'OMP_NUM_THREADS': '1'}
     if options.transports:
         os.environ['FASTDDS_BUILTIN_TRANSPORTS'] = options.transports
@@ -348,18 +349,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command += ['-p', value]
     with ExitStack() as stack, tempfile.TemporaryFile('w+') as log:
 
-        def start(command: list[str], environment: dict[str, str]) -> subprocess.Popen[Any]:
+        def start(
+            command: list[str], environment: Mapping[str, str], folder: Path
+        ) -> subprocess.Popen[Any]:
             process = subprocess.Popen(
-                command, env=environment, cwd=options.node, stdout=log, stderr=subprocess.STDOUT
+                command, env=environment, cwd=folder, stdout=log, stderr=subprocess.STDOUT
             )
             stack.callback(process.wait)
             stack.callback(process.terminate)
             return process
 
-        process = start(command, environment)
+        process = start(command, environment, options.node)
         roles = ['cameras'] * options.apart + ['viewer'] * (options.cameras > 2)
         for role in roles:
-            start([sys.executable, __file__, *words, '--role', role], dict(os.environ))
+            start(
+                [sys.executable, '-m', 'test.robustness.default_client', *words, '--role', role],
+                os.environ,
+                ROOT,
+            )
         try:
             found = play(options, process)
         finally:
