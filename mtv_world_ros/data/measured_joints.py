@@ -184,7 +184,8 @@ def find_unreachable(
         what = 'a second publisher that stands still'
     count = int((~kept).sum())
     handled = (
-        f'{count} of {len(times)} {items} are out of reach of the others and were left out'
+        f'{count} of {len(times)} {items} are out of reach of the others and were '
+        f'{"left out" if items == "messages" else "made of those around them"}'
         if count
         else f'all {items} are kept; cut the recording there where its images do not fit'
     )
@@ -293,12 +294,14 @@ def mend_rows(
     mended, notes = positions.copy(), []
     stamps = np.round((times - times[0]) * 1e9).astype(np.int64)
     mended[~np.isfinite(mended)] = np.nan
+    missing: dict[str, list[str]] = {}
     for joint in np.flatnonzero(np.isnan(mended).any(axis=0)):
         count, name = int(np.isnan(mended[:, joint]).sum()), robot.joint_names[joint]
-        text = f"'{what}': joint '{name}' is not finite in {count} of {len(times)} rows"
+        text = f'not finite in {count} of {len(times)} rows'
         if count == len(times):
-            raise EpisodeError(f'{text}, so that it has no position at all')
-        notes.append(f'{text}; the positions before and after stand in')
+            raise EpisodeError(f"'{what}': joint '{name}' is {text}: it has no position at all")
+        missing.setdefault(text, []).append(name)
+    notes += [_stands_in(what, joints, text) for text, joints in missing.items()]
     found = find_unreachable(what, stamps, mended, JointReach(robot), 'rows')
     notes += [found.text] if found.text else []
     mended[found.rows] = np.nan
@@ -406,14 +409,17 @@ def _table(
     table[~np.isfinite(table)] = np.nan
     unusable = num_given - np.isfinite(table).sum(axis=0)
     wanted = set(names if robot is None else robot.joint_names) - set(constants)
+    found: dict[str, list[str]] = {}
     for column in np.flatnonzero(unusable):
         if names[column] in wanted:
             why = 'named twice with different positions' if column in doubled else 'not finite'
-            share = f'{unusable[column]} of {num_given[column]}'
-            text = f"'{topic}': joint '{names[column]}' is {why} in {share} messages"
+            text = f'{why} in {unusable[column]} of {num_given[column]} messages'
+            found.setdefault(text, []).append(names[column])
             if unusable[column] == num_given[column]:
-                raise EpisodeError(_without_positions(text, names[column], column in doubled))
-            warnings.append(f'{text}; the positions before and after stand in')
+                joint = names[column]
+                begin = f"'{topic}': joint '{joint}' is {text}"
+                raise EpisodeError(_without_positions(begin, joint, column in doubled))
+    warnings += [_stands_in(topic, joints, text) for text, joints in found.items()]
     return names, table
 
 
@@ -432,6 +438,13 @@ def _own_columns(
     if robot is not None and set(robot.joint_names) <= set(names):
         used &= np.isin(names, robot.joint_names)
     return tuple(np.array(names, object)[used]), table[:, used]
+
+
+def _stands_in(what: str, joints: Sequence[str], text: str) -> str:
+    """What is done about positions that cannot be used, once for all joints."""
+    quoted = ', '.join(f"'{joint}'" for joint in joints)
+    named = f'joint {quoted} is' if len(joints) == 1 else f'joints {quoted} are'
+    return f"'{what}': {named} {text}; the positions before and after stand in"
 
 
 def _without_positions(text: str, joint: str, is_doubled: bool) -> str:

@@ -659,6 +659,11 @@ def check_row_times(times: FloatArray, what: str, rate_hz: float | None = None) 
 def _fall(times: FloatArray, row: int) -> str:
     """How and why times do not increase at a row."""
     size = float(times[row - 1] - times[row])
+    if not np.ptp(times) and times[0] > 2**24:
+        return (
+            f'is {times[0]:g} in all {len(times)} rows: seconds since 1970 do not fit a number of '
+            "32 bits; store them from the recording's start on"
+        )
     if not np.ptp(times):
         return f'is {times[0]:g} in all {len(times)} rows: the recorder set no times'
     if size == 0:

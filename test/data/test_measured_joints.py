@@ -250,7 +250,9 @@ def test_rows_of_a_table_without_a_number_are_between_their_neighbours(franka):
     mended, notes = mend_rows('observation.state', stamps * 1e-9, given, franka)
     np.testing.assert_allclose(mended, rows, atol=2e-4)
     assert mended[40, 3] == pytest.approx((rows[39, 3] + rows[41, 3]) / 2)
+    assert len(notes) == 2
     assert "joint 'panda_joint4' is not finite in 2 of 100 rows" in ' '.join(notes)
+    assert "joints 'panda_joint1', 'panda_joint2'" in ' '.join(notes)
 
 
 def test_a_spike_in_the_rows_of_a_table_is_left_out_and_named(franka):
@@ -259,6 +261,6 @@ def test_a_spike_in_the_rows_of_a_table_is_left_out_and_named(franka):
     given[50, 1] += 1.2
     mended, (note,) = mend_rows('observation.state', stamps * 1e-9, given, franka)
     np.testing.assert_allclose(mended, rows, atol=2e-4)
-    assert '1 of 100 rows are out of reach of the others and were left out' in note
-    with pytest.raises(EpisodeError, match='has no position at all'):
+    assert '1 of 100 rows are out of reach of the others and were made of those' in note
+    with pytest.raises(EpisodeError, match='it has no position at all'):
         mend_rows('observation.state', stamps * 1e-9, np.full_like(rows, math.nan), franka)

@@ -300,6 +300,7 @@ def test_files_that_are_not_in_the_order_of_time_are_left(recording):
     ('times', 'text'),
     [
         ([0.0] * 9, 'is 0 in all 9 rows: the recorder set no times'),
+        (np.float32(1.75e9 + np.arange(9) / 10), 'seconds since 1970 do not fit'),
         ([0.0, 0.1, 0.1, 0.2], 'is 0.1 s in rows 1 and 2: a row that was written twice'),
         ([5.0, 5.1, 5.2, 2.0, 2.1], 'goes back by 3.2 s at row 3, from 5.2 to 2 s'),
         (np.r_[4294967.2, 0.004, 0.104], 'a millisecond counter of 32 bits'),
