@@ -158,8 +158,7 @@ def test_a_bag_is_written_into_an_empty_folder_and_through_a_link(kind, tmp_path
     assert sorted(os.listdir(tmp_path)) == ['bag', 'disk']
 
 
-@pytest.mark.parametrize('words', ['faults grasp_height', 'robot yam_bimanual --picture ü.png'])
-def test_ascii_terminals_get_every_text(words, tmp_path):
+def test_ascii_terminals_get_every_text(tmp_path):
     environment = {**os.environ, 'LC_ALL': 'C', 'PYTHONUTF8': '0', 'PYTHONCOERCECLOCALE': '0'}
     code = (
         'import sys\n'
@@ -169,7 +168,7 @@ def test_ascii_terminals_get_every_text(words, tmp_path):
         'print("\\u2026 \\udcff")\n'
         'sys.exit(status)\n'
     )
-    command = [sys.executable, '-c', code, *words.split()]
+    command = [sys.executable, '-c', code, 'robot', 'yam_bimanual', '--picture', 'ü.png']
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, timeout=60)
     assert done.returncode == 0 and b'Traceback' not in done.stderr, done.stderr
     assert done.stdout.endswith(b'\\u2026 \\udcff\n')
