@@ -6,6 +6,9 @@
 # happens: both steps use the same anchor, so that the square comes back one pixel to the lower
 # right, 7 of 16 pixels outside of where it was. erode and dilate with anchors (0, 0) and (1, 1) give
 # the opening.
+#
+# Guards mtv_world_ros/vision/segmenters/examples.py, which opens masks by erode and dilate with
+# two anchors.
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT

@@ -7,6 +7,9 @@
 # nonLinearEffects - gravity, or that refusal. What happens: a matrix with another product, without
 # a word. Locking the joint that is mimicked (buildReducedModel), as a closed gripper is, ends in
 # "Should never happen".
+#
+# Guards mtv_world_ros/physics/mechanics.py, which couples mimic joints itself and asks for
+# nonLinearEffects.
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT

@@ -4,6 +4,8 @@
 # Joint positions are often a column of an (N, J) array. Expected of serialize_cdr: the values are
 # written, as those of any float64 array. What happens: ValueError about a last axis that must be
 # contiguous; a copy of the same values is written.
+#
+# Guards mtv_world_ros/data/bag/messages.py, which copies arrays before they are serialised.
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT

@@ -6,6 +6,8 @@
 # prompt encoder's class, without a word; the model that is built from it then lacks a number of
 # masks. The image model's configuration (Sam2Config) comes back whole in all of them, and the
 # video one from 5.20.0 on.
+#
+# Guards the bound transformers>=5.23 of the extra `vision` in setup.py.
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT

@@ -6,6 +6,8 @@
 # from all. What happens: urchin 0.0.30 leaves j3 at 0 without a word, not even its offset is
 # there; yourdfpy 0.0.60 takes j2 for 0, so that j3 = 0.1, and logs a warning; Pinocchio 4.1.0
 # refuses the robot (mimic=True); only MuJoCo 4.0.0 keeps both equations.
+#
+# Guards mtv_world_ros/robot/file.py, which resolves chains of mimic joints itself.
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT

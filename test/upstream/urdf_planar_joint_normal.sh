@@ -6,6 +6,8 @@
 # turns about x, as said; Pinocchio 4.1.0 and urchin 0.0.30 take no notice of the axis and slide
 # along x and y, out of the plane, without a word; yourdfpy 0.0.60 says that the robot has two
 # degrees of freedom and then refuses two numbers, as it counts joints.
+#
+# Guards mtv_world_ros/robot/file.py, in which planar joints rest.
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT

@@ -4,6 +4,8 @@
 # A revolute joint whose <limit> has effort and velocity only (lower and upper are optional and
 # mean 0). Expected: the same joint from both. What happens: Pinocchio holds it at 0 .. 0, so that
 # a check of limits refuses every motion; MuJoCo makes it turn without end.
+#
+# Guards mtv_world_ros/robot/file.py, which reads joints without stops itself.
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT
