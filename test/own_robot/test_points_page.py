@@ -70,6 +70,7 @@ def test_what_it_saves_is_where_the_clicks_were(page, tmp_path):
         )  # whole pixels of the screen
 
 
+@pytest.mark.slow
 def test_a_click_is_corrected_and_a_frame_that_lacks_a_finger_tip_is_not_saved(page, tmp_path):
     browser = Browser(tmp_path / 'profile')
     try:

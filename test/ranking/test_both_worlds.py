@@ -103,6 +103,7 @@ def test_worlds_that_are_alike_do_not_part(ranked):
         assert when_they_part(course) == []
 
 
+@pytest.mark.slow
 def test_a_rollout_s_video_sheet_and_frames_lie_beside_its_result(ranked):
     out, results = ranked
     for result in results.values():
@@ -116,6 +117,7 @@ def test_a_rollout_s_video_sheet_and_frames_lie_beside_its_result(ranked):
         assert (out / 'rollouts' / f'{stem}.webp').stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_objects_that_are_imagined_elsewhere_part_and_the_page_says_when(
     runner, expert, ranked, tmp_path
 ):
@@ -129,6 +131,7 @@ def test_objects_that_are_imagined_elsewhere_part_and_the_page_says_when(
     assert (moved.course.objects_part_s, what) in when_they_part(moved.course)
 
 
+@pytest.mark.slow
 def test_every_rollout_can_be_played_from_the_page_the_worst_first(ranked):
     out, results = ranked
     wrong = replace(
@@ -169,6 +172,7 @@ def test_an_open_verdict_is_none_though_the_estimate_says_something(make_result)
     assert verdict(make_result('a', 0, False, 0.8)) == 'false success'
 
 
+@pytest.mark.slow
 def test_the_page_plays_and_filters_rollouts_in_a_browser(ranked, tmp_path):
     out, results = ranked
     wrong = replace(results['expert'], final=False)

@@ -17,6 +17,7 @@ def chunks_of(file):
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout
 
 
+@pytest.mark.slow
 def test_topics_are_shown_as_they_appear(ros, tmp_path):
     file = tmp_path / 'live.rrd'
     command = [sys.executable, '-m', 'mtv_world_ros.cli', 'view', '--live', '--save', str(file)]

@@ -19,7 +19,6 @@ def observing_policy(tmp_path, ros):
     assert [process.stop() for process in (policy, world)] == [0, 0]
 
 
-@pytest.mark.slow
 def test_in_observe_mode_a_camera_that_stops_ends_the_episode_and_says_so(observing_policy, ros):
     client = ros.Client()
     try:
@@ -54,7 +53,6 @@ def test_in_observe_mode_a_camera_that_stops_ends_the_episode_and_says_so(observ
         client.close()
 
 
-@pytest.mark.slow
 def test_an_imagined_episode_starts_from_what_the_cameras_show(tmp_path, ros):
     """The cameras go on; the episode does not look at them again."""
     ros.make_checkpoint(tmp_path / 'checkpoint')

@@ -16,6 +16,8 @@ from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.ros.messages.conversions import NANO, values_of
 
+pytestmark = pytest.mark.slow
+
 FRAME_NS, NUM_FRAMES = 200_000_000, 4
 START_NS = 1_700_000_000 * NANO
 #: of the runner: episode k has seed 200 + 1000 k, and the fake model blocks at 1200 to 1299
@@ -244,7 +246,6 @@ def test_a_dead_policy_ends_the_run_with_its_record_closed(stack, results):
     assert results[-1]['how'] == 'policy_died'
 
 
-@pytest.mark.slow
 def test_a_dead_recorder_ends_the_run_at_once_and_says_so(stack, ros):
     stack.start('again', ros, stack.episodes[:1], BLOCKED_SEED)
     stack.wait(lambda: stack.state('world_model').get('busy') == 'true', 'the blocked rollout')
@@ -256,7 +257,6 @@ def test_a_dead_recorder_ends_the_run_at_once_and_says_so(stack, ros):
     assert last.startswith('EpisodeError: the recorder ended with status -9: ')
 
 
-@pytest.mark.slow
 def test_an_interrupted_run_lists_the_bag_that_it_closes(stack, ros):
     out = stack.folder / 'stopped'
     stack.start(out.name, ros, stack.episodes[:1], BLOCKED_SEED)
