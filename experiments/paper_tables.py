@@ -59,8 +59,6 @@ ZERO_SHOT_EPISODES = 395
 ZERO_SHOT_KINDS = 'view,task,object'
 #: of four real episodes three train and one tests
 REAL_TEST_SHARE = 4
-#: what the paper's trajectory video has not: lines along the arm's links
-PAPER_RENDERING = ('rendering.link_width_m=null',)
 #: small models of real recordings: frames of 16:9, chunks of 1.6 s, colours as they are
 REAL_SETTINGS = (
     'video.num_frames=8', 'video.width=160', 'video.height=96', 'augment.colour_permutation=0',
@@ -279,7 +277,7 @@ class PaperTables:
     def _overrides(self, row: Row) -> list[str]:
         """Settings of the preset that a row changes, the user's last."""
         options = self.options
-        found: list[str] = [*PAPER_RENDERING]
+        found: list[str] = []
         if row.is_real:
             robot = options.real_robot or options.real / 'robot' / 'robot.yaml'
             found += [*REAL_SETTINGS, f'video.robot={robot}', f'video.views=[{options.real_view}]']
@@ -714,7 +712,7 @@ def parser() -> argparse.ArgumentParser:
     add('--real-view', help='the view of Table 2')
     add('--real-robot', type=Path, help='default: robot/robot.yaml in REAL')
     add('--real-segmenter', type=Path, help='objects.safetensors of the import')
-    add('--preset', default='small', help='name or YAML file')
+    add('--preset', default='paper', help='name or YAML file')
     add('--set', action='append', default=[], metavar='SECTION.KEY=VALUE', help='of all rows')
     add('--threads', type=int, default=1, help='CPU threads')
     add('--workers', type=int, default=1, help='processes that make and score episodes')
