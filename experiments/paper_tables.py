@@ -34,7 +34,7 @@ import numpy as np
 from mtv_world_ros.cli import main as mtv_world
 from mtv_world_ros.cli.shared_options import machine
 from mtv_world_ros.cli.train import set_overrides
-from mtv_world_ros.control.registry import TRAJECTORY_VIDEO
+from mtv_world_ros.control.registry import control_class, TRAJECTORY_VIDEO
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.documents import DASH, Table
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
@@ -180,6 +180,8 @@ class PaperTables:
     def _check_before(self) -> None:
         """Refuse what would fail after hours: weights of another network, missing packages."""
         options = self.options
+        for row in self.rows:
+            control_class(row.control)
         if options.fid_weights is not None:
             frame_features(options.fid_weights)
         if options.fvd_weights is not None:

@@ -7,6 +7,7 @@ import errno
 import json
 from pathlib import Path
 import shutil
+import sys
 from types import ModuleType
 
 import pytest
@@ -227,6 +228,21 @@ def test_weights_of_another_network_are_refused_before_anything_is_trained(
         words = words_of(tmp_path / 'out', data, ROWS, option, str(weights))
         assert tables.main(words, nothing) == 1
         assert str(weights) in capsys.readouterr().err
+    assert nothing.commands == []
+
+
+def test_a_control_whose_package_is_missing_is_named_before_anything_is_trained(
+    tables: ModuleType,
+    data: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setitem(sys.modules, 'tokenizers', None)
+    monkeypatch.delitem(sys.modules, 'mtv_world_ros.control.fast_tokens', raising=False)
+    nothing = Recorder(lambda words: 1)
+    assert tables.main(words_of(tmp_path / 'out', data, 'ee_mlp,fast_tokens'), nothing) == 1
+    assert "control 'fast_tokens' cannot be imported" in capsys.readouterr().err
     assert nothing.commands == []
 
 
