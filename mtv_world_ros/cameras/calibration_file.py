@@ -67,7 +67,7 @@ _Pixels = Annotated[
 
 
 class _View(Schema):
-    """What a file says of a camera; see `load_calibration`."""
+    """Camera of a calibration file; see `load_calibration`."""
 
     section = ''
 

@@ -26,7 +26,7 @@ _MOST_PIXELS = 20_000
 #: cameras are nearer to what carries them [m]
 _FARTHEST_M = 100.0
 _LARGEST_COEFFICIENT = 1e4
-#: condition number from which on rays count as parallel
+#: condition number above which rays count as parallel
 _PARALLEL = 1e9
 
 
@@ -103,7 +103,7 @@ def unproject(camera: CameraModel, pixels: FloatArray) -> FloatArray:
 
 
 def unknown_camera(view: str, width: int, height: int, mount_link: str) -> CameraModel:
-    """Returns a placeholder for a camera of which nothing is known: one of 80 degrees."""
+    """Return a placeholder for an uncalibrated camera: a field of view of 80 degrees."""
     focal = 0.6 * width
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
     return CameraModel(

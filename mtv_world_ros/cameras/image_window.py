@@ -12,13 +12,15 @@ from mtv_world_ros.core.errors import CalibrationError
 
 #: sizes that were rounded differ from exact ones by less [px]
 _ROUNDING_PX = 1.0
-#: a principal point is this near to the middle of its image, in shares of the image's size
-_NEAR_MIDDLE, _OFF_MIDDLE = 0.12, 0.2
+#: largest offset of a principal point from the middle of its own image [fraction of its size]
+MAX_CENTRE_OFFSET = 0.12
+#: offset from the middle beyond which a principal point is of another image [fraction of its size]
+MIN_FOREIGN_OFFSET = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageWindow:
-    """Which pixels of the calibrated image are sent: CameraInfo's `roi` and `binning`.
+    """Region of interest and binning of a CameraInfo.
 
     Attributes:
         x, y: left and top of the region of interest, in full resolution [px].
@@ -141,7 +143,7 @@ def _shift(window: ImageWindow) -> FloatArray:
 
 
 def _has_aspect(size: tuple[int, int], sent: tuple[int, int]) -> bool:
-    """Whether one factor, and rounding, makes one size of the other."""
+    """Return whether two sizes differ by one factor and rounding."""
     error = abs(size[0] * sent[1] - size[1] * sent[0])
     return error <= _ROUNDING_PX * max(*sent, *size)
 
@@ -164,8 +166,8 @@ def _check_K(camera: CameraModel, window: ImageWindow, size: tuple[int, int]) ->
     """Refuses a K that is of the window already, by where its principal point is."""
     centre = camera.K[:2, 2]
     sent, full = np.array(size), np.array([camera.width, camera.height])
-    near = np.abs(centre - (sent - 1) / 2) <= _NEAR_MIDDLE * sent
-    off = np.abs(centre - (full - 1) / 2) > _OFF_MIDDLE * full
+    near = np.abs(centre - (sent - 1) / 2) <= MAX_CENTRE_OFFSET * sent
+    off = np.abs(centre - (full - 1) / 2) > MIN_FOREIGN_OFFSET * full
     if window != WHOLE and tuple(sent) != tuple(full) and near.all() and off.all():
         raise CalibrationError(
             f"camera_info of view '{camera.view}' contradicts itself: cx, cy = "

@@ -102,7 +102,7 @@ def _view_live(arguments: argparse.Namespace) -> int:
 
 
 def _shown(arguments: argparse.Namespace) -> dict[str, Streams | ScoredRollout]:
-    """What the paths hold, by path of its entities."""
+    """Return the content of the paths, by path of its entities."""
     from mtv_world_ros.data.episode_reader import list_episodes
     from mtv_world_ros.viewing.scored_rollout import is_scored, scored_rollouts
     from mtv_world_ros.viewing.streams import read_streams

@@ -170,7 +170,7 @@ VIDEO_ONLY = InputLayout(video=True)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlOptions:
-    """What a control is created for.
+    """Source of a control: robot, views and size that it is created for.
 
     Attributes:
         robot: the robot that the model is trained on.
@@ -186,7 +186,7 @@ class ControlOptions:
 
 
 class Control(Protocol):
-    """A method by which a plan enters the world model.
+    """Method that turns a plan into inputs of the world model.
 
     Subclass it, or write a class of the same shape. Instances are immutable and picklable:
     training prepares clips in other processes. `mtv-world train --set video.control=NAME` selects

@@ -66,7 +66,7 @@ _Length = Annotated[float, Field(gt=0, le=1000), expected('positive and at most 
 
 
 class TrajectoryVideoConfig(Schema):
-    """How trajectory videos look; a model is served with what it was trained with."""
+    """Appearance of trajectory videos; a model is served as it was trained."""
 
     section: ClassVar = 'rendering'
 
@@ -126,7 +126,7 @@ class TrajectoryVideoConfig(Schema):
 
     @property
     def draws_masks(self) -> bool:
-        """Whether a model of this rendering was trained with the masks of the first frame."""
+        """True if a model of this rendering was trained with the masks of the first frame."""
         return not self.object_motion or self.foreseen_ratio < 1
 
 
@@ -312,7 +312,7 @@ def _trail_frames(
     arm: int,
     config: TrajectoryVideoConfig,
 ) -> Iterator[tuple[Box, GlowArray]]:
-    """Yields the box outside of which the arm's trail is dark, and the trail in it, by frame.
+    """Yield, by frame, the bounding box of the arm's trail and the trail in it.
 
     A camera that stands still keeps what is drawn and lets it fade; for one that moves, all
     points that are not too old are projected anew.
@@ -536,12 +536,12 @@ class TrajectoryVideo(Control):
 
     @property
     def uses_masks(self) -> bool:  # type: ignore[override]
-        """Whether masks of the start frame are drawn."""
+        """True if masks of the start frame are drawn."""
         return self.object_mask
 
     @property
     def shows_objects(self) -> bool:  # type: ignore[override]
-        """Whether the model is trained to see objects where they are expected to be."""
+        """True if the model is trained with objects drawn at their expected places."""
         return self.object_mask and self.config.object_motion
 
     @property

@@ -315,7 +315,7 @@ class ObjectMasks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SuccessEstimate:
-    """How likely the task succeeds, given the world model.
+    """Probability that the task succeeds, given the world model.
 
     Attributes:
         probability: in [0, 1]; NaN = abstains.
@@ -345,7 +345,7 @@ class SuccessEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldModelSpec:
-    """What a world model expects and gives.
+    """Input and output of a world model: views, size, frame rate, length of a chunk.
 
     Attributes:
         views: names of the V views, in order.

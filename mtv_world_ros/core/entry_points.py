@@ -8,7 +8,9 @@ from typing import Any
 from mtv_world_ros.core.errors import ConfigError
 
 #: groups of entry points; each names a module, see docs/architecture.md
-COMMANDS, POLICIES, ROLLOUTS = 'mtv_world.commands', 'mtv_world.policies', 'mtv_world.rollouts'
+COMMANDS = 'mtv_world.commands'
+POLICIES = 'mtv_world.policies'
+ROLLOUTS = 'mtv_world.rollouts'
 #: group of controls: each entry point names a class, see `control/control.py`
 CONTROLS = 'mtv_world.controls'
 

@@ -84,7 +84,7 @@ def inverse(T: FloatArray) -> FloatArray:
 
 
 def is_rigid(T: FloatArray) -> bool:
-    """Whether a (4, 4) matrix is a right-handed rotation (to 1e-4) and a translation."""
+    """Return whether a (4, 4) matrix is a right-handed rotation (to 1e-4) and a translation."""
     turn = T[:3, :3]
     return bool(
         np.isfinite(T).all()

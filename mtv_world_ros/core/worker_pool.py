@@ -45,7 +45,7 @@ _run: Run | None = None
 
 
 class Scores(Protocol):
-    """What a job gives."""
+    """Result of a job, or the reason why it failed."""
 
     def as_json(self) -> dict[str, Any]:
         """Returns plain values."""

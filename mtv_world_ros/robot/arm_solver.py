@@ -11,8 +11,10 @@ from mtv_world_ros.robot.model import RobotModel, Tool
 
 #: of damped least squares: added to the diagonal of J^T J
 _DAMPING = 1e-5
-#: accepted errors of position [m] and orientation [rad]
-_TOLERANCE_M, _TOLERANCE_RAD = 3e-4, 2e-3
+#: accepted position error of inverse kinematics [m]
+POSITION_TOLERANCE_M = 3e-4
+#: accepted orientation error of inverse kinematics [rad]
+ROTATION_TOLERANCE_RAD = 2e-3
 #: steps before a pose counts as out of reach
 _NUM_ITERATIONS = 60
 #: distance kept from the joint limits [rad]
@@ -72,8 +74,8 @@ class ArmSolver:
             placement = self._data.oMf[self._frame] * self._tool
             error = pin.log6(placement.actInv(goal)).vector
             there = (
-                np.linalg.norm(error[:3]) < _TOLERANCE_M
-                and np.linalg.norm(error[3:]) < _TOLERANCE_RAD
+                np.linalg.norm(error[:3]) < POSITION_TOLERANCE_M
+                and np.linalg.norm(error[3:]) < ROTATION_TOLERANCE_RAD
             )
             if there and len(joints) <= 6:
                 return joints
@@ -85,7 +87,7 @@ class ArmSolver:
             )
             if len(joints) > 6:
                 slack = _slack(jacobian, rest - joints)
-                if there and np.abs(slack).max() < _TOLERANCE_RAD:
+                if there and np.abs(slack).max() < ROTATION_TOLERANCE_RAD:
                     return joints
             normal = jacobian.T @ jacobian + _DAMPING * np.eye(len(joints))
             step = np.linalg.solve(normal, jacobian.T @ error) + slack

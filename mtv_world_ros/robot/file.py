@@ -140,7 +140,7 @@ def parser_errors() -> Iterator[list[str]]:
 
 
 def _without_errors(text: bytes) -> bytes:
-    """What is left without errors and the places in urdfdom's source that follow them."""
+    """Return the parser's messages without error marks and places in urdfdom's source."""
     return re.sub(rb'^Error: .+\n(?: +at line \d+ in .+\n)?', b'', text, flags=re.MULTILINE)
 
 
@@ -297,7 +297,9 @@ def _movable(model: pin.Model, followers: set[str]) -> list[str]:
 
 
 #: names in a folder that holds a copy of a robot
-_URDF, _MESHES, _PIECES = 'robot.urdf', 'meshes', 'pieces'
+_URDF = 'robot.urdf'
+_MESHES = 'meshes'
+_PIECES = 'pieces'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -572,7 +574,7 @@ def _add_dh_arm(model: pin.Model, arm: DhArmEntry) -> None:
 
 
 def _around_joint(row: DhEntry, modified: bool) -> tuple[pin.SE3, pin.SE3]:
-    """What stands before and after the joint's own motion along or about its z.
+    """Return the transforms before and after the joint's motion along or about its z.
 
     The standard row is Rz(theta) Tz(d) Tx(a) Rx(alpha), the modified one (J. Craig, Introduction
     to Robotics, 3.4) Rx(alpha) Tx(a) Rz(theta) Tz(d); motions along and about one axis commute.

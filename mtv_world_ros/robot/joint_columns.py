@@ -38,7 +38,7 @@ class JointColumn:
 
 
 class ColumnEntry(Schema):
-    """What a joint's values are made of: a column with unit, sign and offset, or with a range."""
+    """Source of a joint's values: a column with unit, sign and offset, or with a range."""
 
     column: Annotated[int | str | None, expected('a name or a number')] = None
     unit: Unit | None = Field(default=None, description="null = that of the joints' table")
@@ -97,7 +97,7 @@ JointEntries = dict[str, Annotated[ColumnEntry, BeforeValidator(_entry)]]
 
 
 class JointTable(Schema):
-    """Which column each joint of the robot is; validated with `robot` in the context.
+    """Column of each joint of the robot; validated with `robot` in the context.
 
     An entry is a column (name or number) or a `ColumnEntry`. Without `joints` the columns have
     the joints' names.

@@ -21,17 +21,28 @@ from mtv_world_ros.core.errors import RobotError
 from mtv_world_ros.core.files import write_whole
 from mtv_world_ros.robot.xml_file import check_xml, NO_XML
 
-#: directions in which a mesh's outermost points are kept
-_DIRECTIONS = 256
-#: a mesh is cut into slices where they hold less than this share of its hull's volume
-_HOLLOW, _SLICE_DIRECTIONS = 0.8, 96
-#: for silhouettes: so many slices of meshes that are not shorter than this [m]
-_SLICES, _LEAST_SLICED = 5, 0.12
-#: pieces of less than this share of the mesh's hull are left out
-_THINNEST = 1e-4
-#: for contact: most pieces of a mesh, what another one must gain as a share of its hull, and how
-#: many cuts are tried along an axis, by how many edges and directions of hulls
-_MOST_PIECES, _LEAST_GAIN, _CUTS, _SEGMENTS, _CUT_DIRECTIONS = 10, 0.03, 7, 1000, 32
+#: number of directions in which a mesh's outermost points are kept
+NUM_HULL_DIRECTIONS = 256
+#: fraction of its hull's volume below which a mesh is cut into slices for silhouettes
+HOLLOW_FRACTION = 0.8
+#: number of directions in which a slice's outermost points are kept
+NUM_SLICE_DIRECTIONS = 96
+#: number of slices of a mesh for silhouettes
+NUM_SLICES = 5
+#: shortest mesh that is cut into slices [m]
+MIN_SLICED_LENGTH_M = 0.12
+#: smallest piece, as a fraction of the volume of the mesh's hull
+MIN_PIECE_FRACTION = 1e-4
+#: largest number of convex pieces of a mesh for contact
+MAX_PIECES = 10
+#: smallest gain of another piece, as a fraction of the volume of the mesh's hull
+MIN_CUT_GAIN = 0.03
+#: number of cuts that are tried along an axis
+NUM_CUTS = 7
+#: number of edges that approximate a mesh while cuts are tried
+NUM_CUT_EDGES = 1000
+#: number of directions of the hulls while cuts are tried
+NUM_CUT_DIRECTIONS = 32
 
 
 #: folders above a URDF in which a mesh is looked for by the end of its path
@@ -233,7 +244,7 @@ def _collada_unit_m(path: Path) -> float:
     return unit
 
 
-def outermost(points: FloatArray, directions: int = _DIRECTIONS) -> FloatArray:
+def outermost(points: FloatArray, directions: int = NUM_HULL_DIRECTIONS) -> FloatArray:
     """Returns the points (M, 3) of (N, 3) that are outermost in one of some directions."""
     return points[np.unique((points @ even_directions(directions).T).argmax(axis=0))]
 
@@ -244,14 +255,14 @@ def slices(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
     middle = vertices - vertices.mean(axis=0)
     axis = np.linalg.svd(middle[:: max(1, len(middle) // 2000)], full_matrices=False)[2][0]
     along = vertices @ axis
-    cuts = np.linspace(along.min(), along.max(), _SLICES + 1)
+    cuts = np.linspace(along.min(), along.max(), NUM_SLICES + 1)
     slices = [_slice(vertices, edges, along, *ends) for ends in zip(cuts, cuts[1:], strict=False)]
     try:
         volumes = [float(ConvexHull(points).volume) for points in (whole, *slices)]
     except (QhullError, ValueError):  # flat
         return [whole]
-    hollow = sum(volumes[1:]) < _HOLLOW * volumes[0]
-    return slices if hollow and np.ptp(along) > _LEAST_SLICED else [whole]
+    hollow = sum(volumes[1:]) < HOLLOW_FRACTION * volumes[0]
+    return slices if hollow and np.ptp(along) > MIN_SLICED_LENGTH_M else [whole]
 
 
 def convex_pieces(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
@@ -268,14 +279,14 @@ def convex_pieces(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatA
         return [outermost(vertices)]
     whole = vertices[edges]
     pieces = [(whole, *_best_cut(whole))]
-    least = _LEAST_GAIN * _hull_volume(whole)
-    while len(pieces) < _MOST_PIECES:
+    least = MIN_CUT_GAIN * _hull_volume(whole)
+    while len(pieces) < MAX_PIECES:
         number = int(np.argmax([gain for _, gain, _ in pieces]))
         _, gain, halves = pieces[number]
         if gain <= least:
             break
         pieces[number : number + 1] = [(half, *_best_cut(half)) for half in halves]
-    flat = _THINNEST * _hull_volume(whole)
+    flat = MIN_PIECE_FRACTION * _hull_volume(whole)
     bodies = [piece for piece, _, _ in pieces if _hull_volume(piece) > flat]
     return [outermost(points.reshape(-1, 3)) for points in bodies or [whole]]
 
@@ -306,10 +317,10 @@ def write_convex_hull(points: FloatArray, out: Path) -> None:
 
 
 def _is_convex(vertices: FloatArray) -> bool:
-    """Whether all of the vertices are corners of their hull, as those of pieces made before."""
+    """Return whether all vertices are corners of their convex hull."""
     points = np.unique(vertices, axis=0)
     try:
-        return len(points) < _SEGMENTS and len(ConvexHull(points).vertices) == len(points)
+        return len(points) < NUM_CUT_EDGES and len(ConvexHull(points).vertices) == len(points)
     except (QhullError, ValueError):
         return True
 
@@ -317,7 +328,7 @@ def _is_convex(vertices: FloatArray) -> bool:
 def _best_cut(segments: FloatArray) -> tuple[float, list[FloatArray]]:
     """By how much a cut makes hulls smaller [m^3], and the two parts (E, 2, 3)."""
     whole = segments
-    segments = segments[:: max(1, len(segments) // _SEGMENTS)]  # enough to choose a cut by
+    segments = segments[:: max(1, len(segments) // NUM_CUT_EDGES)]  # enough to choose a cut by
     points = segments.reshape(-1, 3)
     volume, best = _hull_volume(segments), (0.0, np.zeros(3), 0.0)
     if not volume:
@@ -325,7 +336,7 @@ def _best_cut(segments: FloatArray) -> tuple[float, list[FloatArray]]:
     middle = points - points.mean(axis=0)
     for axis in np.linalg.svd(middle, full_matrices=False)[2]:
         along = points @ axis
-        for at in np.linspace(along.min(), along.max(), _CUTS + 2)[1:-1]:
+        for at in np.linspace(along.min(), along.max(), NUM_CUTS + 2)[1:-1]:
             halves = [_half(segments, axis, at), _half(segments, -axis, -at)]
             gain = volume - sum(map(_hull_volume, halves))
             if gain > best[0]:
@@ -335,7 +346,7 @@ def _best_cut(segments: FloatArray) -> tuple[float, list[FloatArray]]:
 
 
 def _half(segments: FloatArray, axis: FloatArray, at: float) -> FloatArray:
-    """What of segments (E, 2, 3) lies below a plane."""
+    """Return the parts of segments (E, 2, 3) below a plane."""
     along = segments @ axis
     order = np.argsort(along, axis=1)
     segments = np.take_along_axis(segments, order[..., None], axis=1)[along.min(axis=1) < at]
@@ -346,12 +357,14 @@ def _half(segments: FloatArray, axis: FloatArray, at: float) -> FloatArray:
 
 
 def _hull_volume(segments: FloatArray) -> float:
-    """Of the convex hull [m^3]; 0 = it is flat."""
+    """Return the volume of the convex hull [m^3]; 0 if it is flat."""
     points = segments.reshape(-1, 3)
     if len(points) < 4:
         return 0.0
     try:
-        return float(ConvexHull(outermost(points, _CUT_DIRECTIONS), qhull_options='Qt Pp').volume)
+        return float(
+            ConvexHull(outermost(points, NUM_CUT_DIRECTIONS), qhull_options='Qt Pp').volume
+        )
     except (QhullError, ValueError):
         return 0.0
 
@@ -369,7 +382,7 @@ def _slice(
         a, b = vertices[edges[crossed, 0]], vertices[edges[crossed, 1]]
         found.append(a + share * (b - a))
     points = np.concatenate(found)
-    return outermost(points, _SLICE_DIRECTIONS)
+    return outermost(points, NUM_SLICE_DIRECTIONS)
 
 
 def even_directions(count: int) -> FloatArray:

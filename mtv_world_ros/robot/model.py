@@ -366,7 +366,7 @@ class RobotModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Setter:
-    """Where Pinocchio keeps a joint, and which of the robot's it follows.
+    """Place of a joint in Pinocchio's configuration, and the robot's joint it follows.
 
     Attributes:
         joint: number of the joint in Pinocchio's model.

@@ -11,8 +11,10 @@ from mtv_world_ros.robot.resample import resample
 
 #: commands may run ahead of a joint that lags: they are refused from this many times its speed on
 SPEED_RATIO = 2.0
-#: speed limits of joints whose description gives none [rad/s, m/s]
-DEFAULT_TURN, DEFAULT_SLIDE = 10.0, 2.0
+#: speed limit of a revolute joint whose description gives none [rad/s]
+DEFAULT_TURN = 10.0
+#: speed limit of a prismatic joint whose description gives none [m/s]
+DEFAULT_SLIDE = 2.0
 #: an arm that lags is not where a plan begins: it has at least this long to get there [s]
 CATCH_UP_S = 0.2
 #: a curve between two points may swing out of the limits by this share of their range

@@ -1,4 +1,4 @@
-"""What a robot's links look like: convex parts by its URDF, or rods; parts filled in a view."""
+"""Shapes of a robot's links: convex parts of its URDF, or rods; parts filled in a view."""
 
 from __future__ import annotations
 
@@ -31,12 +31,14 @@ from mtv_world_ros.robot.xml_file import parse_xml
 
 #: corners of a round shape's rims
 _CORNERS = 16
-#: radius of the rods that stand for links of which nothing is known [m]
+#: radius of the rods that stand for links without a shape [m]
 ROD_RADIUS_M = 0.03
 #: no vertex of a robot's mesh is further from its link than this [m]
 _MOST_M = 1e4
-#: size above which a link that moves, and one that rests, does not fit the arm [arm lengths]
-_LARGE_MOVING, _LARGE_RESTING = 3.0, 15.0
+#: size above which a moving link does not fit the arm [arm lengths]
+MAX_MOVING_LINK_SIZE = 3.0
+#: size above which a resting link does not fit the arm [arm lengths]
+MAX_RESTING_LINK_SIZE = 15.0
 #: size below which a link does not fit the arm [arm lengths]
 _SMALL = 1e-3
 _TOO_LARGE = (
@@ -70,7 +72,7 @@ class LinkShape:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotShape:
-    """What a robot looks like.
+    """Shapes of a robot's links.
 
     Attributes:
         parts: of its links.
@@ -166,7 +168,7 @@ def size_doubts(robot: RobotModel, parts: Sequence[LinkShape]) -> tuple[str, ...
     reach = _arm_length(robot)
     doubts = []
     for link, size in sizes.items():
-        large = (_LARGE_MOVING if link in moving else _LARGE_RESTING) * reach
+        large = (MAX_MOVING_LINK_SIZE if link in moving else MAX_RESTING_LINK_SIZE) * reach
         if size > large or size < _SMALL * reach:
             advice = _TOO_LARGE if size > large else _TOO_SMALL
             text = f"link '{link}' is {size:.3g} m large and the arm {reach:.3g} m long"

@@ -37,14 +37,14 @@ class ObservedEpisode:
         self._waiting: list[Observation] = []
 
     def is_due(self, stamp_ns: int) -> bool:
-        """Tells whether an observation at this time would be kept: one a frame of the model."""
+        """Return whether an observation at this time is kept: one per frame of the model."""
         with self._lock:
             last_ns = self._waiting[-1].stamp_ns if self._waiting else self._seen_ns
             return self._seen is not None and stamp_ns - last_ns >= self._period_ns
 
     @property
     def is_behind(self) -> bool:
-        """Whether a whole chunk of observations is queued."""
+        """True if a whole chunk of observations is queued."""
         with self._lock:
             return len(self._waiting) >= self._pipeline.spec.num_frames
 

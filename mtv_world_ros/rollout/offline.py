@@ -27,7 +27,7 @@ from mtv_world_ros.rollout.prediction_writer import chunk_values, ERROR, OK, Pre
 
 @dataclass(slots=True, kw_only=True)
 class ReplaySummary:
-    """What a replay did.
+    """Counts and results of a replay.
 
     Attributes:
         out: folder with the predictions.
@@ -177,7 +177,7 @@ def _write_rollout(
 
 
 def _write_observed(writer: PredictionWriter, episode: Episode, fps: float) -> None:
-    """What the cameras showed when frames were predicted: the nearest within half a frame."""
+    """Return the recorded frames at the predicted times: the nearest within half a frame."""
     reach_ns = round(0.5e9 / fps)
     for view, camera in episode.cameras.items():
         known = episode.images[view].stamps_ns
@@ -194,7 +194,7 @@ def _write_observed(writer: PredictionWriter, episode: Episode, fps: float) -> N
 def _seen_between(
     episode: Episode, pipeline: Pipeline, begin_ns: int, end_ns: int
 ) -> Iterator[Observation]:
-    """What was seen between two moments, once a frame of the model."""
+    """Return the observations between two times, one per frame of the model."""
     spec = pipeline.spec
     period_ns = round(1e9 / spec.fps)
     for stamp_ns in range(begin_ns + period_ns, end_ns, period_ns):

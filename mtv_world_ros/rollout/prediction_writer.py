@@ -21,7 +21,8 @@ ARRAY = 'std_msgs/msg/Float32MultiArray'
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 _JPEG_QUALITY = 90
 #: levels of diagnostic_msgs/DiagnosticStatus
-OK, ERROR = 0, 2
+OK = 0
+ERROR = 2
 
 
 class PredictionWriter(BagWriter):

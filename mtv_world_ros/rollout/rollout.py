@@ -96,7 +96,7 @@ class Rollout:
 
     @property
     def observation(self) -> Observation:
-        """Where the episode stands now, at the model's size: its last frame, or its first one."""
+        """Newest frames of the episode at the model's size: the last ones, or the first."""
         return self._states[0].observation
 
     @property

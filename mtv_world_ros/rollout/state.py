@@ -64,7 +64,7 @@ class RolloutState:
 
     @property
     def is_begun(self) -> bool:
-        """Whether no real frame was observed since the episode began."""
+        """True if no real frame was observed since the episode began."""
         return self.memory is None or self.memory.num_frames == 1 + self.num_imagined
 
     def after(

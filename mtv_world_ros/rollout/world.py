@@ -81,7 +81,7 @@ class PolicyRun:
 
     @property
     def is_over(self) -> bool:
-        """Whether something else than the limit ended it."""
+        """True if the episode ended before its limit."""
         return self.end != End.TIME_OUT
 
 

@@ -35,7 +35,7 @@ _VIEWER_IS_ON = re.compile(r'^((?:open|written:) .+)\n', re.M)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImagineOptions:
-    """What is started; see the parameters of the nodes and the options of the runner.
+    """Launch options of the node, the policy and the episode runner.
 
     Attributes:
         policy: YAML file, name of a bundled one, or a scripted policy such as `expert-miss-0.5`.

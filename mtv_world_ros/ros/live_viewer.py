@@ -105,7 +105,7 @@ class LiveViewer(Node):
         rerun_log.log_streams(self._stream, taken, self._root, self._begin_ns)
 
     def _begins_episode(self, topic: str, msgtype: str) -> bool:
-        """Whether a message is the first image of a new episode."""
+        """Return whether a message is the first image of a new episode."""
         kind = shown_as(topic, msgtype) or ('',)
         return kind[:2] == ('image', 'real') and kind[1:] in self._shown.images
 

@@ -392,7 +392,7 @@ def span(field: FieldInfo) -> Span | None:
 
 
 def is_read_only(field: FieldInfo) -> bool:
-    """Tells whether the parameter is read only when the node starts."""
+    """Return whether the parameter is read only when the node starts."""
     return bool(field.json_schema_extra)
 
 

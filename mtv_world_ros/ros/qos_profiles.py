@@ -28,7 +28,7 @@ LATCHED = QoSProfile(
 
 
 def is_latched(profile: QoSProfile) -> bool:
-    """Whether late subscribers get earlier messages."""
+    """Return whether late subscribers get earlier messages."""
     return profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
 

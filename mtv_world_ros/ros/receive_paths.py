@@ -287,7 +287,7 @@ def _is_free(port: int) -> bool:
 
 
 def _is_open_here(port: int) -> bool:
-    """Whether this process has the UDP port open; without /proc, whether anybody has."""
+    """Return whether this process (without /proc: any process) has the UDP port open."""
     try:
         rows = [line.split() for line in Path('/proc/self/net/udp').read_text().splitlines()[1:]]
         open_here = {os.readlink(link.path) for link in os.scandir('/proc/self/fd')}

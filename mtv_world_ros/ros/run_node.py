@@ -124,7 +124,7 @@ def run(
 
 
 def _why_refused(error: Exception) -> str:
-    """Why rclpy refused the command line or a parameter file, and what is valid."""
+    """Return why rclpy refused the command line or a parameter file, and what is valid."""
     detail = str(error).partition('failed to initialize rcl: ')[2] or str(error)
     hint = ''
     if 'same type' in detail:

@@ -33,7 +33,7 @@ _NODE_START_S = 120.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoOptions:
-    """What the node is started with; see its parameters."""
+    """Options the node is started with; see its parameters."""
 
     checkpoint: str
     calibration: Path

@@ -292,7 +292,7 @@ def _estimate_text(estimate: CameraEstimate) -> str:
 
 
 def is_doubtful(estimate: CameraEstimate) -> bool:
-    """Tells whether an estimate may be another place at which the robot moves alike."""
+    """Return whether an estimate may be a wrong pose at which the robot moves alike."""
     return estimate.match < GOOD_MATCH
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def is_shared(arguments: argparse.Namespace) -> bool:
-    """Whether several recordings are asked about, or what one recording's search has not."""
+    """Return whether the options need the search over several recordings."""
     asked = arguments.points or arguments.focal == 'estimate' or arguments.apply
     asked = asked or arguments.click or len(arguments.views) > 1
     return bool(asked) or len(recordings(arguments.episodes)) > 1
@@ -238,7 +238,7 @@ def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_kno
 
 
 def _lens(estimate: SharedEstimate) -> str:
-    """What else was found of the lens, or why not."""
+    """Return the estimated lens parameters in words, or why there are none."""
     camera = estimate.cameras[0]
     stretch = f'fy is {camera.K[1, 1] / camera.K[0, 0]:.3f} fx'
     if not estimate.bent:

@@ -145,7 +145,7 @@ def _check_places(arguments: argparse.Namespace, checkpoint: Checkpoint) -> None
 
 
 def _is_of_pictures(arguments: argparse.Namespace, checkpoint: Checkpoint) -> bool:
-    """Whether the fit is to rollouts without the object motion that the checkpoint foresees."""
+    """Return whether the fit is to rollouts without foreseen object motion."""
     robot = checkpoint.load_robot(arguments.robot)
     return not arguments.foresight and checkpoint.can_foresee(robot)
 

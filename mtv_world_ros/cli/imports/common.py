@@ -74,7 +74,7 @@ def write_boxes_page(
 def object_stage(
     arguments: argparse.Namespace, found: Mapping[str, Any], read: Callable[[Any], Episode]
 ) -> ObjectStage:
-    """What names and finds objects, by boxes where there are any."""
+    """Return the stage that names and segments objects, by boxes where there are any."""
     from mtv_world_ros.importing.object_boxes import learn_objects, load_object_boxes
     from mtv_world_ros.importing.stored_objects import ObjectStage
     from mtv_world_ros.vision.segmenters.examples import ExampleSegmenter

@@ -273,7 +273,7 @@ class EpisodeRunner(Node):
         return self._ended
 
     def _dead(self) -> dict[str, str]:
-        """How the episode ends if one of its nodes has died, else nothing."""
+        """Return the end of the episode if one of its nodes has died, else None."""
         options = self._options
         nodes = {'policy_died': options.policy_node, 'world_model_died': options.world_model}
         for how, node in nodes.items():

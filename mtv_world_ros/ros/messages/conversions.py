@@ -46,7 +46,7 @@ def message_class(msgtype: str) -> Any:
 
 @cache
 def has_header(msgtype: str) -> bool:
-    """Whether a type starts with a std_msgs/Header."""
+    """Return whether a type starts with a std_msgs/Header."""
     fields = message_class(msgtype).get_fields_and_field_types()
     return next(iter(fields.values()), '') == 'std_msgs/Header'
 

@@ -1,4 +1,4 @@
-"""Why a message or a rollout was refused: the reasons that are counted, and the error."""
+"""Reasons for rejecting a message or a rollout, and the error that carries one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mtv_world_ros.core.errors import MtvWorldError, PlanError
 
 
 class Reason(StrEnum):
-    """What `/diagnostics` and `~/report` count rejections under."""
+    """Reason of a rejection, as counted in `/diagnostics` and `~/report`."""
 
     IMAGE_ENCODING = 'image_encoding'
     IMAGE_DATA = 'image_data'

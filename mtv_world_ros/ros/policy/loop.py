@@ -87,7 +87,7 @@ class PredictedFrames:
         self._joints[to_ns(message.header.stamp)] = message
 
     def clear(self) -> None:
-        """Forgets all of them."""
+        """Drop all stored messages."""
         for stored in (*self._images.values(), self._joints):
             stored.clear()
 

@@ -1,4 +1,4 @@
-"""The node `policy`: lets a policy live in the world model, or beside it on the real robot."""
+"""The node `policy`: runs a policy in the world model, or on the real robot."""
 
 from __future__ import annotations
 

@@ -186,7 +186,7 @@ class ObservationBuffer:
             raise Rejection(Reason.JOINT_STATE_STALE, stale)
 
     def _jump(self, name: str, stamp_ns: int, position: float, received: float) -> str:
-        """Why a sample is out of reach of the last one, unless two in a row agree."""
+        """Return why a sample is out of reach of the last one, unless two in a row agree."""
         if not self._joints[name]:
             return ''
         last_ns, last = self._joints[name].newest
@@ -366,7 +366,7 @@ class ObservationBuffer:
 
 
 def _refusal(samples: Samples[Any], what: str, stamp_ns: int, now_ns: int, limit_s: float) -> str:
-    """Why a sample is not taken by its stamp; empty = it is taken."""
+    """Return why a sample is rejected by its stamp; empty if it is taken."""
     why = samples.refuse_reason(stamp_ns, now_ns, limit_s) if now_ns else ''
     return f'{what} {why}; do the clocks of its sender and this node agree?' if why else ''
 
@@ -490,7 +490,7 @@ class Intrinsics:
         return camera
 
     def has(self, view: str) -> bool:
-        """Tells whether an info of the view was received that can be used."""
+        """Return whether a usable CameraInfo of the view was received."""
         return view in self._infos
 
     def missing(self, view: str) -> list[str]:

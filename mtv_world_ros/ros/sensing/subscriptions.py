@@ -1,4 +1,4 @@
-"""What the nodes subscribe to, with the quality of service that the publishers offer."""
+"""Subscriptions of the nodes, with the quality of service that the publishers offer."""
 
 from __future__ import annotations
 
@@ -98,11 +98,11 @@ class Inputs:
 
     @property
     def plan_topic(self) -> str:
-        """Where trajectories come in."""
+        """Subscription to trajectories."""
         return self._plans.topic
 
     def receive_paths(self) -> Mapping[str, str]:
-        """Where plans and joint states come in, as `receive_path.<topic>`."""
+        """Receive paths of plans and joint states, as `receive_path.<topic>`."""
         return self._paths
 
     def publisher_counts(self) -> dict[str, int]:

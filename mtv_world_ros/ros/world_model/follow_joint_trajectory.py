@@ -244,7 +244,7 @@ def _code(reason: Reason | None) -> str:
 
 
 def _verdict(ended: Ended) -> str:
-    """What is known of the plan."""
+    """State of the plan of a goal."""
     if ended.last is None:
         return 'nothing was imagined'
     prediction = ended.last.prediction

@@ -57,7 +57,7 @@ class Expected:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScoredChunk:
-    """How a chunk compares with what really came: V views, O objects.
+    """Comparison of a chunk with the real frames: V views, O objects.
 
     Attributes:
         chunk: the imagined chunk.
@@ -172,7 +172,7 @@ class LiveFidelity:
             self._thread.join()
 
     def values(self) -> dict[str, object]:
-        """What `/diagnostics` shows: chunks compared and not, mean J of those that are kept."""
+        """Values for `/diagnostics`: chunks compared and not, mean J of those that are kept."""
         kept = [value for value in self._kept if np.isfinite(value)]
         return {
             'fidelity_chunks': len(self._kept),

@@ -1,4 +1,4 @@
-"""What the parameters name: pipeline, cameras of its views, and the adapter that is set live."""
+"""Resources that parameters name: pipeline, cameras of its views, live adapter."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def load_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[CameraMo
 
 
 def reload_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[CameraModel, ...]:
-    """The same while the node runs.
+    """Exchange the adapter while the node runs.
 
     Raises:
         Rejection: the file is wrong, lacks a view, or cannot be read in time.

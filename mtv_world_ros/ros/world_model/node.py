@@ -159,7 +159,7 @@ class WorldModelNode(LifecycleNode):
         return self._state_machine.current_state[1]
 
     def _missing(self) -> Sequence[str]:
-        """What keeps the node from taking plans."""
+        """Return the reason why the node takes no plans."""
         if self._error is not None:
             return [f'not configured: {self._error}']
         if self._rollouts is None or self._lifecycle() != 'active':

@@ -50,12 +50,12 @@ class ImageStream:
 
     @property
     def publishers(self) -> list[Publisher]:
-        """All of them."""
+        """Return all publishers."""
         return [self._image, self._info, *([] if self._jpeg is None else [self._jpeg])]
 
     @property
     def is_wanted(self) -> bool:
-        """Whether somebody subscribes."""
+        """Return whether the topics have subscribers."""
         return any(publisher.get_subscription_count() for publisher in self.publishers)
 
     def publish(self, pixels: ByteArray, header: Header, info: CameraInfo, quality: int) -> None:
@@ -93,7 +93,7 @@ _LOOK_PERIOD_S = 0.01
 
 @dataclass(slots=True)
 class Sent:
-    """What became of the frames of a chunk.
+    """Fate of the frames of a chunk: published, dropped, pre-empted.
 
     Attributes:
         publish_s: time spent on publishing [s].

@@ -214,7 +214,7 @@ class Tally:
     def level(
         self, now_s: float, *, num_policies: int = 1, missing: Sequence[str] = ()
     ) -> tuple[bytes, str]:
-        """How bad it is, and everything that is wrong.
+        """Return the diagnostic level and all problems.
 
         Args:
             now_s: now [s].
@@ -297,7 +297,7 @@ def _sent_values(chunk: Chunk, sent: Sent) -> dict[str, object]:
 
 
 def _chunk_identity(chunk: Chunk) -> dict[str, object]:
-    """Which chunk of which plan it is."""
+    """Return the identity of a chunk: plan, number, rollout."""
     prediction = chunk.prediction
     return {
         **_request_values(chunk.request),
@@ -319,7 +319,7 @@ def _ended_values(ended: Ended) -> dict[str, object]:
 
 
 def _request_values(request: Request) -> dict[str, object]:
-    """What identifies a plan and how it is imagined."""
+    """Return the identity of a plan and the options of its rollout."""
     return {
         'rollout': request.rollout,
         'trajectory_stamp_ns': request.stamp_ns,
@@ -375,7 +375,7 @@ def _fidelity_values(scored: ScoredChunk) -> dict[str, object]:
 
 
 def _trust_values(chunk: Chunk, level: float) -> dict[str, object]:
-    """How far the chunk's end is from the last real frame, and how far J is to be trusted [s]."""
+    """Return the chunk's distance from the last real frame, and the trusted horizon [s]."""
     trusted_s = chunk.prediction.trusted_seconds(level)
     end_s = chunk.prediction.imagined_seconds
     known = 'yes' if end_s <= trusted_s + 1e-6 else 'no'

@@ -1,4 +1,4 @@
-"""What a configured node has: a loaded pipeline, with its inputs and outputs."""
+"""Resources of a configured node: pipeline, subscriptions, publishers."""
 
 from __future__ import annotations
 
@@ -307,7 +307,7 @@ class Rollouts:
         self._look_again()
 
     def missing(self) -> Sequence[str]:
-        """What the node needs and does not get; in imagine mode only to begin."""
+        """Return the inputs that the node lacks; in imagine mode only to begin."""
         if self._description is not None and self._description.problem:
             return [self._description.problem]
         return [*self._inputs.mismatches(), *self._missing_inputs()]
@@ -382,7 +382,7 @@ class Rollouts:
             self._arrivals.trigger()
 
     def _is_early(self, arrived: _Arrived) -> bool:
-        """Whether the first plan of an imagined episode arrived before its observation.
+        """Return whether the first plan of an imagined episode arrived before its observation.
 
         Nothing orders topics: a policy may answer before this node receives the start.
         """
@@ -462,7 +462,7 @@ class Rollouts:
         self._publisher.reset()
 
     def _check_clock(self) -> bool:
-        """Tells whether the system clock was set back; then everything from before is dropped.
+        """Return whether the system clock was set back; then older samples are dropped.
 
         rclpy tells of jumps of `/clock` only.
         """

@@ -77,7 +77,7 @@ class Chunk:
 
     @property
     def lead_s(self) -> float:
-        """How long before its last frame's stamp the chunk was ready [s].
+        """Lead of the chunk over the stamp of its last frame [s].
 
         The time that computing took is taken off the stamp by the wall, not by the node's clock:
         a player that holds the clock meanwhile makes no lead.
@@ -180,7 +180,7 @@ class RolloutWorker:
 
     @property
     def _is_given_up(self) -> bool:
-        """Whether the calling thread was replaced by another one."""
+        """Return whether the calling thread was replaced."""
         return current_thread() is not self._thread
 
     @property
@@ -191,7 +191,7 @@ class RolloutWorker:
 
     @property
     def busy(self) -> bool:
-        """Whether a rollout runs or waits."""
+        """True if a rollout runs or waits."""
         with self._changed:
             return self._running is not None or self._pending is not None
 
