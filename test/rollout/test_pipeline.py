@@ -12,6 +12,7 @@ from mtv_world_ros.cameras.mask_geometry import centroids, locate
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.control.arm_pictures import arm_pictures
 from mtv_world_ros.control.control import ControlScene
+from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.core.data_types import (
     History,
     JointTrajectory,
@@ -40,6 +41,7 @@ from mtv_world_ros.physics import solid_foresight
 from mtv_world_ros.physics.checkpoint_files import load_foresight
 from mtv_world_ros.physics.object_motion import ObjectMotion
 from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.observed_episode import ObservedEpisode
 from mtv_world_ros.rollout.options import RolloutOptions
@@ -576,6 +578,27 @@ def test_arms_are_drawn_as_the_frame_that_each_chunk_starts_from_shows_them(
         assert visible.mean() > 0.05
         # trails and objects lie over some of it
         assert (control[:, 0][visible] == start[visible]).all(axis=-1).mean() > 0.7
+
+
+def test_forward_kinematics_run_once_for_the_frames_of_a_chunk_and_once_for_its_trails(
+    world_model, recording, monkeypatch
+):
+    """Whoever draws, checks or judges takes the same poses, also of a camera on the wrist."""
+    passes, whole = [], RobotModel._placements
+
+    def counted(self, positions, *more):
+        passes.append(len(positions))
+        return whole(self, positions, *more)
+
+    monkeypatch.setattr(RobotModel, '_placements', counted)
+    card = CARD.replace(rendering={'link_width_m': 0.02, 'finger_width_m': 0.01})
+    pipeline = Pipeline.assemble(card, world_model, robot=YAM)
+    start = observe(recording)
+    wrist = replace(start.cameras[1], mount_link=YAM.tools[0].link)
+    rollout = pipeline.begin(replace(start, cameras=(start.cameras[0], wrist)))
+    list(rollout.extend(commands(recording, 1.6)))
+    dense = 1 + SPEC.num_frames * TrajectoryVideoConfig().points_per_frame
+    assert passes == [1 + SPEC.num_frames, dense]
 
 
 def test_the_objects_are_those_of_the_instruction(pipeline, recording):
