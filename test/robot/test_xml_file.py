@@ -43,10 +43,10 @@ def urdf(text: str) -> str:
     ids=lambda value: value[:12] if isinstance(value, str) else None,
 )  # fmt: skip
 def test_a_description_that_a_parser_would_not_survive_is_refused_in_time(text, reason):
-    begin_s = time.perf_counter()
+    begin_s = time.process_time()
     with pytest.raises(RobotError, match=reason):
         parse_urdf(text, 'it')
-    assert time.perf_counter() - begin_s < 2 * MOST_S
+    assert time.process_time() - begin_s < 2 * MOST_S
 
 
 def test_entities_take_no_memory():
@@ -92,9 +92,9 @@ def test_a_limit_is_raised_by_its_variable(monkeypatch):
 def test_followers_in_a_row_are_resolved_in_time():
     count = 1_900
     text = urdf(star(count, '<mimic joint="l{next}" multiplier="1.001"/>', last=''))
-    begin_s = time.perf_counter()
+    begin_s = time.process_time()
     _, mimics, _ = parse_urdf(text, 'it')
-    assert time.perf_counter() - begin_s < 2 * MOST_S
+    assert time.process_time() - begin_s < 2 * MOST_S
     assert {mimic.source for mimic in mimics} == {f'l{count - 1}'}
     by_joint = {mimic.joint: mimic.multiplier for mimic in mimics}
     assert by_joint['l0'] == pytest.approx(1.001 ** (count - 1))
