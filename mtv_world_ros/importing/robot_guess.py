@@ -19,6 +19,10 @@ from mtv_world_ros.robot.model import check_can_move, Mimic
 from mtv_world_ros.robot.shape import link_shapes
 from mtv_world_ros.robot.xml_file import parse_xml
 
+#: arms of the largest robot that is guessed
+MOST_ARMS = 8
+#: joints of the largest hand that is guessed; hands of five fingers have up to 24
+MOST_FINGER_JOINTS = 24
 #: a tree with a fork at most this far from its ends is a gripper [joints]
 _FINGER_JOINTS = 6
 #: the tool point is this far inside the finger tips [m]
@@ -75,6 +79,7 @@ def guess_robot(urdf: Path) -> GuessedRobot:
     arms = _arms(model, {mimic.joint for mimic in mimics})
     if not arms:
         raise RobotError(f"'{urdf}' has no arm: no chain of {_SHORT_ARM_JOINTS} joints that move")
+    _check_size(urdf, arms)
     base = _base_link(model, arms)
     notes.append(f"base link '{base}': nothing that moves carries it")
     names = _arm_names(model, arms)
@@ -113,6 +118,24 @@ def guess_robot(urdf: Path) -> GuessedRobot:
 
 def _named_joints(model: pin.Model) -> list[tuple[str, Any]]:
     return list(zip(model.names[1:], list(model.joints)[1:], strict=True))
+
+
+def _check_size(urdf: Path, arms: Sequence[_Arm]) -> None:
+    """Raise where a robot has more arms or fingers than one has: the guess would take minutes.
+
+    Raises:
+        RobotError: it has.
+    """
+    num_fingers = max(len(arm.fingers) for arm in arms)
+    for count, most, what in (
+        (len(arms), MOST_ARMS, 'arms'),
+        (num_fingers, MOST_FINGER_JOINTS, 'joints of fingers on one arm'),
+    ):
+        if count > most:
+            raise RobotError(
+                f"'{urdf}' has {count} {what}; at most {most} are guessed. Write its YAML by "
+                "hand, as 'config/robots/yam_bimanual/robot.yaml' shows"
+            )
 
 
 def _arms(model: pin.Model, followers: set[str]) -> list[_Arm]:

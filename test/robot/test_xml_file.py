@@ -12,6 +12,7 @@ import pytest
 
 from mtv_world_ros.core.errors import RobotError
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.importing.robot_guess import guess_robot
 from mtv_world_ros.robot.file import parse_urdf
 from mtv_world_ros.robot.mesh_pieces import load_mesh, MissingMeshError
 from mtv_world_ros.robot.xml_file import check_xml, parse_xml, root_link
@@ -134,3 +135,27 @@ def test_what_is_no_xml_is_an_error_of_the_parser(text):
     with pytest.raises(ElementTree.ParseError) as expected:
         ElementTree.fromstring(text)
     assert str(error.value) == str(expected.value)
+
+
+def test_a_robot_of_more_arms_or_fingers_than_one_has_is_not_guessed(tmp_path):
+    def branches(depth: int) -> str:
+        text, level, count = '', ['root'], 0
+        for _ in range(depth):
+            ends = []
+            for parent in level:
+                for _ in range(2):
+                    text += f'<link name="t{count}"/>' + joint(
+                        parent, f't{count}', kind='revolute'
+                    )
+                    ends.append(f't{count}')
+                    count += 1
+            level = ends
+        return text
+
+    for depth in (7, 9):
+        path = tmp_path / f'{depth}.urdf'
+        path.write_text(urdf(branches(depth)))
+        begin_s = time.process_time()
+        with pytest.raises(RobotError, match='at most (8|24) are guessed. Write its YAML by hand'):
+            guess_robot(path)
+        assert time.process_time() - begin_s < 3 * MOST_S
