@@ -48,7 +48,7 @@ def check_rate(what: str, stamps_ns: Stamps) -> tuple[dict[str, str], list[Findi
 
 
 def check_skew(view: str, images: Mapping[str, Track]) -> tuple[dict[str, str], list[Finding]]:
-    """How far a view's frames are from the first view's nearest ones."""
+    """Measure the time from each frame of a view to the nearest frame of the first view."""
     first = next(iter(images))
     if view == first or not len(images[view].stamps_ns):
         return {}, []
@@ -223,5 +223,5 @@ class JointTrack:
         return other
 
     def covers(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether the stamps lie within the recorded joint states."""
+        """Return True for each stamp (N,) within the recorded joint states."""
         return (stamps_ns >= self.stamps_ns[0]) & (stamps_ns <= self.stamps_ns[-1])

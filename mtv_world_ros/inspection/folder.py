@@ -25,12 +25,16 @@ from mtv_world_ros.inspection.inspection_report import (
 )
 from mtv_world_ros.inspection.places import background, CameraPlaces, find_places
 
-#: width of a tile of the picture, and the episodes it shows at most [px]
-_TILE, _MOST_ROWS = 320, 24
-#: a pose that moved with its camera shifts what it shows by this share of the background's shift,
-#: at least; no background is further away than this [share of the width]
-_FOLLOWS, _FAR = 0.25, 0.04
-#: focal lengths of a view that differ by more are of different cameras
+#: width of one view in the overview picture [px]
+_TILE_WIDTH_PX = 320
+#: maximum number of episodes in the overview picture
+_MAX_ROWS = 24
+#: minimum shift of the projected robot after a camera moved; if smaller, the pose was not updated
+#: [fraction of the background's shift]
+_MIN_POSE_SHIFT = 0.25
+#: larger shifts of the background count like this one [fraction of image width]
+_MAX_BACKGROUND_SHIFT = 0.04
+#: relative difference of focal lengths above which the views are of different cameras
 _SAME_FOCAL = 0.02
 
 
@@ -71,12 +75,12 @@ class FolderInspection:
 def inspect_folder(
     paths: Iterable[Path], inspector: Inspector, read: Callable[[Path], Episode]
 ) -> tuple[FolderInspection, dict[str, dict[str, ByteArray]]]:
-    """Inspects episodes, and returns overlay pictures by episode and view beside.
+    """Inspect episodes; return the inspection and the overlay pictures by episode and view.
 
     Args:
-        paths: of the episodes.
-        inspector: of their robot.
-        read: reads one.
+        paths: folders of the episodes.
+        inspector: inspector of their robot.
+        read: function that reads one episode.
     """
     inspections: dict[str, Inspection] = {}
     failed: dict[str, str] = {}
@@ -167,7 +171,7 @@ def _with_strangers(found: FolderInspection) -> FolderInspection:
 
 
 def _fits(found: FolderInspection, view: str, name: str) -> bool:
-    """Whether nothing is wrong with a view, and all of it was checked."""
+    """Return True if a view of an episode was checked completely and nothing is wrong."""
     sections = [section for section in found.episodes[name].views if section.name == view]
     return all(section.verdict == 'ok' for section in sections)
 
@@ -175,7 +179,7 @@ def _fits(found: FolderInspection, view: str, name: str) -> bool:
 def _with_places(
     found: FolderInspection, posed: dict[str, dict[str, CameraModel]]
 ) -> FolderInspection:
-    """Says where each view's camera stands, and whether it was moved without another pose."""
+    """Add a note on the places of each camera; a finding if one moved with an unchanged pose."""
     findings, notes = list(found.findings), list(found.notes)
     for view, places in found.places.items():
         names = found.members[view]
@@ -213,7 +217,7 @@ def _stale(
             if np.isinf(places.apart[early, late]):
                 continue
             shift = _shift(posed[other], posed[name])
-            if shift < _FOLLOWS * min(places.apart[early, late], _FAR):
+            if shift < _MIN_POSE_SHIFT * min(places.apart[early, late], _MAX_BACKGROUND_SHIFT):
                 stale.setdefault(name, other)
     return stale
 
@@ -255,7 +259,7 @@ def table(found: FolderInspection) -> list[list[str]]:
 
 
 def _conclusions(found: FolderInspection) -> list[str]:
-    """What concerns all episodes, and what was not checked, once for the episodes it holds for."""
+    """Return the notes on all episodes; each check that was not possible is listed once."""
     unchecked: dict[str, list[str]] = {}
     for name, inspection in found.episodes.items():
         for section in inspection.sections:
@@ -305,8 +309,8 @@ def folder_markdown(found: FolderInspection, picture: str) -> str:
 
 
 def folder_picture(pictures: dict[str, dict[str, ByteArray]]) -> ByteArray | None:
-    """(H, W, 3) RGB: a row an episode, its views beside each other; None without any."""
-    rows = [_row(name, views) for name, views in list(pictures.items())[:_MOST_ROWS]]
+    """Return the overview (H, W, 3, RGB), one row per episode; None without pictures."""
+    rows = [_row(name, views) for name, views in list(pictures.items())[:_MAX_ROWS]]
     if not rows:
         return None
     width = max(row.shape[1] for row in rows)
@@ -325,5 +329,7 @@ def _row(name: str, views: dict[str, ByteArray]) -> ByteArray:
 def _small(picture: ByteArray) -> ByteArray:
     """The first of the picture's frames, small."""
     half = picture[: picture.shape[0] // 2, : picture.shape[1] // 2]
-    height = round(half.shape[0] * _TILE / half.shape[1])
-    return np.asarray(cv2.resize(half, (_TILE, height), interpolation=cv2.INTER_AREA), np.uint8)
+    height = round(half.shape[0] * _TILE_WIDTH_PX / half.shape[1])
+    return np.asarray(
+        cv2.resize(half, (_TILE_WIDTH_PX, height), interpolation=cv2.INTER_AREA), np.uint8
+    )

@@ -1,4 +1,4 @@
-"""A scene without pictures: objects and a plan in a file, and what is foreseen of them.
+"""Simulated motion of objects under a plan, both read from a file, without camera images.
 
 Shape letters: K futures, T rows, O objects, J joints.
 """
@@ -31,10 +31,19 @@ from mtv_world_ros.robot.file import Position
 from mtv_world_ros.robot.model import check_positions, RobotModel
 from mtv_world_ros.robot.resample import match_joints, resample
 
-#: of a picture, and where its camera looks from
-_WIDTH, _HEIGHT, _DISTANCE, _ELEVATION = 480, 360, 0.9, -30.0
-#: colours of what stands still, of the robot, and of objects in turn
-_TABLE, _ROBOT = (0.75, 0.73, 0.7, 1.0), (0.45, 0.47, 0.5, 1.0)
+#: width of the rendered picture [px]
+_WIDTH_PX = 480
+#: height of the rendered picture [px]
+_HEIGHT_PX = 360
+#: distance of the camera from the point it looks at [m]
+_CAMERA_DISTANCE_M = 0.9
+#: elevation of the camera's viewing direction; negative = it looks down [degrees]
+_CAMERA_ELEVATION_DEG = -30.0
+#: colour of the table (RGBA)
+_TABLE_COLOUR = (0.75, 0.73, 0.7, 1.0)
+#: colour of the robot (RGBA)
+_ROBOT_COLOUR = (0.45, 0.47, 0.5, 1.0)
+#: colours of the objects in turn (RGBA)
 _COLOURS = ((0.8, 0.2, 0.2, 1.0), (0.2, 0.4, 0.8, 1.0), (0.2, 0.6, 0.3, 1.0), (0.8, 0.6, 0.1, 1.0))
 #: instants that a picture shows, as shares of the plan
 _SHOWN = (0.0, 0.5, 1.0)
@@ -165,7 +174,7 @@ def draw_foreseen(tracked: TrackedSolids, commands: FloatArray, out: Path) -> No
     _paint(model)
     pictures, state = [], None
     rows = np.unique(np.round(np.array(_SHOWN) * ((len(commands) - 1) // COMMANDS_A_STEP)))
-    with mujoco.Renderer(model, _HEIGHT, _WIDTH) as renderer:
+    with mujoco.Renderer(model, _HEIGHT_PX, _WIDTH_PX) as renderer:
         last = 0
         for row in rows.astype(int) * COMMANDS_A_STEP:
             if row > last:
@@ -185,14 +194,14 @@ def _camera(solids: Sequence[Solid | None]) -> Any:
     camera.lookat[:] = np.mean(known, 0) if known else np.zeros(3)
     x, y, _ = camera.lookat  # it looks back to the robot
     camera.azimuth = np.degrees(np.arctan2(-y, -x)) + 25
-    camera.distance, camera.elevation = _DISTANCE, _ELEVATION
+    camera.distance, camera.elevation = _CAMERA_DISTANCE_M, _CAMERA_ELEVATION_DEG
     return camera
 
 
 def _paint(model: Any) -> None:
     """Gives table, robot and objects colours of their own."""
-    model.geom_rgba[:] = _ROBOT
-    model.geom_rgba[0] = _TABLE
+    model.geom_rgba[:] = _ROBOT_COLOUR
+    model.geom_rgba[0] = _TABLE_COLOUR
     model.vis.headlight.ambient[:] = 0.45
     for number in range(model.nbody):
         kind, _, item = model.body(number).name.partition(' ')

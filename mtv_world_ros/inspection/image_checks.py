@@ -18,9 +18,13 @@ from mtv_world_ros.inspection.inspection_report import broken, Finding, suspicio
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import load_shape, RobotShape
 
-_SIZE, _FOCAL = 480, 520.0
-#: colours of x, y and z axes
+#: width and height of a picture of a robot [px]
+_SIZE_PX = 480
+#: focal length of its camera [px]
+_FOCAL_PX = 520.0
+#: colours of the x, y and z axes (RGB)
 _AXES = ((220, 40, 40), (30, 160, 30), (40, 60, 230))
+#: length of the axes that are drawn [m]
 _AXIS_M = 0.08
 
 
@@ -53,7 +57,7 @@ def _tile(
     points = [p.points @ poses[p.link][0, :3, :3].T + poses[p.link][0, :3, 3] for p in shape.parts]
     cloud = np.concatenate([*points, robot.tool_poses(positions)[:, 0, :3, 3]])
     camera = _camera(cloud, np.radians(angle_deg))
-    image = np.full((_SIZE, _SIZE, 3), 245, np.uint8)
+    image = np.full((_SIZE_PX, _SIZE_PX, 3), 245, np.uint8)
     depths = [float(project(camera, camera.T_mount_camera, p)[1].mean()) for p in points]
     for index in np.argsort(depths)[::-1]:
         part = shape.parts[int(index)]
@@ -76,9 +80,9 @@ def _camera(cloud: FloatArray, angle: float) -> CameraModel:
     T = np.eye(4)
     T[:3, :3] = looking_along(ahead)
     T[:3, 3] = centre - T[:3, 2] * radius * 2.6
-    K = np.array([[_FOCAL, 0, _SIZE / 2], [0, _FOCAL, _SIZE / 2], [0, 0, 1]])
+    K = np.array([[_FOCAL_PX, 0, _SIZE_PX / 2], [0, _FOCAL_PX, _SIZE_PX / 2], [0, 0, 1]])
     return CameraModel(
-        view='picture', width=_SIZE, height=_SIZE, K=K, mount_link='', T_mount_camera=T
+        view='picture', width=_SIZE_PX, height=_SIZE_PX, K=K, mount_link='', T_mount_camera=T
     )
 
 
@@ -94,8 +98,10 @@ def _draw_axes(image: ByteArray, camera: CameraModel, T: FloatArray) -> None:
 _SAME_PICTURE = 0.05
 #: joints that move more between two frames must change the picture [rad or m]
 _MOVES = 0.02
-#: share of such frames without change from which a view is suspicious, broken
-_FROZEN, _BROKEN = 0.1, 0.5
+#: fraction of frames that repeat the last one while joints move, above which a view is suspicious
+_SUSPICIOUS_FROZEN_FRACTION = 0.1
+#: fraction of such frames above which a view is broken
+_BROKEN_FROZEN_FRACTION = 0.5
 #: frames a second below which motions between frames are guessed
 _LEAST_HZ = 2.5
 #: joint states this long before the first or after the last frame [s]
@@ -124,9 +130,9 @@ def check_frozen(track: Track, joints: JointTrack) -> tuple[dict[str, str], list
         f'{share:.0%} of the frames in which joints move are the same as the one before: the '
         'camera hangs, or this is not a view of this robot'
     )
-    if share > _BROKEN:
+    if share > _BROKEN_FROZEN_FRACTION:
         return measures, [broken(text)]
-    return measures, [suspicious(text)] if share > _FROZEN else []
+    return measures, [suspicious(text)] if share > _SUSPICIOUS_FROZEN_FRACTION else []
 
 
 def check_lengths(stamps_ns: Stamps, joints: JointTrack) -> tuple[dict[str, str], list[Finding]]:

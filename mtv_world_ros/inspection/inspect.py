@@ -68,21 +68,24 @@ Checked = tuple[dict[str, str], list[Finding]]
 _LEAST_IN_IMAGE = 0.5
 #: recorded joint states overshoot by this much [rad or m]
 _LIMIT_TOLERANCE = 1e-3
-#: distance of drawn robot and moving pixels from which a view is suspicious, broken [image width]
-_SUSPICIOUS, _BROKEN = 0.012, 0.03
-#: both times this, where the robot's shape is not known
+#: distance of drawn robot and moving pixels above which a view is suspicious [fraction of image
+#: width]
+_SUSPICIOUS_DISTANCE = 0.012
+#: distance of drawn robot and moving pixels above which a view is broken [fraction of image width]
+_BROKEN_DISTANCE = 0.03
+#: factor on both distances for a robot of unknown shape, which is drawn as rods
 _RODS_FACTOR = 6.0
 #: correlation of drawn and seen motion below which they are unrelated
 _MIN_MATCH = 0.12
-#: gain in that correlation, as a share, from which another place is taken for right
+#: relative gain of that correlation above which another camera position is reported
 _BETTER_PLACE = 0.05
-#: the same, of another roll or focal length
+#: relative gain of that correlation above which another roll or focal length is reported
 _BETTER_MATCH = 0.1
-#: delay of the images against the joint states from which on it matters [s]
+#: delay of the images against the joint states above which a view is suspicious [s]
 _MAX_LAG_S = 0.1
-#: gain in the correlation, as a share, from which a delay is shown by the data
+#: relative gain of the correlation above which a delay is measured reliably
 _LAG_GAIN = 0.03
-#: the same of a delay of one frame
+#: relative gain of the correlation above which a delay of one frame is measured reliably
 _LAG_GAIN_OF_A_FRAME = 0.1
 #: what else may be wrong, and by how much more drawn and seen motion then correlate
 _MIRRORED = 'the drawn robot moves like the mirrored image: the camera mirrors its images'
@@ -108,7 +111,7 @@ class Inspector:
     ) -> None:
         self.robot, self.shape, self._search = robot, shape, search
         factor = 1.0 if shape.is_known else _RODS_FACTOR
-        self._suspicious, self._broken = factor * _SUSPICIOUS, factor * _BROKEN
+        self._suspicious, self._broken = factor * _SUSPICIOUS_DISTANCE, factor * _BROKEN_DISTANCE
 
     def inspect(
         self, episode: Episode, progress: Callable[[Sequence[str]], Iterable[str]] = iter
@@ -211,9 +214,9 @@ class Inspector:
         return (measured[0], findings), notes
 
     def stands_still(self, episode: Episode, view: str) -> bool:
-        """Whether a view's camera is neither on the arm nor moved by itself.
+        """Return True if a view's camera is not on the arm and was not moved.
 
-        Of a camera whose pose is not known, the pictures tell.
+        A camera of unknown pose is judged by its images.
         """
         if view in episode.unknown:
             return keeps_place(episode.images[view])
@@ -308,7 +311,7 @@ class Inspector:
         return [suspicious(text)] if distance > self._suspicious * camera.width else []
 
     def _better_fit(self, residual: MotionResidual) -> list[Finding]:
-        """A roll or a focal length with which the drawn robot fits clearly better."""
+        """Return a finding if another roll or focal length fits the seen motion clearly better."""
         name, match = residual.best_change
         if not self.shape.is_known or not match > residual.match * (1 + _BETTER_MATCH):
             return []
@@ -484,8 +487,10 @@ def check_limits(
 _NUM_FRAMES = 4
 #: width of one frame in the picture [px]
 _WIDTH = 640
-#: longest trail that is drawn [s], and its points a second
-_TRAIL_S, _TRAIL_HZ = 2.0, 20
+#: duration of the longest trail that is drawn [s]
+_TRAIL_S = 2.0
+#: points of a trail per second [Hz]
+_TRAIL_HZ = 20
 
 
 def overlay_picture(

@@ -29,8 +29,10 @@ _LEAST_AREA_PX = 20
 _LEAST_INSIDE = 0.5
 #: share of the most motion seen over all shifts that counts at least, where less is seen
 _LEAST_ENERGY = 0.25
-#: images are shrunk to this width, for delays and changes of the camera to the second [px]
-_WIDTH, _COARSE = 384, 192
+#: width to which images are shrunk [px]
+_WIDTH_PX = 384
+#: width to which images are shrunk to search for delays and for changes of the camera [px]
+_COARSE_WIDTH_PX = 192
 #: time between the two frames of a pair [s]
 _STEP_S = 0.5
 #: search radius, as a share of the image width
@@ -98,13 +100,13 @@ def measure_residual(
     joints: JointTrack,
     search: ResidualSearch = WHOLE_SEARCH,
 ) -> MotionResidual:
-    """Compares the motion that joint states and calibration predict with the one in the images.
+    """Compare the motion predicted from joint states and calibration with that in the images.
 
     For pairs of frames half a second apart, each link's silhouettes at both times are drawn; where
     they differ the image should have changed, unless the robot covers the place in both. The maps
     of all pairs are correlated with the images' differences over shifts, for each link on its
-    own. Links count alike, so that one whose drawn shape is wrong does not decide; a calibration
-    error moves all of them.
+    own. All links have the same weight, so that a link whose drawn shape is wrong does not decide;
+    a calibration error moves all links.
 
     Args:
         track: frames of a camera that stands still.
@@ -124,7 +126,7 @@ def measure_residual(
         return MotionResidual(
             reason=f'no two frames {_STEP_S:g} s apart with joint states and motion'
         )
-    small, coarse = shrunk(camera, _WIDTH), shrunk(camera, _COARSE)
+    small, coarse = shrunk(camera, _WIDTH_PX), shrunk(camera, _COARSE_WIDTH_PX)
     some, changed = pairs[::3], _changes(coarse, search)
     seen = _seen_motion(track, some, coarse) if changed or len(search.lags_s) > 1 else []
 
@@ -207,7 +209,7 @@ def _pairs(stamps_ns: NDArray[np.int64], joints: JointTrack, count: int) -> np.n
 
 
 def _seen_motion(track: Track, pairs: np.ndarray, small: CameraModel) -> list[FloatImage]:
-    """How much each pixel changed between the frames of a pair, 0 .. 1, NaN around the image."""
+    """Return the change of each pixel in each pair of frames, 0 .. 1; NaN outside of the image."""
     grey = {int(i): _grey(track.frames[int(i)], small) for i in np.unique(pairs)}
     return [_softened(np.abs(grey[int(j)] - grey[int(i)])) for i, j in pairs]
 

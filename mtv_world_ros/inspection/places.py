@@ -1,4 +1,4 @@
-"""Where a fixed camera stands in several recordings: what stays of their backgrounds."""
+"""Places of a fixed camera in several recordings, from their backgrounds."""
 
 from __future__ import annotations
 
@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.data.episode import Track
 
-#: frames that a background is the median of, and the width that it is looked at [px]
-_NUM_FRAMES, _WIDTH = 21, 640
-#: corners of a background at most, and matches of two of them at least
-_NUM_CORNERS, _LEAST_MATCHES = 1500, 12
+#: number of frames whose median is the background
+_NUM_FRAMES = 21
+#: width to which a background is resized before it is matched [px]
+_WIDTH_PX = 640
+#: maximum number of features of a background
+_MAX_FEATURES = 1500
+#: minimum number of matches of two backgrounds that are comparable
+_MIN_MATCHES = 12
 #: a match is this near to where the others put it [px of the width above]
 _INLIER_PX = 3.0
 #: backgrounds that are this far apart are of different places [share of the width]
@@ -39,7 +43,11 @@ class CameraPlaces:
     matches: dict[tuple[int, int], FloatArray]
 
     def near(self, within: float) -> list[int]:
-        """The most recordings that lie within a shift of one of them, that one first."""
+        """Return the largest group of recordings within a shift of one recording, that one first.
+
+        Args:
+            within: maximum shift of the background [fraction of image width].
+        """
         counts = (self.apart < within).sum(axis=1)
         medoid = int(counts.argmax())
         return [int(n) for n in np.argsort(self.apart[medoid]) if self.apart[medoid, n] < within]
@@ -54,7 +62,7 @@ def background(track: Track) -> ByteArray:
 
 
 def keeps_place(track: Track) -> bool:
-    """Whether a camera stands still, by the backgrounds of both halves of its recording."""
+    """Return True if both halves of a recording have the same background: the camera is still."""
     half = len(track.stamps_ns) // 2
     parts = (slice(0, half), slice(half, None))
     halves = [
@@ -70,7 +78,7 @@ def find_places(backgrounds: Sequence[ByteArray]) -> CameraPlaces:
     A moved camera shifts all of the background; a moved object only a part, which the homography
     of the rest leaves out.
     """
-    sift = cv2.SIFT_create(_NUM_CORNERS, contrastThreshold=0.01)  # type: ignore[attr-defined]
+    sift = cv2.SIFT_create(_MAX_FEATURES, contrastThreshold=0.01)  # type: ignore[attr-defined]
     corners = [_corners(sift, image) for image in backgrounds]
     count = len(backgrounds)
     apart = np.full((count, count), np.inf)
@@ -79,7 +87,7 @@ def find_places(backgrounds: Sequence[ByteArray]) -> CameraPlaces:
     for a in range(count):
         for b in range(a + 1, count):
             pairs = _matched(corners[a], corners[b])
-            if len(pairs) >= _LEAST_MATCHES:
+            if len(pairs) >= _MIN_MATCHES:
                 matches[a, b] = pairs
                 shift = np.linalg.norm(pairs[:, 0] - pairs[:, 1], axis=1)
                 apart[a, b] = apart[b, a] = float(np.median(shift))
@@ -87,7 +95,7 @@ def find_places(backgrounds: Sequence[ByteArray]) -> CameraPlaces:
 
 
 def turn_between(pairs: FloatArray, focal: float) -> FloatArray:
-    """(3, 3) R with which rays of the first picture become those of the second.
+    """Return the rotation (3, 3) from rays of the first picture to rays of the second.
 
     Args:
         pairs: matched points (M, 2, 2), see `CameraPlaces`.
@@ -102,13 +110,13 @@ def turn_between(pairs: FloatArray, focal: float) -> FloatArray:
 def _corners(sift: cv2.Feature2D, image: ByteArray) -> tuple[FloatArray, NDArray[np.float32]]:
     """Places (N, 2) [share of the width, from the middle] and descriptors."""
     height, width = image.shape[:2]
-    size = _WIDTH, round(height * _WIDTH / width)
+    size = _WIDTH_PX, round(height * _WIDTH_PX / width)
     grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), cv2.COLOR_RGB2GRAY)
     found, described = sift.detectAndCompute(grey, None)
     if described is None:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
     points = np.array([point.pt for point in found], np.float64)
-    return (points - (np.array(size) - 1) / 2) / _WIDTH, np.asarray(described, np.float32)
+    return (points - (np.array(size) - 1) / 2) / _WIDTH_PX, np.asarray(described, np.float32)
 
 
 def _matched(
@@ -116,14 +124,14 @@ def _matched(
 ) -> FloatArray:
     """(M, 2, 2) points of both backgrounds that move together."""
     none = np.zeros((0, 2, 2))
-    if min(len(a[0]), len(b[0])) < _LEAST_MATCHES:
+    if min(len(a[0]), len(b[0])) < _MIN_MATCHES:
         return none
     found = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(a[1], b[1])
-    if len(found) < _LEAST_MATCHES:
+    if len(found) < _MIN_MATCHES:
         return none
     pairs = np.array([[a[0][m.queryIdx], b[0][m.trainIdx]] for m in found])
     H, inside = cv2.findHomography(
-        pairs[:, 0] * _WIDTH, pairs[:, 1] * _WIDTH, cv2.RANSAC, _INLIER_PX
+        pairs[:, 0] * _WIDTH_PX, pairs[:, 1] * _WIDTH_PX, cv2.RANSAC, _INLIER_PX
     )
     return none if H is None else pairs[inside.ravel() > 0]
 

@@ -1,4 +1,4 @@
-"""Whether the masks that an import stored can be those of the named objects."""
+"""Plausibility check of the object masks that an import stored."""
 
 from __future__ import annotations
 

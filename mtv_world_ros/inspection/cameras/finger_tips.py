@@ -1,4 +1,4 @@
-"""Where the middle between the finger tips is: what somebody clicks in a picture."""
+"""Middle between the finger tips of a gripper: the point that a user clicks in a picture."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import gripper_links, LinkShape
 
-#: a finger ends in its points this far behind its farthest one, and a link that ends this far
-#: behind the farthest one has no tip [m]
-_TIP_M, _BESIDE_TIP_M = 0.002, 0.015
+#: depth of a finger's tip: mesh points within this distance of the farthest one are averaged [m]
+_TIP_DEPTH_M = 0.002
+#: a link that ends farther than this behind the farthest link has no finger tip [m]
+_MAX_SHORTER_BY_M = 0.015
 
 
 def tip_middles(
@@ -49,7 +50,7 @@ def num_tips(robot: RobotModel, shapes: Sequence[LinkShape], arm: int = 0) -> in
 def _tips(
     robot: RobotModel, shapes: Sequence[LinkShape], positions: FloatArray, arm: int
 ) -> list[list[FloatArray]]:
-    """Of each of T states, the (3,) tips in the base link; empty without fingers or shapes."""
+    """Return the finger tips (3,) of each of T states [m], base frame; empty without shapes."""
     links = gripper_links(robot, robot.tools[arm])
     parts = [part for part in shapes if part.link in links]
     if not parts:
@@ -73,6 +74,6 @@ def _ends(
     for found in by_link.values():
         points = np.concatenate(found)
         reach = (points - tool[:3, 3]) @ tool[:3, 2]
-        ends.append((reach.max(), points[reach > reach.max() - _TIP_M].mean(axis=0)))
+        ends.append((reach.max(), points[reach > reach.max() - _TIP_DEPTH_M].mean(axis=0)))
     farthest = max(reach for reach, _ in ends)
-    return [end for reach, end in ends if reach > farthest - _BESIDE_TIP_M]
+    return [end for reach, end in ends if reach > farthest - _MAX_SHORTER_BY_M]

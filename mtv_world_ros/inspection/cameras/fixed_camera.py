@@ -38,21 +38,44 @@ from mtv_world_ros.robot.mesh_pieces import outermost
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import fill, LinkShape, moving_links
 
-#: widths of the images and blurs [px] of the steps of the search, from coarse to fine
-_COARSE, _WIDE, _MIDDLE, _NEAR, _FINE = (64, 1.5), (120, 5.0), (120, 2.0), (160, 1.0), (240, 1.5)
-#: difference of drawn and seen change from which on a pixel counts less
+
+class ImageStage(NamedTuple):
+    """Image size of one step of the search.
+
+    Attributes:
+        width: width to which the images are shrunk [px].
+        blur: standard deviation of the blur [px].
+    """
+
+    width: int
+    blur: float
+
+
+#: search without a guess: cameras all around the robot
+_SEARCH_STAGE = ImageStage(64, 1.5)
+#: first fit from a guess: a wide blur, so that distant silhouettes still attract each other
+_WIDE_STAGE = ImageStage(120, 5.0)
+#: second fit from a guess
+_MIDDLE_STAGE = ImageStage(120, 2.0)
+#: first fit of a pose that is nearly right
+_NEAR_STAGE = ImageStage(160, 1.0)
+#: last fit, whose residuals give the standard error
+_FINE_STAGE = ImageStage(240, 1.5)
+#: outlier threshold: a pixel counts less where drawn and seen change differ by more than this
 _OUTLIER = 0.3
 #: where the robot is in both frames, a pixel may change or not
 _INSIDE = 0.3
 _NUM_FRAMES = 24
 #: directions in which a part's outermost points are drawn
 _NUM_CORNERS = 48
-#: parts that move less are left out: an arm that rests says nothing [m]
+#: links that move less are left out, because an arm at rest does not constrain the pose [m]
 _STILL_M = 0.02
-#: of the first search's sizes, the part that it looks at
+#: factor by which the images of the first search are shrunk again
 _ROUGH = 4
-#: without a guess: cameras tried around the robot, and how many of the best are looked at closely
-_NUM_TRIED, _NUM_KEPT = 1500, 6
+#: search without a guess: number of camera poses tried around the robot
+_NUM_CANDIDATES = 1500
+#: search without a guess: number of best candidates that are refined
+_NUM_REFINED = 6
 _Item = TypeVar('_Item')
 #: measurements that the pixels of all frames are worth
 _NUM_INDEPENDENT = 12
@@ -63,7 +86,7 @@ _LEAST_FIT = 0.45
 
 
 class Reading(NamedTuple):
-    """How colours that change are read.
+    """Settings that turn a change of colour into a probability of motion.
 
     Attributes:
         brightness: the share of a colour's brightness that counts.
@@ -84,7 +107,7 @@ READINGS = (Reading(1.0, 4.0, 16.0), Reading(0.3, 6.0, 20.0))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Changes:
-    """What changed between frames, at one size of the images.
+    """Changed pixels of pairs of frames, at one image size.
 
     Attributes:
         camera: its intrinsics at that size.
@@ -175,7 +198,7 @@ class FixedCamera:
         starts = [(T, reading) for reading in READINGS] if guess else self._search(seed, progress)
         found = []
         sizes = {
-            reading: (self.changes(*_WIDE, reading), self.changes(*_MIDDLE, reading))
+            reading: (self.changes(*_WIDE_STAGE, reading), self.changes(*_MIDDLE_STAGE, reading))
             for reading in dict.fromkeys(reading for _, reading in starts)
         }
         for start, reading in progress(starts):
@@ -183,7 +206,7 @@ class FixedCamera:
             pose = self._aligned(self._aligned(start, wide), middle)
             found.append((self.fit(pose, middle), pose, reading))
         _, T, reading = max(found, key=lambda one: one[0])
-        near, fine = self.changes(*_NEAR, reading), self.changes(*_FINE, reading)
+        near, fine = self.changes(*_NEAR_STAGE, reading), self.changes(*_FINE_STAGE, reading)
         for sign in (1.0, -1.0):
             T = self._refined(T, near, sign * self._alike_steps(T, near))
         T = self._aligned(T, fine)
@@ -223,7 +246,7 @@ class FixedCamera:
         return np.array(pairs)
 
     def changes(self, width: int, blur: float, reading: Reading) -> Changes:
-        """What changes between frames, in images of a width, blurred by some pixels."""
+        """Return the changed pixels of all pairs, in images of a width and blur [px]."""
         small = shrunk(self.camera, width)
         size = small.width, small.height
         colours = [
@@ -280,7 +303,7 @@ class FixedCamera:
         return (self._drawn(T, changes) - changes.seen).reshape(len(changes.pairs), -1)
 
     def _standard_errors(self, T: FloatArray, changes: Changes) -> tuple[float, float]:
-        """Of the camera's place [mm] and direction [degrees].
+        """Return the standard errors of the camera's position [mm] and direction [degrees].
 
         Errors of the shapes, shadows and the robot's own pattern are the same for a whole link
         in all frames, so that pixels say much less than their number: they are counted as few
@@ -321,10 +344,11 @@ class FixedCamera:
         return errors, 1 / (1 + (errors / _OUTLIER) ** 2), slopes
 
     def _alike_steps(self, T: FloatArray, changes: Changes) -> FloatArray:
-        """(6, 6) steps, in rows, that change the drawn pixels alike; the largest is of `_STEP`.
+        """Return steps (6, 6), one per row, that change the drawn pixels by equal amounts.
 
-        A camera that circles the robot while it looks at it hardly changes them: there, least
-        squares stop far from the best pose, and a simplex of these steps goes on.
+        The largest step has length `_STEP`. A camera that circles the robot while it looks at it
+        hardly changes the pixels: there, least squares stop far from the best pose, and a simplex
+        search continues from these steps.
         """
         _, weights, slopes = self._linearized(T, changes)
         values, vectors = np.linalg.eigh(np.asarray((weights * slopes) @ slopes.T, np.float64))
@@ -367,13 +391,13 @@ class FixedCamera:
     ) -> list[tuple[FloatArray, Reading]]:
         """The best of many upright cameras around the robot, and how each reads changes best."""
         generator = np.random.default_rng(seed)
-        changes = {reading: self.changes(*_COARSE, reading) for reading in READINGS}
+        changes = {reading: self.changes(*_SEARCH_STAGE, reading) for reading in READINGS}
         reach = float(np.linalg.norm(self.points.reshape(-1, 3) - self.centre, axis=1).max())
         narrowest = min(self.camera.width / self.camera.K[0, 0],
                         self.camera.height / self.camera.K[1, 1])  # fmt: skip
         rough = [roughened(one) for one in changes.values()]
         tried = []
-        for _ in progress(range(_NUM_TRIED)):
+        for _ in progress(range(_NUM_CANDIDATES)):
             away = reach / narrowest * generator.uniform(0.7, 3.5)
             T = random_camera(self.centre, away, reach, generator)
             fits = self.rough_fits(T, changes[READINGS[0]], rough)
@@ -390,7 +414,10 @@ class FixedCamera:
     def rough_fits(
         self, T: FloatArray, like: Changes, rough: Sequence[NDArray[np.float32]]
     ) -> list[float]:
-        """As `_fit`, with points in place of silhouettes, on each of `_rough`."""
+        """Return the correlation of drawn and seen motion of each reading, drawn with mesh points.
+
+        Points in place of silhouettes are fast enough to try thousands of poses.
+        """
         width, height = like.camera.width // _ROUGH, like.camera.height // _ROUGH
         pixels, _ = project(with_pose(like.camera, T), T, self.points)
         cells = np.floor(np.nan_to_num(pixels, nan=-99.0) / _ROUGH).astype(int)
@@ -441,7 +468,7 @@ def best_apart(
     for _, _, T, item in sorted(tried, key=lambda one: one[:2], reverse=True):
         if all(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.15 * reach for other, _ in best):
             best.append((T, item))
-        if len(best) == _NUM_KEPT:
+        if len(best) == _NUM_REFINED:
             break
     return best
 
@@ -464,7 +491,7 @@ def _colour_distance(
 
 
 def _way(part: LinkShape, poses: FloatArray) -> float:
-    """How far a part's points get from where they are at first, at most [m]."""
+    """Return the largest distance of a part's points from their first position [m]."""
     points = _sample(part.points) @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
     return float(np.linalg.norm(points - points[0], axis=-1).max())
 

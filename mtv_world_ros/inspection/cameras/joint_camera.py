@@ -28,14 +28,20 @@ from mtv_world_ros.inspection.cameras.fixed_camera import (
 )
 from mtv_world_ros.inspection.places import CameraPlaces, turn_between
 
-#: widths of the images and blurs [px], from coarse to fine
-_COARSE, _FIRST, _STAGES = (64, 1.5), (64, 3.0), ((80, 3.0), (120, 2.0), (160, 1.2))
-#: recordings whose background is shifted by less look alike to the search [share of the width]
-_NEAR = 0.06
-#: difference of drawn and seen change from which on a pixel counts less
+#: image width and blur of the search without a guess [px]
+_SEARCH_STAGE = (64, 1.5)
+#: image width and blur of the first fit of its candidates [px]
+_FIRST_STAGE = (64, 3.0)
+#: image width and blur of the fits that follow, from coarse to fine [px]
+_STAGES = ((80, 3.0), (120, 2.0), (160, 1.2))
+#: background shift below which two recordings share one camera pose [fraction of image width]
+_SAME_POSE_SHIFT = 0.06
+#: outlier threshold: a pixel counts less where drawn and seen change differ by more than this
 _OUTLIER = 0.3
-#: cameras tried without a guess, and how many of the best are looked at closely
-_NUM_TRIED, _NUM_REFINED = 2400, 2
+#: search without a guess: number of camera poses tried
+_NUM_CANDIDATES = 2400
+#: search without a guess: number of best candidates that are refined
+_NUM_REFINED = 2
 #: recordings that the search without a guess looks at
 _NUM_SEARCHED = 4
 #: cameras that points are fitted from
@@ -51,11 +57,15 @@ _BEHIND = 30.0
 #: units of a lens: logarithms of fx and of fy / fx, and k1; images that were resized to another
 #: aspect have pixels that are not square
 _LENS_UNITS = np.array([0.02, 0.02, 0.02])
-#: their standard deviations where the intrinsics are known, or a mere guess
-_LENS_KNOWN, _LENS_GUESSED = np.array([0.003, 0.001, 0.001]), np.array([0.35, 0.1, 0.1])
-#: with so many points, a tenth of which are this far from the middle of the image, k1 is estimated
-#: [share of the width]: one of -.1 shifts them by 1 % of the width, where fx is .4 of it
-LEAST_POINTS, LEAST_REACH = 8, 0.25
+#: prior standard deviation of the lens where the intrinsics are known, in units of the lens
+_CALIBRATED_LENS_STD = np.array([0.003, 0.001, 0.001])
+#: prior standard deviation of the lens where the intrinsics are a guess, in units of the lens
+_GUESSED_LENS_STD = np.array([0.35, 0.1, 0.1])
+#: minimum number of clicked points from which the distortion k1 is estimated
+LEAST_POINTS = 8
+#: k1 is estimated if a tenth of the points are farther than this from the principal point
+#: [fraction of image width]: k1 = -0.1 shifts such a point by 1 % of the width if fx is 0.4 of it
+LEAST_REACH = 0.25
 
 
 def through(camera: CameraModel, lens: FloatArray) -> CameraModel:
@@ -142,7 +152,7 @@ class JointCamera:
         self._recordings, self._places = list(recordings), list(places)
         self._view_of = dict(zip(self._places, views or [0] * len(places), strict=True))
         self._known = intrinsics_known
-        self._lens_std = _LENS_KNOWN if intrinsics_known else _LENS_GUESSED
+        self._lens_std = _CALIBRATED_LENS_STD if intrinsics_known else _GUESSED_LENS_STD
         self._free = [0, 1]
         self._centre = np.mean([one.centre for one in recordings], axis=0)
         self._points: dict[int, list[SeenPoint]] = {}
@@ -172,18 +182,20 @@ class JointCamera:
         elif points:
             starts = [self.from_points(places, points, seed)]
         else:
-            near = [n for n in places.near(_NEAR) if n < len(self._recordings)][:_NUM_SEARCHED]
+            near = [n for n in places.near(_SAME_POSE_SHIFT) if n < len(self._recordings)][
+                :_NUM_SEARCHED
+            ]
             found = [
-                self.refined(self._spread(near[0], T, lens, places), (_FIRST,), 10, near)
+                self.refined(self._spread(near[0], T, lens, places), (_FIRST_STAGE,), 10, near)
                 for T, lens in self.search(near, seed)
             ]
-            found.sort(key=lambda state: -float(self.fits(state, _FIRST, near).mean()))
+            found.sort(key=lambda state: -float(self.fits(state, _FIRST_STAGE, near).mean()))
             starts = found[:_NUM_REFINED]
             starts = [self._respread(near[0], state, places) for state in starts]
         ends = [self.refined(start, _STAGES[:1], 14) for start in starts]
         best = max(ends, key=lambda state: float(self.fits(state, _STAGES[0]).mean()))
         if guess is None:
-            best = self._respread(places.near(_NEAR)[0], best, places)
+            best = self._respread(places.near(_SAME_POSE_SHIFT)[0], best, places)
         return best if rough else self.refined(best, _STAGES[1:], 9)
 
     def together(
@@ -205,7 +217,7 @@ class JointCamera:
         return self._cost(state, {n: self._read(n, state, stage) for n in numbers})
 
     def _take(self, points: Sequence[SeenPoint]) -> None:
-        """Takes the seen points; where enough of them are far out, k1 is estimated, too."""
+        """Store the clicked points; k1 is also estimated if enough points are near the border."""
         self._points = {}
         for point in points:
             self._points.setdefault(self._places[point.recording], []).append(point)
@@ -240,7 +252,7 @@ class JointCamera:
         X = np.stack([point.position for point in points])
         seen = np.stack([point.pixel for point in points])
         generator = np.random.default_rng(seed)
-        std = (np.minimum(self._lens_std, 0.3) if lens is None else _LENS_KNOWN)[:2]
+        std = (np.minimum(self._lens_std, 0.3) if lens is None else _CALIBRATED_LENS_STD)[:2]
         middle = np.zeros(3) if lens is None else lens
 
         def errors(p: FloatArray) -> FloatArray:
@@ -314,13 +326,13 @@ class JointCamera:
         generator = np.random.default_rng(seed)
         members = members[:_NUM_SEARCHED]
         chosen = [self._recordings[n] for n in members]
-        changes = [{r: self._changes(n, _COARSE, r) for r in READINGS} for n in members]
+        changes = [{r: self._changes(n, _SEARCH_STAGE, r) for r in READINGS} for n in members]
         rough = [[roughened(found) for found in each.values()] for each in changes]
         points = np.concatenate([one.points.reshape(-1, 3) for one in chosen])
         reach = float(np.linalg.norm(points - self._centre, axis=1).max())
         camera = changes[0][READINGS[0]].camera
         tried = []
-        for _ in range(_NUM_TRIED):
+        for _ in range(_NUM_CANDIDATES):
             zoom = 1.0 if self._known else float(np.exp(generator.normal(0, 0.3)))
             lens = np.array([np.log(zoom), 0.0, 0.0])
             narrowest = min(camera.width / camera.K[0, 0], camera.height / camera.K[1, 1]) / zoom

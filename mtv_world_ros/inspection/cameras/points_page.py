@@ -20,16 +20,15 @@ _NUM_FRAMES = 4
 def points_page(
     episodes: Sequence[Episode], views: Sequence[str], robot: RobotModel, tips: int
 ) -> str:
-    """Returns the page, in HTML.
+    """Return the HTML page on which a user clicks the tool in frames of recordings.
 
-    Of each recording it has the frames in which the tool is farthest from where it was in the
-    others.
+    The page shows the frames of each recording whose tool positions are farthest apart.
 
     Args:
-        episodes: with joint states.
-        views: whose frames are shown.
-        robot: of the recordings.
-        tips: of its tool's fingers, each of which is clicked; what is saved is their middle.
+        episodes: recordings with joint states.
+        views: names of the views whose frames are shown.
+        robot: robot of the recordings.
+        tips: number of finger tips that are clicked per frame; their middle is saved.
 
     Raises:
         EpisodeError: a recording has no frame within its joint states.

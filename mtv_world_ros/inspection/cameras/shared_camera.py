@@ -1,4 +1,4 @@
-"""Views of several recordings: their poses and focal length, judged beside a guess."""
+"""Camera poses and focal length of the views of several recordings, compared with a guess."""
 
 from __future__ import annotations
 
@@ -33,14 +33,17 @@ from mtv_world_ros.inspection.places import background, CameraPlaces, find_place
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import LinkShape, moving_links
 
-#: frames of a recording that are compared, and directions in which shapes are drawn
-_NUM_FRAMES, _NUM_CORNERS = 10, 20
-#: the doctor's measure alone: nothing else is tried
+#: number of frames of a recording that are compared
+_NUM_FRAMES = 10
+#: number of directions in which the outermost mesh points of a link are drawn
+_NUM_CORNERS = 20
+#: settings of the motion residual of `mtv-world check` without a search for better settings
 _MEASURE = ResidualSearch(max_pairs=24, lags_s=(0.0,), rolls_deg=(), zooms=())
-#: distance of drawn and seen robot from which on a pose is doubted [share of the width]
+#: distance of drawn and seen robot above which a pose is reported as doubtful [fraction of image
+#: width]
 _DOUBTED = 0.02
-#: correlation of drawn and seen motion (the doctor's) from which on a pose is not doubted: on ten
-#: real recordings a view with the right focal length had .35 to .47, and .23 to .32 with one a
+#: minimum correlation of drawn and seen motion of a pose that is not doubtful: on ten real
+#: recordings a view with the right focal length had .35 to .47, and .23 to .32 with one a
 #: third too long; another view had .37 to .56 with any of three focal lengths
 _LEAST_MATCH = 0.335
 #: of the points of a recording each third is left out of a first fit, and tells how good it is: on
@@ -48,10 +51,11 @@ _LEAST_MATCH = 0.335
 _LEFT_OUT = 3
 #: of a view, to begin a search with
 _LEAST_POINTS = 4
-#: a seen point that is drawn farther from where it was seen is named [medians of all, and share of
-#: the width]: of 80 hasty clicks on real video two are (4 and 10 px of 320: a finger was hidden),
-#: of 87 careful ones none
-_STRAYS_MEDIANS, _STRAYS_WIDTH = 3.5, 0.01
+#: outlier threshold of clicked points, as a factor of the median error; of 80 hasty clicks on real
+#: video two are outliers (4 and 10 px of 320: a finger was hidden), of 87 careful ones none
+_OUTLIER_MEDIANS = 3.5
+#: clicked points with a smaller error are never outliers [fraction of image width]
+_OUTLIER_MIN_ERROR = 0.01
 
 
 def expected_within(apart_px: FloatArray) -> float:
@@ -68,7 +72,7 @@ def expected_within(apart_px: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SharedEstimate:
-    """What was found of one view in several recordings.
+    """Estimated camera poses of one view in several recordings.
 
     Attributes:
         cameras: of each recording, (R,).
@@ -101,7 +105,7 @@ class SharedEstimate:
         return expected_within(self.apart_px)
 
     def doubts(self, number: int) -> str:
-        """Why the pose of a recording may be wrong; empty where nothing says so."""
+        """Return the reason why the pose of a recording may be wrong; empty if there is none."""
         measure = self.measures[number]
         if measure.reason:
             return f'not checked: {measure.reason}'
@@ -358,7 +362,7 @@ def _strays(
     apart = [_apart(point, cameras[point.recording]) for point in points]
     if not apart:
         return ()
-    least = max(_STRAYS_MEDIANS * float(np.median(apart)), _STRAYS_WIDTH * cameras[0].width)
+    least = max(_OUTLIER_MEDIANS * float(np.median(apart)), _OUTLIER_MIN_ERROR * cameras[0].width)
     found = [(point, away) for point, away in zip(points, apart, strict=True) if not away <= least]
     return tuple(sorted(found, key=lambda pair: -np.nan_to_num(pair[1], nan=np.inf)))
 

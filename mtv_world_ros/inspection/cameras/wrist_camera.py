@@ -38,12 +38,48 @@ from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import moving_links
 
 _WIDTH = 640
-#: stretches of frames, frames of each that count, and the most points in each
-_NUM_STRETCHES, _LENGTH, _NUM_POINTS = 24, 6, 120
-#: a stretch ends when fewer points are left, or after so many frames
-_LEAST_POINTS, _LONGEST = 20, 15
-#: least points of the still scene in a stretch, and in all
-_LEAST_STILL, _LEAST_TRACKS = 8, 80
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingSettings:
+    """Settings of the point tracks that the pose is estimated from.
+
+    Attributes:
+        num_stretches: number of stretches of frames, spread over the recording.
+        num_frames: number of frames of a stretch that the fit uses.
+        max_points: maximum number of points tracked in a stretch.
+        min_points: a stretch ends when fewer points are left.
+        max_length: maximum number of frames of a stretch.
+        min_still_points: minimum number of points of the still scene in a usable stretch.
+        min_tracks: minimum number of points of the still scene in all stretches together.
+    """
+
+    num_stretches: int = 24
+    num_frames: int = 6
+    max_points: int = 120
+    min_points: int = 20
+    max_length: int = 15
+    min_still_points: int = 8
+    min_tracks: int = 80
+
+
+@dataclass(frozen=True, slots=True)
+class RotationSettings:
+    """Settings that select the stretches whose rotation shows the camera's direction.
+
+    Attributes:
+        min_angle_rad: minimum rotation of link and camera.
+        relative_tolerance: tolerated difference of both angles, as a fraction of the larger one.
+        tolerance_rad: tolerated difference of both angles in addition.
+    """
+
+    min_angle_rad: float = 0.06
+    relative_tolerance: float = 0.15
+    tolerance_rad: float = 0.02
+
+
+_TRACKING = TrackingSettings()
+_ROTATION = RotationSettings()
 #: blocks of stretches that are left out in turn for the standard error
 _NUM_GROUPS = 8
 #: a track that is off by more than this forwards and backwards is lost [px]
@@ -57,9 +93,6 @@ _LEAST_MOTION_PX = 6.0
 _EPIPOLAR_PX = 1.5
 #: ways to turn that explain a stretch: by its essential matrix, and by its homography
 _NUM_TURNS = 5
-#: a stretch says where the camera points if link and camera turn by this at least [rad], and by
-#: the same angle up to this factor and this difference [rad]
-_LEAST_TURN, _TURN_FACTOR, _TURN_APART = 0.06, 0.15, 0.02
 #: axes of turns within this of each other agree [rad]
 _AGREE = 0.12
 #: points are farther from the camera than the inverse of this [1/m]
@@ -67,8 +100,10 @@ _NEAREST = 50.0
 #: measurements that all points are worth: some errors are the same in all stretches, e.g. of
 #: points that slide along edges
 _NUM_INDEPENDENT = 100
-#: errors beyond which a pose counts as not found [mm, degrees]; twice the standard error
-_WORST_MM, _WORST_DEG = 100.0, 10.0
+#: maximum position error of a pose that counts as found, twice the standard error [mm]
+_MAX_ERROR_MM = 100.0
+#: maximum direction error of a pose that counts as found, twice the standard error [degrees]
+_MAX_ERROR_DEG = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +154,7 @@ class WristCamera:
         start = self._camera.T_mount_camera if guess else self._direction()
         T, scale_px = self._refined(start)
         std_mm, std_deg = self._standard_errors(T, scale_px)
-        if not 2 * std_mm < _WORST_MM or not 2 * std_deg < _WORST_DEG:
+        if not 2 * std_mm < _MAX_ERROR_MM or not 2 * std_deg < _MAX_ERROR_DEG:
             raise CalibrationError(
                 f"view '{self._camera.view}': the recording does not determine the pose "
                 f'(standard error {std_mm:.0f} mm and {std_deg:.1f} degrees); record one in which '
@@ -168,9 +203,9 @@ class WristCamera:
         return T
 
     def _errors(self, T_mount_camera: FloatArray) -> FloatArray:
-        """(M, L - 1, 2) where points should be seen, seen from where they are [px].
+        """Return the reprojection errors (M, L - 1, 2) of the tracked points [px].
 
-        A point lies on its first ray, at the distance with which its other sights fit best.
+        A point lies on its first ray, at the distance that fits its other observations best.
         """
         tracks = self._tracks
         T = self._poses @ T_mount_camera
@@ -265,7 +300,7 @@ def _rotation_between(turns: FloatArray) -> FloatArray | None:
 def _agree(R: FloatArray, turns: FloatArray) -> np.ndarray:
     """(N,) whether the turned second vectors point as the first do."""
     apart = np.linalg.norm(turns[:, 0] - turns[:, 1] @ R.T, axis=-1)
-    return apart < _AGREE * np.linalg.norm(turns[:, 0], axis=-1) + _TURN_APART
+    return apart < _AGREE * np.linalg.norm(turns[:, 0], axis=-1) + _ROTATION.tolerance_rad
 
 
 def follow_scene(
@@ -284,17 +319,18 @@ def follow_scene(
     """
     indices = covered_frames(track, joints)
     small = shrunk(camera, _WIDTH)
-    starts = np.unique(np.linspace(0, len(indices) - 3, _NUM_STRETCHES).astype(int))
+    starts = np.unique(np.linspace(0, len(indices) - 3, _TRACKING.num_stretches).astype(int))
     found = [
         stretch
         for start in starts
-        if (stretch := _stretch(track, indices[start : start + _LONGEST], small)) is not None
+        if (stretch := _stretch(track, indices[start : start + _TRACKING.max_length], small))
+        is not None
     ]
     count = sum(len(rays) for rays, _, _ in found)
-    if count < _LEAST_TRACKS or len(found) < _NUM_GROUPS:
+    if count < _TRACKING.min_tracks or len(found) < _NUM_GROUPS:
         raise CalibrationError(
             f"view '{camera.view}': only {count} points of a scene that moves past the camera "
-            f'could be tracked, in {len(found)} stretches of frames ({_LEAST_TRACKS} in '
+            f'could be tracked, in {len(found)} stretches of frames ({_TRACKING.min_tracks} in '
             f'{_NUM_GROUPS} are needed); record a scene with texture, in good light, and turn the '
             'wrist slowly about several axes'
         )
@@ -313,20 +349,23 @@ def _stretch(
 ) -> tuple[FloatArray, np.ndarray, FloatArray] | None:
     """Rays (M, L, 3) tracked from the first frame on, the L frames, and the camera's turns."""
     pixels = _tracked(track, chosen, camera)
-    if len(pixels) < _LEAST_STILL or pixels.shape[1] < 3:
+    if len(pixels) < _TRACKING.min_still_points or pixels.shape[1] < 3:
         return None
-    steps = np.linspace(0, pixels.shape[1] - 1, _LENGTH).round().astype(int)
+    steps = np.linspace(0, pixels.shape[1] - 1, _TRACKING.num_frames).round().astype(int)
     rays = unproject(camera, pixels[:, steps])
     rays = rays[np.isfinite(rays).all(axis=(1, 2))]
     still, turns = _still_scene(rays, camera)
-    if still.sum() < _LEAST_STILL:
+    if still.sum() < _TRACKING.min_still_points:
         return None
     return rays[still], chosen[steps], turns
 
 
 def _alike(link: FloatArray, seen: FloatArray) -> bool:
     a, b = float(np.linalg.norm(link)), float(np.linalg.norm(seen))
-    return min(a, b) > _LEAST_TURN and abs(a - b) < _TURN_FACTOR * max(a, b) + _TURN_APART
+    return (
+        min(a, b) > _ROTATION.min_angle_rad
+        and abs(a - b) < _ROTATION.relative_tolerance * max(a, b) + _ROTATION.tolerance_rad
+    )
 
 
 def _vector(R: FloatArray) -> FloatArray:
@@ -343,7 +382,7 @@ def _still_scene(rays: FloatArray, camera: CameraModel) -> tuple[np.ndarray, Flo
     moves = np.linalg.norm((rays[..., :2] / rays[..., 2:]) - first[:, None], axis=-1).max(axis=1)
     moving = moves * focal > _LEAST_MOTION_PX
     nothing = np.zeros(len(rays), bool), np.full((_NUM_TURNS, 3), np.nan)
-    if moving.sum() < _LEAST_STILL:
+    if moving.sum() < _TRACKING.min_still_points:
         return nothing
     first, last = first[moving], last[moving]
     E, inside = cv2.findEssentialMat(
@@ -368,7 +407,7 @@ def _tracked(track: Track, chosen: np.ndarray, camera: CameraModel) -> FloatArra
     It ends where too few are left.
     """
     before = grey(np.asarray(track.frames[int(chosen[0])]), camera)
-    corners = cv2.goodFeaturesToTrack(before, _NUM_POINTS, 0.01, 8)
+    corners = cv2.goodFeaturesToTrack(before, _TRACKING.max_points, 0.01, 8)
     if corners is None:
         return np.zeros((0, 1, 2))
     paths = _on_corner(before, corners).reshape(-1, 1, 2).astype(np.float64)
@@ -379,7 +418,7 @@ def _tracked(track: Track, chosen: np.ndarray, camera: CameraModel) -> FloatArra
         kept = ok & (np.linalg.norm((back - start).reshape(-1, 2), axis=1) < _LOST_PX)
         inside = (ahead >= 4) & (ahead < np.array([camera.width, camera.height]) - 4)
         kept &= inside.reshape(-1, 2).all(axis=1)
-        if kept.sum() < _LEAST_POINTS:
+        if kept.sum() < _TRACKING.min_points:
             break
         there = _on_corner(after, ahead[kept]).reshape(-1, 1, 2)
         paths = np.concatenate([paths[kept], there], axis=1)
