@@ -111,11 +111,11 @@ class BagMapping(Written):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeSource:
-    """How recordings are read that are not episodes of this package's own.
+    """Topic names and calibration of recordings that were not made by this package.
 
     Attributes:
         mapping: names and kinds of the topics; None = the default names.
-        calibration: camera calibration; None = `calibration.yaml` beside each, or TF.
+        calibration: camera calibration; None = `calibration.yaml` next to each recording, or TF.
     """
 
     mapping: BagMapping | None = None

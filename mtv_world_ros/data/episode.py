@@ -30,8 +30,10 @@ METADATA_NAME = 'mtv_world'
 MASKS_BY = 'masks_by'
 #: key of the metadata that names the views whose camera's pose was not known at the import
 UNKNOWN_CAMERAS = 'unknown_cameras'
-#: key of the metadata that names the physics of a simulated episode, and the usual one
-PHYSICS, NOMINAL = 'physics', 'nominal'
+#: key of the metadata that names the physics of a simulated episode
+PHYSICS = 'physics'
+#: name of the default physics
+NOMINAL = 'nominal'
 CALIBRATION_FILE = 'calibration.yaml'
 OUTCOMES = ('success', 'failure', 'unknown')
 
@@ -67,7 +69,7 @@ def check_outcome(outcome: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeInfo:
-    """What an episode shows.
+    """Metadata of an episode.
 
     Attributes:
         path: its folder or file.
@@ -113,7 +115,7 @@ def dump_info(info: EpisodeInfo) -> dict[str, str]:
 def parse_info(
     path: Path, values: Mapping[str, str], *, default_instruction: str = ''
 ) -> EpisodeInfo:
-    """What the metadata record of the episode at `path` says; inverse of `dump_info`.
+    """Return the metadata of the episode at `path` from its record; inverse of `dump_info`.
 
     Raises:
         EpisodeError: a value cannot be used.
@@ -138,10 +140,11 @@ def parse_info(
 
 
 class Frames(Protocol):
-    """N frames that are decoded when asked for.
+    """N frames that are decoded on access.
 
-    `frames[i]` is one frame, `frames[i:j]` and `frames[[i, j]]` arrays of them, and
-    `numpy.asarray(frames)` all: (N, H, W, 3) uint8 RGB, or (N, H, W) uint8 for masks.
+    `frames[i]` is one frame, `frames[i:j]` and `frames[[i, j]]` are arrays of frames, and
+    `numpy.asarray(frames)` is the array of all frames,
+    (N, H, W, 3) uint8 RGB, or (N, H, W) uint8 for masks.
     """
 
     def __len__(self) -> int: ...
@@ -152,7 +155,7 @@ class Frames(Protocol):
 
 
 class LazyFrames:
-    """`Frames` of image messages, each of which is decoded by itself.
+    """`Frames` of image messages that are decoded independently of each other.
 
     Args:
         topic: name of the topic, for error texts.

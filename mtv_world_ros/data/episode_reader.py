@@ -388,7 +388,7 @@ class _EpisodeReader:
     def _parsed(
         self, topic: str, msgtype: str, parse: Callable[[Any], Item]
     ) -> list[tuple[int, Item]]:
-        """What messages of a topic are parsed to, by stamp; those that cannot be are refused."""
+        """Return the parsed messages of a topic and their stamps [ns]; refuse invalid ones."""
         good = []
         for stamp, message in self._take(topic, msgtype):
             try:
@@ -652,7 +652,7 @@ class _EpisodeReader:
         )
 
     def _placeholder(self, view: str, mount: str, images: Track) -> CameraModel:
-        """A camera of which nothing is known but, perhaps, a CameraInfo."""
+        """Return a placeholder for a camera of unknown pose, and store what is unknown."""
         self.unknown[view] = 'pose' if self._camera_infos(view) else 'pose and intrinsics'
         height, width = images.frames[0].shape[:2]
         return unknown_camera(view, width, height, mount)
@@ -773,7 +773,7 @@ def _info(bag: BagReader, instructions: Sequence[tuple[int, str]]) -> EpisodeInf
 
 
 def _estimate(path: Path, view: str) -> str:
-    """What to do about a camera of unknown pose."""
+    """Return the advice for a camera of unknown pose: the command that estimates it."""
     return f'estimate it from the recording: mtv-world fit camera {path} --view {view} --no-guess'
 
 
@@ -801,7 +801,7 @@ class EpisodeTopics:
     object_poses: str
 
     def names(self, *, with_masks: bool) -> set[str]:
-        """All of them."""
+        """Return the names of all topics, of mask topics only on request."""
         names = {self.joint_states, self.joint_trajectory, self.instruction, self.object_poses}
         for view in self.views.values():
             names |= {view.image, view.camera_info, *([view.mask] if with_masks else [])}
@@ -814,10 +814,10 @@ def find_topics(
     views: Sequence[str] | None,
     named: Mapping[str, str],
 ) -> EpisodeTopics:
-    """Chooses the topics of an episode.
+    """Return the topics of an episode.
 
     A view's images are at `/<view>/image_raw` or `/<view>/image_raw/compressed` (raw is taken
-    where both are there) unless `named` says otherwise; CameraInfo and masks lie beside them.
+    if both exist) unless `named` says otherwise; CameraInfo and masks have the same namespace.
 
     Args:
         path: the bag, for error texts.

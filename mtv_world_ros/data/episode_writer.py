@@ -34,7 +34,7 @@ from mtv_world_ros.data.episode import (
 
 
 class EpisodeWriter(BagWriter):
-    """Records an episode: frames, joint states, commands, masks and metadata.
+    """Writer of an episode: frames, joint states, commands, masks and metadata.
 
     Log times equal the headers' stamps. Set `outcome` before the block ends.
 
@@ -43,7 +43,7 @@ class EpisodeWriter(BagWriter):
         task: name of the task.
         instruction: text for the robot; `write_instruction` records it as a topic.
         robot: name of the robot.
-        cameras: calibrated views; go into calibration.yaml beside the record.
+        cameras: calibrated views, written to calibration.yaml in the folder.
         seed: seed the episode is made from.
         objects: names of the objects; masks number them from 1.
         metadata: further text by key.

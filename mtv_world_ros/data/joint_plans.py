@@ -91,15 +91,15 @@ def _rows(names: Sequence[str], points: Iterable[Any], field: str) -> FloatArray
 
 
 def following(states: JointStates, chunk_s: float, start_ns: int) -> list[Plan]:
-    """Positions as commands: each is reached at its own stamp.
+    """Return trajectories that reach measured positions at the stamps of their measurement.
 
     Args:
         states: positions over time.
         chunk_s: length of a trajectory [s].
-        start_ns: where the first trajectory starts: none can be played before there are images.
+        start_ns: start of the first trajectory, which cannot be played before there are images.
 
     Returns:
-        (start stamp [ns], trajectory), each of which ends where the next one starts.
+        (start stamp [ns], trajectory); each trajectory ends where the next one starts.
     """
     stamps = states.stamps_ns
     seconds = (stamps - stamps[0]) * 1e-9
@@ -159,14 +159,14 @@ def hold_at_stops(
 
 
 def join_streams(plans: Sequence[Plan], chunk_s: float) -> tuple[list[Plan], int]:
-    """Joins plans of one point that follow one another quickly, as MoveIt Servo sends them.
+    """Join streams of plans with a single point, as MoveIt Servo sends them, into longer plans.
 
     Args:
         plans: (start stamp [ns], trajectory), by stamp.
-        chunk_s: length of the plans that are made of them [s].
+        chunk_s: length of the joined plans [s].
 
     Returns:
-        Plans by stamp, and how many of one point were joined.
+        Plans by stamp, and the number of plans with a single point that were joined.
     """
     joined: list[Plan] = []
     count = 0

@@ -42,7 +42,7 @@ class ReachSettings:
     scattered_ratio: float = 0.3
     #: a publisher whose joints vary by less stands still [rad or m]
     still: float = 1e-3
-    #: publishers that are told apart at most
+    #: maximum number of publishers that are distinguished
     num_publishers: int = 32
 
 
@@ -123,11 +123,11 @@ class JointReach:
 
 
 class Unreachable(NamedTuple):
-    """Samples that the joints cannot have moved to.
+    """Samples that the joints cannot have reached.
 
     Attributes:
-        rows: (N,) which of the samples.
-        text: joint, size, time and number of them; empty = none.
+        rows: (N,) True for an unreachable sample.
+        text: joint, size, time and number of the unreachable samples; empty if there is none.
     """
 
     rows: BoolArray
@@ -268,7 +268,7 @@ def _robot_source(
 
 
 def _moves(positions: FloatArray, settings: ReachSettings) -> bool:
-    """Whether a tenth of the samples are away from the median position."""
+    """Return True if a tenth of the samples or more differ from the median position."""
     with np.errstate(invalid='ignore'):
         away = np.nan_to_num(np.abs(positions - np.nanmedian(positions, axis=0)))
     return bool(np.quantile(away.max(axis=1), 0.9) > settings.still)
@@ -441,7 +441,7 @@ def _own_columns(
 
 
 def _stands_in(what: str, joints: Sequence[str], text: str) -> str:
-    """What is done about positions that cannot be used, once for all joints."""
+    """Return the note on unusable positions of joints, which their neighbours replace."""
     quoted = ', '.join(f"'{joint}'" for joint in joints)
     named = f'joint {quoted} is' if len(joints) == 1 else f'joints {quoted} are'
     return f"'{what}': {named} {text}; the positions before and after stand in"

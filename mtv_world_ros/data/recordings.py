@@ -155,10 +155,10 @@ def commanded(recording: Recording, start: int, times: FloatArray) -> FloatArray
 
 
 def commands_until(recording: Recording, start: int, seconds: float) -> JointTrajectory:
-    """The commands that are due after frame `start`, counted from it, up to a time.
+    """Return the commands after frame `start`, relative to its time, cut off at `seconds`.
 
-    All of them, as they were sent: what is quicker than the frames decides about contact. They
-    end at that time; past their own end the arms hold still.
+    No command is resampled, because motion between two frames can decide about contact. After the
+    last command the arms hold their position.
     """
     return cut_off(commands_from(recording, start), recording.positions[start], seconds)
 

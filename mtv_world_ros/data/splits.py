@@ -1,4 +1,4 @@
-"""Which episodes of a data set are used: its splits, and the fault kinds of what acted in them."""
+"""Selection of the episodes of a data set: splits, and fault kinds of the recorded policies."""
 
 from __future__ import annotations
 
@@ -16,11 +16,15 @@ from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest, Policy
 from mtv_world_ros.data.episode import EpisodeInfo, NOMINAL, PHYSICS
 from mtv_world_ros.data.episode_reader import list_episodes, read_info
 
-#: keys of an episode's metadata: what acted, and the splits of its fault kinds
-POLICY, FAULT_SPLIT = 'policy', 'fault_split'
-#: kind of policies, and what their names begin with
-_SCRIPTED, _EXPERT = 'scripted', 'expert'
-#: fault kinds of this split are for rankings alone
+#: key of the metadata that names the policy of an episode
+POLICY = 'policy'
+#: key of the metadata that names the split of the policy's fault kinds
+FAULT_SPLIT = 'fault_split'
+#: name of the kind of scripted policies
+_SCRIPTED_KIND = 'scripted'
+#: prefix of the names of scripted policies
+_SCRIPTED_PREFIX = 'expert'
+#: name of the split whose fault kinds are for rankings alone
 _TEST = 'test'
 
 
@@ -31,7 +35,7 @@ def recorded_policy(path: Path) -> str:
         EpisodeError: the episode's metadata cannot be used.
     """
     name = read_info(path).metadata.get(POLICY, '')
-    return name if name.split('-')[0] == _EXPERT else ''
+    return name if name.split('-')[0] == _SCRIPTED_PREFIX else ''
 
 
 def recorded_kinds(paths: Iterable[Path]) -> dict[Path, tuple[str, ...]]:
@@ -46,7 +50,7 @@ def recorded_kinds(paths: Iterable[Path]) -> dict[Path, tuple[str, ...]]:
     scripted = {path: policy for path, policy in named.items() if policy}
     if not scripted:
         return {}
-    kind = policy_kind(_SCRIPTED)
+    kind = policy_kind(_SCRIPTED_KIND)
     return {path: kind.fault_kinds(policy) for path, policy in scripted.items()}
 
 
@@ -72,9 +76,9 @@ def refuse_test_kinds(paths: Iterable[Path], what: str) -> None:
         )
     # earlier episodes do not say it: the name does
     names = {m.get(POLICY, '') for m in read if FAULT_SPLIT not in m}
-    scripted = sorted(name for name in names if name.split('-')[0] == _EXPERT)
+    scripted = sorted(name for name in names if name.split('-')[0] == _SCRIPTED_PREFIX)
     if scripted:
-        policy_kind(_SCRIPTED).refuse_test_kinds(scripted, what)
+        policy_kind(_SCRIPTED_KIND).refuse_test_kinds(scripted, what)
 
 
 #: describes a data set; `mtv-world collect` writes it
@@ -105,13 +109,13 @@ class Selection:
 def select(
     dataset: Path, split: str | None = None, limit: int | None = None, *, default: str = 'test'
 ) -> Selection:
-    """Returns the episodes of a split.
+    """Return the episodes of a split.
 
     Args:
         dataset: folder with episode folders in it; its `dataset.json`, if there is one, names the
             splits and, per episode, `zero_shot`: `view`, `task` or `object`.
         split: name of a split, or `all`; None = `default` where the data set has it, else `all`.
-        limit: only the first so many of them.
+        limit: maximum number of episodes; the first ones are kept.
         default: see `split`.
 
     Raises:
@@ -143,11 +147,11 @@ def select(
 
 
 def of_physics(selection: Selection, physics: str | None = None) -> tuple[Selection, str]:
-    """Returns the episodes of one physics, and what is true in them, in words.
+    """Return the episodes of one physics, and a text with the physics and number of episodes.
 
     Args:
         selection: episodes to choose from.
-        physics: as `collect --physics` named it; None = all of them.
+        physics: name given to `collect --physics`; None = all episodes.
 
     Raises:
         ConfigError: no episode is of this physics.
@@ -167,7 +171,7 @@ def of_physics(selection: Selection, physics: str | None = None) -> tuple[Select
 
 
 def _physics(info: EpisodeInfo) -> str:
-    """What is true in an episode; the simulator's older ones do not say it."""
+    """Return the name of an episode's physics; older simulated episodes do not store it."""
     usual = NOMINAL if info.seed is not None else 'not stated'
     return info.metadata.get(PHYSICS, usual)
 
@@ -182,7 +186,7 @@ class _Entry(BaseModel):
 
 
 class _Card(BaseModel):
-    """What is read of `dataset.json`; it has more."""
+    """Entries of `dataset.json` that are used; other entries are ignored."""
 
     splits: dict[str, list[str]] = {}
     episodes: list[_Entry] = []

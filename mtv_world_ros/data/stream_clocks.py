@@ -33,11 +33,13 @@ class ClockSettings:
     step_back_s: float = 0.03
     #: the least step ahead [s]; late messages that come at once look like smaller ones
     step_ahead_s: float = 0.3
-    #: messages before and after a step [s], at least so many, over which it is measured
+    #: time before and after a step in which it is measured [s]
     window_s: float = 0.5
+    #: minimum number of messages in that window
     window_messages: int = 5
-    #: messages before a step ahead; longer than any pause of the recorder [s]
+    #: window before a step ahead; longer than any pause of the recorder [s]
     long_window_s: float = 5.0
+    #: minimum number of messages in that window
     long_window_messages: int = 50
     #: a stretch between steps that is shorter holds wrong stamps, not another clock [s]
     stretch_s: float = 0.25
@@ -212,7 +214,7 @@ def _takes_received(stream: StampedStream) -> bool:
 def _mend(
     stream: StampedStream, begin_ns: int, notes: list[str], settings: ClockSettings
 ) -> tuple[Stamps, BoolArray, list[ClockStep]]:
-    """Stamps of a stream by itself, which of them are kept, and its steps."""
+    """Return mended stamps [ns] of one stream, True for each row that is kept, and its steps."""
     stamps, all_rows = stream.stamps_ns.copy(), np.ones(len(stream.stamps_ns), bool)
     is_plan = stream.spans_ns is not None
     if is_plan or _takes_received(stream) or len(stamps) < settings.stretch_messages:
@@ -492,7 +494,10 @@ def _is_same_size(one: float, other: float, settings: ClockSettings) -> bool:
 
 
 def _follows(stream: StampedStream, step: ClockStep, settings: ClockSettings) -> bool:
-    """Whether a stream without a step of its own allows one; slow streams and plans do."""
+    """Return True if a step agrees with a stream in which none was found.
+
+    Slow streams and plans agree with any step.
+    """
     before = stream.received_ns <= step.before_ns
     after = stream.received_ns >= step.after_ns
     least = settings.stretch_messages
@@ -593,7 +598,7 @@ def _offset(stream: StampedStream, reference: StampedStream) -> float | None:
 
 
 def _is_possible(stream: StampedStream, ahead_s: float, settings: ClockSettings) -> bool:
-    """Whether a delay, or the start of a plan, explains an offset."""
+    """Return True if a delay, or the start of a plan, explains an offset [s]."""
     if stream.spans_ns is None:
         return -settings.refused_behind_s <= ahead_s <= settings.refused_ahead_s
     length_s = float(np.median(stream.spans_ns)) / NANO
@@ -657,7 +662,7 @@ def check_row_times(times: FloatArray, what: str, rate_hz: float | None = None) 
 
 
 def _fall(times: FloatArray, row: int) -> str:
-    """How and why times do not increase at a row."""
+    """Return a text on how, and why, times do not increase at a row."""
     size = float(times[row - 1] - times[row])
     if not np.ptp(times) and times[0] > 2**24:
         return (

@@ -41,7 +41,7 @@ class ToolTargets(Schema):
 
     @property
     def has_rotation(self) -> bool:
-        """Whether the tool shall turn; else it keeps its own rotation."""
+        """True if the targets have a rotation; otherwise the tool keeps its own."""
         return True
 
     def check(self, arm: str, robot: RobotModel) -> Tool:

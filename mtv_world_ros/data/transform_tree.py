@@ -32,13 +32,13 @@ MAX_GAP_S = 0.5
 
 
 class Mount(NamedTuple):
-    """What carries a frame.
+    """Link that carries a frame.
 
     Attributes:
         link: a link of the robot that is fixed to the frame.
         T_link_frame: (4, 4) pose of the frame in it [m]; of `pose_track` (N, 4, 4).
         stamp_ns: when the least recent transform between the two was published [ns]; None = all
-            of them are from /tf_static and hold for good.
+            transforms are from /tf_static and do not change.
     """
 
     link: str
@@ -71,7 +71,7 @@ class _Edge:
     recent: deque[tuple[int, _Numbers]] = field(default_factory=lambda: deque(maxlen=_NUM_RECENT))
 
     def see(self, numbers: _Numbers, stamp_ns: int | None) -> None:
-        """Adds a transform: widens the span of an edge that has not moved so far."""
+        """Add a transform: widen the span of an edge that has not moved yet."""
         self.count += 1
         if numbers != self.last and self.is_still:
             T = pose(numbers[:3], numbers[3:])
@@ -207,7 +207,7 @@ class TransformTree:
 
     @property
     def problems(self) -> list[str]:
-        """What was left out, a line each."""
+        """Notes on the transforms that were left out, one per line."""
         lines = [
             f'/tf: {count} transforms {edge} are no poses and were left out'
             for edge, count in self._unusable.items()
@@ -297,12 +297,12 @@ class TransformTree:
         raise CalibrationError(f"/tf and /tf_static do not lead from frame '{frame}' to the robot")
 
     def is_moving(self, frame: str, links: Collection[str]) -> bool:
-        """Tells whether TF leads from a frame to the robot's links, but to none that is fixed."""
+        """Return True if TF connects a frame with the robot's links, but with no link rigidly."""
         fixed = self._reachable(self.name(frame), only_still=True)
         return self.is_connected(frame, links) and all(m.link not in links for m in fixed)
 
     def moves_in(self, link: str, frame: str) -> bool:
-        """Tells whether TF has a transform from a link to a frame that moves."""
+        """Return True if TF has a transform from a link to a frame, and it changes over time."""
         edge = self._edges.get((self.name(link), self.name(frame)))
         return edge is not None and not edge.is_still
 
@@ -328,7 +328,7 @@ class TransformTree:
         ]
 
     def is_connected(self, frame: str, links: Collection[str]) -> bool:
-        """Tells whether TF leads from a frame to one of the links, moving or not."""
+        """Return True if TF connects a frame with one of the links, moving or not."""
         frame = self.name(frame)
         reached = self._reachable(frame, only_still=False)
         return frame in self.frames and any(mount.link in links for mount in reached)

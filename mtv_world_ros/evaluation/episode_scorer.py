@@ -74,7 +74,7 @@ class EvaluationJob:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Instruments:
-    """What episodes are measured with; None = not measured.
+    """Models and metrics that episodes are evaluated with; None = not measured.
 
     Attributes:
         pipeline: imagines and segments.
@@ -91,7 +91,7 @@ class Instruments:
 
 @dataclass(slots=True)
 class _Found:
-    """What is gathered over the stretches of an episode."""
+    """Results gathered over the stretches of an episode."""
 
     rows: list[ScoreRow] = field(default_factory=list)
     shown: list[StoredRollout] = field(default_factory=list)
@@ -266,9 +266,10 @@ class EpisodeScorer:
         truth: Truth,
         found: _Found,
     ) -> tuple[dict[str, ObjectScores], ByteArray | None]:
-        """Scores under other actions, where anything moves; what the robot cannot do is noted.
+        """Score rollouts under other actions if an object moves; return their scores and frames.
 
-        Shuffled actions are imagined in any case: their frames are returned beside.
+        Shuffled actions are imagined in any case, and their frames are returned. Actions that the
+        robot cannot execute become a note.
         """
         scores: dict[str, ObjectScores] = {}
         shuffled = None

@@ -46,12 +46,12 @@ MakePipeline = Callable[[], Pipeline]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Parallel:
-    """How many processes score episodes.
+    """Settings of the parallel evaluation of episodes.
 
     Attributes:
-        workers: processes.
-        make_pipeline: makes the same pipeline in each of them; has to be picklable.
-        threads: of each process; 0 = the cores shared evenly.
+        workers: number of processes.
+        make_pipeline: picklable function that makes the pipeline in each process.
+        threads: number of threads of each process; 0 = the cores shared evenly.
     """
 
     workers: int

@@ -26,7 +26,7 @@ from mtv_world_ros.evaluation.results import EpisodeResult, rollout_path
 from mtv_world_ros.viewing.scored_rollout import StoredRollout
 from mtv_world_ros.viewing.stored_rollout import load_rollout
 
-#: what a set of episodes that the model was trained for is called beside zero-shot sets
+#: name of the group of episodes that are not zero-shot: the model was trained for them
 SEEN = 'seen'
 NOT_MEASURED = Estimate(value=nan, interval=(nan, nan), num_episodes=0)
 
@@ -44,7 +44,7 @@ class Group:
     zero_shot: str | None = None
 
     def holds(self, result: EpisodeResult) -> bool:
-        """Whether an episode is one of them."""
+        """Return True if an episode belongs to the group."""
         fits = self.zero_shot in (None, result.zero_shot or SEEN)
         return fits and self.task in (None, result.task)
 
@@ -120,7 +120,7 @@ class EvaluationSummary:
 
     @cached_property
     def metrics(self) -> dict[str, Any]:
-        """What metrics.json holds."""
+        """Content of metrics.json."""
         seconds = float(np.mean([result.seconds_per_chunk for result in self.results]))
         source = "the simulator's" if all(r.has_ids for r in self.results) else "the segmenter's"
         return {
@@ -155,7 +155,7 @@ class EvaluationSummary:
 
     @property
     def judgements(self) -> list[Judgement]:
-        """Success estimates beside the outcomes."""
+        """Success estimates and true outcomes of the episodes."""
         return [Judgement(probability=r.probability, outcome=r.outcome) for r in self.results]
 
     @cached_property
@@ -166,12 +166,12 @@ class EvaluationSummary:
 
     @property
     def following(self) -> Following:
-        """Whether the model follows the commands, by its pictures and its moving objects."""
+        """Verdict whether the model follows the commands, from its pictures and moving objects."""
         return following(self.pictures[None], self.estimates(None).get('margin_moving'))
 
     @property
     def has_objects(self) -> bool:
-        """Whether any episode names an object; else only pictures are compared."""
+        """True if any episode names an object; otherwise only pictures are compared."""
         return bool(self._rows(None, ALL))
 
     @property

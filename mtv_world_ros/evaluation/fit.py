@@ -23,9 +23,21 @@ from mtv_world_ros.success.evidence import FEATURES
 MIN_EPISODES = 8
 #: of a fitted logistic; all labels equal would have no finite one
 MAX_BIAS = 30.0
-#: what the scores are called, in the order of the tables
-BEFORE, AFTER, AFTER_KINDS, FITTED = 'before', 'after', 'after_kinds', 'fitted'
-OBSERVED, UNFORESEEN, RESUMED = 'observed', 'unforeseen', 'resumed'
+#: judgements with the stated weights, before the fit
+BEFORE = 'before'
+#: judgements by a fit without the task of the judged episode
+AFTER = 'after'
+#: judgements by a fit without the fault kind of the judged episode
+AFTER_KINDS = 'after_kinds'
+#: judgements by the fit to all episodes: too good, because it contains the judged episode
+FITTED = 'fitted'
+#: judgements of recorded frames, by a fit to recorded frames
+OBSERVED = 'observed'
+#: judgements with only the last chunk imagined and no simulated motion, by a fit of their own
+UNFORESEEN = 'unforeseen'
+#: judgements with only the last chunk imagined
+RESUMED = 'resumed'
+#: baseline: every episode is called a success
 ALWAYS = 'always success'
 
 
@@ -58,24 +70,24 @@ class Sample:
 
     @property
     def as_observed(self) -> Sample:
-        """The same with the recorded frames in place of the imagined ones."""
+        """Copy of the sample with recorded frames in place of imagined ones."""
         return replace(self, features=(self.observed,))
 
     @property
     def as_resumed(self) -> Sample:
-        """The same with all but the last chunk seen."""
+        """Copy of the sample in which only the last chunk is imagined."""
         return replace(self, features=(self.resumed,))
 
     @property
     def as_unforeseen(self) -> Sample:
-        """The same with nothing foreseen; empty where pictures do not tell."""
+        """Copy of the sample without simulated motion; no features if pictures give no verdict."""
         is_judged = isfinite(self.resumed.get('margin', nan))
         return replace(self, features=({**self.resumed, 'foreseen': nan} if is_judged else {},))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibrated:
-    """A calibration and what it was judged by.
+    """Fitted calibration with the judgements of its samples.
 
     Attributes:
         calibration: fitted to all samples.
@@ -186,7 +198,7 @@ def _check(samples: Sequence[Sample]) -> None:
 
 
 def _tells(samples: Sequence[Sample]) -> bool:
-    """Whether there are enough episodes, of both outcomes."""
+    """Return True if there are enough judged episodes, with both outcomes."""
     outcomes = [sample.success for sample in samples if any(sample.features)]
     return len(outcomes) >= MIN_EPISODES and len(set(outcomes)) == 2
 
@@ -269,7 +281,7 @@ def _probability(fit: dict[str, Any], sample: Sample) -> float:
 
 
 def _mean_of(probabilities: Sequence[float]) -> float:
-    """The mean over the seeds that know; NaN where most of them abstain."""
+    """Return the mean over the seeds with a verdict; NaN if half of the seeds or more abstain."""
     known = [value for value in probabilities if isfinite(value)]
     return float(np.mean(known)) if 2 * len(known) > len(probabilities) else nan
 

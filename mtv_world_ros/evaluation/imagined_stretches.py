@@ -29,7 +29,7 @@ MODES = ('observe', 'imagine')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stretch:
-    """What one rollout is compared with.
+    """Recorded stretch of an episode that one rollout is compared with.
 
     Attributes:
         index: its number in the episode.

@@ -1,4 +1,4 @@
-"""What scores are compared with: other actions, the held first frame, the round trip."""
+"""Baselines of the scores: other actions, the held first frame, the autoencoder's round trip."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings stored beside results: checkpoints by their content, and a check of a folder."""
+"""Settings stored with results: checkpoints by their content, and a check of a folder."""
 
 from __future__ import annotations
 

@@ -23,22 +23,22 @@ class EpisodeResult:
 
     Attributes:
         episode: name of its folder.
-        task: its name.
-        zero_shot: what the model was not trained for in it: `view`, `task`, `object`; or empty.
+        task: name of its task.
+        zero_shot: aspect that the model was not trained for: `view`, `task`, `object`; or empty.
         outcome: `success`, `failure` or `unknown`.
-        rows: scores.
-        quality: PSNR and the like by view, as far as measured.
-        probability: the success estimate at the end of its last stretch; NaN = abstained.
-        reasons: of that estimate.
-        notes: what was wrong with the recording, and what could not be imagined.
+        rows: scores of the objects.
+        quality: PSNR, SSIM and LPIPS by view, if measured.
+        probability: success estimate at the end of the last stretch; NaN = abstained.
+        reasons: reasons of that estimate.
+        notes: defects of the recording, and rollouts that could not be imagined.
         seconds_per_chunk: mean time to imagine a chunk [s].
         seconds: by stage of the episode's evaluation [s].
-        pictures: `picture_scores` by view and name, of held frame and shuffled commands too.
-        features: of that estimate, by name; empty where it abstained.
-        observed: of the estimate at the end of the recorded frames, likewise; empty where they
-            were not judged.
-        resumed: features of the estimate where all but the last chunk was seen.
-        has_ids: whether recorded identities say which objects move.
+        pictures: `picture_scores` by view and name, with the held frame and shuffled commands.
+        features: features of the success estimate, by name; empty if it abstained.
+        observed: features of the success estimate at the end of the recorded frames, by name;
+            empty if the recorded frames were not judged.
+        resumed: features of the success estimate if only the last chunk is imagined.
+        has_ids: recorded object identities show which objects move.
     """
 
     episode: str
@@ -87,7 +87,7 @@ def _nan_for_none(values: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def compare(chunks: Sequence[Prediction], real: ByteArray) -> Comparison:
-    """Returns a rollout's chunks beside (V, T, H, W, 3) recorded frames at the same times."""
+    """Return a rollout's chunks with recorded frames (V, T, H, W, 3) of the same times."""
     videos = [chunk.video for chunk in chunks]
     return Comparison(
         views=videos[0].views,

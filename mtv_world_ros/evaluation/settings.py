@@ -1,4 +1,4 @@
-"""What an evaluation imagines and how it scores it."""
+"""Settings of an evaluation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mtv_world_ros.evaluation.references import check_actions
 
 
 class EvaluationConfig(Schema):
-    """What is imagined and how it is scored."""
+    """Settings of an evaluation: rollouts and their scores."""
 
     section: ClassVar = ''
 

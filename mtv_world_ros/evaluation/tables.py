@@ -148,7 +148,7 @@ def _numbers(
 
 
 def controls_table(summary: EvaluationSummary) -> Table:
-    """Returns J of moving objects by what was shown and view, as far as measured."""
+    """Return the table of J of moving objects, by baseline and view; only measured rows."""
     views = {view: summary.estimates(view) for view in summary.spec.views}
     rows = [
         [words, *(cell(found.get(key)) for found in views.values())]
@@ -180,7 +180,7 @@ def quality_table(summary: EvaluationSummary) -> Table | None:
 
 
 def pictures_table(summary: EvaluationSummary) -> Table | None:
-    """Returns picture scores beside held frame and other commands; None where none were made."""
+    """Return the table of picture scores and their baselines; None if there are no scores."""
     if not any(result.pictures for result in summary.results):
         return None
     rows = [
@@ -201,7 +201,7 @@ def status_table(summary: EvaluationSummary) -> Table:
 
 
 def _why_dashes(summary: EvaluationSummary) -> str:
-    """Why numbers of objects are not there, a line each; empty where all are."""
+    """Return the reasons why object scores are missing, one per line; empty if none is."""
     overall = summary.estimates(None)
     missing = [key for key in COLUMNS if cell(overall.get(key)) == DASH]
     if not missing:
@@ -217,7 +217,7 @@ def _why_dashes(summary: EvaluationSummary) -> str:
 
 
 def _truth(summary: EvaluationSummary) -> str:
-    """What the predictions were scored against."""
+    """Return the sentence that names the ground truth of the scores."""
     count = len(summary.results)
     others = count - summary.num_true
     if not others:

@@ -190,7 +190,7 @@ def import_bags(
     stage: ObjectStage = AS_RECORDED,
     progress: Callable[[Iterable[Path]], Iterable[Path]] = iter,
 ) -> ImportSummary[BagPart]:
-    """Converts bags into episodes `out/<name of the bag>`, with `out/robot/` beside them.
+    """Convert bags into episodes `out/<name of the bag>`, and save the robot in `out/robot/`.
 
     A bag in which all clocks jump at once is divided there: `out/<name>_part1` and so on.
 
@@ -241,7 +241,12 @@ def episode_name(bag: Path) -> str:
 
 
 def summary_line(path: Path, objects: bool = False) -> str:
-    """What an imported episode holds, in one line; `objects` = also where none are named."""
+    """Return one line on the content of an imported episode.
+
+    Args:
+        path: folder of the episode.
+        objects: mention objects even if none is named.
+    """
     episode = read_episode(path, with_cameras=False)
     states = episode.joint_states
     assert states is not None
@@ -470,7 +475,7 @@ def _instructions(episode: Episode, mapping: BagMapping, start_ns: int) -> list[
 
 
 def _metadata(episode: Episode, source: str, key: str) -> dict[str, str]:
-    """Where the episode is from, and who made its masks."""
+    """Return the metadata on the source of the episode and the segmenter of its masks."""
     values = {'source': source, MAPPING_KEY: key}
     values |= {UNKNOWN_CAMERAS: ', '.join(episode.unknown)} if episode.unknown else {}
     by = episode.info.metadata.get(MASKS_BY, '')

@@ -71,7 +71,7 @@ def _is_there(name: Any, info: ValidationInfo[dict[str, Any]]) -> Path | None:
 
 
 class CameraSource(Schema):
-    """Where a view is from."""
+    """Source of a view: image feature and calibration."""
 
     view: str = Field(default='', description='its name; set by the mapping')
     feature: str = Field(description='of its images')
@@ -212,7 +212,7 @@ class _Lookup:
             self._document = _read_json(self._file, source.where)
 
     def at(self, row: int) -> _Lookup:
-        """The same for the pose of another row."""
+        """Return a copy that looks up the pose of another row."""
         other = copy(self)
         other._at = row
         return other

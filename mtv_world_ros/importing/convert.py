@@ -146,7 +146,7 @@ def import_dataset(
     stage: ObjectStage = AS_RECORDED,
     progress: Callable[[Iterable[int]], Iterable[int]] = iter,
 ) -> ImportSummary[int]:
-    """Converts a LeRobot dataset into episodes `out/episode_<number>`, with `out/robot/` beside.
+    """Convert a LeRobot dataset into episodes `out/episode_<number>`, robot in `out/robot/`.
 
     Args:
         dataset: folder of the dataset.
@@ -309,7 +309,7 @@ def _commanded(
     mapping: DatasetMapping,
     measured: FloatArray,
 ) -> tuple[FloatArray, tuple[str, ...]]:
-    """(T, J) targets beside the rows, and what was odd."""
+    """Return the commanded positions (T, J) of the rows, and notes on repaired values."""
     stream = mapping.action
     if stream is None:
         return measured, ()

@@ -346,7 +346,7 @@ class LeRobotDataset:
         return table
 
     def _stale(self, entry: EpisodeEntry) -> str:
-        """Says which other files have the episode's rows; empty where none has."""
+        """Return a text on the other files with the episode's rows; empty if there is none."""
         files = [f for f in self._files_by_episode.get(entry.index, ()) if f != entry.data_file]
         if not files:
             return ''
@@ -358,7 +358,7 @@ class LeRobotDataset:
         )
 
     def _stale_video(self, feature: str) -> str:
-        """Says which video files no episode names; empty where none."""
+        """Return a text on the video files that no episode refers to; empty if there is none."""
         named = {entry.videos[feature].file for entry in self.episodes.values()}
         there = {f for f in (self.root / 'videos').rglob('*.mp4') if feature in f.parts}
         others = sorted(there - named)
@@ -392,7 +392,7 @@ class LeRobotDataset:
         for number in order:
             try:
                 cell = column[int(number)].as_py()
-            except UnicodeDecodeError as error:  # the path beside the bytes
+            except UnicodeDecodeError as error:  # pyarrow decodes the path next to the bytes
                 raise EpisodeError(
                     f"'{entry.data_file}': an image of '{feature}' is damaged: {error}"
                 ) from error
@@ -465,7 +465,7 @@ class LeRobotDataset:
 
 
 def _are_numbers(values: list[Any]) -> bool:
-    """Whether values are the numbers from 0 on, in any order."""
+    """Return True if the values are the numbers 0 .. N - 1, in any order."""
     is_whole = all(isinstance(value, int) for value in values)
     return bool(values) and is_whole and sorted(values) == list(range(len(values)))
 
@@ -489,7 +489,7 @@ def _is_file(path: Path) -> bool:
 
 
 def _is_depth_map(feature: Mapping[str, Any]) -> bool:
-    """Whether a feature says so of itself, in any of the places where LeRobot has written it."""
+    """Return True if a feature is marked as a depth map, under any key that LeRobot has used."""
     places = (feature, feature.get('info'), feature.get('video_info'))
     keys = ('is_depth_map', 'video.is_depth_map')
     return any(bool(p.get(key)) for p in places if isinstance(p, Mapping) for key in keys)

@@ -1,7 +1,7 @@
-"""Writes episodes as a LeRobot dataset of format v3.0: parquet, MP4 or PNG, and metadata.
+"""Writer of episodes as a LeRobot dataset of format v3.0: parquet, MP4 or PNG, and metadata.
 
 Layout as in huggingface/lerobot 0.4 (`src/lerobot/datasets/utils.py`, `lerobot_dataset.py`): files
-of one episode each, which the format allows. Beside it stands a mapping, with which
+of one episode each, which the format allows. A mapping is written next to the dataset; with it,
 `import lerobot` reads the dataset back.
 """
 
@@ -30,9 +30,12 @@ from mtv_world_ros.importing.lerobot import pyarrow_modules
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.resample import nearest_rows, resample
 
-#: files of a folder at most
+#: maximum number of files in a folder
 _CHUNK = 1000
-_CODEC, _PIXELS = 'libx264', 'yuv420p'
+#: encoder of videos
+_CODEC = 'libx264'
+#: pixel format of videos: the one that every player shows
+_PIXEL_FORMAT = 'yuv420p'
 #: bf: frames in the order in which they are shown; Rerun 0.41 plays no others without ffmpeg
 _CODEC_OPTIONS = {'crf': '18', 'g': '2', 'bf': '0'}
 _QUANTILES = {'q01': 0.01, 'q10': 0.1, 'q50': 0.5, 'q90': 0.9, 'q99': 0.99}
@@ -161,12 +164,12 @@ def _commanded(recording: Recording, times: FloatArray) -> FloatArray:
 
 
 class _Writer:
-    """Writes one episode after the other.
+    """Writer that adds episodes to a dataset.
 
     Attributes:
         root: folder of the dataset.
-        num_episodes: written so far.
-        has_outcomes: whether it is known of every episode if it succeeded.
+        num_episodes: number of written episodes.
+        has_outcomes: the outcome of every episode is known.
     """
 
     def __init__(
@@ -280,7 +283,7 @@ class _Writer:
             if self._as_videos:
                 features[_image_key(camera)]['info'] = {
                     'video.height': camera.height, 'video.width': camera.width,
-                    'video.codec': 'h264', 'video.pix_fmt': _PIXELS,
+                    'video.codec': 'h264', 'video.pix_fmt': _PIXEL_FORMAT,
                     'video.is_depth_map': False, 'video.fps': self._fps,
                     'video.channels': 3, 'has_audio': False,
                 }  # fmt: skip
@@ -392,7 +395,7 @@ def _write_video(path: Path, frames: ByteArray, fps: int) -> None:
     with av.open(str(path), 'w') as container:
         stream = container.add_stream(_CODEC, rate=fps, options=_CODEC_OPTIONS)
         stream.height, stream.width = frames.shape[1:3]
-        stream.pix_fmt, stream.time_base = _PIXELS, Fraction(1, fps)
+        stream.pix_fmt, stream.time_base = _PIXEL_FORMAT, Fraction(1, fps)
         for number, image in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format='rgb24')
             frame.pts, frame.time_base = number, Fraction(1, fps)

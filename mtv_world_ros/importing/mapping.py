@@ -62,7 +62,7 @@ class Stream(JointTable):
 
 
 class ActionStream(Stream):
-    """What is commanded: joint values, differences of them, or poses of tools."""
+    """Stream of commands: joint values, their differences, or poses of tools."""
 
     delay_frames: float = Field(
         default=1.0,
@@ -207,10 +207,10 @@ def load_mapping(path: Path) -> DatasetMapping:
 def guess_mapping(
     dataset: LeRobotDataset, robot: str, calibration: Path
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Returns the values of a mapping for columns that are named like the robot's joints.
+    """Return the values of a mapping for columns that are named like the robot's joints.
 
     Views are the image features that the calibration has, by the last part of their names; the
-    others are returned beside.
+    names of the other image features are returned as the second value.
 
     Raises:
         ConfigError: the calibration has none of the views.

@@ -83,7 +83,7 @@ def load_object_boxes(path: Path) -> ObjectBoxes:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoxedObjects:
-    """What was learnt from boxes.
+    """Object examples and start masks from boxes that a user drew.
 
     Attributes:
         boxes: as drawn.

@@ -54,7 +54,7 @@ def find_damaged(path: Path) -> list[Path]:
 
 
 def recover(source: Path, out: Path | None = None) -> Recovered:
-    """Copies every whole message, and what lies beside them, into a new bag with an index.
+    """Copy every whole message, and the other files of the folder, into a new bag with an index.
 
     Args:
         source: folder or MCAP file; it is not changed.

@@ -29,9 +29,11 @@ _FINGER_JOINTS = 6
 _TIP_M = 0.0085
 #: finger links that end this far behind the others have no tip [m]
 _BESIDE_TIP_M = 0.015
-#: joints of an arm at least; an arm of fewer, down to the second number, is one where no other is
-#: longer, or where it ends in fingers by their names or because they follow each other
-_ARM_JOINTS, _SHORT_ARM_JOINTS = 3, 2
+#: minimum number of joints of an arm
+_ARM_JOINTS = 3
+#: minimum number of joints of a short arm: a chain without a longer one, or one that ends in
+#: fingers (recognised by their names or by mimic joints)
+_SHORT_ARM_JOINTS = 2
 #: depth of a fork at the end of a short arm that is a gripper [joints]
 _SHORT_ARM_FINGER_JOINTS = 2
 #: names of tool frames, the best first
@@ -162,7 +164,7 @@ def _arms(model: pin.Model, followers: set[str]) -> list[_Arm]:
 def _is_finger(
     model: pin.Model, joint: int, children: dict[int, list[int]], followers: set[str]
 ) -> bool:
-    """Whether a joint and all beyond it belong to a gripper.
+    """Return True if a joint and all joints beyond it belong to a gripper.
 
     It is one of several short chains that fork off beyond an arm, or a last joint that is called
     a finger, or stands beyond such a joint. Beyond two joints, names or mimic joints must say so:
@@ -186,7 +188,7 @@ def _is_finger(
 
 
 def _is_called_finger(model: pin.Model, joint: int, followers: set[str]) -> bool:
-    """Whether a joint or its link is called a finger, or the joint follows another one."""
+    """Return True if a joint or its link is named like a finger, or if it is a mimic joint."""
     link = next((f.name for f in model.frames if f.parentJoint == joint and _is_body(f)), '')
     names = (model.names[joint].lower(), link.lower())
     return model.names[joint] in followers or any(
@@ -294,7 +296,7 @@ class _Hand:
         return T
 
     def _way(self) -> float:
-        """How far tips that turn go along the tool's y [m]; how they lean does not count."""
+        """Return the travel of the finger tips along the tool's y axis [m], without their tilt."""
         y = self.tool_pose()[:3, 1]
         pairs = zip(*self._tips(), strict=True)
         return float(np.mean([abs((wide - shut).mean(axis=0) @ y) for shut, wide in pairs]))

@@ -17,20 +17,22 @@ from mtv_world_ros.importing.object_boxes import BoxedObjects
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
-#: frames that are segmented together, at least, and as many as fit into so many bytes; the next
-#: ones follow the masks of the last of them
-_PIECE, _PIECE_BYTES = 32, 64 * 2**20
+#: minimum number of frames that are segmented in one call; the next call continues from the masks
+#: of its last frame
+_MIN_BATCH_FRAMES = 32
+#: memory of the frames of one call; small frames fill it in larger batches [bytes]
+_BATCH_BYTES = 64 * 2**20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectStage:
-    """What names the objects of imported episodes and finds their masks.
+    """Describer and segmenter that name the objects of imported episodes and find their masks.
 
     Attributes:
-        describer: names the objects; None = the mapping or the recording does.
-        segmenter: finds the masks that are stored; None = those recorded are kept.
-        boxed: objects with boxes, which name those of their recordings and start their masks.
-        key: changes with all of them.
+        describer: names the objects; None = the mapping or the recording names them.
+        segmenter: finds the masks that are stored; None = recorded masks are kept.
+        boxed: objects with boxes, which start the masks of their recordings.
+        key: text that changes with any of the three.
     """
 
     describer: Describer | None = None
@@ -122,7 +124,7 @@ class MaskWriter:
             return
         waiting = self._waiting.setdefault(view, [])
         waiting.append((stamp_ns, frame))
-        if len(waiting) >= max(_PIECE, _PIECE_BYTES // frame.nbytes):
+        if len(waiting) >= max(_MIN_BATCH_FRAMES, _BATCH_BYTES // frame.nbytes):
             self._write(view)
 
     def finish(self) -> None:

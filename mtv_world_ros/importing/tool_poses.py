@@ -23,13 +23,15 @@ from mtv_world_ros.robot.model import RobotModel, Tool
 
 Column = Annotated[int | str, expected('a name or a number')]
 
-#: postures that the first pose is solved from, and rows that may be out of reach
-_NUM_STARTS, _MOST_LOST = 24, 0.2
+#: number of postures from which the inverse kinematics of the first pose starts
+_NUM_STARTS = 24
+#: maximum fraction of the poses that may be out of reach
+_MAX_LOST_FRACTION = 0.2
 _HINT = 'are frame, link, unit and rotation_is right?'
 
 
 class ToolPoses(ToolTargets):
-    """Columns that say where an arm's tool shall be."""
+    """Columns of a target pose of an arm's tool."""
 
     position: ListOf[Column] = Field(description='columns of x, y, z')
     rotation: ListOf[Column] = Field(
@@ -44,7 +46,7 @@ class ToolPoses(ToolTargets):
 
     @property
     def has_rotation(self) -> bool:
-        """Whether columns say how the tool turns."""
+        """True if columns give the rotation of the tool."""
         return bool(self.rotation)
 
     @model_validator(mode='after')
@@ -126,7 +128,7 @@ def joints_of_poses(
         except TrajectoryError:
             lost += 1
         positions[k, solver.indices] = row
-    if lost > _MOST_LOST * len(goals):
+    if lost > _MAX_LOST_FRACTION * len(goals):
         raise EpisodeError(f"arm '{arm}': {lost} of {len(goals)} poses are out of reach: {_HINT}")
     mm, degrees = _left(positions, robot, tool, goals)
     free = ''

@@ -1,4 +1,4 @@
-"""Frames of video files as players show them, and the times of frames beside those of rows.
+"""Frames of video files as players show them, and their times compared with those of rows.
 
 N frames, T rows.
 """
@@ -32,8 +32,10 @@ _MATRIX_TOLERANCE = 0.02
 _JITTER = 0.25
 #: difference of a frame's and its row's time that is rounding [periods]
 _SAME_TIME = 0.1
-#: difference of two spans that still counts as one duration, as a share and in periods
-_SAME_SPAN, _SAME_SPAN_PERIODS = 0.05, 2.0
+#: difference of two durations that count as equal [fraction of the longer one]
+_SAME_SPAN = 0.05
+#: difference of two durations that count as equal [periods]
+_SAME_SPAN_PERIODS = 2.0
 #: difference of two rates that still counts as one rate, as a share
 _SAME_RATE = 0.1
 #: packets are stored in the order of decoding: at most this much before others [s]

@@ -155,12 +155,12 @@ def import_videos(
     stage: ObjectStage = AS_RECORDED,
     progress: Callable[[Iterable[VideoRecording]], Iterable[VideoRecording]] = iter,
 ) -> ImportSummary[VideoRecording]:
-    """Converts the recordings of a folder into episodes `out/<name>`, with `out/robot/` beside.
+    """Convert the recordings of a folder into episodes `out/<name>`, robot in `out/robot/`.
 
     Args:
-        folder: of the files that the mapping names.
+        folder: folder of the files that the mapping names.
         out: folder of the episodes.
-        mapping: which file and column is what.
+        mapping: meaning of the files and columns.
         calibration: file of the cameras; None = not known.
         stage: names the objects and finds their masks.
         progress: wraps the recordings, e.g. in a progress bar.

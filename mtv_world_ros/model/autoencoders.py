@@ -21,7 +21,7 @@ _CHANNELS = 16
 _WIDTH = 64
 #: of the decoder's three levels, from small to large
 _WIDTHS = (256, 128, 64, 64)
-#: latent frames that are decoded (or come of encoding) together: more take more memory
+#: number of latent frames that are encoded or decoded in one call, limited to save memory
 _TOGETHER = 7
 
 
@@ -118,12 +118,12 @@ class TinyAutoencoder(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the weights."""
+        """Data type of the weights."""
         return next(self.parameters()).dtype
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         return next(self.parameters()).device
 
     def num_latent_frames(self, num_frames: int) -> int:
@@ -218,12 +218,12 @@ class WanAutoencoder(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the weights."""
+        """Data type of the weights."""
         return self.vae.dtype
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         return self.vae.device
 
     @property
@@ -259,10 +259,10 @@ class WanAutoencoder(nn.Module):
 
 
 class SpaceToDepthAutoencoder(ModelMixin, ConfigMixin):
-    """Maps RGB video in [-1, 1] to latents of `3 * block_size**2` channels and back, exactly.
+    """Lossless mapping of RGB video in [-1, 1] to latents of `3 * block_size**2` channels.
 
-    A learned autoencoder beside a model as small as `small` costs more than it gives (measured,
-    see `experiments/results/`). The interface is that of diffusers' as far as it is used.
+    With a model of the size of `small`, a learned autoencoder costs more than it gains (measured,
+    see `experiments/results/`). The interface is the used part of a diffusers autoencoder.
 
     Shapes: B batch, F frames, H W pixels, h w = H / block_size, W / block_size.
     """

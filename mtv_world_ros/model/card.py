@@ -15,8 +15,10 @@ from mtv_world_ros.core.data_types import WorldModelSpec
 from mtv_world_ros.core.errors import CheckpointError, ConfigError
 
 CARD = 'world_model.json'
-#: the robot that a checkpoint was trained on (see `robot.file.save_robot`), and its cameras
-ROBOT_FOLDER, CAMERAS = 'robot', 'cameras.yaml'
+#: folder of the robot that a checkpoint was trained on (see `robot.file.save_robot`)
+ROBOT_FOLDER = 'robot'
+#: file of the cameras that a checkpoint was trained on, in that folder
+CAMERAS = 'cameras.yaml'
 #: LoRA adapter of the transformer
 ADAPTER_FOLDER = 'adapter'
 #: contact settings and response of the arms, for object motion
@@ -24,7 +26,7 @@ OBJECT_MOTION_FOLDER = 'object_motion'
 
 
 class HistorySettings(Schema):
-    """How a model is conditioned on earlier frames of a rollout; default: not at all."""
+    """Conditioning of a model on earlier frames of a rollout; off by default."""
 
     section: ClassVar = 'history'
 
@@ -47,12 +49,12 @@ class HistorySettings(Schema):
 
     @property
     def on(self) -> bool:
-        """Whether the model is conditioned on earlier frames."""
+        """True if the model is conditioned on earlier frames."""
         return self.num_frames > 0 or self.anchored
 
     @property
     def anchored(self) -> bool:
-        """Whether the reference tokens show the rollout's first frame."""
+        """True if the reference tokens show the rollout's first frame."""
         return self.reference == 'first_frame'
 
     def as_card(self) -> dict[str, Any]:

@@ -87,7 +87,7 @@ class Checkpoint:
 
     @property
     def is_bundled(self) -> bool:
-        """Whether it ships with the package, into which nothing is written."""
+        """True if the checkpoint is part of the installed package, which is read-only."""
         return self.name in BUNDLED_FOLDERS
 
     @property

@@ -1,4 +1,4 @@
-"""What the transformer is conditioned on, in latents: control, start image, reference.
+"""Conditioning of the transformer in latents: control, start image, reference.
 
 Shape letters: B batch, V views, T frames, H W pixels, C latent channels, F latent frames,
 h w = latent size, L context tokens of a control.
@@ -85,7 +85,7 @@ class Conditioning:
 
     @property
     def has_control_tokens(self) -> bool:
-        """Whether the control feeds tokens of the cross-attention."""
+        """True if the control provides tokens for the cross-attention."""
         return self.context is not None or self.frame is not None
 
     def part(self, samples: slice) -> Conditioning:
@@ -264,17 +264,17 @@ def with_history(
     frames: Tensor,
     sigmas: Tensor,
 ) -> Conditioning:
-    """Returns the conditioning with clean latents of the history.
+    """Return the conditioning with clean latents of the history.
 
-    They are encoded anew: the latents that a causal autoencoder was denoised in stand for frames
-    that follow a certain start, and cannot be cut out of it.
+    The frames are encoded again, because latents of a causal autoencoder depend on the frames
+    before them and cannot be cut out of a denoised chunk.
 
     Args:
-        autoencoder: of the preset.
-        conditioning: of the chunk.
+        autoencoder: autoencoder of the preset.
+        conditioning: conditioning of the chunk.
         frames: (B, V, N, H, W, 3) uint8 RGB.
-        sigmas: (B,) noise levels. Where there is no history it is 1: pure noise, of which the
-            timestep says so. That needs no attention mask, and every chunk has the same shapes.
+        sigmas: (B,) noise levels; 1 (pure noise) without history. The timestep then marks the
+            history as noise: no attention mask is needed, and every chunk has the same shapes.
     """
     return replace(conditioning, history=encode_frames(autoencoder, frames), history_sigmas=sigmas)
 

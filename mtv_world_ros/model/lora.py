@@ -19,7 +19,7 @@ from mtv_world_ros.model.lora_file import Factors, PEFT_CONFIG, read_lora
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 ADAPTER = 'pytorch_lora_weights.safetensors'
-#: weights that are trained whole and saved beside the adapter: phi, views, the stem, the
+#: weights that are trained whole and saved with the adapter: phi, views, the stem, the
 #: embeddings of controls that are not drawn
 BESIDE = ('ref_conv.', 'view_embedding', 'patch_embedding.', 'control_tokens.')
 BESIDE_FILE = 'beside.safetensors'
@@ -29,7 +29,7 @@ _PEFT_FILE = 'adapter_model.safetensors'
 
 
 def beside(transformer: MultiViewWanTransformer) -> dict[str, Tensor]:
-    """Returns the weights that are saved beside an adapter, by name."""
+    """Return the weights that are trained whole and saved with an adapter, by name."""
     return {n: p for n, p in transformer.named_parameters() if n.startswith(BESIDE)}
 
 
@@ -38,9 +38,9 @@ class Adapter:
     """An adapter in memory, checked against a transformer; an empty one means no adapter.
 
     Attributes:
-        path: of the adapter's file; None = no adapter.
-        factors: of the layers that it changes, by name.
-        whole: the weights beside it, by name.
+        path: path of the adapter's file; None = no adapter.
+        factors: low-rank factors of the changed layers, by name.
+        whole: weights that were trained whole, by name.
     """
 
     path: Path | None

@@ -75,10 +75,11 @@ class PeftSettings(Schema):
     """Scaling of the factors, under peft's names.
 
     Attributes:
-        r: rank where `rank_pattern` says no other.
-        lora_alpha: alpha where `alpha_pattern` says no other; None = the tensors say it.
+        r: default rank of modules without an entry in `rank_pattern`.
+        lora_alpha: default alpha of modules without an entry in `alpha_pattern`; None = stored
+            with the tensors.
         rank_pattern: ranks by a regular expression for the end of a module's name.
-        alpha_pattern: alphas, likewise.
+        alpha_pattern: alphas by a regular expression for the end of a module's name.
         use_rslora: the product counts alpha / sqrt(r) in place of alpha / r.
     """
 

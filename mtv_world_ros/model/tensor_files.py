@@ -158,10 +158,10 @@ def _stored(file: Path, part: Any, name: str) -> StoredTensor:
 
 
 def read_tensors(path: Path, stem: str = '') -> dict[str, Tensor]:
-    """Returns the tensors that `open_tensors` finds, all of them read.
+    """Read all tensors that `open_tensors` finds, by name.
 
     Raises:
-        CheckpointError: as there, or one holds what is no number.
+        CheckpointError: the file cannot be opened, or a tensor holds values that are not finite.
     """
     return {name: stored.read() for name, stored in open_tensors(path, stem).items()}
 

@@ -16,7 +16,7 @@ _PREFIXES = ('model.diffusion_model.', 'diffusion_model.', 'model.', 'vae.', 'pi
 
 @dataclass(frozen=True, slots=True)
 class TakenTensor:
-    """Where a tensor comes from: a source, or one of several equal parts of it along axis 0."""
+    """Source of a tensor: a stored tensor, or one of its equal parts along axis 0."""
 
     source: str
     part: int = 0
@@ -25,11 +25,11 @@ class TakenTensor:
 
 @dataclass(frozen=True, slots=True)
 class KeyMap:
-    """How a file's tensors become a model's.
+    """Mapping of the tensors of a file to the tensors of a model.
 
     Attributes:
-        takes: by our name.
-        unused: names that the model has no use for, and why.
+        takes: source of each tensor, by its name in this package.
+        unused: names of tensors without use in the model, with the reason.
     """
 
     takes: dict[str, TakenTensor]

@@ -128,14 +128,14 @@ def denoise(
     conditioning: Conditioning,
     text: Tensor | None,
 ) -> Tensor:
-    """Returns the transformer's prediction for latents, in float32.
+    """Return the transformer's prediction for latents, in float32.
 
     Args:
         transformer: the model.
-        latents: (B, V, C, F, h, w) noisy.
-        timestep: of all of them, in [0, 1000].
-        conditioning: in the transformer's number format.
-        text: tokens in place of the conditioning's.
+        latents: (B, V, C, F, h, w) noisy latents.
+        timestep: timestep of all latents, in [0, 1000].
+        conditioning: conditioning in the transformer's number format.
+        text: text tokens that replace those of the conditioning; None = keep them.
     """
     return transformer(
         latents.to(transformer.dtype),

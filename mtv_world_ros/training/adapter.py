@@ -1,4 +1,4 @@
-"""LoRA adapters in training: added beside frozen weights, saved."""
+"""LoRA adapters in training: added to layers with frozen weights, and saved."""
 
 from __future__ import annotations
 

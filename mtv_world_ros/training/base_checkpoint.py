@@ -42,7 +42,7 @@ class Base:
 
 
 def needs_base(config: TrainingConfig) -> bool:
-    """Whether the preset trains on top of a checkpoint: an adapter, or a model with text."""
+    """Return True if the preset needs a base checkpoint: an adapter, or a model with text."""
     return config.lora.rank > 0 or config.transformer.get('context') != 'none'
 
 

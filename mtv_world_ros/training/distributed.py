@@ -60,7 +60,7 @@ class Processes:
 
     @property
     def is_main(self) -> bool:
-        """Whether this is the one that writes."""
+        """True for the main process, the only one that writes files."""
         return self.number == 0
 
     def share(self, count: int) -> range:
@@ -84,7 +84,7 @@ class Processes:
             ) from error
 
     def any(self, flag: bool) -> bool:
-        """Whether a flag is set in any of the processes; all of them have to ask.
+        """Return True if a flag is set in any process; all processes have to call this.
 
         Raises:
             TrainingError: another process is gone.

@@ -36,17 +36,16 @@ _REPEATS = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepCost:
-    """Cost of a step of the transformer; encoding the videos comes on top.
+    """Cost of a training step of the transformer, without the encoding of the videos.
 
     Attributes:
-        parameters: numbers in the transformer.
-        trainable: number of those that are trained.
+        parameters: number of weights in the transformer.
+        trainable: number of weights that are trained.
         forward_flop: floating-point operations of a forward pass of one batch.
-        step_flop: of forward and backward.
-        weight_bytes: weights in the number format of forward and backward, and in float32 what is
-            trained of them.
-        training_bytes: averaged weights, gradients and Adam's moments of what is trained.
-        activation_bytes: kept by the forward pass for the backward pass.
+        step_flop: floating-point operations of a forward and a backward pass.
+        weight_bytes: weights in the number format of the passes, and trained weights in float32.
+        training_bytes: averaged weights, gradients and Adam's moments of the trained weights.
+        activation_bytes: activations that the forward pass keeps for the backward pass.
     """
 
     parameters: int

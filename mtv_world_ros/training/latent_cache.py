@@ -172,7 +172,7 @@ def _other_settings(root: Path, mine: Mapping[str, Any]) -> list[str]:
 
 #: to be increased when the stored data or their computation change
 _VERSION = 2
-#: tokens of a control; clips have unequal numbers of them
+#: name of the tokens of a control, whose number differs between clips
 CONTEXT = 'context'
 #: kinds of pixels with extra weight, in the order of a cache's `shares`
 WEIGHTS = ('change_weight', 'object_weight', 'moved_weight')

@@ -80,7 +80,7 @@ class TrainingLog:
         self.write(report.step, row)
 
     def _speed(self) -> dict[str, float]:
-        """Of the steps since the last row."""
+        """Return the speed since the last row: steps per second and fraction of waiting."""
         seconds = max(self._seconds, 1e-9)
         found = {
             'steps_per_second': round(self._steps / seconds, 4),

@@ -141,13 +141,13 @@ def sample_loss(
     delta: float | None,
     by_sample: Tensor | None = None,
 ) -> Loss:
-    """Returns the weighted loss between predicted and clean latents (B, V, C, T, h, w).
+    """Return the weighted loss between predicted and clean latents (B, V, C, T, h, w).
 
     Args:
-        predicted: what the transformer gives.
-        clean: what it should give.
+        predicted: latents that the transformer predicts.
+        clean: ground truth.
         weights: positive weights, of the same shape.
-        delta: error from which on the Huber loss is linear; None = the squared error.
+        delta: error above which the Huber loss is linear; None = the squared error.
         by_sample: (B,) weights of samples; None = equal.
     """
     predicted, clean = predicted.float(), clean.float()

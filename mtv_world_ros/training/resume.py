@@ -19,9 +19,12 @@ from mtv_world_ros.core.files import recover_folder, whole_folder
 from mtv_world_ros.training.averaged_weights import AveragedWeights
 from mtv_world_ros.training.training_config import TrainingConfig
 
-#: folder of the state in that of the training
+#: folder of the training state, in the folder of the training
 STATE = 'state'
-_TENSORS, _CARD = 'state.safetensors', 'state.json'
+#: file of the tensors of weights and optimizer, in that folder
+_TENSORS_FILE = 'state.safetensors'
+#: file of the other values of the state, such as the step, in that folder
+_CARD_FILE = 'state.json'
 
 
 class DiskError(TrainingError):
@@ -62,8 +65,8 @@ def save_state(
     tensors = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
     whole = {**card, 'ema_step': weights.ema.optimization_step}
     with disk_errors_named(folder), whole_folder(folder / STATE) as partial:
-        save_file(tensors, partial / _TENSORS)
-        (partial / _CARD).write_text(json.dumps(whole))
+        save_file(tensors, partial / _TENSORS_FILE)
+        (partial / _CARD_FILE).write_text(json.dumps(whole))
 
 
 def read_card(folder: Path) -> dict[str, Any] | None:
@@ -73,7 +76,7 @@ def read_card(folder: Path) -> dict[str, Any] | None:
         TrainingError: the state is damaged.
     """
     recover_folder(folder / STATE)
-    file = folder / STATE / _CARD
+    file = folder / STATE / _CARD_FILE
     try:
         return dict(read_json(file)) if file.is_file() else None
     except (OSError, ValueError, TypeError) as error:
@@ -136,7 +139,7 @@ def load_state(folder: Path, weights: AveragedWeights, optimizer: torch.optim.Op
     Raises:
         TrainingError: the state is damaged, or of another model.
     """
-    card, file = read_card(folder), folder / STATE / _TENSORS
+    card, file = read_card(folder), folder / STATE / _TENSORS_FILE
     assert card is not None
     try:
         tensors = load_file(file)

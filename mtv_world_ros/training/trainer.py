@@ -248,7 +248,7 @@ class Trainer:
                 saved = time.monotonic()
 
     def _self_rollout(self, source: BatchSource | CachedSource) -> SelfRollout | None:
-        """What imagines the start frames of clips; None where all start from recorded ones."""
+        """Return the rollout that imagines start frames of clips; None if all are recorded."""
         if not self.config.self_rollout.share or not isinstance(source, BatchSource):
             return None
         return SelfRollout(
@@ -345,9 +345,10 @@ class Trainer:
         return self.folder / ('adapter' if self.config.lora.rank else 'checkpoint')
 
     def export(self, folder: Path, *, dtype: torch.dtype = torch.float16) -> None:
-        """Writes the averaged weights, with all other parts of a checkpoint beside them.
+        """Write a checkpoint with the averaged weights and all its other parts.
 
-        Of an adapter, which is in float32, the weights that are trained beside it and its card.
+        For an adapter, write its factors (float32), the weights that are trained whole, and the
+        card.
         """
         base = self.base
         theirs = base.checkpoint.card.plain() if base else {}  # prompt and guidance

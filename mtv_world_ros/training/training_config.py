@@ -35,7 +35,7 @@ Weight = Annotated[float, Field(ge=0, le=1000)]
 
 
 class VideoConfig(Schema):
-    """What the model sees and predicts."""
+    """Video that the model sees and predicts: views, size, rate, robot."""
 
     section: ClassVar = 'video'
 
@@ -124,7 +124,7 @@ class AugmentConfig(Schema):
 
 
 class HistoryConfig(HistorySettings):
-    """How clips are shown what came before them; see `clips/clip_controls.py`."""
+    """Conditioning of clips on the frames before them; see `clips/clip_controls.py`."""
 
     max_noise: Annotated[float, Field(ge=0, lt=1)] = Field(
         default=0.3,
@@ -165,7 +165,7 @@ class SelfRolloutConfig(Schema):
 
 
 class SamplingConfig(Schema):
-    """How its checkpoints are sampled unless told otherwise."""
+    """Default sampling settings of the checkpoint."""
 
     section: ClassVar = 'sampling'
 
@@ -265,7 +265,7 @@ class TrainingConfig(Schema):
 
     @property
     def spec(self) -> WorldModelSpec:
-        """What a model of this configuration takes and gives."""
+        """Inputs and outputs of a model of this configuration."""
         return self.card({}).spec
 
     def control_options(self, robot: RobotModel) -> ControlOptions:

@@ -69,7 +69,10 @@ def find_episodes(dataset: Path) -> list[Path]:
 
 
 def spread(paths: Sequence[Path], count: int | None) -> list[Path]:
-    """Returns `count` of them, spread evenly: the first ones by name are all of one task."""
+    """Return `count` of the paths, spread evenly.
+
+    The first paths by name would all belong to one task.
+    """
     if count is None or count >= len(paths):
         return list(paths)
     return [paths[index * len(paths) // count] for index in range(count)]
@@ -126,11 +129,13 @@ def load_recordings(
 
 #: joints outside their limits by more are of another unit, zero or robot [rad or m]
 _LIMIT_TOLERANCE = 0.05
-#: joints that move more between two frames change the picture, by more than this [grey levels]
-_MOVES, _SAME_PICTURE = 0.02, 0.02
-#: share of the frames in which joints move that may stay as they were
+#: joints that move more than this between two frames must change the picture [rad or m]
+_MOVES = 0.02
+#: mean difference of two frames below which they are the same picture [grey levels]
+_SAME_PICTURE = 0.02
+#: maximum fraction of the frames with joint motion that repeat the frame before
 _MOST_FROZEN = 0.5
-#: joints so far beside the picture may still show their links [share of its size]
+#: distance outside of the image at which a joint may still show its link [fraction of image size]
 _MARGIN = 0.1
 #: episodes that are named with the reason why they were left out
 _NAMED = 3
@@ -179,7 +184,7 @@ def _check_arm_is_seen(recording: Recording, robot: RobotModel) -> None:
 
 
 def _other_robot(paths: Sequence[Path], robot: RobotModel) -> str:
-    """What to set where the first episode is of a robot of another name; else empty."""
+    """Return the advice if the first episode has a robot of another name; otherwise empty."""
     with suppress(MtvWorldError, IndexError):
         name = read_info(paths[0]).robot
         if name not in ('', robot.name):
@@ -326,12 +331,12 @@ def _save_robot(
 def notes(
     config: TrainingConfig, recordings: Sequence[Recording], initial: Path | None = None
 ) -> list[str]:
-    """What a user should know of a training before it runs.
+    """Return notes on a training for the user, before it runs.
 
     Args:
-        config: of the training.
-        recordings: it learns from.
-        initial: checkpoint whose weights it starts from.
+        config: configuration of the training.
+        recordings: recordings of the training set.
+        initial: checkpoint of the initial weights; None = no such checkpoint.
     """
     found, optimizer = [], config.optimizer
     if initial is not None:
@@ -366,7 +371,7 @@ def notes(
 
 
 def _drawn_otherwise(now: TrajectoryVideoConfig, before: Mapping[str, Any]) -> list[str]:
-    """What a checkpoint was trained to read in trajectory videos and will not be shown."""
+    """Return notes on drawing settings that differ from those of the initial checkpoint."""
     other = [
         f'rendering.{name}={json.dumps(value)}'
         for name, value in before.items()
@@ -394,7 +399,7 @@ def _camera_key(camera: CameraModel) -> tuple[object, ...]:
 
 
 def _best_score(file: Path) -> float:
-    """Score of the best checkpoint so far; the lowest where none is known."""
+    """Return the score of the best checkpoint of earlier runs; -inf if there is none."""
     try:
         return float(read_json(file)['score'])
     except (OSError, ValueError, LookupError, TypeError):
@@ -450,7 +455,7 @@ class StopSignals:
         self._before: dict[signal.Signals, Any] = {}
 
     def came(self) -> bool:
-        """Whether one came."""
+        """Return True if a stop signal was received."""
         return self.number != 0
 
     def __enter__(self) -> StopSignals:
@@ -535,7 +540,11 @@ Judge = Callable[[Path, int], HeldOutScores]
 
 
 class HeldOut:
-    """Scores checkpoints by a judge at every so many steps of a training, and at the last one.
+    """Evaluation of checkpoints on held-out episodes, at regular steps and at the last step.
+
+    Args:
+        judge: function that scores the checkpoint in a folder at a step.
+        every: interval of the evaluations [steps].
 
     Raises:
         ConfigError: `every` is not positive.

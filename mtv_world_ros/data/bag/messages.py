@@ -30,10 +30,13 @@ POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
 POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
 TF_MESSAGE = 'tf2_msgs/msg/TFMessage'
 
-#: `format` of compressed images, as image_transport writes it
-JPEG, PNG_LABELS = 'rgb8; jpeg compressed bgr8', 'mono8; png compressed mono8'
+#: `format` of colour images in JPEG, as image_transport writes it
+JPEG = 'rgb8; jpeg compressed bgr8'
+#: `format` of label images (object masks) in PNG, as image_transport writes it
+PNG_LABELS = 'mono8; png compressed mono8'
+#: nanoseconds in a second
 NANO = 1_000_000_000
-#: what the reader of generated code raises for bytes that are no such message
+#: errors that the generated reader raises for bytes that are not a message of its type
 _UNREADABLE = (
     SerdeError, struct.error, ValueError, LookupError, TypeError, ArithmeticError, MemoryError,
     AssertionError,
@@ -51,7 +54,7 @@ def typestore() -> Typestore:
 
 
 def is_standard(msgtype: str) -> bool:
-    """Whether the type is among the standard message packages."""
+    """Return True if the type belongs to a standard message package."""
     return msgtype in typestore().fielddefs
 
 

@@ -117,7 +117,7 @@ class BagReader:
                 raise EpisodeError(f"cannot read '{file}': {error}") from error
 
     def declared(self) -> dict[str, tuple[str, str, str]]:
-        """Message type, `.msg` text and offered profiles by topic, as far as was read by now."""
+        """Return message type, `.msg` text and offered QoS profiles of the topics read by now."""
         found = {}
         for channel in self._channels.values():
             schema = self._schemas.get(channel.schema_id)
@@ -297,7 +297,7 @@ def _is_storage(file: Path) -> bool:
 
 
 def _lost_pages(file: Path) -> str:
-    """How much of an SQLite file is not there, by its header; empty = nothing."""
+    """Return a text on the missing bytes of an SQLite file, from its header; empty if complete."""
     with file.open('rb') as stream:
         head = stream.read(_SQLITE_HEAD.size)
     if len(head) < _SQLITE_HEAD.size or _journal(file):
@@ -309,13 +309,19 @@ def _lost_pages(file: Path) -> str:
 
 
 def _journal(file: Path) -> bool:
-    """Whether a recorder that was killed left its journal beside an SQLite file."""
+    """Return True if a recorder that was killed left its journal next to an SQLite file."""
     journal = file.with_name(f'{file.name}-wal')
     return journal.is_file() and journal.stat().st_size > 0
 
 
 def _open_sqlite(file: Path, most_bytes: int, *, is_cut: bool) -> sqlite3.Connection:
-    """Opens it without writing beside it, unless a recorder that was killed left its journal."""
+    """Open an SQLite file read-only; SQLite writes next to it only if there is a journal.
+
+    Args:
+        file: the file.
+        most_bytes: maximum size of a value [bytes].
+        is_cut: the file is shorter than its header states.
+    """
     mode = 'ro' if _journal(file) else 'ro&immutable=1'
     database = sqlite3.connect(f'{file.resolve().as_uri()}?mode={mode}', uri=True)
     database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, most_bytes)
@@ -402,7 +408,7 @@ def _decompress(body: bytes, end: int, most: int) -> bytes:
 
 
 def _inflate(compression: bytes, data: bytes, most: int) -> bytes:
-    """At most so many bytes of the content."""
+    """Return the decompressed content, cut off at `most` bytes."""
     if not compression or not data:
         return data
     if compression == b'zstd':

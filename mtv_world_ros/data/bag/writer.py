@@ -34,9 +34,9 @@ RESERVE_NAME = '.reserve'
 
 
 class BagWriter:
-    """Records topics of the standard message packages as a rosbag2 MCAP folder.
+    """Writer of topics of the standard message packages into a rosbag2 MCAP folder.
 
-    Everything is written into a hidden folder beside `path` that gets its name in `close()`,
+    Everything is written into a hidden folder next to `path` that gets its name in `close()`,
     so a crash leaves nothing under `path`; `mtv-world recover` finds such a folder. As a context
     manager it closes when the block ends and drops the record when it raises. Messages may come
     from several threads.
@@ -70,7 +70,7 @@ class BagWriter:
 
     @property
     def num_messages(self) -> int:
-        """Messages recorded so far."""
+        """Number of messages recorded by now."""
         return sum(record.message_count for _, record in self._topics.values())
 
     @property
@@ -361,7 +361,7 @@ class _Spool:
         self._file.close()
 
     def _reserve(self) -> None:
-        """Holds space for the next chunk and the index of all chunks so far."""
+        """Reserve disk space for the next chunk and for the index of all chunks."""
         chunk, channel = _INDEX_BYTES
         index = self._num_flushes * (chunk + channel * self.num_channels)
         needed = _RESERVE_BYTES + 2 * self._largest + index

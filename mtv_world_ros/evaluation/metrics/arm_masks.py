@@ -29,7 +29,7 @@ _LEAST_ARM = 0.002
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArmMasks:
-    """Where the arm stands in frames, and what is seen there without it.
+    """Masks of the arm in frames, and the scene behind the arm.
 
     Attributes:
         scene: (H, W, 3) uint8 RGB without the arm.
@@ -42,7 +42,7 @@ class ArmMasks:
     arm: BoolArray
 
     def jaccard(self, frames: ByteArray) -> float:
-        """Mean J over frames (T, H, W, 3) of which enough can be compared; NaN without any."""
+        """Return the mean J of the arm over frames (T, H, W, 3); NaN if no frame is comparable."""
         found = []
         for frame, arm in zip(frames, self.arm, strict=True):
             drawn = arm & self.compared
@@ -55,7 +55,7 @@ class ArmMasks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArmScene:
-    """What a still camera sees without the arm.
+    """Background of a still camera, without the arm.
 
     Attributes:
         picture: (H, W, 3) uint8 RGB, the median of a recording.

@@ -1,4 +1,4 @@
-"""Frechet distance; features of scored episodes on disk, and FID and FVD over all of them."""
+"""Features of scored episodes on disk; FID and FVD (Frechet distances) over all episodes."""
 
 from __future__ import annotations
 
@@ -99,13 +99,13 @@ def feature_path(out: Path, episode: str) -> Path:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FeatureTaker:
-    """Takes the features of frames and clips.
+    """Feature extractors of frames and clips.
 
     Attributes:
-        views: V names.
-        num_frames: a stretch is cut into clips of so many frames; what is left over is no clip.
-        frames: for FID; None = not measured.
-        clips: for FVD; None = not measured.
+        views: names of the V views.
+        num_frames: number of frames of a clip; the last frames of a stretch are left out if fewer.
+        frames: feature extractor for FID; None = not measured.
+        clips: feature extractor for FVD; None = not measured.
     """
 
     views: tuple[str, ...]
@@ -145,7 +145,7 @@ class EpisodeFeatures:
                     self._found.setdefault(f'{name}/{view}/{side}', []).append(features)
 
     def save(self, path: Path) -> None:
-        """Writes them beside the name and renames."""
+        """Write the features to a temporary file, then rename it: a reader never sees a part."""
         held = {
             key: np.concatenate(parts).astype(np.float32) for key, parts in self._found.items()
         }
@@ -171,7 +171,7 @@ def load_features(path: Path) -> dict[str, FloatArray]:
 
 
 def distances(episodes: Sequence[dict[str, FloatArray]], view: str) -> dict[str, Estimate]:
-    """Returns FID and FVD of a view as far as measured, of what `load_features` gives of each."""
+    """Return FID and FVD of a view, if measured, from the `load_features` of each episode."""
     found = {}
     for name in DISTANCES:
         keys = {side: f'{name}/{view}/{side}' for side in _SIDES}

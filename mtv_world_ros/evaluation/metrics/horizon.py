@@ -87,7 +87,7 @@ def _moving(
 
 
 def _curve(sums: np.ndarray, counts: np.ndarray) -> Curve:
-    """Means of (E, T) sums of so many values, and their intervals."""
+    """Return the mean over episodes and its interval, from sums and counts of values (E, T)."""
     values, (low, high) = mean_interval(sums, counts)
     return Curve(
         values=tuple(values.tolist()),

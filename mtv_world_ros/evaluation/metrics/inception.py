@@ -30,7 +30,11 @@ class _Step(NamedTuple):
     same: bool = True
 
 
-_SQUARE, _FIVE, _ROW, _COLUMN = (3, 3), (5, 5), (1, 7), (7, 1)
+#: kernel sizes (height, width) of the convolutions
+_KERNEL_3X3 = (3, 3)
+_KERNEL_5X5 = (5, 5)
+_KERNEL_1X7 = (1, 7)
+_KERNEL_7X1 = (7, 1)
 #: one list of steps per branch; a tuple within a list is a fork whose ends are put side by side
 _Branch = list[_Step | tuple[_Step, _Step]]
 
@@ -42,11 +46,11 @@ def _pooled(channels: int) -> _Branch:
 def _block_35(pool_channels: int) -> tuple[_Branch, ...]:
     return (
         [_Step('branch1x1', 64)],
-        [_Step('branch5x5_1', 48), _Step('branch5x5_2', 64, _FIVE)],
+        [_Step('branch5x5_1', 48), _Step('branch5x5_2', 64, _KERNEL_5X5)],
         [
             _Step('branch3x3dbl_1', 64),
-            _Step('branch3x3dbl_2', 96, _SQUARE),
-            _Step('branch3x3dbl_3', 96, _SQUARE),
+            _Step('branch3x3dbl_2', 96, _KERNEL_3X3),
+            _Step('branch3x3dbl_3', 96, _KERNEL_3X3),
         ],
         _pooled(pool_channels),
     )
@@ -57,15 +61,15 @@ def _block_17(inner: int) -> tuple[_Branch, ...]:
         [_Step('branch1x1', 192)],
         [
             _Step('branch7x7_1', inner),
-            _Step('branch7x7_2', inner, _ROW),
-            _Step('branch7x7_3', 192, _COLUMN),
+            _Step('branch7x7_2', inner, _KERNEL_1X7),
+            _Step('branch7x7_3', 192, _KERNEL_7X1),
         ],
         [
             _Step('branch7x7dbl_1', inner),
-            _Step('branch7x7dbl_2', inner, _COLUMN),
-            _Step('branch7x7dbl_3', inner, _ROW),
-            _Step('branch7x7dbl_4', inner, _COLUMN),
-            _Step('branch7x7dbl_5', 192, _ROW),
+            _Step('branch7x7dbl_2', inner, _KERNEL_7X1),
+            _Step('branch7x7dbl_3', inner, _KERNEL_1X7),
+            _Step('branch7x7dbl_4', inner, _KERNEL_7X1),
+            _Step('branch7x7dbl_5', 192, _KERNEL_1X7),
         ],
         _pooled(192),
     )
@@ -81,7 +85,7 @@ def _block_8() -> tuple[_Branch, ...]:
         [_Step('branch3x3_1', 384), _fork('branch3x3_2')],
         [
             _Step('branch3x3dbl_1', 448),
-            _Step('branch3x3dbl_2', 384, _SQUARE),
+            _Step('branch3x3dbl_2', 384, _KERNEL_3X3),
             _fork('branch3x3dbl_3'),
         ],
         _pooled(192),
@@ -89,30 +93,30 @@ def _block_8() -> tuple[_Branch, ...]:
 
 
 _TO_17: tuple[_Branch, ...] = (
-    [_Step('branch3x3', 384, _SQUARE, 2, False)],
+    [_Step('branch3x3', 384, _KERNEL_3X3, 2, False)],
     [
         _Step('branch3x3dbl_1', 64),
-        _Step('branch3x3dbl_2', 96, _SQUARE),
-        _Step('branch3x3dbl_3', 96, _SQUARE, 2, False),
+        _Step('branch3x3dbl_2', 96, _KERNEL_3X3),
+        _Step('branch3x3dbl_3', 96, _KERNEL_3X3, 2, False),
     ],
 )
 _TO_8: tuple[_Branch, ...] = (
-    [_Step('branch3x3_1', 192), _Step('branch3x3_2', 320, _SQUARE, 2, False)],
+    [_Step('branch3x3_1', 192), _Step('branch3x3_2', 320, _KERNEL_3X3, 2, False)],
     [
         _Step('branch7x7x3_1', 192),
-        _Step('branch7x7x3_2', 192, _ROW),
-        _Step('branch7x7x3_3', 192, _COLUMN),
-        _Step('branch7x7x3_4', 192, _SQUARE, 2, False),
+        _Step('branch7x7x3_2', 192, _KERNEL_1X7),
+        _Step('branch7x7x3_3', 192, _KERNEL_7X1),
+        _Step('branch7x7x3_4', 192, _KERNEL_3X3, 2, False),
     ],
 )
 #: before the first block; 'pool' halves the size
 _STEM = (
-    _Step('Conv2d_1a_3x3', 32, _SQUARE, 2, False),
-    _Step('Conv2d_2a_3x3', 32, _SQUARE, 1, False),
-    _Step('Conv2d_2b_3x3', 64, _SQUARE),
+    _Step('Conv2d_1a_3x3', 32, _KERNEL_3X3, 2, False),
+    _Step('Conv2d_2a_3x3', 32, _KERNEL_3X3, 1, False),
+    _Step('Conv2d_2b_3x3', 64, _KERNEL_3X3),
     'pool',
     _Step('Conv2d_3b_1x1', 80),
-    _Step('Conv2d_4a_3x3', 192, _SQUARE, 1, False),
+    _Step('Conv2d_4a_3x3', 192, _KERNEL_3X3, 1, False),
     'pool',
 )
 #: (name, branches, what happens to the input of the pooled branch)

@@ -192,7 +192,7 @@ def score_frames(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> Objec
     return object_scores(find_masks(frames, truth, segmenter), truth.masks)
 
 
-#: videos beside the prediction that are scored like it; each is `j_<name>` of a row
+#: baselines that are scored like the prediction; each is column `j_<name>` of a row
 OTHERS = ('shuffled', 'zero', 'ceiling', 'self')
 
 
@@ -251,7 +251,7 @@ def _frames(scores: ObjectScores | None, view: int, item: int) -> tuple[float, .
 def _values(
     scores: Mapping[str, ObjectScores], value: Callable[[ObjectScores], float]
 ) -> dict[str, Any]:
-    """`j_<name>` of every video beside the prediction, NaN where it was not scored."""
+    """Return the columns `j_<name>` of all baselines; NaN if a baseline was not scored."""
     return {
         f'j_{name}': float(value(scores[name])) if name in scores else np.nan
         for name in ('copy', *OTHERS)

@@ -1,7 +1,8 @@
-"""PSNR, SSIM and changed pixels of imagined frames, beside what knows nothing of the commands.
+"""PSNR, SSIM and changed pixels of imagined frames, and of baselines without the commands.
 
-The held first frame and frames imagined with another episode's commands are scored alike, over
-whole frames and where the recorded picture differs from the first one. No object is needed.
+The baselines are the held first frame and frames imagined with another episode's commands. Scores
+are over whole frames and over the pixels that differ from the first recorded frame. No object is
+needed.
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ from numpy.typing import NDArray
 from mtv_world_ros.core.data_types import ByteArray
 from mtv_world_ros.evaluation.metrics.statistics import Estimate, mean_interval, MIN_EPISODES
 
-#: what is scored: imagined, first frame held, another episode's commands, and recorded frames
-#: themselves, whose J of the arm is the most that a calibration allows
-HELD, SHUFFLED, RECORDED = 'held', 'shuffled', 'recorded'
-#: what is shown in tables, by the end of a number's name
+#: baseline: the first frame, held
+HELD = 'held'
+#: baseline: frames imagined with another episode's commands
+SHUFFLED = 'shuffled'
+#: upper bound: recorded frames, whose J of the arm is limited by the calibration alone
+RECORDED = 'recorded'
+#: names of the rows of tables, by the suffix of a number's name
 KINDS = {
     '': 'imagined',
     f'_{HELD}': 'first frame held',
@@ -42,8 +46,12 @@ _CHANGED = 20.0
 _LEAST_CHANGED = 0.002
 #: largest margin over shuffled commands of a model that does not follow commands [dB]
 _NO_MARGIN_DB = 0.25
-#: SSIM: window and constants of Wang et al. 2004
-_SIGMA, _C1, _C2 = 1.5, (0.01 * 255) ** 2, (0.03 * 255) ** 2
+#: standard deviation of the window of SSIM [px] (Wang et al. 2004)
+_SSIM_SIGMA_PX = 1.5
+#: constant C1 of SSIM, K1 = 0.01 of the value range 255 (Wang et al. 2004)
+_SSIM_C1 = (0.01 * 255) ** 2
+#: constant C2 of SSIM, K2 = 0.03 of the value range 255 (Wang et al. 2004)
+_SSIM_C2 = (0.03 * 255) ** 2
 
 
 def picture_scores(frames: ByteArray, real: ByteArray, first: ByteArray) -> dict[str, float]:
@@ -79,7 +87,10 @@ def _frame_scores(frame: ByteArray, real: ByteArray, first: ByteArray) -> dict[s
 
 
 def _psnr(error: NDArray[np.float64]) -> float:
-    """As if one value of equal frames differed by half a grey level, so that means are finite."""
+    """Return the PSNR of a squared error [dB].
+
+    Equal frames count as if one value differed by half a grey level, so that means are finite.
+    """
     return float(10 * np.log10(255.0**2 / max(float(error.mean()), 0.25 / error.size)))
 
 
@@ -93,14 +104,14 @@ def ssim_map(a: ByteArray, b: ByteArray) -> NDArray[np.float64]:
     """(H, W) structural similarity of two frames (H, W, 3), the mean of the channels."""
 
     def blurred(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        found = cv2.GaussianBlur(x, (11, 11), _SIGMA, borderType=cv2.BORDER_REFLECT_101)
+        found = cv2.GaussianBlur(x, (11, 11), _SSIM_SIGMA_PX, borderType=cv2.BORDER_REFLECT_101)
         return np.asarray(found, np.float64)
 
     x, y = a.astype(np.float64), b.astype(np.float64)
     mx, my = blurred(x), blurred(y)
     vx, vy, both = blurred(x * x) - mx**2, blurred(y * y) - my**2, blurred(x * y) - mx * my
-    top = (2 * mx * my + _C1) * (2 * both + _C2)
-    found = top / ((mx**2 + my**2 + _C1) * (vx + vy + _C2))
+    top = (2 * mx * my + _SSIM_C1) * (2 * both + _SSIM_C2)
+    found = top / ((mx**2 + my**2 + _SSIM_C1) * (vx + vy + _SSIM_C2))
     return np.asarray(found.mean(axis=-1), np.float64)
 
 
@@ -146,7 +157,7 @@ def picture_estimates(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Following:
-    """Whether a model follows the commands: `yes`, `no` or `cannot tell`, and why."""
+    """Verdict whether a model follows the commands (`yes`, `no`, `cannot tell`) and its reason."""
 
     word: str
     why: str

@@ -1,4 +1,4 @@
-"""How well one way of judging policies agrees with another: r, MMRV, intervals, PPI."""
+"""Agreement of two ways of judging policies: Pearson's r, MMRV, their intervals, PPI."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def _observed(outcomes: FloatArray) -> tuple[FloatArray, FloatArray]:
     own = np.where(is_known, whole - slope / slope.mean(1, keepdims=True) * common, 0.0)
     num_policies = outcomes.shape[1]
     share = np.einsum('apke,bpke->ab', own, own) * num_policies / (num_policies - 1)
-    # outcomes scatter just so much; estimates of the same rate less
+    # binary outcomes have exactly this variance; estimates of the same rate have less
     most = (count[..., None] * mean * (1 - mean)).sum((1, 2, 3))
     scale = np.maximum(np.sqrt(most), 1e-9)
     share /= scale[:, None] * scale
@@ -185,11 +185,15 @@ def _root_times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
 
 #: fewer policies than this have no interval of r or MMRV
 MIN_POLICIES = 3
-#: of the posterior below and above an interval; with .025 an interval held the truth too rarely
-#: (`experiments/interval_coverage.py`)
+#: posterior probability below and above an interval; with 0.025 the interval contained the truth
+#: too rarely (`experiments/interval_coverage.py`)
 _TAILS = (0.0125, 0.0125)
-#: the same of r where policies have few episodes, up to so many; from many on, it is as above
-_TAILS_OF_FEW, _FEW, _MANY = (0.0075, 0.0025), 20, 60
+#: posterior probability below and above the interval of r, with `_FEW_EPISODES` a policy or fewer
+_TAILS_OF_FEW = (0.0075, 0.0025)
+#: episodes a policy up to which `_TAILS_OF_FEW` holds
+_FEW_EPISODES = 20
+#: episodes a policy from which `_TAILS` holds; linear between
+_MANY_EPISODES = 60
 
 
 def pearson(judged: Sequence[float] | FloatArray, true: Sequence[float] | FloatArray) -> float:
@@ -260,11 +264,11 @@ class ScoreOfRates:
 
 
 def rate_agreement(judged: FloatArray, true: FloatArray) -> dict[str, ScoreOfRates]:
-    """Returns `pearson` and `mmrv` of the policies' success rates, over all tasks.
+    """Return `pearson` and `mmrv` of the policies' success rates, over all tasks.
 
     Args:
         judged: (P, K, E) outcomes of P policies on E episodes of each of K tasks, or estimates
-            of them, 0 to 1; NaN = none.
+            of the outcomes, 0 to 1; NaN = none.
         true: (P, K, E) true outcomes.
     """
     observed = {name: score(rates(judged), rates(true)) for name, (score, _) in _SCORES.items()}
@@ -285,9 +289,9 @@ def rate_agreement(judged: FloatArray, true: FloatArray) -> dict[str, ScoreOfRat
 
 def _tails_of_pearson(true: FloatArray) -> FloatArray:
     episodes = float(np.median(np.isfinite(true).sum(axis=(1, 2))))
-    return _TAILS_OF_FEW + np.interp(episodes, (_FEW, _MANY), (0, 1)) * np.subtract(
-        _TAILS, _TAILS_OF_FEW
-    )
+    return _TAILS_OF_FEW + np.interp(
+        episodes, (_FEW_EPISODES, _MANY_EPISODES), (0, 1)
+    ) * np.subtract(_TAILS, _TAILS_OF_FEW)
 
 
 def _draws(judged: FloatArray, true: FloatArray) -> FloatArray | None:
@@ -355,16 +359,17 @@ def powered_mean(
     *,
     weight: float | None = None,
 ) -> PoweredMean:
-    """Returns the prediction-powered estimate of the mean of true values in [0, 1].
+    """Return the prediction-powered estimate of the mean of true values in [0, 1].
 
-    Unbiased however wrong the predictions are: their error is measured where both are known.
+    The estimate is unbiased even if the predictions are wrong, because their error is measured on
+    the samples with both values.
 
     Args:
         true: n true values.
-        predicted: n predictions of them.
-        more: N predictions for others of the same population.
-        weight: lambda; 1 = plain PPI (arXiv 2301.09633), None = what makes the interval
-            shortest (PPI++, arXiv 2311.01453, example 6.1: cov(Y, f) / ((1 + n/N) var f)).
+        predicted: n predictions of these values.
+        more: N predictions for other samples of the same population.
+        weight: lambda; 1 = plain PPI (arXiv 2301.09633), None = the value with the shortest
+            interval (PPI++, arXiv 2311.01453, example 6.1: cov(Y, f) / ((1 + n/N) var f)).
 
     Raises:
         ConfigError: not as many predictions as true values.

@@ -1,4 +1,4 @@
-"""How well success estimates agree with what really happened."""
+"""Agreement of success estimates with true outcomes."""
 
 from __future__ import annotations
 

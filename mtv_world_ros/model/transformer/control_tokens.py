@@ -32,9 +32,9 @@ class Context(NamedTuple):
     """Tokens that a block's cross-attention sees.
 
     Attributes:
-        num_views: V, by which time slots are found in the token sequence.
-        shared: (B, N, D) tokens that all see; None = none.
-        mask: (B, N) bool, False = padding of the shared tokens; None = all count.
+        num_views: number of views V, which gives the time slots in the token sequence.
+        shared: (B, N, D) tokens that all video tokens see; None = none.
+        mask: (B, N) bool, False = padding of the shared tokens; None = no padding.
         by_slot: (B, S, G, D) tokens that are seen by one time slot alone; None = none.
         image: (B, M, D) tokens of the added image attention; None = none.
     """
@@ -207,7 +207,7 @@ class _ContextEmbedding(nn.Module):
     def forward(
         self, given: Tensor, text: Tensor, kept: Tensor | None
     ) -> tuple[Tensor, Tensor | None]:
-        """Return (B, N', D) tokens and which of them count, of text (B, N, D)."""
+        """Return the tokens (B, N', D) of text (B, N, D) and control, and their mask (B, N')."""
         counts = given >= 0 if given.ndim == 2 else given.isfinite().all(-1)
         if given.ndim == 2:
             embedded = self.net(given.clamp_min(0))

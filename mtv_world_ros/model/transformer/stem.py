@@ -103,7 +103,7 @@ class ReferenceStem(nn.Module):
 
 
 class CopyAttention(nn.Module):
-    """Attention by which each output patch copies pixels of its view's reference image."""
+    """Attention that copies pixels of a view's reference image into each output patch."""
 
     def __init__(self, channels: int, reference_channels: int, head_dim: int = 32) -> None:
         super().__init__()

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mtv_world_ros.core.errors import CheckpointError
 
-#: where the start image may enter: as reference tokens and in its channel slot, or in one of them
+#: inputs of the start image: both the reference tokens and its channel slot, or either
 START_IMAGES = ('both', 'either')
 
 
