@@ -70,7 +70,7 @@ _NUM_FRAMES = 24
 _NUM_CORNERS = 48
 #: links that move less are left out, because an arm at rest does not constrain the pose [m]
 _STILL_M = 0.02
-#: factor by which the images of the first search are shrunk again
+#: shrink factor of the images that candidate poses are compared on
 _ROUGH = 4
 #: search without a guess: number of camera poses tried around the robot
 _NUM_CANDIDATES = 1500
