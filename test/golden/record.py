@@ -130,8 +130,8 @@ def weights(out: Path) -> dict[str, str]:
 
 def plans() -> dict[str, Any]:
     """Every fault kind in its typical size, in all tasks; what is refused, by text."""
-    robots, make = module('assembly'), module('scripted_policy').scripted_policy
-    expert, load = module('expert').Expert, import_module(modules()['file']).load_robot
+    robots, make = module('file'), module('scripted_policy').scripted_policy
+    expert, load = module('expert').Expert, robots.load_robot
     tasks = sorted(path.stem for path in (ROOT / 'config' / 'tasks').glob('*.yaml'))
     two, one = (expert(load(robots.robot_path(name))) for name in ('yam_bimanual', ONE_ARM))
     found: dict[str, Any] = {}
@@ -152,8 +152,8 @@ def kinds() -> dict[str, Any]:
     """Every fault kind in one scene: seed, commands, mean and deviation of each joint, a row."""
     import numpy as np
 
-    robots, make = module('assembly'), module('scripted_policy').scripted_policy
-    load = import_module(modules()['file']).load_robot
+    robots, make = module('file'), module('scripted_policy').scripted_policy
+    load = robots.load_robot
     expert = module('expert').Expert(load(robots.robot_path('yam_bimanual')))
     found: dict[str, Any] = {}
     for name in _policies():
