@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -19,10 +20,27 @@ from mtv_world_ros.simulation import yam
 from mtv_world_ros.simulation.actuator import Actuator
 from mtv_world_ros.simulation.cameras import camera_xml
 
-#: gains of a joint by its largest torque or force: kp [1/rad], [1/m], and kv as a share of kp [s]
-_TURN_GAIN, _SLIDE_GAIN, _DAMPING_S = 25.0, 10.0, 0.1
-#: armature of joints that turn and that slide [kg m2, kg]
-_ARMATURE, _SLIDE_ARMATURE = 0.1, 0.05
+
+@dataclass(frozen=True, slots=True)
+class DriveSettings:
+    """Position drives and armatures of joints whose URDF states none.
+
+    Attributes:
+        revolute_gain: position gain of a revolute joint, divided by its largest torque [1/rad].
+        prismatic_gain: position gain of a prismatic joint, divided by its largest force [1/m].
+        damping_s: velocity gain divided by the position gain [s].
+        revolute_armature: armature of a revolute joint [kg m2].
+        prismatic_armature: armature of a prismatic joint [kg].
+    """
+
+    revolute_gain: float = 25.0
+    prismatic_gain: float = 10.0
+    damping_s: float = 0.1
+    revolute_armature: float = 0.1
+    prismatic_armature: float = 0.05
+
+
+_DRIVE = DriveSettings()
 
 
 def bodies_xml(robot: RobotModel, cameras: Sequence[CameraModel]) -> str:
@@ -51,7 +69,11 @@ def actuators_of(robot: RobotModel) -> tuple[Actuator, ...]:
         own = [(name, 1.0, 0.0)]
         followers = [(m.joint, m.multiplier, m.offset) for m in robot.mimics if m.source == name]
         force = float(model.effortLimit[model.joints[model.getJointId(name)].idx_v])
-        kp = force * (_SLIDE_GAIN if _slides(model, model.getJointId(name)) else _TURN_GAIN)
+        kp = force * (
+            _DRIVE.prismatic_gain
+            if _slides(model, model.getJointId(name))
+            else _DRIVE.revolute_gain
+        )
         found += [
             Actuator(
                 joint=joint,
@@ -59,7 +81,7 @@ def actuators_of(robot: RobotModel) -> tuple[Actuator, ...]:
                 multiplier=multiplier,
                 offset=offset,
                 kp=kp,
-                kv=kp * _DAMPING_S,
+                kv=kp * _DRIVE.damping_s,
                 max_force=force,
             )
             for joint, multiplier, offset in own + followers
@@ -110,7 +132,8 @@ class _UrdfBodies:
             f'<body name="{name}" {_at(model.jointPlacements[number].homogeneous)} gravcomp="1">'
             f'<joint name="{name}" type="{"slide" if slides else "hinge"}" '
             f'axis="{_axis(model, joint)}" range="{_numbers(limits)}" '
-            f'armature="{_SLIDE_ARMATURE if slides else _ARMATURE}" damping="0.05"/>'
+            f'armature="{_DRIVE.prismatic_armature if slides else _DRIVE.revolute_armature}" '
+            'damping="0.05"/>'
             f'{inside}</body>'
         )
 

@@ -75,7 +75,7 @@ class CameraJitter:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraMoves:
-    """How far cameras stand from the nominal ones; the defaults are those of zero-shot views.
+    """Ranges of camera offsets from the nominal poses; the defaults give zero-shot views.
 
     Attributes:
         azimuth: turn about the table to either side [deg].

@@ -8,7 +8,7 @@ from types import ModuleType
 
 from mtv_world_ros.core.errors import SimulatorError
 
-#: MUJOCO_GL value -> (shared libraries any of which will do, Debian package)
+#: MUJOCO_GL value -> (alternative shared libraries, Debian packages)
 BACKENDS = {
     'egl': (('libEGL.so.1', 'libEGL.so'), 'libegl1 libgl1-mesa-dri'),
     'osmesa': (('libOSMesa.so.8', 'libOSMesa.so.6', 'libOSMesa.so'), 'libosmesa6'),

@@ -24,8 +24,10 @@ from mtv_world_ros.simulation.workcell import Workcell
 DART = 'dart'
 #: geoms of this priority are the pads of fingers
 _PAD_PRIORITY = 1
-#: seed of the directions of joint zeros; pictures and cameras are drawn by the episode's seed
-_ZERO_SEED, _SPAWN_KEY = 17, 8
+#: seed of the directions of joint zero errors; the same for all episodes
+_ZERO_SEED = 17
+#: key of the random stream of physics; pictures and cameras have streams of their own
+_SPAWN_KEY = 8
 
 _Degrees = Annotated[float, Field(ge=0, le=180)]
 

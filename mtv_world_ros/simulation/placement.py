@@ -118,7 +118,7 @@ def _is_free(
     now: dict[str, SceneObject],
     config: PlacementConfig,
 ) -> bool:
-    """Whether the goal is free of objects other than those it is put on, in or beside."""
+    """Return True if the goal is free of objects, except for those that define the goal."""
     move = task.moves[number]
     if not isinstance(move, PickPlace):
         return True

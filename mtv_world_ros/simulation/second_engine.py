@@ -20,9 +20,11 @@ from mtv_world_ros.simulation.shapes import CONTAINER_KG, RIM_M, shape_named, WA
 if TYPE_CHECKING:
     from mtv_world_ros.simulation.dart.stepped_world import SteppedWorld
 
-#: stiffness of finger tips [N/m]; density of solids without a stated mass [kg/m3]
-_PAD_STIFFNESS, _DENSITY = 1e4, 300.0
-#: shapes that are as long as wide and not round
+#: stiffness of finger tips [N/m]
+_PAD_STIFFNESS_N_M = 1e4
+#: density of solids without a stated mass [kg/m3]
+_DENSITY_KG_M3 = 300.0
+#: shapes with equal length and width that are not round
 _SQUARE = frozenset({'block'})
 
 
@@ -106,10 +108,10 @@ def _settings(
         finger_damping=-float(model.actuator_biasprm[number, 2]),
         finger_mass_kg=float(model.dof_armature[int(joint.dofadr[0])]),
         fingers_swing=True,
-        pad_stiffness=_PAD_STIFFNESS,
+        pad_stiffness=_PAD_STIFFNESS_N_M,
         grip_friction=float(model.geom_friction[pads, 0].max()),
         table_friction=float(model.geom('table').friction[0]),
-        density=_DENSITY,
+        density=_DENSITY_KG_M3,
         tray_kg=CONTAINER_KG,
         rim_m=RIM_M,
         wall_m=WALL_M,

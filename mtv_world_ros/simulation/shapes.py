@@ -15,15 +15,17 @@ from mtv_world_ros.vision.segmenters.colour import PALETTE
 Rgb = tuple[float, float, float]
 Size = tuple[float, float, float]
 
-#: walls of plates and bowls; a gripper holds on to their rim [m]
+#: thickness of the walls of plates and bowls, which a gripper holds at the rim [m]
 RIM_M = 0.012
-#: walls of containers [m]; how heavy an empty container is [kg]
-WALL_M, CONTAINER_KG = 0.006, 0.8
+#: thickness of the walls of containers [m]
+WALL_M = 0.006
+#: mass of an empty container [kg]
+CONTAINER_KG = 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grasp:
-    """How a top-down gripper takes a shape; its fingers close along the object's x.
+    """Top-down grasp of a shape; the fingers close along the object's x axis.
 
     Attributes:
         height: height of the tool over the object's bottom, as a share of the object's height.

@@ -35,7 +35,7 @@ class ObjectRole:
 
     Attributes:
         role: its part in the task; the placeholder of the task's instruction and relations.
-        shapes: keys of `SHAPES`, one of which is drawn; also the noun of its name (`red block`).
+        shapes: keys of `SHAPES`; one is drawn and is the noun of its name (`red block`).
         size_share: range of sizes, from the shape's smallest (0) to its largest (1).
         x_range: range of its centre's x, to the right of the table's middle [m].
         y_range: range of its centre's y, away from the robot [m].

@@ -11,13 +11,32 @@ YAM = 'yam_bimanual'
 ARMS = ('left', 'right')
 #: arm bases in the base frame [m]; both are turned +90 degrees about z, so they reach to +y
 _BASE_POSITIONS = {'left': (-0.28, 0.0, 0.0), 'right': (0.28, 0.0, 0.0)}
-FINGER_WIDTH_M, FINGER_THICKNESS_M = 0.015, 0.01
+#: width of a finger [m]
+FINGER_WIDTH_M = 0.015
+#: thickness of a finger, along its travel [m]
+FINGER_THICKNESS_M = 0.01
 
-_LIGHT, _DARK = '0.62 0.62 0.63 1', '0.16 0.16 0.17 1'
-#: kp [N m/rad], kv [N m s/rad] and largest torque [N m] of joints 1-6
-_SHOULDER, _ELBOW, _WRIST = (40, 2.5, 28), (20, 1.0, 10), (10, 0.5, 10)
+#: RGBA colour of the light parts
+_LIGHT = '0.62 0.62 0.63 1'
+#: RGBA colour of the dark parts
+_DARK = '0.16 0.16 0.17 1'
+#: kp [N m/rad], kv [N m s/rad] and largest torque [N m] of joints 1 to 3
+_SHOULDER = (40, 2.5, 28)
+#: the same quantities of joints 4 and 5
+_ELBOW = (20, 1.0, 10)
+#: the same quantities of the last joint
+_WRIST = (10, 0.5, 10)
+#: the same quantities by joint, 1 to 6
 _GAINS = (_SHOULDER, _SHOULDER, _SHOULDER, _ELBOW, _ELBOW, _WRIST)
-FINGER_MASS, FINGER_KP, FINGER_KV, FINGER_FORCE = 0.118, 100.0, 10.0, 20.0
+#: mass of a finger [kg]
+FINGER_MASS = 0.118
+#: position gain of a finger's drive [N/m]
+FINGER_KP = 100.0
+#: velocity gain of a finger's drive [N s/m]
+FINGER_KV = 10.0
+#: largest force of a finger's drive [N]
+FINGER_FORCE = 20.0
+#: limits of the finger joint [m]
 _FINGER_RANGE = (-0.00205, 0.037524)
 _FINGER_BASES = {'left': (-0.037, 0.0392, 0.0605), 'right': (0.037, -0.0392, 0.0605)}
 

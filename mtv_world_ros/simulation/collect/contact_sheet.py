@@ -14,8 +14,14 @@ from mtv_world_ros.simulation.collect.dataset_card import CardEntry
 
 SHEET_FILE = 'contact_sheet.png'
 OUTCOMES = ('success', 'failure')
-_GAP, _LINE = 6, 18  # between blocks; height of a line of text [px]
-_PAPER, _INK = 255, (40, 40, 40)
+#: gap between the blocks of a sheet [px]
+_GAP_PX = 6
+#: height of a line of text [px]
+_LINE_PX = 18
+#: grey level of the background
+_BACKGROUND = 255
+#: RGB colour of the text
+_TEXT_COLOUR = (40, 40, 40)
 
 
 def film_strip(path: Path, num_frames: int, width: int) -> ByteArray:
@@ -41,13 +47,13 @@ def film_strip(path: Path, num_frames: int, width: int) -> ByteArray:
 def _small(frame: ByteArray, width: int) -> ByteArray:
     height = round(frame.shape[0] * width / frame.shape[1])
     small = cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
-    return np.pad(small, ((0, 2), (0, 2), (0, 0)), constant_values=_PAPER).astype(np.uint8)
+    return np.pad(small, ((0, 2), (0, 2), (0, 0)), constant_values=_BACKGROUND).astype(np.uint8)
 
 
 def titled(text: str, picture: ByteArray) -> ByteArray:
     """Returns a picture (H, W, 3) with a line of text above it."""
-    line = np.full((_LINE, picture.shape[1], 3), _PAPER, np.uint8)
-    cv2.putText(line, text, (2, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _INK, 1, cv2.LINE_AA)
+    line = np.full((_LINE_PX, picture.shape[1], 3), _BACKGROUND, np.uint8)
+    cv2.putText(line, text, (2, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _TEXT_COLOUR, 1, cv2.LINE_AA)
     return np.concatenate([line, picture])
 
 
@@ -62,7 +68,7 @@ def _row(out: Path, pair: Sequence[CardEntry | None], num_frames: int, width: in
         )
         for outcome, entry, strip in zip(OUTCOMES, pair, strips, strict=True)
     ]
-    gap = np.full((len(blocks[0]), _GAP, 3), _PAPER, np.uint8)
+    gap = np.full((len(blocks[0]), _GAP_PX, 3), _BACKGROUND, np.uint8)
     return np.concatenate([blocks[0], gap, blocks[1]], axis=1)
 
 
@@ -100,5 +106,5 @@ def contact_sheet(
         width: width of a frame [px].
     """
     rows = [_row(out, pair, num_frames, width) for pair in _pairs(entries, pairs)]
-    gap = np.full((_GAP, rows[0].shape[1], 3), _PAPER, np.uint8)
+    gap = np.full((_GAP_PX, rows[0].shape[1], 3), _BACKGROUND, np.uint8)
     return np.concatenate([part for row in rows for part in (row, gap)])

@@ -20,7 +20,10 @@ from mtv_world_ros.core.files import write_whole
 from mtv_world_ros.data.episode import METADATA_NAME
 
 CARD_FILE = 'dataset.json'
-TASKS_SET, ZERO_SHOT_SET = 'tasks', 'zero_shot'
+#: name of the set of episodes that show the tasks
+TASKS_SET = 'tasks'
+#: name of the set of episodes from unseen camera poses
+ZERO_SHOT_SET = 'zero_shot'
 #: folder of an episode in progress: its task, number, and a random word of the bag's writer
 _IN_PROGRESS = re.compile(r'\.\w+_\d{5}\.[a-z0-9_]{8}\.tmp')
 #: what to do where something cannot be written

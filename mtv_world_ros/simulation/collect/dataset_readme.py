@@ -106,7 +106,7 @@ def _robot(config: Mapping[str, Any]) -> str:
 
 
 def _is_usual(config: Mapping[str, Any]) -> bool:
-    """Whether the configuration is that of a plain command."""
+    """Return True if the configuration is that of the command without options."""
     usual = plain_config(CollectConfig(robot=_robot(config)))
     for key in ('moved_share', 'policies', 'kinds'):
         usual |= {key: config[key]} if key in config else {}

@@ -31,7 +31,7 @@ _DEFAULT_ROBOT = 'yam_bimanual'
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CollectConfig:
-    """What is randomised, how the expert moves, how episodes are sampled.
+    """Settings of simulated episodes: randomisation, motion of the expert, sampling.
 
     Attributes:
         robot: a bundled one's name, or a robot YAML; it must have a workcell.

@@ -30,7 +30,7 @@ MISS_TOLERANCE_M = 0.02
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordConfig:
-    """How an episode is sampled.
+    """Sampling settings of a recorded episode.
 
     Attributes:
         hold_s: from the end of the commands to the last frame, at least [s].
@@ -78,11 +78,11 @@ class Take:
         observations: T, one a frame.
         control_positions: (C, J) measured joints at every control period.
         commands: the commanded trajectory.
-        ever: the task was done in some frame.
-        final: it was done in each of the last frames.
+        ever: True if the task was done in at least one frame.
+        final: True if the task was done in each of the last frames.
         moved: role -> distance of the object from its start at the end [m].
         missed: role of the object that the gripper is to miss; None = none.
-        any_outcome: the policy has faults, and what comes of them is as wanted.
+        any_outcome: True if the policy has faults, so that every outcome is accepted.
         object_poses: (T, O, 4, 4) T_base_object [m].
     """
 

@@ -1,7 +1,9 @@
-"""How fingers swing as their hand moves: each has a mass and hangs on a drive that gives way.
+"""Swing of fingers under the acceleration of the hand: each is a mass on a compliant drive.
 
-A gripper reports the mean of its fingers, so two that swing to the same side do not show, though
-both are millimetres off when they come down beside an object. Shape letters: T steps, F fingers.
+A gripper reports the mean of its fingers. A swing of both fingers to the same side is therefore
+not measured, although both fingers may be millimetres off next to an object.
+
+Shape letters: T steps, F fingers.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A table, a robot and solids as rigid bodies of the engine DART (dartsim.github.io).
 
 Friction is Coulomb's, with the lower one of two bodies' coefficients. Everything is made of boxes
-and balls, of which the engine's own detector finds contacts best.
+and balls, because the engine's own detector finds the contacts of these shapes best.
 
 Shape letters: J joints, D degrees of freedom of the description, O solids, A tools.
 """
@@ -33,33 +33,44 @@ from mtv_world_ros.robot.shape import urdf_path
 from mtv_world_ros.robot.xml_file import parse_xml
 from mtv_world_ros.simulation.dart.finger_swing import FingerDrives
 
-#: what is at least this wide, and wider than high by this factor, is hollow: a dish, a tray [m]
-_DISH_M, _DISH_RATIO = 0.06, 1.5
-#: thickness of the floor of what is hollow [m]
+#: minimum width of a hollow solid, for example a dish or a tray [m]
+_MIN_HOLLOW_WIDTH_M = 0.06
+#: minimum ratio of width to height of a hollow solid
+_MIN_HOLLOW_ASPECT = 1.5
+#: thickness of the floor of a hollow solid [m]
 _FLOOR_M = 0.006
-#: walls end this far above the bottom, so that they do not touch the table, too [m]
+#: gap between the bottom of a hollow solid and its walls, so that walls never touch the table [m]
 _LIFT_M = 0.0005
-#: round things are prisms of so many sides: flat fingers touch a cylinder along a line only
-_SIDES = 16
-#: side of the square that has the area of a circle, in radii; a capsule is this much longer than
-#: its cylinder, in radii
-_SQUARE, _CAPS = np.sqrt(np.pi), 4 / 3
-#: largest velocity of a solid at rest, angular [rad/s] before linear [m/s]; largest deviations of
-#: an arm in free air from its way [m or rad], [m/s or rad/s]
-_REST = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
-_ON_WAY, _ON_WAY_SPEED = 5e-4, 0.01
-_LEAST_KG = 0.01
-#: time constant with which pads of fingers give way [s]
+#: number of sides of the prism that stands for a round solid: flat fingers touch a cylinder along
+#: a line only
+_NUM_PRISM_SIDES = 16
+#: side of the square that has the area of a circle [radii]
+_SQUARE_SIDE = np.sqrt(np.pi)
+#: length of the cylinder that has the volume of a capsule's two caps [radii]
+_CAPS_LENGTH = 4 / 3
+#: maximum velocity of a solid at rest: three angular [rad/s], then three linear components [m/s]
+_MAX_REST_VELOCITY = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
+#: maximum deviation of an arm from its motion in free air [rad or m]
+_FREE_MOTION_TOLERANCE = 5e-4
+#: maximum difference of its speed from that motion [rad/s or m/s]
+_FREE_MOTION_SPEED_TOLERANCE = 0.01
+#: minimum mass of a solid [kg]
+_MIN_MASS_KG = 0.01
+#: time constant of the compliance of finger pads [s]
 _PAD_S = 0.02
-#: a pad gives way, or does not
-_FREE, _LOCKED = dart.dynamics.ActuatorType.FORCE, dart.dynamics.ActuatorType.LOCKED
-#: fingers press on what they touch with a normal that is more upright than this, else push it
-_STEEP = 0.5
-#: fingers that are further from their middle and touch the same, hold it between them [m]
+#: actuator of a compliant pad
+_COMPLIANT_PAD = dart.dynamics.ActuatorType.FORCE
+#: actuator of a rigid pad
+_RIGID_PAD = dart.dynamics.ActuatorType.LOCKED
+#: minimum vertical component of a contact normal for a finger to press; below it the finger pushes
+_MIN_PRESS_SLOPE = 0.5
+#: minimum distance of two fingers from their middle when they hold a solid that both touch [m]
 _GRIP_M = 0.002
-#: how exactly friction is solved while fingers touch something: repetitions, relative error
-_SWEEPS, _TOLERANCE = 50, 1e-5
-#: half the extents of the table [m]
+#: iterations of the friction solver while fingers touch a solid
+_FRICTION_ITERATIONS = 50
+#: relative error at which the friction solver stops
+_FRICTION_TOLERANCE = 1e-5
+#: half extents of the table [m]
 _TABLE_M = (1.5, 1.5, 0.1)
 
 
@@ -145,8 +156,10 @@ class RigidBodies:
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether no solid moves."""
-        return all((np.abs(solid.getVelocities()) < _REST).all() for solid in self._solids)
+        """True if no solid moves."""
+        return all(
+            (np.abs(solid.getVelocities()) < _MAX_REST_VELOCITY).all() for solid in self._solids
+        )
 
     def passes(self, way: FloatArray, velocity: FloatArray) -> bool:
         """Moves the arms along their way (D,) if they touch nothing there, else not at all."""
@@ -175,7 +188,7 @@ class RigidBodies:
             body = self._solids[number].getBodyNode(0)
             for node in map(body.getShapeNode, range(body.getNumShapeNodes())):
                 node.getDynamicsAspect().setFrictionCoeff(grip if touched[number] else table)
-        is_pushed = max(chain.from_iterable(slopes), default=1.0) < _STEEP
+        is_pushed = max(chain.from_iterable(slopes), default=1.0) < _MIN_PRESS_SLOPE
         self.solve_friction(as_cone=is_pushed or self._holds(touched))
         self._touched = touched
         for group, pad in zip(self._of_pads, self.arms.pads, strict=True):
@@ -183,7 +196,7 @@ class RigidBodies:
             if not is_soft:
                 pad.setPosition(0, 0.0)
                 pad.setVelocity(0, 0.0)
-            pad.setActuatorType(_FREE if is_soft else _LOCKED)
+            pad.setActuatorType(_COMPLIANT_PAD if is_soft else _RIGID_PAD)
 
     def solve_friction(self, *, as_cone: bool) -> None:
         """Solves friction from here on as a cone or as a pyramid, see `notice_touch`."""
@@ -192,17 +205,17 @@ class RigidBodies:
 
     @property
     def is_lost(self) -> bool:
-        """Whether the engine no longer knows where an object or an arm is."""
+        """True if the pose of a solid or a joint position of an arm is not finite."""
         return not (np.isfinite(self.poses()).all() and np.isfinite(self.arms.joints).all())
 
     def _slopes(self, solid: Any) -> list[float]:
-        """How upright the normals of contacts of fingers with a solid are, 0 to 1."""
+        """Return the vertical components of contact normals of fingers with a solid, 0 to 1."""
         found = dart.collision.CollisionResult()
         self._of_fingers.collide(solid, dart.collision.CollisionOption(), found)
         return [abs(found.getContact(k).normal[2]) for k in range(found.getNumContacts())]
 
     def _holds(self, touched: BoolArray) -> bool:
-        """Whether a tool has one of the touched solids (O,) between its fingers."""
+        """Return True if a tool has one of the touched solids (O,) between its fingers."""
         tools = zip(self._of_tools, self.arms.finger_gaps, strict=True)
         wide = [fingers for fingers, gap in tools if gap > _GRIP_M]
         solids = [self._of_solids[number] for number in np.flatnonzero(touched)]
@@ -211,7 +224,7 @@ class RigidBodies:
         )
 
     def step(self, forces: FloatArray) -> None:
-        """Goes on by a step with forces (D,) on the arms."""
+        """Advance the world by one step, with forces (D,) on the arms [N m or N]."""
         self.arms.skeleton.setForces(forces)
         self._world.step()
 
@@ -355,10 +368,12 @@ class DrivenArms:
             )
 
     def is_on(self, way: FloatArray, velocity: FloatArray) -> bool:
-        """Tells whether the arms are where they are in free air, (D,) each."""
+        """Return True if the arms follow their motion in free air, (D,) each."""
         off = np.abs(self.skeleton.getPositions() - way)[self._driven]
         slow = np.abs(self.skeleton.getVelocities() - velocity)[self._driven]
-        return bool((off < _ON_WAY).all() and (slow < _ON_WAY_SPEED).all())
+        return bool(
+            (off < _FREE_MOTION_TOLERANCE).all() and (slow < _FREE_MOTION_SPEED_TOLERANCE).all()
+        )
 
     def ways(self, positions: FloatArray) -> FloatArray:
         """Returns positions (T, D) of the degrees of freedom at joints (T, J)."""
@@ -367,10 +382,10 @@ class DrivenArms:
     def carried(
         self, ways: FloatArray, velocities: FloatArray, accelerations: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Returns what moves the arms along their ways in free air, (T, D) each.
+        """Return the forces that move the arms along their motion in free air, (T, D) each.
 
         Returns:
-            Forces (T, D) of the drives, and those with which hands pull their fingers (T, F).
+            Forces (T, D) of the drives and forces (T, F) of the hands on their fingers [N m or N].
         """
         forces, own = np.zeros_like(ways), accelerations[:, self.fingers]
         for row, acceleration in enumerate(accelerations):
@@ -454,17 +469,17 @@ def _same_arm(arms: Any) -> list[tuple[Any, Any]]:
 def _cone() -> Any:
     """A solver of contacts whose friction is the same in all directions."""
     options = dart.constraint.NsgsFrictionSolver.Options()
-    options.maxSweeps, options.tolerance = _SWEEPS, _TOLERANCE
+    options.maxSweeps, options.tolerance = _FRICTION_ITERATIONS, _FRICTION_TOLERANCE
     return dart.constraint.NsgsFrictionSolver(options)
 
 
 def _boxed(shape: Any) -> Any:
     """A box in place of a cylinder or capsule; other shapes as they are."""
-    caps = {'CylinderShape': 0.0, 'CapsuleShape': _CAPS}.get(shape.getType())
+    caps = {'CylinderShape': 0.0, 'CapsuleShape': _CAPS_LENGTH}.get(shape.getType())
     if caps is None:
         return shape
     radius = shape.getRadius()
-    side, length = _SQUARE * radius, shape.getHeight() + caps * radius
+    side, length = _SQUARE_SIDE * radius, shape.getHeight() + caps * radius
     return dart.dynamics.BoxShape(np.array([side, side, length]))
 
 
@@ -510,7 +525,7 @@ def _pad(arms: Any, name: str, settings: ContactSettings) -> Any:
     joint.setLimitEnforcement(False)
     joint.setSpringStiffness(0, stiffness)
     joint.setDampingCoefficient(0, stiffness * _PAD_S)
-    joint.setActuatorType(_LOCKED)
+    joint.setActuatorType(_RIGID_PAD)
     return joint
 
 
@@ -536,10 +551,10 @@ def _skeleton(robot: RobotModel, path: Path, tree: ElementTree.Element) -> tuple
 
 
 def _described(path: Path) -> ElementTree.Element:
-    """A URDF without its visual shapes.
+    """Return a URDF without its visual shapes.
 
     Raises:
-        RobotError: it collides with meshes, of which the engine finds no contacts.
+        RobotError: it has collision meshes; the engine finds no contacts of meshes.
     """
     tree = parse_xml(read_text(path, 'urdf_bytes'))
     for link in tree.iterfind('link'):
@@ -638,14 +653,14 @@ def _set_inertia(body: Any, inertia: FloatArray) -> None:
 def _parts(solid: Solid, settings: ContactSettings) -> list[_Part]:
     wide, long, high = map(float, solid.size)
     across = min(wide, long)
-    if across > _DISH_M and across > _DISH_RATIO * high:
+    if across > _MIN_HOLLOW_WIDTH_M and across > _MIN_HOLLOW_ASPECT * high:
         if not solid.is_round:
             return _tray(wide, long, high, settings)
         return _vessel(wide, high, settings.rim_m, settings.density)
     if solid.is_open and solid.is_round:
         return _vessel(wide, high, settings.wall_m, settings.density)
     volume = wide * long * high * (np.pi / 4 if solid.is_round else 1.0)
-    mass = max(volume * settings.density, _LEAST_KG)
+    mass = max(volume * settings.density, _MIN_MASS_KG)
     if not solid.is_round:
         return [_Part(size=(wide / 2, long / 2, high / 2), pose=np.eye(4), mass=mass)]
     return _prism(wide, high, 0.0, mass)
@@ -656,8 +671,8 @@ def _prism(wide: float, high: float, middle: float, mass: float) -> list[_Part]:
 
     They stand on one box within the round, which makes few contacts.
     """
-    sides, within = _SIDES // 2, wide / 2 * np.sqrt(0.5)
-    size = (wide / 2, wide / 2 * float(np.tan(np.pi / _SIDES)), high / 2 - _LIFT_M)
+    sides, within = _NUM_PRISM_SIDES // 2, wide / 2 * np.sqrt(0.5)
+    size = (wide / 2, wide / 2 * float(np.tan(np.pi / _NUM_PRISM_SIDES)), high / 2 - _LIFT_M)
     turns = [_turned(k * np.pi / sides) for k in range(sides)]
     at = _shifted(0.0, 0.0, middle)
     return [
@@ -669,11 +684,11 @@ def _prism(wide: float, high: float, middle: float, mass: float) -> list[_Part]:
 def _vessel(wide: float, high: float, rim: float, density: float) -> list[_Part]:
     """Round and open at the top."""
     middle, half = (wide - rim) / 2, (high - _LIFT_M) / 2
-    length = middle * np.tan(np.pi / _SIDES) * 1.02
+    length = middle * np.tan(np.pi / _NUM_PRISM_SIDES) * 1.02
     mass = np.pi * middle**2 * _FLOOR_M * density
     wall = (rim / 2, float(length), half)
     wall_mass = 8 * float(np.prod(wall)) * density
-    turns = [_turned(k * 2 * np.pi / _SIDES) for k in range(_SIDES)]
+    turns = [_turned(k * 2 * np.pi / _NUM_PRISM_SIDES) for k in range(_NUM_PRISM_SIDES)]
     return [
         *_prism(2 * middle, _FLOOR_M, (_FLOOR_M - high) / 2, mass),
         *(

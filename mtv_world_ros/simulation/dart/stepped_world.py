@@ -68,7 +68,7 @@ class SteppedWorld:
         return self._bodies.poses()
 
     def advance(self, command: FloatArray) -> None:
-        """Goes on by one period of commands, towards joints (J,).
+        """Advance the world by one period of commands, towards joints (J,) [rad or m].
 
         Raises:
             SimulatorError: a position of an object or of an arm is not finite.
@@ -107,7 +107,7 @@ class SteppedWorld:
 
 @dataclass(frozen=True, slots=True)
 class DriveTargets:
-    """What arms are to do in a period of commands, at steps of the engine.
+    """Set points of the arms in a period of commands, at the steps of the engine.
 
     Attributes:
         ways: (1 + N, D) positions of drives.

@@ -24,8 +24,8 @@ from mtv_world_ros.simulation.shapes import Grasp, SHAPES
 from mtv_world_ros.simulation.tasks import Move, PickPlace, Shake, Task
 from mtv_world_ros.simulation.workcell import workcell_of
 
-#: step by which the share of a way is reduced until the second arm reaches its end
-_LESS = 0.05
+#: step in the search for the longest reachable part of a path [fraction of the path]
+_SHORTENING_STEP = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +45,7 @@ class PickingConfig:
 
 @dataclass(frozen=True, slots=True)
 class Pick:
-    """How one object is taken.
+    """Grasp of one object by one arm.
 
     Attributes:
         arm: its name.
@@ -63,7 +63,7 @@ class Pick:
 
 
 def grasp_of(subject: SceneObject) -> Grasp:
-    """Returns how the object's shape is taken."""
+    """Return the grasp of the object's shape."""
     grasp = SHAPES[subject.shape].grasp
     assert grasp is not None, f'{subject.shape} cannot be grasped'
     return grasp
@@ -287,7 +287,7 @@ class Expert:
         max_gap: float,
         rng: np.random.Generator,
     ) -> FloatArray:
-        """The sideways shift (3,) [m] with which the closing fingers miss the subject.
+        """Return a sideways shift (3,) [m] that makes the closing fingers miss the subject.
 
         Past a rim it goes outwards, past anything else across the fingers' travel, to the side
         with more room.
@@ -425,7 +425,7 @@ class Expert:
             except SimulatorError:
                 if not share:
                     raise
-                share = max(share - _LESS, 0.0)
+                share = max(share - _SHORTENING_STEP, 0.0)
 
     def _follow(self, arm: str, stops: list[WayPoint], pace: tuple[float, float]) -> FloatArray:
         """Minimum-jerk blends between way points, at a pace."""

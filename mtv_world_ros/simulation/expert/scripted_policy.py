@@ -26,8 +26,10 @@ from mtv_world_ros.simulation.shapes import SHAPES
 from mtv_world_ros.simulation.simulator import scene_generator
 from mtv_world_ros.simulation.tasks import Move, PickPlace, START, Task, task_named
 
-#: horizon of an answer [s], and time between its points [s]
-_CHUNK_S, _POINT_PERIOD_S = 3.2, 0.1
+#: horizon of a chunk [s]
+_CHUNK_S = 3.2
+#: time between the points of a chunk [s]
+_POINT_PERIOD_S = 0.1
 #: default time from the end of the plan to the end of the episode [s]
 HOLD_S = 0.6
 #: draws of a faulty plan before the policy gives up: faults drawn at random may bring a way point
@@ -133,7 +135,7 @@ class ScriptedPolicy:
 
     @property
     def seconds(self) -> float:
-        """How long its episode lasts [s]."""
+        """Duration of the episode [s]."""
         return float(self.plan.times[-1]) + self._hold_s
 
     def _draw_plan(self, rng: np.random.Generator, faults: WayPointFaults) -> JointTrajectory:
@@ -174,9 +176,10 @@ class ScriptedPolicy:
             yield task, replace(self.scene, goals=tuple(goals))
 
     def _with_goal_object_moved(self, size: float, rng: np.random.Generator) -> tuple[Task, Scene]:
-        """With one more move: what one was put on or beside is moved by `size` [m].
+        """Return the task with one more move, which shifts a goal object by `size` [m].
 
-        Where nothing like it can be grasped, another move's subject, else its own once more.
+        If the goal object cannot be grasped, the subject of another move is shifted; if there is
+        none, the subject of the same move is shifted once more.
         """
         own = np.random.default_rng(rng.integers(2**32))
         moves, places = self.task.moves, {i.role: i.position for i in self.scene.objects}

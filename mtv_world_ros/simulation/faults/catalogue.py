@@ -54,7 +54,7 @@ def _known_steps(primitives: Mapping[str, Callable[..., Any]], steps: Steps) -> 
 
 
 class FaultSize(Schema):
-    """How large a fault may be.
+    """Allowed sizes of a fault.
 
     Attributes:
         typical: size at which success and failure are about as frequent.
@@ -309,6 +309,6 @@ def refuse_test_kinds(names: Iterable[str], what: str) -> None:
 
 
 def _near(name: str) -> str:
-    """Of the first word alone: what follows may be right."""
+    """Return a hint on the first word of a name alone, because the other words may be right."""
     first = name.split('-')[0]
     return '' if first == EXPERT else nearest(first, [EXPERT])

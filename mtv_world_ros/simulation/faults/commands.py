@@ -6,6 +6,7 @@ Shape letters: T commands, J joints, A arms, G grippers.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import wraps
 
 import numpy as np
@@ -14,29 +15,67 @@ from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.simulation.faults.glitches import with_glitches
 from mtv_world_ros.simulation.faults.signals import Commands, crossed
 
-#: time in which commands jump [s], and in which a constant error sets in [s]
-_JUMP_S, _SET_IN_S = 0.1, 1.0
-#: part of a plan in which something happens once, as shares of it
-_ONCE = (0.1, 0.7)
-#: period of gripper jerks [s]; range of the durations of a flicker [s], their number, and the time
-#: before a gripper passes its middle at which it is still at rest [s]
-_TWITCH_EVERY_S, _FLICKER_S, _NUM_FLICKERS, _BEFORE_S = 0.8, (0.1, 0.3), 30, 0.6
-#: opening of a gripper at which arms flinch; change of the opening between two commands below
-#: which it stands still, both as shares of its range; speed factor of the way back
-_FLINCH_OPEN, _STANDS, _FLINCH_SPEED = 0.1, 1e-3, 2
-#: number of wrist joints, the last ones of an arm; tool travel up to which an arm is at rest [m]
-_NUM_WRIST, _RESTS_M = 3, 1e-6
-#: length of a chunk of commands [s]; how often commands are lost
-_CHUNK_S, _NUM_LOST = 0.8, 3
-#: damping of swinging arms, as a share of the critical one; onset, duration and end of a swap of
-#: commands [s]; periods of a wavy error over one turn of a joint
-_DAMPING, _SWAP_S, _NUM_WAVES = 0.2, (0.2, 0.4, 0.2), 4
-#: times of sinking, lying and rising of arms that give way [s]; period of vertical waves [s]; step
-#: of the numerical derivative of the tools' heights [rad], and its least square [m2/rad2]
-_SLUMP_S, _HEAVE_S, _STEP_RAD, _LEAST_SLOPE = (0.3, 0.4, 0.6), 2.0, 1e-4, 1e-3
-#: number and duration of outliers [s]; frequency of a tremor [Hz]; time between the draws that a
-#: slow error is interpolated from [s]
-_NUM_SPIKES, _SPIKE_S, _TREMBLE_HZ, _KNOT_S = 3, 0.4, 2.5, 0.5
+
+@dataclass(frozen=True, slots=True)
+class CommandFaultSettings:
+    """Settings of the command faults.
+
+    Attributes:
+        jump_s: duration of a jump of the commands [s].
+        onset_s: duration of the onset of a constant error [s].
+        event_window: part of a plan in which a single event happens [fraction of its duration].
+        twitch_period_s: period of gripper jerks [s].
+        flicker_s: range of the durations between flickers of a gripper [s].
+        num_flickers: number of flickers.
+        before_flicker_s: time of rest before a gripper passes its middle [s].
+        flinch_opening: gripper opening at which arms flinch [fraction of the range].
+        max_still_change: largest change of the opening between commands at rest [fraction].
+        flinch_speed: speed factor of the motion backwards.
+        num_wrist_joints: number of wrist joints, the last joints of an arm.
+        max_rest_travel_m: tool travel up to which an arm is at rest [m].
+        chunk_s: duration of a chunk of commands [s].
+        num_losses: number of gaps with lost commands.
+        damping_ratio: damping of swinging arms [fraction of critical damping].
+        swap_s: onset, duration and end of a swap of commands [s].
+        num_waves: periods of a wavy error over one turn of a joint.
+        slump_s: durations of sinking, lying and rising of arms [s].
+        heave_period_s: period of vertical waves [s].
+        derivative_step_rad: step of the numerical derivative of tool heights [rad].
+        min_squared_slope: smallest squared derivative of a tool height [m2/rad2].
+        num_spikes: number of outliers.
+        spike_s: duration of an outlier [s].
+        tremor_hz: frequency of a tremor [Hz].
+        drift_knot_s: time between the samples that a slow error is interpolated from [s].
+    """
+
+    jump_s: float = 0.1
+    onset_s: float = 1.0
+    event_window: tuple[float, float] = (0.1, 0.7)
+    twitch_period_s: float = 0.8
+    flicker_s: tuple[float, float] = (0.1, 0.3)
+    num_flickers: int = 30
+    before_flicker_s: float = 0.6
+    flinch_opening: float = 0.1
+    max_still_change: float = 1e-3
+    flinch_speed: int = 2
+    num_wrist_joints: int = 3
+    max_rest_travel_m: float = 1e-6
+    chunk_s: float = 0.8
+    num_losses: int = 3
+    damping_ratio: float = 0.2
+    swap_s: tuple[float, float, float] = (0.2, 0.4, 0.2)
+    num_waves: int = 4
+    slump_s: tuple[float, float, float] = (0.3, 0.4, 0.6)
+    heave_period_s: float = 2.0
+    derivative_step_rad: float = 1e-4
+    min_squared_slope: float = 1e-3
+    num_spikes: int = 3
+    spike_s: float = 0.4
+    tremor_hz: float = 2.5
+    drift_knot_s: float = 0.5
+
+
+_SETTINGS = CommandFaultSettings()
 
 Rng = np.random.Generator
 
@@ -90,7 +129,7 @@ def lag(c: Commands, size: float, rng: Rng, *, joints: str) -> FloatArray:
     late = _followed(c, lambda last, now: last + share * (now - last))
     if joints == 'grippers':
         return c.grippers_of(late[:, c.grippers])
-    whole, columns = c.positions.copy(), c.arms[:, -_NUM_WRIST:].ravel()
+    whole, columns = c.positions.copy(), c.arms[:, -_SETTINGS.num_wrist_joints :].ravel()
     whole[:, columns] = late[:, columns]
     return whole
 
@@ -104,8 +143,8 @@ def give_way(c: Commands, size: float, rng: Rng, *, by: str) -> FloatArray:
 
 def _twitches(c: Commands) -> FloatArray:
     """(T, 1) from 0, which is most of the time, to 1."""
-    knots = _JUMP_S * np.arange(4)
-    return np.interp(c.times % _TWITCH_EVERY_S, knots, [0.0, 1.0, 1.0, 0.0])[:, None]
+    knots = _SETTINGS.jump_s * np.arange(4)
+    return np.interp(c.times % _SETTINGS.twitch_period_s, knots, [0.0, 1.0, 1.0, 0.0])[:, None]
 
 
 def _haste(c: Commands) -> FloatArray:
@@ -122,7 +161,9 @@ def _reach(c: Commands) -> FloatArray:
     tools = np.stack([poses[:, :2, 3] for poses in c.robot.tool_poses(c.positions)], axis=1)
     ways = np.linalg.norm(tools - tools[0], axis=2)
     most = ways.max(axis=0)
-    return (ways / np.where(most > _RESTS_M, most, 1.0))[:, _arms_of_grippers(c)]
+    return (ways / np.where(most > _SETTINGS.max_rest_travel_m, most, 1.0))[
+        :, _arms_of_grippers(c)
+    ]
 
 
 def _arms_of_grippers(c: Commands) -> np.ndarray:
@@ -158,10 +199,10 @@ def flicker(c: Commands, size: float, rng: Rng) -> FloatArray:
     own, whole = _own(rng), c.positions.copy()
     for column, _, row in _passes(c):
         since = c.times - c.times[row]
-        knots = np.cumsum(own.uniform(*_FLICKER_S, size=_NUM_FLICKERS))
-        back = np.interp(since, knots, np.arange(_NUM_FLICKERS) % 2)
-        back *= np.clip((size - since) / _JUMP_S + 1, 0.0, 1.0)
-        before = c.positions[max(row - c.num(_BEFORE_S), 0), column]
+        knots = np.cumsum(own.uniform(*_SETTINGS.flicker_s, size=_SETTINGS.num_flickers))
+        back = np.interp(since, knots, np.arange(_SETTINGS.num_flickers) % 2)
+        back *= np.clip((size - since) / _SETTINGS.jump_s + 1, 0.0, 1.0)
+        before = c.positions[max(row - c.num(_SETTINGS.before_flicker_s), 0), column]
         whole[:, column] += back * (before - whole[:, column])
     return whole
 
@@ -171,7 +212,7 @@ def pause_half_way(c: Commands, size: float, rng: Rng) -> FloatArray:
     whole = c.positions.copy()
     for column, middle, row in _passes(c):
         after = np.maximum(np.arange(len(whole) - row) - c.num(size), 0)
-        blend = np.minimum(after * c.period / _JUMP_S, 1.0)
+        blend = np.minimum(after * c.period / _SETTINGS.jump_s, 1.0)
         whole[row:, column] = middle + blend * (c.positions[row:, column] - middle)
     return whole
 
@@ -204,20 +245,20 @@ def jump(
 
 
 def flinch(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Once, as a gripper opens or closes, the arms go back on their way [s], and return.
+    """Move the arms back along their path by `size` [s] and return, once as a gripper moves.
 
-    The gripper goes on, and stands still at the end of its way until they are there again.
+    The gripper completes its motion and rests until the arms are back at the same place.
     """
     own, ways = _own(rng), []
     for opening in c.robot.gripper_openings(c.positions):
-        stands = np.append(np.abs(np.diff(opening)) < _STANDS, True)
-        for change in np.flatnonzero(np.diff(opening > _FLINCH_OPEN)):
+        stands = np.append(np.abs(np.diff(opening)) < _SETTINGS.max_still_change, True)
+        for change in np.flatnonzero(np.diff(opening > _SETTINGS.flinch_opening)):
             begin = int(change - np.argmax(stands[change::-1]))
             ways.append((begin, int(change + np.argmax(stands[change:]))))
     if not ways:
         return c.positions
     begin, end = ways[int(own.integers(len(ways)))]
-    back = np.arange(begin, max(begin - c.num(size), 0), -_FLINCH_SPEED)
+    back = np.arange(begin, max(begin - c.num(size), 0), -_SETTINGS.flinch_speed)
     rows = np.arange(len(c.positions))
     whole = c.positions[np.insert(rows, begin, [*back, *back[::-1]])]
     hands = np.insert(rows, end, np.full(2 * len(back), end))
@@ -247,7 +288,7 @@ def shuffle(c: Commands, size: float, rng: Rng) -> FloatArray:
     begin = 1 + int(share * (len(rows) - 1 - 2 * num))
     middle, end = begin + num, begin + 2 * num
     order = np.concatenate([rows[:begin], rows[middle:end], rows[begin:middle], rows[end:]])
-    whole, num = c.positions[order], min(c.num(_JUMP_S), num)
+    whole, num = c.positions[order], min(c.num(_SETTINGS.jump_s), num)
     for first in (begin, middle, end):
         after = whole[first : first + num].copy()
         blend = (np.arange(1, len(after) + 1) / num)[:, None]
@@ -259,7 +300,7 @@ def seams(c: Commands, size: float, rng: Rng) -> FloatArray:
     """Every chunk of commands but the first is ahead or behind, by up to the size [s]."""
     own, most = _own(rng), size / c.period
     whole, _ = c.delayed(int(np.ceil(most)))
-    rows, num = np.arange(len(whole)), c.num(_CHUNK_S)
+    rows, num = np.arange(len(whole)), c.num(_SETTINGS.chunk_s)
     chunks = rows // num
     ahead = np.rint(most * own.uniform(-1.0, 1.0, chunks[-1] + 1)).astype(int)
     ahead[0] = 0
@@ -267,7 +308,7 @@ def seams(c: Commands, size: float, rng: Rng) -> FloatArray:
         whole[np.clip(rows + ahead[numbers], 0, len(whole) - 1)]
         for numbers in (np.maximum(chunks - 1, 0), chunks)
     )
-    blend = np.minimum((rows % num + 1) * c.period / _JUMP_S, 1.0)[:, None]
+    blend = np.minimum((rows % num + 1) * c.period / _SETTINGS.jump_s, 1.0)[:, None]
     return (1 - blend) * before + blend * now
 
 
@@ -299,7 +340,7 @@ def hold_all(c: Commands, size: float, rng: Rng) -> FloatArray:
         return c.positions
     rows = np.arange(len(c.positions))
     held = rows // num * num
-    blend = np.minimum((rows - held + 1) * c.period / _JUMP_S, 1.0)[:, None]
+    blend = np.minimum((rows - held + 1) * c.period / _SETTINGS.jump_s, 1.0)[:, None]
     return (1 - blend) * c.positions[np.maximum(held - num, 0)] + blend * c.positions[held]
 
 
@@ -316,7 +357,7 @@ def _average(positions: FloatArray, num: int) -> FloatArray:
 def quantise(c: Commands, size: float, rng: Rng) -> FloatArray:
     """The arms are at multiples of the size [rad] from the first row on, and jump between them."""
     steps = size * np.rint((c.positions - c.positions[0]) / size)
-    return c.arms_of(_average(c.positions[0] + steps, c.num(_JUMP_S)))
+    return c.arms_of(_average(c.positions[0] + steps, c.num(_SETTINGS.jump_s)))
 
 
 def play(c: Commands, size: float, rng: Rng) -> FloatArray:
@@ -328,7 +369,7 @@ def play(c: Commands, size: float, rng: Rng) -> FloatArray:
 def stick(c: Commands, size: float, rng: Rng) -> FloatArray:
     """An arm joint stands until its command is more than the size off [rad], and jumps there."""
     whole = _followed(c, lambda last, now: np.where(np.abs(now - last) <= size, last, now))
-    return c.arms_of(_average(whole, c.num(_JUMP_S)))
+    return c.arms_of(_average(whole, c.num(_SETTINGS.jump_s)))
 
 
 def _of_one(
@@ -355,9 +396,9 @@ def scale_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray
 @_of_one
 def stop_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
     """The joint stands still for a while [s], then catches up."""
-    first = int(rng.uniform(*_ONCE) * len(way))
+    first = int(rng.uniform(*_SETTINGS.event_window) * len(way))
     after = np.maximum(np.arange(len(way)) - first - c.num(size), 0)
-    blend = np.minimum(after * c.period / _JUMP_S, 1.0)
+    blend = np.minimum(after * c.period / _SETTINGS.jump_s, 1.0)
     return np.where(c.rows < first, way, way[first] + blend * (way - way[first]))
 
 
@@ -378,14 +419,14 @@ def bind_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
             way[row] -= far
         elif far:
             side = far
-    return _average(way[:, None], c.num(_JUMP_S))[:, 0]
+    return _average(way[:, None], c.num(_SETTINGS.jump_s))[:, 0]
 
 
 @_of_one
 def slip_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
     """The joint skips to one side [rad], and is off from there on."""
-    first = int(rng.uniform(*_ONCE) * len(way))
-    return way + rng.choice((-size, size)) * c.ramp(_JUMP_S, c.times[first])
+    first = int(rng.uniform(*_SETTINGS.event_window) * len(way))
+    return way + rng.choice((-size, size)) * c.ramp(_SETTINGS.jump_s, c.times[first])
 
 
 def tow(c: Commands, size: float, rng: Rng) -> FloatArray:
@@ -417,7 +458,8 @@ def limit_speed(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 def lose_steps(c: Commands, size: float, rng: Rng) -> FloatArray:
     """Once, the steps of the arms over a time [s] are lost, and never made up for."""
-    begin, num = int(float(_own(rng).uniform(*_ONCE)) * len(c.positions)), c.num(size)
+    share = float(_own(rng).uniform(*_SETTINGS.event_window))
+    begin, num = int(share * len(c.positions)), c.num(size)
     steps, lost = np.diff(c.positions, axis=0), np.zeros_like(c.positions)
     lost[begin + 1 : begin + 1 + num] = steps[begin : begin + num]
     return c.arms_of(c.positions - np.cumsum(lost, axis=0))
@@ -425,14 +467,15 @@ def lose_steps(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 def sink_once(c: Commands, size: float, rng: Rng) -> FloatArray:
     """Once, all tools sink by the size [m], and rise again."""
-    share = float(_own(rng).uniform(*_ONCE))
-    return _lowered(c, size * c.pulse(share * len(c.positions), *_SLUMP_S))
+    share = float(_own(rng).uniform(*_SETTINGS.event_window))
+    return _lowered(c, size * c.pulse(share * len(c.positions), *_SETTINGS.slump_s))
 
 
 def heave(c: Commands, size: float, rng: Rng) -> FloatArray:
     """All tools go up and down in waves [m], once they have set in."""
     phase = float(_own(rng).uniform(0.0, 2 * np.pi))
-    return _lowered(c, size * c.ramp(_SET_IN_S) * np.sin(2 * np.pi * c.times / _HEAVE_S + phase))
+    waves = np.sin(2 * np.pi * c.times / _SETTINGS.heave_period_s + phase)
+    return _lowered(c, size * c.ramp(_SETTINGS.onset_s) * waves)
 
 
 def _lowered(c: Commands, sunk: FloatArray) -> FloatArray:
@@ -446,9 +489,11 @@ def _lowered(c: Commands, sunk: FloatArray) -> FloatArray:
 
     now, slopes = heights(c.positions), np.zeros((c.num_arms, *c.positions.shape))
     for joint in c.arms.ravel():
-        step = _STEP_RAD * (np.arange(c.positions.shape[1]) == joint)
-        slopes[:, :, joint] = ((heights(c.positions + step) - now) / _STEP_RAD).T
-    squares = np.maximum((slopes**2).sum(axis=2, keepdims=True), _LEAST_SLOPE)
+        step = _SETTINGS.derivative_step_rad * (np.arange(c.positions.shape[1]) == joint)
+        slopes[:, :, joint] = (
+            (heights(c.positions + step) - now) / _SETTINGS.derivative_step_rad
+        ).T
+    squares = np.maximum((slopes**2).sum(axis=2, keepdims=True), _SETTINGS.min_squared_slope)
     return c.positions - (sunk[:, None] * slopes / squares).sum(axis=0)
 
 
@@ -461,14 +506,14 @@ def fade(c: Commands, size: float, rng: Rng) -> FloatArray:
 def warp(c: Commands, size: float, rng: Rng) -> FloatArray:
     """An arm joint is off by a wave over its angle [rad]; the plan begins where the arms are."""
     phases = _own(rng).uniform(0.0, 2 * np.pi, c.positions.shape[1])
-    waves = np.sin(_NUM_WAVES * c.positions + phases)
+    waves = np.sin(_SETTINGS.num_waves * c.positions + phases)
     return c.arms_of(c.positions + size * (waves - waves[0]))
 
 
 def swap_arms(c: Commands, size: float, rng: Rng) -> FloatArray:
     """Once, the arms take a share of each other's commands."""
     first = int(float(_own(rng).uniform(0.1, 0.9)) * len(c.positions))
-    weights = size * c.pulse(first, *_SWAP_S)[:, None]
+    weights = size * c.pulse(first, *_SETTINGS.swap_s)[:, None]
     others = c.positions[0] + crossed(c.positions, c.positions.shape[1] // c.num_arms)
     return c.positions + weights * (others - c.positions)
 
@@ -476,9 +521,9 @@ def swap_arms(c: Commands, size: float, rng: Rng) -> FloatArray:
 def swing(c: Commands, size: float, rng: Rng) -> FloatArray:
     """The arms follow as masses on springs do, with a period of the size [s]."""
     angle = 2 * np.pi * c.period / size
-    damped = angle * np.sqrt(1 - _DAMPING**2)
-    decay, cos, sin = np.exp(-_DAMPING * angle), np.cos(damped), np.sin(damped)
-    part = _DAMPING * angle / damped
+    damped = angle * np.sqrt(1 - _SETTINGS.damping_ratio**2)
+    decay, cos, sin = np.exp(-_SETTINGS.damping_ratio * angle), np.cos(damped), np.sin(damped)
+    part = _SETTINGS.damping_ratio * angle / damped
     whole, speed = c.positions.copy(), np.zeros_like(c.positions[0])
     for row in range(1, len(whole)):
         away = whole[row - 1] - c.positions[row]
@@ -490,7 +535,7 @@ def swing(c: Commands, size: float, rng: Rng) -> FloatArray:
 def freeze(c: Commands, size: float, rng: Rng) -> FloatArray:
     """Commands of a time [s] are lost at a few places, where the last one holds."""
     held, own = np.arange(len(c.positions)), _own(rng)
-    for first in (own.uniform(0.1, 0.9, _NUM_LOST) * len(held)).astype(int):
+    for first in (own.uniform(0.1, 0.9, _SETTINGS.num_losses) * len(held)).astype(int):
         held[first : first + c.num(size)] = held[first]
     return c.positions[held]
 
@@ -509,7 +554,7 @@ def error(c: Commands, size: float, rng: Rng, *, of: str) -> FloatArray:
 
 def _offsets(c: Commands, size: float, rng: Rng) -> FloatArray:
     drawn = _own(rng).normal(0.0, size, c.positions.shape[1])
-    return c.ramp(_SET_IN_S)[:, None] * drawn
+    return c.ramp(_SETTINGS.onset_s)[:, None] * drawn
 
 
 def _drifts(c: Commands, size: float, rng: Rng) -> FloatArray:
@@ -519,19 +564,19 @@ def _drifts(c: Commands, size: float, rng: Rng) -> FloatArray:
 def _mirrored(c: Commands, size: float, rng: Rng) -> FloatArray:
     """Arms at rest mirror the motion of the arm before them in the order of the joints."""
     is_still = (c.positions == c.positions[0]).astype(np.float64)
-    at_rest = _average(is_still, c.num(_SET_IN_S))
+    at_rest = _average(is_still, c.num(_SETTINGS.onset_s))
     return size * at_rest * crossed(c.positions, c.positions.shape[1] // c.num_arms)
 
 
 def _tremors(c: Commands, size: float, rng: Rng) -> FloatArray:
     phases = _own(rng).uniform(0.0, 2 * np.pi, c.positions.shape[1])
-    waves = np.sin(2 * np.pi * _TREMBLE_HZ * c.times[:, None] + phases)
-    return size * c.ramp(_SET_IN_S)[:, None] * waves
+    waves = np.sin(2 * np.pi * _SETTINGS.tremor_hz * c.times[:, None] + phases)
+    return size * c.ramp(_SETTINGS.onset_s)[:, None] * waves
 
 
 def _spikes(c: Commands, size: float, rng: Rng) -> FloatArray:
     own = _own(rng)
-    middles = own.uniform(0.1, 0.9, _NUM_SPIKES) * len(c.positions)
+    middles = own.uniform(0.1, 0.9, _SETTINGS.num_spikes) * len(c.positions)
     return _triangles(c, middles, c.positions.shape[1], size, own)
 
 
@@ -547,7 +592,7 @@ def _triangles(
     c: Commands, middles: FloatArray, num_joints: int, deviation: float, rng: Rng
 ) -> FloatArray:
     """(T, J) short triangles about some rows, of heights drawn for each joint."""
-    away = np.abs(c.rows[:, None] - middles) * c.period / (_SPIKE_S / 2)
+    away = np.abs(c.rows[:, None] - middles) * c.period / (_SETTINGS.spike_s / 2)
     return np.maximum(1 - away, 0.0) @ rng.normal(0.0, deviation, (len(middles), num_joints))
 
 
@@ -559,7 +604,7 @@ def _with_grippers(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 def _slow_noise(c: Commands, size: float, rng: Rng) -> FloatArray:
     """(T, J) error, zero at first, drawn every half second and linear in between."""
-    knots = np.arange(0.0, c.times[-1] + 2 * _KNOT_S, _KNOT_S)
+    knots = np.arange(0.0, c.times[-1] + 2 * _SETTINGS.drift_knot_s, _SETTINGS.drift_knot_s)
     drawn = rng.normal(0.0, size, (len(knots), c.positions.shape[1]))
     drawn[0] = 0.0
     return np.stack([np.interp(c.times, knots, column) for column in drawn.T], axis=1)

@@ -18,8 +18,10 @@ from mtv_world_ros.core.files import share_path
 
 #: kinds of a set
 NUM_DRAWN = 12
-#: the sizes of a drawn kind are factors of what was drawn: in rankings, and the largest
-RANKED, LARGEST = (0.6, 1.2), 3.0
+#: sizes of a drawn kind in rankings, as factors of the sampled size
+RANKED = (0.6, 1.2)
+#: largest size of a drawn kind, as a factor of the sampled size
+LARGEST = 3.0
 _NAME = re.compile(r'(drawn|drawn_contact)_(\d{1,9})_(\d{1,3})')
 #: sets that a seed draws
 DRAWN_SETS = ('drawn', 'drawn_contact')
@@ -27,7 +29,7 @@ DRAWN_SETS = ('drawn', 'drawn_contact')
 
 @cache
 def _parts() -> dict[str, Any]:
-    """What drawn kinds are composed of: `config/faults/drawn.yaml`."""
+    """Return the parts of drawn kinds: `config/faults/drawn.yaml`."""
     return read_yaml(share_path('config', 'faults', 'drawn.yaml'), 'fault file', 'config/faults')
 
 
@@ -42,10 +44,10 @@ def is_drawn(name: str) -> bool:
 
 
 def drawn_values(name: str) -> dict[str, Any]:
-    """Returns the entry of a drawn kind, as `config/faults` has those of the others.
+    """Return the entry of a drawn kind, in the format of the entries of `config/faults`.
 
-    Steps are one edit of way points, or two, or one of them and one of commands; of contact one
-    edit or two different ones.
+    Its steps are one or two edits of way points, or an edit of way points and one of commands.
+    A drawn kind of contact has one edit or two different ones.
     """
     match = _NAME.fullmatch(name)
     assert match is not None, name

@@ -15,14 +15,23 @@ from mtv_world_ros.simulation.expert.way_points import Draws, Stops, WayPoint
 By = Mapping[str, Any]
 #: an object nearer to the grasp than this is the grasped one [m]
 _OWN_M = 0.06
-#: an object next to the goal: largest distance from the goal, and from the arm's rest, or by how
-#: much it may be farther from there than the goal; one next to the grasped object: the second [m]
-_GOAL_M, _ARM_M, _MORE_M = 0.2, 0.27, 0.03
-#: least height of a carried tool over the grasp; largest depth of shut fingers below the release;
-#: gap between an object and the one that it is put on [m]
-_LOWEST_M, _UNDER_M, _GAP_M = 0.004, 0.02, 0.005
+#: maximum distance of a neighbour from the goal [m]
+_MAX_GOAL_DISTANCE_M = 0.2
+#: maximum distance of a neighbour from the rest position of the arm [m]
+_MAX_REACH_M = 0.27
+#: a neighbour of the goal may be this much farther from the rest position than the goal [m]
+_EXTRA_REACH_M = 0.03
+#: minimum height of a carried tool over the grasp [m]
+_MIN_CARRY_HEIGHT_M = 0.004
+#: maximum depth of closed fingers below the release [m]
+_MAX_CLOSED_DEPTH_M = 0.02
+#: gap between an object and the object that it is put on [m]
+_STACKING_GAP_M = 0.005
 
-FLAT, UP = np.array([1.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+#: mask of the horizontal components of a vector
+FLAT = np.array([1.0, 1.0, 0.0])
+#: unit vector upwards
+UP = np.array([0.0, 0.0, 1.0])
 
 
 class EditedMove:
@@ -186,7 +195,7 @@ def _inwards(move: EditedMove) -> FloatArray:
 
 def _to_floor(move: EditedMove) -> FloatArray:
     height = move.stop('lower').position[2] - move.stop('grasp').position[2]
-    return -min(_UNDER_M, max(height, 0.0)) * UP
+    return -min(_MAX_CLOSED_DEPTH_M, max(height, 0.0)) * UP
 
 
 def _other_arm(move: EditedMove) -> FloatArray:
@@ -208,7 +217,7 @@ def _wandering(move: EditedMove, stop: WayPoint) -> FloatArray:
 
 def _lowered(move: EditedMove, stop: WayPoint) -> FloatArray:
     """Down by the size, not below the grasp."""
-    floor, z = move.stop('close').position[2] + _LOWEST_M, stop.position[2]
+    floor, z = move.stop('close').position[2] + _MIN_CARRY_HEIGHT_M, stop.position[2]
     return (max(z - move.size, min(z, floor)) - z) * UP
 
 
@@ -294,11 +303,12 @@ def _next_to_goal(move: EditedMove) -> FloatArray:
 
 def _object_by_goal(move: EditedMove, other: FloatArray) -> FloatArray:
     own, goal, home = move.stop('close').position, move.stop('open').position, move.stops[-1]
-    farthest = max(_ARM_M, _MORE_M + _distance(goal, home.position))
+    farthest = max(_MAX_REACH_M, _EXTRA_REACH_M + _distance(goal, home.position))
     nears = [
         place
         for place in _others(move, own)
-        if _distance(place, goal) < _GOAL_M and _distance(place, home.position) < farthest
+        if _distance(place, goal) < _MAX_GOAL_DISTANCE_M
+        and _distance(place, home.position) < farthest
     ]
     return min(nears, key=lambda place: _distance(place, goal), default=other)
 
@@ -312,7 +322,7 @@ def _on_next_to_goal(move: EditedMove) -> FloatArray:
 def _next_to_own(move: EditedMove) -> FloatArray:
     """Position of the object next to the grasped one, else the grasp."""
     own, home = move.stop('close').position, move.stops[-1].position
-    others = [place for place in _others(move, own) if _distance(place, home) < _ARM_M]
+    others = [place for place in _others(move, own) if _distance(place, home) < _MAX_REACH_M]
     grasp = move.stop('grasp').position
     return min(others, key=lambda place: _distance(place, own), default=grasp)
 
@@ -320,7 +330,7 @@ def _next_to_own(move: EditedMove) -> FloatArray:
 def _on_own(move: EditedMove) -> FloatArray:
     grasp = move.stop('grasp').position
     own = min(move.draws.objects, key=lambda place: _distance(place, grasp))
-    return own * (1, 1, 2) + (_next_to_own(move)[2] + _GAP_M) * UP
+    return own * (1, 1, 2) + (_next_to_own(move)[2] + _STACKING_GAP_M) * UP
 
 
 def _nearest_to_goal(move: EditedMove) -> FloatArray:
@@ -329,7 +339,7 @@ def _nearest_to_goal(move: EditedMove) -> FloatArray:
     return min(_others(move, own), key=lambda place: _distance(place, goal), default=own)
 
 
-#: places (3,) [m], beside those of way points
+#: named places (3,) [m]; the names of way points are places, too
 PLACES: Mapping[str, OfMove] = {
     'next_to_goal': _next_to_goal,
     'on_next_to_goal': _on_next_to_goal,

@@ -20,9 +20,11 @@ from mtv_world_ros.simulation.faults.random_edits import RANDOM_EDITS
 
 #: a program of `config/faults`: steps of one primitive and its options
 Program = Sequence[Mapping[str, Mapping[str, Any]]]
-#: distances of pushing fingers behind the object at first, and short of the push's end: half a
-#: finger and half a small object lie between the tool and the object's centre [m]
-_BEHIND_M, _SHORT_M = 0.07, 0.03
+#: distance of pushing fingers behind the object's centre at the start of a push [m]
+_PUSH_START_M = 0.07
+#: distance of the tool from the end of a push: half a finger and half a small object lie between
+#: the tool and the object's centre [m]
+_PUSH_END_M = 0.03
 _KEPT: Any = object()
 #: options of a row: what `changed` takes
 ROW = ('place', 'by', 'phase', 'seconds', 'opening', 'yaw', 'lean')
@@ -119,9 +121,10 @@ def insert(
     drop: int = 0,
     **base: Any,
 ) -> None:
-    """Inserts way points, each like a named one, or like the `last` of them, but for a row.
+    """Insert way points: copies of a named one, or of the `last`, each changed by a row.
 
-    `base` changes all of them. Rows are repeated with their ways shorter; `drop` that follow go.
+    `base` changes all new way points. Rows are repeated with shorter paths; the `drop` way points
+    that follow are removed.
     """
     move.put(at, made_of(move, rows, like, repeat, base), drop)
 
@@ -162,7 +165,8 @@ def push(
     stop = move.stop(like)
     way = move.way(to, stop)
     stop = changed(stop, move, phase='above', opening=0.0, **base)
-    away, end = -(move.length(before) + _BEHIND_M) * way, (move.length(far) - _SHORT_M) * way
+    away = -(move.length(before) + _PUSH_START_M) * way
+    end = (move.length(far) - _PUSH_END_M) * way
     up = move.way(rise, stop)
     rows = [stop.moved(away + up), stop.moved(away), stop.moved(end), stop.moved(end + up)]
     if stroke is not None:

@@ -7,27 +7,50 @@ over orders of magnitude, so that a few hundred episodes cover faults of many ki
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.simulation.faults.signals import Commands, crossed
 
-#: between the points of a trajectory that a policy publishes [s]
-_POINTS_S = 0.1
-#: ranges of its duration, its onset, and the pause between repetitions [s]
-_LENGTH_S, _ONSET_S, _EVERY_S = (0.06, 3.0), (0.02, 0.5), (0.3, 2.0)
-#: share of the glitches that are repeated to the end
-_REPEATED = 0.3
-#: ranges of the standard deviation of joint errors [rad], and of their frequency [Hz]
-_OFF_RAD, _SWING_HZ = (0.005, 0.25), (0.2, 6.0)
-#: shares of joint glitches that oscillate, and that only one joint has
-_SWINGS, _ALONE = 0.5, 0.4
-#: ranges of the factor of time, and of the time for which a command is held [s]
-_SPEED, _HELD_S = (0.3, 4.0), (0.05, 1.5)
-#: range of the share by which a resting arm follows another one, and its largest delay [s]
-_SHARE, _LAG_S = (0.3, 1.3), 1.0
+
+@dataclass(frozen=True, slots=True)
+class GlitchSettings:
+    """Settings of random glitches.
+
+    Attributes:
+        point_period_s: time between the points of a policy's trajectory [s].
+        duration_s: range of the duration of a glitch [s].
+        onset_s: range of the onset of a glitch [s].
+        pause_s: range of the pause between repetitions [s].
+        repeated_fraction: fraction of glitches that are repeated to the end.
+        joint_error_rad: range of the standard deviation of joint errors [rad].
+        oscillation_hz: range of the frequency of joint errors [Hz].
+        oscillating_fraction: fraction of joint glitches that oscillate.
+        single_joint_fraction: fraction of joint glitches of one joint only.
+        speed_factor: range of the factor on the speed.
+        hold_s: range of the time for which a command is held [s].
+        mirror_gain: range of the gain of a resting arm that follows another arm.
+        max_mirror_delay_s: largest delay of an arm that follows another arm [s].
+    """
+
+    point_period_s: float = 0.1
+    duration_s: tuple[float, float] = (0.06, 3.0)
+    onset_s: tuple[float, float] = (0.02, 0.5)
+    pause_s: tuple[float, float] = (0.3, 2.0)
+    repeated_fraction: float = 0.3
+    joint_error_rad: tuple[float, float] = (0.005, 0.25)
+    oscillation_hz: tuple[float, float] = (0.2, 6.0)
+    oscillating_fraction: float = 0.5
+    single_joint_fraction: float = 0.4
+    speed_factor: tuple[float, float] = (0.3, 4.0)
+    hold_s: tuple[float, float] = (0.05, 1.5)
+    mirror_gain: tuple[float, float] = (0.3, 1.3)
+    max_mirror_delay_s: float = 1.0
+
+
+_GLITCHES = GlitchSettings()
 
 
 def with_glitches(commands: Commands, count: int, rng: np.random.Generator) -> FloatArray:
@@ -42,7 +65,7 @@ def with_glitches(commands: Commands, count: int, rng: np.random.Generator) -> F
 def _published(commands: Commands, changed: FloatArray) -> FloatArray:
     """(T, J) at the rate of the published points, linear between them where something changed."""
     rows = np.arange(len(changed))
-    points = np.append(rows[:: round(_POINTS_S / commands.period)], rows[-1])
+    points = np.append(rows[:: round(_GLITCHES.point_period_s / commands.period)], rows[-1])
     straight = np.stack([np.interp(rows, points, c[points]) for c in changed.T], axis=1)
     differs = np.abs(changed - commands.positions).max(axis=1) > 0
     between = np.searchsorted(points, rows, side='right')
@@ -56,17 +79,17 @@ def _log_uniform(bounds: tuple[float, float], rng: np.random.Generator) -> float
 def _presence(commands: Commands, rng: np.random.Generator) -> FloatArray:
     """(T, 1) weight of the glitch, 0 to 1."""
     times = np.arange(len(commands.positions)) * commands.period
-    begin, length = rng.uniform(0.0, 0.95) * times[-1], _log_uniform(_LENGTH_S, rng)
-    onset, pause = _log_uniform(_ONSET_S, rng), _log_uniform(_EVERY_S, rng)
+    begin, length = rng.uniform(0.0, 0.95) * times[-1], _log_uniform(_GLITCHES.duration_s, rng)
+    onset, pause = _log_uniform(_GLITCHES.onset_s, rng), _log_uniform(_GLITCHES.pause_s, rng)
     since = times - begin
-    if rng.random() < _REPEATED:
+    if rng.random() < _GLITCHES.repeated_fraction:
         since = np.where(since > 0, since % (length + 2 * onset + pause), since)
     shape = np.interp(since, np.cumsum([0.0, onset, length, onset]), [0.0, 1.0, 1.0, 0.0])
     return np.asarray(shape)[:, None]
 
 
 def _gripper(commands: Commands, rng: np.random.Generator) -> FloatArray:
-    """One gripper or all are as far open as drawn; without one, joints are off."""
+    """Set one or more grippers to a random opening; without a gripper, change joints."""
     if not commands.grippers:
         return _joints(commands, rng)
     there = _presence(commands, rng)
@@ -81,12 +104,15 @@ def _gripper(commands: Commands, rng: np.random.Generator) -> FloatArray:
 def _joints(commands: Commands, rng: np.random.Generator) -> FloatArray:
     """Joints are off, or swing."""
     rows, joints = commands.positions.shape
-    off = _log_uniform(_OFF_RAD, rng) * rng.normal(size=joints)
-    if rng.random() < _ALONE:
+    off = _log_uniform(_GLITCHES.joint_error_rad, rng) * rng.normal(size=joints)
+    if rng.random() < _GLITCHES.single_joint_fraction:
         off *= np.arange(joints) == rng.choice(np.delete(np.arange(joints), commands.grippers))
     off[commands.grippers] = 0.0
-    frequency, phases = _log_uniform(_SWING_HZ, rng), rng.uniform(0.0, 2 * np.pi, joints)
-    if rng.random() < _SWINGS:
+    frequency, phases = (
+        _log_uniform(_GLITCHES.oscillation_hz, rng),
+        rng.uniform(0.0, 2 * np.pi, joints),
+    )
+    if rng.random() < _GLITCHES.oscillating_fraction:
         times = np.arange(rows)[:, None] * commands.period
         wave = np.sin(2 * np.pi * frequency * times + phases)
         # swings go on
@@ -104,23 +130,23 @@ def _time(commands: Commands, rng: np.random.Generator) -> FloatArray:
     rows, period = len(commands.positions), commands.period
     at = np.arange(rows, dtype=np.float64)
     begin = int(rng.uniform(0.05, 0.9) * rows)
-    length = max(round(_log_uniform(_LENGTH_S, rng) / period), 2)
+    length = max(round(_log_uniform(_GLITCHES.duration_s, rng) / period), 2)
     during = slice(begin, begin + length)
     match int(rng.integers(4)):
-        case 0:  # what follows is so much later, or earlier
+        case 0:  # the rest of the plan is delayed or advanced
             rates = np.ones(rows)
-            rates[during] = _log_uniform(_SPEED, rng)
+            rates[during] = _log_uniform(_GLITCHES.speed_factor, rng)
             at = np.cumsum(rates) - rates[0]
         case 1:  # commands are lost, and the last one held
             at[during] = begin
         case 2:  # left out, or carried out again
             at[begin:] += length * rng.choice((-1.0, 1.0))
         case _:
-            held = max(round(_log_uniform(_HELD_S, rng) / period), 2)
+            held = max(round(_log_uniform(_GLITCHES.hold_s, rng) / period), 2)
             span = slice(begin, None) if rng.random() < 0.5 else during
             at[span] = at[span] // held * held
     at = np.clip(at, 0, rows - 1)
-    ramp = max(round(_log_uniform(_ONSET_S, rng) / period), 1)
+    ramp = max(round(_log_uniform(_GLITCHES.onset_s, rng) / period), 1)
     warped = np.stack([np.interp(at, np.arange(rows), c) for c in commands.positions.T], axis=1)
     before = np.repeat(warped[:1], ramp - 1, axis=0)
     padded = np.concatenate([before, warped])
@@ -140,11 +166,14 @@ def _other_arm(commands: Commands, rng: np.random.Generator) -> FloatArray:
     ways, signs = positions - positions[0], np.ones(joints)
     if rng.random() < 0.5:
         signs = rng.choice((-1.0, 1.0), joints, p=(0.2, 0.8))
-    late = np.maximum(np.arange(len(ways)) - int(rng.uniform(0, _LAG_S) / commands.period), 0)
+    late = np.maximum(
+        np.arange(len(ways)) - int(rng.uniform(0, _GLITCHES.max_mirror_delay_s) / commands.period),
+        0,
+    )
     resting = (np.abs(ways) < 1e-9).all(axis=0) | (rng.random(joints) < 0.3)
     there = (ways == 0) | resting
-    error = rng.uniform(*_SHARE) * signs * crossed(positions, to_next)[late]
-    num = max(round(_log_uniform(_ONSET_S, rng) / commands.period), 1)
+    error = rng.uniform(*_GLITCHES.mirror_gain) * signs * crossed(positions, to_next)[late]
+    num = max(round(_log_uniform(_GLITCHES.onset_s, rng) / commands.period), 1)
     sets_in = [np.convolve(column, np.ones(num) / num, 'same') for column in there.T]
     error = error * np.stack(sets_in, axis=1, dtype=np.float64)
     error[:, commands.grippers] = 0.0

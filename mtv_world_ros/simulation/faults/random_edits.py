@@ -3,32 +3,70 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mtv_world_ros.simulation.expert.way_points import WayPoint
 from mtv_world_ros.simulation.faults.edited_move import EditedMove, UP
 
-#: a way point of play: standard deviations in the plane [m], in yaw [rad]; largest height [m]
-_PLAY_M, _PLAY_RAD, _PLAY_HEIGHT_M = 0.03, 0.4, 0.06
-#: an odd way point: standard deviations of its place [m], yaw and lean [rad]; the longest run
-_ODD_M, _ODD_YAW_RAD, _ODD_LEAN_RAD, _ODD_RUN = 0.025, 0.5, 0.35, 3
-#: a visit to an object: from how far to how far past its centre it goes in the plane, how low and
-#: high over it, how much it rises before and after [m]; standard deviations beside the centre [m],
-#: of yaw and lean [rad]
-_VISIT_FROM_M, _VISIT_TO_M = (0.0, 0.08), (-0.02, 0.06)
-_VISIT_HEIGHT_M, _VISIT_RISE_M = (-0.03, 0.05), (0.03, 0.1)
-_VISIT_BESIDE_M, _VISIT_YAW_RAD, _VISIT_LEAN_RAD = 0.012, 0.6, 0.35
-#: one action after the other at an object: standard deviations beside its centre [m], of a lean
-#: and of a turn [rad]; how far it rises or sinks [m]; time that opening or closing takes [s]
-_FIDGET_BESIDE_M, _FIDGET_RAD, _FIDGET_RISE_M, _FIDGET_S = 0.03, 0.5, (-0.04, 0.06), 0.3
-#: how deep what is held may be pressed on what is under it [m]; how often it comes to an object,
-#: and how far it rises there [m]
-_TINKER_DEPTH_M, _TINKER_OTHER, _PERCH_RISE_M = 0.025, 0.2, 0.05
-#: what is carried meets an object: how high the tool is over where it grasped, how far the centres
-#: pass each other [m]
-_MEET_HEIGHT_M, _MEET_BESIDE_M = (0.0, 0.09), 0.03
+
+@dataclass(frozen=True, slots=True)
+class RandomEditSettings:
+    """Settings of random edits of way points.
+
+    Attributes:
+        play_m: standard deviation of a way point of play in the plane [m].
+        play_yaw_rad: standard deviation of its yaw [rad].
+        play_height_m: largest change of its height [m].
+        odd_m: standard deviation of the position of an odd way point [m].
+        odd_yaw_rad: standard deviation of its yaw [rad].
+        odd_lean_rad: standard deviation of its lean [rad].
+        max_odd_run: largest number of consecutive odd way points.
+        visit_from_m: range of the start of a visit, before the object's centre [m].
+        visit_to_m: range of the end of a visit, past the object's centre [m].
+        visit_height_m: range of the height of a visit over the object [m].
+        visit_rise_m: range of the rise before and after a visit [m].
+        visit_offset_m: standard deviation of a visit's offset from the centre [m].
+        visit_yaw_rad: standard deviation of the yaw in a visit [rad].
+        visit_lean_rad: standard deviation of the lean in a visit [rad].
+        action_offset_m: standard deviation of the offset of actions at an object [m].
+        action_angle_rad: standard deviation of a lean or a turn in an action [rad].
+        action_rise_m: range of the rise in an action [m].
+        action_gripper_s: duration of opening or closing in an action [s].
+        max_press_depth_m: largest depth of a held object pressed on the one below [m].
+        other_object_fraction: probability that a held object is moved to another object.
+        perch_rise_m: rise of a held object over another object [m].
+        meet_height_m: range of the tool height over its grasp at a meeting [m].
+        meet_offset_m: standard deviation of the path from the centre of the other object [m].
+    """
+
+    play_m: float = 0.03
+    play_yaw_rad: float = 0.4
+    play_height_m: float = 0.06
+    odd_m: float = 0.025
+    odd_yaw_rad: float = 0.5
+    odd_lean_rad: float = 0.35
+    max_odd_run: int = 3
+    visit_from_m: tuple[float, float] = (0.0, 0.08)
+    visit_to_m: tuple[float, float] = (-0.02, 0.06)
+    visit_height_m: tuple[float, float] = (-0.03, 0.05)
+    visit_rise_m: tuple[float, float] = (0.03, 0.1)
+    visit_offset_m: float = 0.012
+    visit_yaw_rad: float = 0.6
+    visit_lean_rad: float = 0.35
+    action_offset_m: float = 0.03
+    action_angle_rad: float = 0.5
+    action_rise_m: tuple[float, float] = (-0.04, 0.06)
+    action_gripper_s: float = 0.3
+    max_press_depth_m: float = 0.025
+    other_object_fraction: float = 0.2
+    perch_rise_m: float = 0.05
+    meet_height_m: tuple[float, float] = (0.0, 0.09)
+    meet_offset_m: float = 0.03
+
+
+_EDITS = RandomEditSettings()
 
 
 def _above(stop: WayPoint, floor: float) -> WayPoint:
@@ -43,14 +81,16 @@ def random_way_points(move: EditedMove) -> None:
     for _ in range(round(move.size)):
         at = move.index(str(rng.choice(list(begins), p=list(begins.values()))))
         where = move.stops[at if move.stops[at].phase == 'grasp' else at - 1]
-        x, y = where.position[:2] + rng.normal(0.0, _PLAY_M, 2)
-        # half of them as low as they may be, where things are
-        z = max(floor, where.position[2] + rng.uniform(-_PLAY_HEIGHT_M, _PLAY_HEIGHT_M))
+        x, y = where.position[:2] + rng.normal(0.0, _EDITS.play_m, 2)
+        # half of the way points are at the lowest allowed height, where objects are
+        z = max(
+            floor, where.position[2] + rng.uniform(-_EDITS.play_height_m, _EDITS.play_height_m)
+        )
         drawn = replace(
             where,
             phase='above',
             position=np.array([x, y, z]),
-            yaw=where.yaw + float(rng.normal(0.0, _PLAY_RAD)),
+            yaw=where.yaw + float(rng.normal(0.0, _EDITS.play_yaw_rad)),
             opening=float(rng.uniform()),
             seconds=None,
         )
@@ -62,9 +102,9 @@ def random_runs(move: EditedMove) -> None:
     rng, floor = move.draws.play, move.floor
     for _ in range(round(move.size)):
         first = int(rng.integers(len(move.stops) - 1))
-        end = min(first + int(rng.integers(1, _ODD_RUN + 1)), len(move.stops) - 1)
-        way, opening = rng.normal(0.0, _ODD_M, 3), float(rng.uniform())
-        yaw, lean = rng.normal(0.0, (_ODD_YAW_RAD, _ODD_LEAN_RAD))
+        end = min(first + int(rng.integers(1, _EDITS.max_odd_run + 1)), len(move.stops) - 1)
+        way, opening = rng.normal(0.0, _EDITS.odd_m, 3), float(rng.uniform())
+        yaw, lean = rng.normal(0.0, (_EDITS.odd_yaw_rad, _EDITS.odd_lean_rad))
         match str(rng.choice(['opening', 'place', 'turn', 'detour'], p=[0.4, 0.2, 0.2, 0.2])):
             case 'opening':
                 run = [replace(s, opening=opening) for s in move.stops[first:end]]
@@ -88,44 +128,45 @@ def random_visits(move: EditedMove) -> None:
         x, y, z = move.draws.objects[int(rng.integers(len(move.draws.objects)))]
         angle = rng.uniform(0.0, 2 * np.pi)
         way = np.array([np.cos(angle), np.sin(angle)])
-        past = np.array([x, y]) + rng.normal(0.0, _VISIT_BESIDE_M, 2)
-        height = max(floor, z + rng.uniform(*_VISIT_HEIGHT_M))
-        begin = np.array([*(past - rng.uniform(*_VISIT_FROM_M) * way), height])
-        end = np.array([*(past + rng.uniform(*_VISIT_TO_M) * way), height])
+        past = np.array([x, y]) + rng.normal(0.0, _EDITS.visit_offset_m, 2)
+        height = max(floor, z + rng.uniform(*_EDITS.visit_height_m))
+        begin = np.array([*(past - rng.uniform(*_EDITS.visit_from_m) * way), height])
+        end = np.array([*(past + rng.uniform(*_EDITS.visit_to_m) * way), height])
         arrives = WayPoint(
             phase='above',
             position=begin,
-            yaw=float(rng.normal(0.0, _VISIT_YAW_RAD)),
-            # half of them with the opening that the gripper has
+            yaw=float(rng.normal(0.0, _EDITS.visit_yaw_rad)),
+            # half of the visits keep the opening of the gripper
             opening=float(rng.uniform()) if rng.random() < 0.5 else move.stops[at].opening,
-            lean=float(rng.normal(0.0, _VISIT_LEAN_RAD)) if rng.random() < 0.5 else 0.0,
+            lean=float(rng.normal(0.0, _EDITS.visit_lean_rad)) if rng.random() < 0.5 else 0.0,
         )
         leaves = replace(arrives, position=end)
         if rng.random() < 0.5:
             leaves = replace(leaves, opening=float(rng.uniform()))
-        before, after = (rng.uniform(*_VISIT_RISE_M) * UP for _ in range(2))
+        before, after = (rng.uniform(*_EDITS.visit_rise_m) * UP for _ in range(2))
         visit = [arrives.moved(before), arrives, leaves, leaves.moved(after)]
         move.stops = [*move.stops[:at], *visit, *move.stops[at:]]
 
 
 def random_actions_at_object(move: EditedMove) -> None:
-    """At an object, over it or beside it, one thing changes after the other.
+    """Insert a sequence of random actions at an object: each changes one quantity.
 
-    So fingers also open where they are, and what is held is raised, leaned and let go.
+    The actions include opening the fingers in place, and raising, leaning and releasing the held
+    object.
     """
     rng, floor = move.draws.play, move.floor
     at = int(rng.integers(len(move.stops)))
     place = move.draws.objects[int(rng.integers(len(move.draws.objects)))]
     here = WayPoint(
         phase='above',
-        position=place + rng.normal(0.0, _FIDGET_BESIDE_M, 3) * (1, 1, 0),
-        yaw=float(rng.normal(0.0, _VISIT_YAW_RAD)),
+        position=place + rng.normal(0.0, _EDITS.action_offset_m, 3) * (1, 1, 0),
+        yaw=float(rng.normal(0.0, _EDITS.visit_yaw_rad)),
         opening=float(rng.choice((0.0, rng.uniform(), 1.0))),
     )
     run = [_above(here, floor)]
     for _ in range(round(move.size)):
         run.append(_varied(run[-1], floor, rng))
-    before, after = (rng.uniform(*_VISIT_RISE_M) * UP for _ in range(2))
+    before, after = (rng.uniform(*_EDITS.visit_rise_m) * UP for _ in range(2))
     left = replace(run[-1], seconds=None).moved(after)
     move.stops = [*move.stops[:at], run[0].moved(before), *run, left, *move.stops[at:]]
 
@@ -136,15 +177,15 @@ def _varied(stop: WayPoint, floor: float, rng: np.random.Generator) -> WayPoint:
     match str(rng.choice(['opening', 'height', 'place', 'lean', 'turn'], p=[0.4, *[0.15] * 4])):
         case 'opening':
             opening = float(rng.choice((0.0, rng.uniform(), 1.0)))
-            return replace(last, opening=opening, seconds=_FIDGET_S)
+            return replace(last, opening=opening, seconds=_EDITS.action_gripper_s)
         case 'height':
-            return _above(last.moved(rng.uniform(*_FIDGET_RISE_M) * UP), floor)
+            return _above(last.moved(rng.uniform(*_EDITS.action_rise_m) * UP), floor)
         case 'place':
-            return last.moved(rng.normal(0.0, _FIDGET_BESIDE_M, 3) * (1, 1, 0))
+            return last.moved(rng.normal(0.0, _EDITS.action_offset_m, 3) * (1, 1, 0))
         case 'lean':
-            return replace(last, lean=float(rng.normal(0.0, _FIDGET_RAD)))
+            return replace(last, lean=float(rng.normal(0.0, _EDITS.action_angle_rad)))
         case _:
-            return replace(last, yaw=last.yaw + float(rng.normal(0.0, _FIDGET_RAD)))
+            return replace(last, yaw=last.yaw + float(rng.normal(0.0, _EDITS.action_angle_rad)))
 
 
 def random_actions_with_object(move: EditedMove) -> None:
@@ -154,17 +195,17 @@ def random_actions_with_object(move: EditedMove) -> None:
     """
     rng, lift = move.draws.play, move.index('lift')
     low = float(move.stops[lift - 1].position[2])
-    floor = low - rng.uniform(0.0, _TINKER_DEPTH_M)
+    floor = low - rng.uniform(0.0, _EDITS.max_press_depth_m)
     at = int(rng.integers(lift, move.index('open') + 1))
     run = [replace(move.stops[at - 1], phase='carry', seconds=None)]
     for _ in range(round(move.size)):
-        if rng.random() < _TINKER_OTHER:
+        if rng.random() < _EDITS.other_object_fraction:
             place = move.draws.objects[int(rng.integers(len(move.draws.objects)))]
             # what lies on the table is twice as high as its centre
             over = place * (1, 1, rng.choice((0, 2))) + floor * UP
-            over = over + rng.normal(0.0, _FIDGET_BESIDE_M, 3) * (1, 1, 0)
+            over = over + rng.normal(0.0, _EDITS.action_offset_m, 3) * (1, 1, 0)
             there = replace(run[-1], position=over, seconds=None)
-            high = max(_PERCH_RISE_M, run[-1].position[2] - over[2]) * UP
+            high = max(_EDITS.perch_rise_m, run[-1].position[2] - over[2]) * UP
             run += [there.moved(high), there]
         else:
             run.append(_varied(run[-1], floor, rng))
@@ -172,29 +213,33 @@ def random_actions_with_object(move: EditedMove) -> None:
 
 
 def random_carried_contacts(move: EditedMove) -> None:
-    """What the gripper holds is carried low through another object's place, or past it."""
+    """Carry the held object at a low height through, or past, the position of another object."""
     rng = move.draws.play
     grasp = move.stop('close').position
     others = [
         place
         for place in move.draws.objects
-        if np.linalg.norm((place - grasp)[:2]) > _VISIT_TO_M[1]
+        if np.linalg.norm((place - grasp)[:2]) > _EDITS.visit_to_m[1]
     ]
     for _ in range(round(move.size) if others else 0):
         at = int(rng.integers(move.index('lift') + 1, move.index('open') + 1))
-        place = others[int(rng.integers(len(others)))][:2] + rng.normal(0.0, _MEET_BESIDE_M, 2)
-        angle, height = rng.uniform(0.0, 2 * np.pi), grasp[2] + rng.uniform(*_MEET_HEIGHT_M)
+        place = others[int(rng.integers(len(others)))][:2] + rng.normal(
+            0.0, _EDITS.meet_offset_m, 2
+        )
+        angle, height = rng.uniform(0.0, 2 * np.pi), grasp[2] + rng.uniform(*_EDITS.meet_height_m)
         way = np.array([np.cos(angle), np.sin(angle)])
         begin, end = (
             np.array([*(place + far * way), height])
-            for far in (-rng.uniform(0.06, 0.14), rng.uniform(*_VISIT_TO_M))
+            for far in (-rng.uniform(0.06, 0.14), rng.uniform(*_EDITS.visit_to_m))
         )
         before = move.stops[at - 1]
         arrives = replace(before, phase='carry', position=begin, seconds=None)
         if rng.random() < 0.5:
-            arrives = replace(arrives, yaw=before.yaw + float(rng.normal(0.0, _VISIT_YAW_RAD)))
+            arrives = replace(
+                arrives, yaw=before.yaw + float(rng.normal(0.0, _EDITS.visit_yaw_rad))
+            )
         leaves = replace(arrives, position=end)
-        over, after = (rng.uniform(*_VISIT_RISE_M) * UP for _ in range(2))
+        over, after = (rng.uniform(*_EDITS.visit_rise_m) * UP for _ in range(2))
         meeting = [arrives.moved(over), arrives, leaves, leaves.moved(after)]
         move.stops = [*move.stops[:at], *meeting, *move.stops[at:]]
 

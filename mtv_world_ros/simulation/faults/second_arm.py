@@ -1,4 +1,4 @@
-"""What a second arm does in a move of another one: a visit to a place, at a time."""
+"""Motion of a second arm during a move of the first arm: a visit to a place, at a time."""
 
 from __future__ import annotations
 
@@ -18,23 +18,26 @@ from mtv_world_ros.simulation.faults.edits import changed, made_of
 
 #: shortest stay where it waits for the other one [s]
 _STAYS_S = 0.4
-#: a second arm roams: standard deviation of how far off objects, how low at least, and how high
-#: it comes and leaves [m]
-_BESIDE_M, _LEAST_M, _ROAM_RISE_M = 0.04, 0.02, 0.07
+#: standard deviation of the horizontal offset of a roaming arm from an object [m]
+_ROAM_OFFSET_M = 0.04
+#: minimum height of a roaming arm [m]
+_MIN_ROAM_HEIGHT_M = 0.02
+#: height above a place from which a roaming arm approaches and to which it retreats [m]
+_ROAM_RISE_M = 0.07
 
 
 class SecondArm(Schema):
-    """What a second arm does meanwhile: an entry of `config/faults`.
+    """Visit of a second arm during a move: an entry of `config/faults`.
 
     Attributes:
-        to: the place that it visits, by name.
-        share: share of the way to that place.
+        to: name of the place that it visits.
+        share: fraction of the path to that place.
         level: it goes less far in the plane alone.
         like: way point of the first arm that it is like; empty = as it rests.
         but: changes of that way point.
         rows: its way points, as differences from that.
         before: way point of the first arm before which `done` of the rows are done.
-        after: the same after a way point, or after a number of them.
+        after: way point after which they are done, or a number of way points.
         done: number of rows.
         late: time from there [s].
         waits: the first arm waits at its first way point if the second one takes longer.
@@ -86,7 +89,7 @@ def visit_of(
     home: WayPoint,
     times: Sequence[float],
 ) -> Visit:
-    """Returns the visit of a second arm in a move of the first one.
+    """Return the visit of a second arm during a move of the first arm.
 
     Args:
         spec: description of its visit.
@@ -94,7 +97,7 @@ def visit_of(
         size: the fault's size.
         draws: random draws for the move.
         home: way point at which the second arm rests.
-        times: of the first arm's way points, before scaling [s].
+        times: times of the first arm's way points, before scaling [s].
     """
     move = EditedMove(stops, size, draws)
     ways = partial(_rows_of, spec, move, home, times)
@@ -147,8 +150,8 @@ def _roamed(count: int, draws: Draws) -> list[FloatArray]:
     places, rng = list[FloatArray](), draws.play
     for _ in range(count):
         x, y, z = draws.objects[int(rng.integers(len(draws.objects)))]
-        beside = rng.normal(0.0, _BESIDE_M, 2)
-        places.append(np.array([x + beside[0], y + beside[1], max(z, _LEAST_M)]))
+        beside = rng.normal(0.0, _ROAM_OFFSET_M, 2)
+        places.append(np.array([x + beside[0], y + beside[1], max(z, _MIN_ROAM_HEIGHT_M)]))
     return places
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.robot.model import RobotModel
 
-#: travel from which on a joint takes part in a plan [rad]
-_MOVES_RAD = 0.2
+#: minimum travel of a joint that takes part in a plan [rad]
+_MIN_TRAVEL_RAD = 0.2
 
 
 @dataclass(frozen=True)
@@ -83,13 +83,13 @@ class Commands:
         return np.delete(columns, self.grippers).reshape(self.num_arms, -1)
 
     def arms_of(self, changed: FloatArray) -> FloatArray:
-        """Returns (T, J) of which the arms are changed and the grippers as they are."""
+        """Return positions (T, J) with changed arms and unchanged grippers."""
         whole = changed.copy()
         whole[:, self.grippers] = self.positions[:, self.grippers]
         return whole
 
     def grippers_of(self, changed: FloatArray) -> FloatArray:
-        """Returns (T, J) of which the grippers (T, G) are changed and the arms as they are."""
+        """Return positions (T, J) with changed grippers (T, G) and unchanged arms."""
         whole = self.positions.copy()
         whole[:, self.grippers] = changed
         return whole
@@ -98,7 +98,7 @@ class Commands:
         """Returns the column of one of the arm joints that move, drawn."""
         travel = np.ptp(self.positions, axis=0)
         travel[self.grippers] = 0.0
-        return int(rng.choice(np.flatnonzero(travel >= min(_MOVES_RAD, travel.max()))))
+        return int(rng.choice(np.flatnonzero(travel >= min(_MIN_TRAVEL_RAD, travel.max()))))
 
     def delayed(self, num: int) -> tuple[FloatArray, FloatArray]:
         """Returns (T + num, J) twice: with the end held, and `num` rows later."""

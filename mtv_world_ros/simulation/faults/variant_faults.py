@@ -46,7 +46,7 @@ class WayPointFaults:
 
     @property
     def keeps_tempo(self) -> bool:
-        """Whether added way points take time of their own; else they share the move's."""
+        """True if added way points extend the move; else they share its duration."""
         return any(fault.keeps_tempo for fault, _ in self._faults)
 
     def move_of(self, num_moves: int) -> int:

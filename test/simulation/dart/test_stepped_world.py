@@ -18,7 +18,7 @@ from mtv_world_ros.physics.mechanics import RobotMechanics
 from mtv_world_ros.physics.solids import Solid
 from mtv_world_ros.robot.arm_solver import ArmSolver
 from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.simulation.dart.rigid_bodies import _FREE, RigidBodies
+from mtv_world_ros.simulation.dart.rigid_bodies import _COMPLIANT_PAD, RigidBodies
 from mtv_world_ros.simulation.dart.stepped_world import STEP_S, SteppedWorld
 
 SETTINGS = ContactSettings(
@@ -252,7 +252,7 @@ def test_pads_give_way_on_objects_and_not_on_the_table(robot, response):
         assert len(bodies.arms.pads) == 2 * len(robot.tools)
         bodies.notice_touch()
         kinds = {pad.getActuatorType() for pad in bodies.arms.pads}
-        assert (_FREE in kinds) == is_soft
+        assert (_COMPLIANT_PAD in kinds) == is_soft
 
 
 @pytest.mark.parametrize(('is_open', 'height'), [(True, 0.02), (False, 0.07)])
