@@ -24,10 +24,14 @@ from mtv_world_ros.vision.jaccard import jaccard
 
 #: number of frames in a row with too small an overlap after which an object has parted
 _FRAMES_APART = 3
-#: an object is hidden where this share of what was seen of it at first is seen in neither world
+#: visible fraction of an object's first mask, in both worlds, below which the object is hidden
 _HIDDEN = 1 / 3
-#: files of a rollout: both worlds as a video and a contact sheet, and as frames with masks
-VIDEO, SHEET, FRAMES = '.mp4', '.webp', '.rollout.npz'
+#: suffix of the video of both worlds
+VIDEO = '.mp4'
+#: suffix of the contact sheet of both worlds
+SHEET = '.webp'
+#: suffix of the file with the frames and masks of both worlds
+FRAMES = '.rollout.npz'
 #: quality of a video is lowered until it is smaller [bytes]
 _VIDEO_BYTES = 150_000
 #: where a world has ended

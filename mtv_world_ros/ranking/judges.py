@@ -1,4 +1,4 @@
-"""Who judges rollouts, and the scores of a judge: rates, agreement with the simulator, AUROC."""
+"""Judges of rollouts and their scores: rates, agreement with the simulator, AUROC."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mtv_world_ros.simulation.faults.catalogue import FAULTS, parse_variant
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judge:
-    """Who or what estimates whether a rollout succeeded.
+    """Estimator of the success of a rollout.
 
     Attributes:
         title: its row in the table of what a picture is worth.

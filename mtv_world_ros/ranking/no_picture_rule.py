@@ -23,10 +23,14 @@ from mtv_world_ros.success.relations import FLOOR_M
 from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import ever_and_final, match_task, TaskSpec
 
-#: a tool that closes this near to an object's centre, in the plane and in height, takes it [m]
-REACH_M, REACH_HEIGHT_M = 0.02, 0.03
-#: a gripper has closed below this share of what it was open, and opens by the other again
-CLOSES_BELOW, OPENS_BY = 0.5, 0.1
+#: maximum horizontal distance of a closing tool from the centre of an object that it grasps [m]
+REACH_M = 0.02
+#: maximum vertical distance of a closing tool from the centre of an object that it grasps [m]
+REACH_HEIGHT_M = 0.03
+#: opening below which a gripper has closed [fraction of its opening before]
+CLOSES_BELOW = 0.5
+#: increase of the opening at which a closed gripper opens again [fraction of its range]
+OPENS_BY = 0.1
 #: commands between two samples of the situation: 10 Hz, as where the simulator is judged
 _STRIDE = 5
 
@@ -49,7 +53,7 @@ class Thing:
 
     @property
     def is_hollow(self) -> bool:
-        """Whether objects lie in it, not on it."""
+        """True if objects lie in it, not on it."""
         shape = SHAPES.get(self.name.split()[-1])
         return shape is not None and shape.hollow
 
@@ -141,13 +145,13 @@ def things_in(
     cameras: Sequence[CameraModel],
     poses: Sequence[FloatArray],
 ) -> dict[str, Thing]:
-    """Returns the objects of masks by name, those that two views see.
+    """Return the objects that are visible in at least two views, by name.
 
     Args:
-        names: O of them.
-        masks: (V, O, H, W) of one frame.
+        names: names of the O objects.
+        masks: (V, O, H, W) masks of one frame.
         cameras: V cameras at the masks' size.
-        poses: V of T_base_camera (4, 4).
+        poses: V poses T_base_camera (4, 4).
     """
     things = {}
     for name, seen in zip(names, masks.swapaxes(0, 1), strict=True):

@@ -1,4 +1,4 @@
-"""What a ranking found: rates per policy and task, agreement, powered estimates, speed."""
+"""Results of a ranking: rates per policy and task, agreement, powered estimates, speed."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ class Summary:
 
     @cached_property
     def gain_over_rule(self) -> tuple[float, float, Score]:
-        """How often imagination and the no-picture rule are right, and the difference by scene.
+        """Accuracy of imagination, accuracy of the no-picture rule, and their difference by scene.
 
         An abstention is half right. The difference has a t interval over scenes, NaN where these
         are too few.

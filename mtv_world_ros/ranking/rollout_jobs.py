@@ -131,7 +131,7 @@ _NOT_MEASURED = StoredEstimate.stated(nan, 'abstains: not measured')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldComparison:
-    """How a rollout went in both worlds, by frame of the model.
+    """Comparison of a rollout in both worlds, by frame of the model.
 
     Attributes:
         times: (T,) since the first observation [s].
@@ -193,7 +193,7 @@ class Result:
         end: why the simulated episode ended; empty = not known.
         imagined_end: why the imagined one ended.
         course: commands, overlaps and estimates over time in both worlds; None = not known.
-        files: pictures of it in base64 by suffix, where they are not yet written beside it.
+        files: files of the rollout in base64 by suffix; empty once they are written to disk.
     """
 
     __pydantic_config__ = ConfigDict(extra='forbid')
@@ -260,7 +260,7 @@ def make_jobs(
 ) -> list[Job]:
     """Returns the jobs; all policies meet the same episodes.
 
-    Episodes take turns, so that what is done so far is always balanced.
+    Episodes alternate between policies and tasks, so that partial results are always balanced.
 
     Raises:
         ConfigError: less than one episode, no task, or a task twice.

@@ -39,8 +39,8 @@ class RolloutConfig:
     Attributes:
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
         max_chunks: answers of the policy at most.
-        hold: an episode also ends when the task is done, or the estimate abstains, after this
-            number of answers in a row; 0 = then it goes on.
+        hold: number of consecutive answers after which an episode ends if the task is done, or the
+            estimate abstains; 0 = the episode continues.
         clips: keep each rollout as a video, a contact sheet and frames; takes as long as
             imagining it.
         physics: physics of the simulator, a key of `config/physics.yaml`.
@@ -228,7 +228,7 @@ class SimulatedRollout:
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """What one job reached, by checkpoint; None = it was not asked for."""
+    """Results of one job, by checkpoint; None = the checkpoint was not requested."""
 
     by_checkpoint: tuple[Result | None, ...]
 
@@ -273,7 +273,7 @@ class WantedJob:
 
 
 def _objects_shown(masks: ObjectMasks) -> str:
-    """Where objects are in the last of the real frames, as `Result.files` has it."""
+    """Return the object masks of the last real frames in the format of `Result.files`."""
     return base64.b64encode(objects_png(masks.masks[:, :, -1])).decode()
 
 

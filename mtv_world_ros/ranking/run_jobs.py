@@ -1,4 +1,4 @@
-"""Runs the jobs of a ranking, here, in processes or on a Ray cluster; goes on where it stopped."""
+"""Jobs of a ranking, run in process, in worker processes or on a Ray cluster, and resumed."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ def run_jobs(
     show_progress: bool = True,
     watch: Callable[[Sequence[Result]], object] = lambda _: None,
 ) -> tuple[list[list[Result]], dict[Job, str]]:
-    """Returns each checkpoint's results in the order of the jobs; why others have none, by job.
+    """Return the results of each checkpoint in the order of the jobs, and failures by job.
 
-    Each result is written beside its name and renamed, and so are its last frames as a PNG, real
-    ones over imagined ones, a video, a contact sheet and the frames of both worlds; jobs that are
-    there already with the same settings are not run again.
+    The files of a result are a JSON file, a PNG of its last frames with real frames over imagined
+    ones, a video, a contact sheet and the frames of both worlds. Each file is written under a
+    temporary name and renamed. Jobs with a result of the same settings are not run again.
 
     Args:
         jobs: the jobs; each is simulated once for all checkpoints.
@@ -114,7 +114,7 @@ class _Store:
             **checkpoint.settings,
             'steps': config.num_inference_steps,
             'max_chunks': config.max_chunks,
-            # what was ranked before episodes could end so goes on
+            # absent by default, so that rankings without this setting can be resumed
             **({'hold': config.hold} if config.hold else {}),
         }
         check_same_settings(self._out / FOLDER, self._settings, overwrite)
