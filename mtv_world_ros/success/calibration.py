@@ -124,7 +124,7 @@ class Calibration(Weights):
 
     @property
     def is_of_pictures(self) -> bool:
-        """Whether the weights were fitted to rollouts without foreseen object motion."""
+        """True if the weights were fitted to rollouts without foreseen object motion."""
         return self.fitted_to is not None and not self.fitted_to.foresight
 
     def objection(self, task: str, segmenter: str) -> str:

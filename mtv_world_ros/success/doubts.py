@@ -62,7 +62,7 @@ class PhysicsWatch:
 
     @property
     def doubt(self) -> str:
-        """Why the fitted physics does not hold here; empty = nothing speaks against it."""
+        """Reason why the fitted physics does not hold here; empty if it holds."""
         count, of = sum(self._unforeseen), len(self._unforeseen)
         if not of or bdtrc(count - 1, of, _USUAL) >= _SURE:
             return ''
@@ -73,7 +73,7 @@ class PhysicsWatch:
 
     @property
     def text(self) -> str:
-        """What `/diagnostics` says."""
+        """Text for `/diagnostics`."""
         of = len(self._unforeseen)
         return self.doubt or (
             f'as it was fitted, by {of} executed chunks' if of else 'not compared yet'
@@ -100,8 +100,10 @@ def doubted(
     return replace(estimate, reasons=(*estimate.reasons, *notes)) if notes else estimate
 
 
-#: a doubted estimate is shrunk towards 0.5 by this share; least half width of its interval
-_SHRINKAGE, _HALF_WIDTH = 0.5, 0.35
+#: shrinkage of a doubted estimate towards 0.5 [fraction of its distance from 0.5]
+_SHRINKAGE = 0.5
+#: minimum half width of the interval of a doubted estimate
+_MIN_HALF_WIDTH = 0.35
 
 
 def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
@@ -117,8 +119,8 @@ def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
     middle = 0.5 + (1 - _SHRINKAGE) * (estimate.probability - 0.5)
     low, high = estimate.interval
     interval = (
-        max(min(low, middle - _HALF_WIDTH), 0.0),
-        min(max(high, middle + _HALF_WIDTH), 1.0),
+        max(min(low, middle - _MIN_HALF_WIDTH), 0.0),
+        min(max(high, middle + _MIN_HALF_WIDTH), 1.0),
     )
     return replace(estimate, probability=middle, interval=interval, reasons=reasons)
 
@@ -130,7 +132,7 @@ _FIT = 'mtv-world fit contact RECORDINGS --checkpoint CHECKPOINT on recordings o
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grounds:
-    """What an estimate of imagined frames that is not calibrated may rest on.
+    """Basis of an uncalibrated estimate from imagined frames.
 
     Attributes:
         foreseen: why foreseen motions are no ground, as their numbers of contact are guessed;

@@ -164,12 +164,12 @@ class SuccessEstimator:
     def foresee(
         self, foreseen: ForeseenMotions, instruction: str, memory: RolloutMemory | None = None
     ) -> ForeseenEnds | None:
-        """Returns whether the task is done at the end of motions; None = not known.
+        """Return the outcome of the task at the end of motions; None = not known.
 
         Args:
-            foreseen: since the objects were found.
+            foreseen: motions since the objects were found.
             instruction: text for the robot; selects the task and its objects.
-            memory: of the rollout so far; None = it begins where they were found.
+            memory: memory of the rollout; None = the rollout begins where they were found.
         """
         try:
             task, bound = self._task(instruction, foreseen.names)
@@ -242,7 +242,7 @@ class SuccessEstimator:
         )
 
     def _objection(self, task: TaskSpec) -> str:
-        """Why the probability is not a fitted one; empty = it is."""
+        """Return the reason why the probability is not fitted; empty if it is fitted."""
         stated = 'a logistic with stated weights, given the world model'
         if self.calibration is None:
             return f'uncalibrated: {stated}'
@@ -250,14 +250,14 @@ class SuccessEstimator:
         return objection and f'{objection}: {stated}'
 
     def _elsewhere(self, views: Views, is_foreseen: bool) -> str:
-        """Why the weights were fitted in another setting; empty = they were fitted in this one."""
+        """Return the difference from the setting of the fit; empty if the settings are equal."""
         if self.calibration is None or self.setting is None:
             return ''
         cameras = [camera for camera in views.footage.cameras if camera.view in views.used]
         return self.calibration.elsewhere(self.setting, cameras, is_foreseen=is_foreseen)
 
     def _origin(self, elsewhere: str, is_real: bool) -> str:
-        """Which episodes the weights were fitted on."""
+        """Return a description of the episodes that the weights were fitted on."""
         calibration = self.calibration
         assert calibration is not None
         called = f'uncalibrated: {elsewhere}; weights' if elsewhere else 'calibrated:'
@@ -269,7 +269,7 @@ class SuccessEstimator:
 
 
 def _released(task: TaskSpec, openings: FloatArray | None) -> float:
-    """Whether the grippers are as open as the task asks; NaN = not known, or it does not ask."""
+    """Return 1 if the grippers are open as required, else 0; NaN = not known or not required."""
     if openings is None or task.gripper != 'open':
         return nan
     return float(grippers_open(openings)[-1])

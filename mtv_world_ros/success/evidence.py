@@ -28,8 +28,8 @@ from mtv_world_ros.vision.jaccard import mean_of_known
 class ImaginedScene:
     """A `Situation` seen in masks; each object is located once, when it is asked for.
 
-    Centres are those of the end (T = 1); clearances and reversals are of all frames so far. How
-    an object is turned is not seen.
+    Centres are those of the end (T = 1); clearances and reversals are those of all frames up to
+    the end. The rotation of an object is not observed.
 
     Attributes:
         views: masks of the rollout.
@@ -247,7 +247,7 @@ def _contained(scene: ImaginedScene, task: TaskSpec) -> float:
 
 
 def _grasps(scene: ImaginedScene, task: TaskSpec) -> tuple[float, float]:
-    """How well grasps explain that objects moved: by where a gripper closed, and by its path.
+    """Return two scores of grasps as causes of object motion: place of closing, and path.
 
     Positive = explained, at most 1; an object that did not move needs no grasp. NaN = the robot's
     motion is not known.
@@ -302,13 +302,13 @@ def _carry_error(scene: ImaginedScene, role: str, grasp: ObservedGrasp) -> float
 
 
 def _has_moved(scene: ImaginedScene, role: str) -> bool:
-    """Whether the object was away from its start in at least three known frames."""
+    """Return True if the object was away from its start in at least three known frames."""
     trail = scene.views.memory.points[scene.item(role)]
     return _is_away(np.linalg.norm(trail - trail[0], axis=1))
 
 
 def _is_away(away: FloatArray) -> bool:
-    """Whether the third largest of the known distances is a move."""
+    """Return True if at least three known distances are larger than `MOVED_M`."""
     known = away[np.isfinite(away)]
     return len(known) > 2 and float(np.partition(known, -3)[-3]) > MOVED_M
 

@@ -55,7 +55,7 @@ class CameraRange(Schema):
         )
 
     def holds(self, camera: CameraModel) -> bool:
-        """Whether a camera is within the range, up to the tolerances."""
+        """Return True if a camera is within the range, up to the tolerances."""
         row = _placement(camera)
         below, above = np.array(self.low) - _CAMERA_SLACK, np.array(self.high) + _CAMERA_SLACK
         is_inside = bool(np.all((row >= below) & (row <= above)))
@@ -63,7 +63,7 @@ class CameraRange(Schema):
 
 
 class Setting(Schema):
-    """Robot and foresight with which estimates are made.
+    """Robot and foresight of a success estimate.
 
     Attributes:
         foresight: digest of the contact settings and the arms' response; empty = none.
@@ -82,7 +82,7 @@ class Setting(Schema):
         return cls(foresight=foresight, robot=robot.name, tools=tuple(map(tuple, tools.tolist())))
 
     def is_same_robot(self, other: Setting) -> bool:
-        """Whether the tools are where the other's are, up to what a calibration changes."""
+        """Return True if the tools of both settings agree, up to changes by a calibration."""
         mine, theirs = np.array(self.tools), np.array(other.tools)
         return (
             self.robot == other.robot

@@ -1,7 +1,7 @@
 """The share of foreseen motions in which a task succeeds: evidence before any picture.
 
 Foresight gives several motions for one plan, from poses and sizes within the error of the masks.
-Where some of them fail, a grasp is near its limits.
+If a part of the motions fails, a grasp is near its limits.
 
 K motions, N steps, O objects, A arms.
 """

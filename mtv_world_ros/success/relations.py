@@ -83,13 +83,13 @@ _Offset = Annotated[
 
 
 class Relation(Schema):
-    """What must hold between objects at the end of a task, or of one object.
+    """Condition on one object, or between objects, at the end of a task.
 
     Attributes:
         kind: its name in task files, a key of `KINDS`.
         subject: placeholder of the object that moves.
         target: placeholder of the object that it is placed by, where there is one.
-        is_of_course: whether it holds by all that happened so far, not by how things are now.
+        is_of_course: True if it depends on the course of the episode, not on the end alone.
     """
 
     is_of_course: ClassVar[bool] = False

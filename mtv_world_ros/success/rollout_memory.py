@@ -17,9 +17,11 @@ from mtv_world_ros.core.data_types import BoolArray, CameraModel, FloatArray, Ob
 MAX_FRAMES = 2000
 #: grasps that are kept
 MAX_GRASPS = 64
-#: a gripper that closes by this share has grasped, one that opens by the other has let go
-CLOSES_BY, OPENS_BY = 0.15, 0.1
-#: a gripper less open than this at the start may hold something already
+#: decrease of the opening at which a gripper has grasped [fraction of its range]
+CLOSES_BY = 0.15
+#: increase of the opening at which a gripper has released [fraction of its range]
+OPENS_BY = 0.1
+#: opening at the start below which a gripper may already hold an object [fraction of its range]
 HOLDING_BELOW = 0.8
 #: an object that shows this share of its largest area is not hidden
 UNHIDDEN_SHARE = 0.9
@@ -95,7 +97,7 @@ class ObservedGrasp(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RolloutMemory:
-    """Memory of a rollout: V views, O objects, A arms, N frames so far.
+    """Memory of a rollout: V views, O objects, A arms, N frames.
 
     Attributes:
         start_masks: of the rollout's first frame (T = 1).
@@ -104,7 +106,7 @@ class RolloutMemory:
             knows one.
         seen_masks: (V, O, H, W) last masks in which an object was not hidden.
         seen_points: (O, 3) where it was then [m].
-        largest: (V, O) largest area of each mask so far [px].
+        largest: (V, O) largest area of each mask in these frames [px].
         grasps: in order.
         levels: (A,) opening since which a gripper's closing or opening counts.
         closed: (A,) whether a gripper has closed since it last opened.
@@ -239,7 +241,7 @@ def _released(memory: RolloutMemory, arm: int, tool: FloatArray) -> RolloutMemor
 def _gap(
     cameras: Sequence[CameraModel], poses: FloatArray, masks: BoolArray, tool: FloatArray
 ) -> float:
-    """How far the tool is outside an object's (V, H, W) masks [m]; the largest over the views."""
+    """Return the largest distance over views of the tool from an object's (V, H, W) masks [m]."""
     gaps = []
     for camera, pose, mask in zip(cameras, poses, masks, strict=True):
         pixel, depth = project(camera, pose, tool)

@@ -1,4 +1,4 @@
-"""What relations are evaluated on: poses and sizes of objects, and gripper openings, over time."""
+"""Input of relations: poses and sizes of objects, and gripper openings, over time."""
 
 from __future__ import annotations
 

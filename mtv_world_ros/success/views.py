@@ -126,10 +126,10 @@ class Views:
         return float(shares[known].min()) if known.any() else float('nan')
 
     def check_visible(self, item: int) -> None:
-        """Refuses an object that has nearly vanished in every view that knows it.
+        """Raise if an object has nearly vanished in every view that knows it.
 
         Raises:
-            CannotTell: it has nearly vanished in each of them.
+            CannotTell: the object has nearly vanished in all of these views.
         """
         masks = self.footage.masks.masks[:, item, -_LAST_FRAMES:]
         last = np.median(masks.sum((-2, -1)), axis=1)
@@ -172,7 +172,7 @@ class Views:
         return found
 
     def _unknown(self, item: int) -> str:
-        """Why views do not know where the object is."""
+        """Return the reasons why the position of the object is not known."""
         words = []
         for camera, row, ok, used in zip(
             self.footage.cameras,
@@ -187,7 +187,7 @@ class Views:
         return ', '.join(words)
 
     def _is_hidden_in_place(self, item: int) -> bool:
-        """Whether some view shows less of the object than before, and none shows it elsewhere."""
+        """Return True if a view shows less of the object and no view shows it elsewhere."""
         seen, last = self.memory.seen_masks[:, item], self.footage.masks.masks[:, item, -1]
         area, seen_area = last.sum((-2, -1)), seen.sum((-2, -1))
         inside = (seen & last).sum((-2, -1))
