@@ -1,4 +1,4 @@
-"""What a calibration changed: tables in markdown, reliability before and after as one page."""
+"""Report of a calibration: tables in markdown, reliability before and after as one page."""
 
 from __future__ import annotations
 

@@ -88,8 +88,8 @@ class Point:
     """Two values in [0, 1] of one thing with their intervals (low, high); NaN = not known.
 
     Attributes:
-        label: short, beside the mark.
-        title: shown where the mouse is, and for those who cannot see it.
+        label: short text next to the mark.
+        title: tooltip, also read by screen readers.
         colour: variable of the style sheet.
     """
 

@@ -14,7 +14,7 @@ from mtv_world_ros.evaluation import tables
 from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, Group, SEEN
 from mtv_world_ros.evaluation.metrics.statistics import Estimate, METHOD
 
-#: tasks beside each other in a table
+#: maximum number of tasks in the columns of a table
 TASKS_PER_TABLE = 3
 _COPY = 'First frame held'
 _ABOUT = (

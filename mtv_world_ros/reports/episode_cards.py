@@ -25,8 +25,10 @@ from mtv_world_ros.vision.jaccard import mean_of_known
 VIDEO_BUDGET = 24_000_000
 #: of the best, the median and the worst episode alone
 _PICKED_BUDGET = 6_000_000
-#: widths up to which small frames are enlarged, of those and of the others [px]
-_PICKED_TILE, _TILE = 320, 192
+#: width up to which small frames of the best, median and worst episode are enlarged [px]
+_PICKED_TILE_PX = 320
+#: width up to which small frames of other episodes are enlarged [px]
+_TILE_PX = 192
 #: episodes with a contact sheet where none can be ranked
 _NUM_UNRANKED = 3
 _BINS = ('0 to .2', '.2 to .4', '.4 to .6', '.6 to .8', '.8 to 1')
@@ -133,7 +135,7 @@ def _bin(score: float) -> str:
 
 
 def _estimate(result: EpisodeResult) -> str:
-    """Whether the success estimate is right; empty where the outcome is not known."""
+    """Return the verdict on the success estimate; empty if the outcome is not known."""
     judged = verdict(result.probability)
     if not isfinite(judged):
         return 'no verdict'
@@ -170,12 +172,12 @@ def _clip(
         return None, str(error)
     if rollout is None:
         return None, ' its frames were not kept'
-    tile = _PICKED_TILE if is_picked else _TILE
+    tile = _PICKED_TILE_PX if is_picked else _TILE_PX
     return make_clip(rollout, max_bytes=budget, tile_width=tile, with_sheet=is_picked), ''
 
 
 def _crop(view: Filter) -> Markup:
-    """Style rules by which videos show the chosen view alone: a row of several."""
+    """Return style rules that crop videos to the row of the chosen view."""
     num = len(view.options)
     return Markup(
         '\n'.join(

@@ -123,7 +123,7 @@ def _paper_tables(ones: Sequence[Marked]) -> list[Table]:
 
 
 def _success(evaluations: Sequence[Marked]) -> dict[str, Any] | None:
-    """How well the success estimates agree with the outcomes; None if none is known."""
+    """Return the agreement of success estimates with outcomes; None if no outcome is known."""
     found = [(one, one.found.metrics['success']) for one in evaluations]
     known = [(one, numbers) for one, numbers in found if numbers['num_outcomes_known']]
     if not known:
@@ -166,7 +166,7 @@ def _episodes(found: EvaluationSummary) -> Table:
 
 
 def _provenance(found: EvaluationSummary) -> dict[str, str]:
-    """How the numbers came about, by heading."""
+    """Return the provenance of the numbers, by heading."""
     lines = {'checkpoint': found.name, **found.provenance, 'results': str(found.folder)}
     lines |= {key: _flat(v) for key, v in found.metrics.items() if key not in _SHOWN}
     return {key.replace('_', ' '): value for key, value in lines.items()}

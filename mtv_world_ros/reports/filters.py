@@ -10,13 +10,13 @@ from markupsafe import Markup
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filter:
-    """A drop-down; its style rules hide cards without the class of what is chosen.
+    """Drop-down filter; its style rules hide cards without the class of the selected option.
 
     Attributes:
         key: part of its id and of the classes; letters only.
         label: heading.
-        options: choices beside `all`.
-        within: another filter, on whose choice it depends what this one compares.
+        options: choices in addition to `all`.
+        within: another filter; its selected option limits the cards that this filter compares.
     """
 
     key: str

@@ -140,7 +140,7 @@ def _keys(evaluations: Sequence[Marked]) -> tuple[tuple[str, str, str], str]:
 
 
 def _doubts(found: EvaluationSummary) -> list[str]:
-    """What keeps the margins from being shown in every view."""
+    """Return the reasons why margins are not shown in every view."""
     return [
         doubt
         for view in found.spec.views
@@ -151,7 +151,7 @@ def _doubts(found: EvaluationSummary) -> list[str]:
 
 
 def _few(found: EvaluationSummary) -> str:
-    """Why there are too few episodes for a verdict, in words; empty = there are enough."""
+    """Return the reason why episodes are too few for a verdict; empty if they suffice."""
     count = len(found.results)
     if count >= MIN_EPISODES:
         return ''
@@ -159,7 +159,7 @@ def _few(found: EvaluationSummary) -> str:
 
 
 def _doubt(margin: Estimate, words: str) -> str:
-    """What keeps a margin from being shown; empty = nothing."""
+    """Return the reason why a margin is not shown; empty if it is shown."""
     if not isfinite(margin.value):
         return f'{words} not measured'
     if margin.num_episodes < MIN_EPISODES:

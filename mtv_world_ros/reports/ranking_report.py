@@ -161,7 +161,7 @@ def _rates(summary: Summary, task: str | None) -> Table:
 
 
 def _worth(summary: Summary) -> Table:
-    """What a picture is worth: one row a judge."""
+    """Return the table of the accuracy of judges with and without pictures, one row a judge."""
     rate = true_rate(summary.results)
     return Table(
         caption=f'What a picture is worth: {rate.count} rollouts, {rate.value:.0%} really succeed',
@@ -345,7 +345,7 @@ def _speed(summary: Summary) -> Table:
 
 
 def _ends(summary: Summary) -> list[Table]:
-    """Why episodes ended, in both worlds."""
+    """Return the table of reasons for the end of episodes, in both worlds."""
     pairs = [(result.end, result.imagined_end) for result in summary.results]
     known = sorted({end for pair in pairs for end in pair if end})
     if not known:
@@ -371,7 +371,7 @@ def _ends(summary: Summary) -> list[Table]:
 
 
 def _failures(summary: Summary) -> list[Table]:
-    """How many rollouts have no result, by policy, and why."""
+    """Return the table of rollouts without a result, by policy and reason."""
     if not summary.failed:
         return []
     by_policy: dict[str, list[str]] = {}
@@ -421,7 +421,7 @@ def write_ranking(summary: Summary, out: Path) -> Path:
         charts=charts,
         policies=_points(summary, next(iter(REPORTED)), None),
         rollouts=rollout_cards(summary.results, out),
-        # the videos lie beside the page: a thousand of them would not fit into it
+        # videos are separate files next to the page: a thousand videos would not fit into it
         files=" 'self' file:",
     )
     write_whole(path, page)

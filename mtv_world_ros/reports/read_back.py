@@ -90,7 +90,7 @@ def _read(folder: Path, metrics: dict[str, Any]) -> EvaluationSummary:
 
 
 def _distances(numbers: dict[str, Any]) -> dict[str, Estimate]:
-    """FID and FVD, as far as they were measured."""
+    """Return the measured distances among FID and FVD, by name."""
     measured = [name for name in DISTANCES if numbers.get(name) is not None]
     return {
         name: Estimate(

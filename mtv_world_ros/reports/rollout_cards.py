@@ -18,8 +18,10 @@ from mtv_world_ros.reports.filters import Filter, filters
 
 _VERDICTS = ('false success', 'false failure', 'right', 'no verdict')
 _PARTS = ('commands', 'objects', 'nothing')
-#: of the curves [px]
-_WIDTH, _HEIGHT = 320, 64
+#: width of a plot of curves [px]
+_PLOT_WIDTH_PX = 320
+#: height of a plot of curves [px]
+_PLOT_HEIGHT_PX = 64
 
 
 def rollout_cards(results: Sequence[Result], out: Path) -> dict[str, Any]:
@@ -119,7 +121,7 @@ def estimate_text(judged: StoredEstimate) -> str:
 
 
 def _first_to_part(course: WorldComparison | None) -> str:
-    """Which of `_PARTS` differs first between the two worlds; empty = not known."""
+    """Return the entry of `_PARTS` that differs first between the worlds; empty = not known."""
     if course is None:
         return ''
     if not isfinite(course.part_s):
@@ -162,13 +164,14 @@ def curves(course: WorldComparison) -> Markup:
         for colour, (words, times, values, is_step) in lines.items()
     ]
     if isfinite(course.part_s):
-        x = course.part_s / last * _WIDTH
+        x = course.part_s / last * _PLOT_WIDTH_PX
         drawn.append(
-            f'<path d="M {x:.1f} 0 V {_HEIGHT}" stroke="var(--bad)"><title>they part at '
+            f'<path d="M {x:.1f} 0 V {_PLOT_HEIGHT_PX}" stroke="var(--bad)"><title>they part at '
             f'{course.part_s:.1f} s</title></path>'
         )
     return Markup(
-        f'<svg viewBox="-2 -2 {_WIDTH + 4} {_HEIGHT + 4}" role="img" class="curves"><title>'
+        f'<svg viewBox="-2 -2 {_PLOT_WIDTH_PX + 4} {_PLOT_HEIGHT_PX + 4}" role="img" '
+        'class="curves"><title>'
         f'Estimates and overlap over {last:.1f} s, from 0 to 1</title>{"".join(drawn)}</svg>'
     )
 
@@ -180,11 +183,11 @@ def _path(times: Sequence[float], values: Sequence[float], last: float, is_step:
     """
     parts, before = [], 0.0
     for time, value in zip(times, values, strict=True):
-        x, y = time / last * _WIDTH, (1 - value) * _HEIGHT
+        x, y = time / last * _PLOT_WIDTH_PX, (1 - value) * _PLOT_HEIGHT_PX
         if not isfinite(value):
             parts.append('')
         elif is_step:
-            parts.append(f'M {before / last * _WIDTH:.1f} {y:.1f} H {x:.1f}')
+            parts.append(f'M {before / last * _PLOT_WIDTH_PX:.1f} {y:.1f} H {x:.1f}')
         else:
             parts.append(f'{"L" if parts and parts[-1] else "M"} {x:.1f} {y:.1f}')
         before = time
