@@ -21,10 +21,14 @@ OUTLINES = (
     (255, 140, 0),  # orange
     (70, 110, 255),  # blue
 )
-#: of the recorded masks over imagined frames
-_TRUE, _SHADOW = (255, 255, 255), (0, 0, 0)
-#: widths up to which small frames are enlarged [px]
-_VIDEO_TILE, _SHEET_TILE = 320, 200
+#: RGB colour of the outlines of recorded masks over imagined frames
+_RECORDED_COLOUR = (255, 255, 255)
+#: RGB colour of the dark border of these outlines
+_SHADOW_COLOUR = (0, 0, 0)
+#: width up to which small frames of a video are enlarged [px]
+_VIDEO_TILE_PX = 320
+#: width up to which small frames of a contact sheet are enlarged [px]
+_SHEET_TILE_PX = 200
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +36,7 @@ class RolloutClip:
     """Files of one rollout.
 
     Attributes:
-        video: MP4; real, trajectory and imagined beside each other, a row per view.
+        video: MP4 with the columns real, trajectory and imagined, and one row per view.
         num_frames: of the video.
         width: of the video [px].
         height: of the video [px].
@@ -52,7 +56,7 @@ def make_clip(
     rollout: StoredRollout,
     *,
     max_bytes: int,
-    tile_width: int = _VIDEO_TILE,
+    tile_width: int = _VIDEO_TILE_PX,
     with_sheet: bool = True,
 ) -> RolloutClip:
     """Returns a rollout's video and contact sheet, masks outlined.
@@ -79,8 +83,8 @@ def make_clip(
 
 def _sheet(rollout: StoredRollout) -> bytes:
     """Some frames as a WebP."""
-    small = outlined(rollout, _SHEET_TILE)
-    sheet = contact_sheet(small, num_columns=6, tile_width=_SHEET_TILE)
+    small = outlined(rollout, _SHEET_TILE_PX)
+    sheet = contact_sheet(small, num_columns=6, tile_width=_SHEET_TILE_PX)
     done, data = cv2.imencode('.webp', sheet[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 80])
     assert done
     return data.tobytes()
@@ -104,7 +108,7 @@ def outlined(rollout: StoredRollout, tile_width: int) -> Comparison:
                 colour = OUTLINES[o % len(OUTLINES)]
                 true, found = rollout.true_masks[v, o, t], rollout.masks[v, o, t]
                 _outline(real[v, t], true, factor, colour)
-                _outline(imagined[v, t], true, factor, _TRUE, shadow=True)
+                _outline(imagined[v, t], true, factor, _RECORDED_COLOUR, shadow=True)
                 _outline(imagined[v, t], found, factor, colour)
     mean = mean_of_known(rollout.j, axis=1)
     return Comparison(
@@ -135,5 +139,5 @@ def _outline(
     large = mask.astype(np.uint8).repeat(factor, axis=0).repeat(factor, axis=1)
     contours, _ = cv2.findContours(large, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if shadow:
-        cv2.drawContours(image, contours, -1, _SHADOW, 3)
+        cv2.drawContours(image, contours, -1, _SHADOW_COLOUR, 3)
     cv2.drawContours(image, contours, -1, colour, 1 if shadow else 2)

@@ -19,7 +19,7 @@ MASKS = ('true_masks', 'masks')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredRollout:
-    """Predicted frames beside the recorded ones: V views, T frames, O objects.
+    """Predicted frames and recorded frames of the same times: V views, T frames, O objects.
 
     Attributes:
         views: V names.
@@ -65,7 +65,7 @@ class StoredRollout:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScoredRollout:
-    """A rollout beside what really happened.
+    """Rollout with its recording, scores and success estimates.
 
     Attributes:
         name: path of its entities.

@@ -15,10 +15,15 @@ from mtv_world_ros.core.images import resize_frames, write_png
 from mtv_world_ros.viewing.streams import read_streams, Streams
 from mtv_world_ros.viewing.video import Comparison, contact_sheet, KINDS, side_by_side, write_video
 
-#: bounds of a video: frames, and bytes down to a limit of quality
-MAX_VIDEO_FRAMES, MAX_VIDEO_BYTES = 600, 4_000_000
-SHEET, VIDEO = 'contact_sheet.png', 'comparison.mp4'
-#: where a kind of frame is not there
+#: maximum number of frames of a video
+MAX_VIDEO_FRAMES = 600
+#: size of a video at which its quality is not lowered any more; the lowest quality may exceed it
+MAX_VIDEO_BYTES = 4_000_000
+#: file name of a contact sheet
+SHEET = 'contact_sheet.png'
+#: file name of a video of recorded and imagined frames
+VIDEO = 'comparison.mp4'
+#: grey level of a missing frame
 _BLANK = 225
 #: frames that may stand for a moment, in imagined frame periods around it
 _REACH = 0.6
@@ -67,7 +72,7 @@ def every(comparison: Comparison, stride: int) -> Comparison:
 
 
 def compared(streams: Streams) -> Comparison:
-    """Returns the imagined frames beside those of the same times; grey where one is missing.
+    """Return imagined frames and the other kinds of frames at their times; missing ones are grey.
 
     Kinds without any frame at these times are not shown.
 

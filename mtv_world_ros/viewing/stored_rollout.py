@@ -53,7 +53,7 @@ def join(stretches: Sequence[StoredRollout]) -> StoredRollout:
 
 
 def save_rollout(path: Path, rollout: StoredRollout) -> None:
-    """Writes a rollout beside its name and renames it; see `MAX_SIDE` and `MAX_FRAMES`."""
+    """Write a rollout atomically, within the limits `MAX_SIDE` and `MAX_FRAMES`."""
     write_whole(path, rollout_bytes(rollout))
 
 

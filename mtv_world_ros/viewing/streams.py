@@ -41,7 +41,7 @@ _KINDS = {'predicted': 'imagined', 'trajectory': 'trajectory', 'mask': 'imagined
 
 @dataclass(frozen=True, slots=True)
 class Streams:
-    """What a bag, or several of the same time, show; each list is ordered by stamps [ns].
+    """Streams of one bag, or of several bags of the same time, each in the order of stamps [ns].
 
     Attributes:
         images: (kind, view) -> stamp and (H, W, 3) uint8 RGB.

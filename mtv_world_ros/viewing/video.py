@@ -19,16 +19,28 @@ from mtv_world_ros.core.files import write_whole
 
 #: kinds of frames, in the order of rows and columns
 KINDS = ('real', 'trajectory', 'imagined')
-_BACKGROUND, _INK, _FAINT = (255, 255, 255), (25, 25, 25), (120, 120, 120)
-_GAP, _HEAD, _MARGIN = 4, 26, 116
+#: RGB colour of the background
+_BACKGROUND = (255, 255, 255)
+#: RGB colour of the text
+_TEXT_COLOUR = (25, 25, 25)
+#: RGB colour of captions and times
+_CAPTION_COLOUR = (120, 120, 120)
+#: gap between frames [px]
+_GAP_PX = 4
+#: height of a line of the header [px]
+_HEAD_PX = 26
+#: width of the column with the names of the rows [px]
+_MARGIN_PX = 116
 #: qualities of x264 that are tried until a video is small enough
 _CRFS = (24, 30, 36, 42)
-_FONT, _SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+#: factor on the font's base size
+_FONT_SCALE = 0.45
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
-    """One rollout beside what really happened.
+    """Recorded frames, trajectory video and predicted frames of one rollout.
 
     Attributes:
         views: V names.
@@ -86,15 +98,20 @@ def contact_sheet(
         for view in range(len(comparison.views))
     ]
     width = bands[0].shape[1]
-    head = _blank(_HEAD * (2 if title else 1), width)
+    head = _blank(_HEAD_PX * (2 if title else 1), width)
     _text(head, title, (8, 18), scale=0.6)
     tile = _tile_size(comparison.real.shape[2:4], tile_width)[1]
     for column, frame in enumerate(np.unique(shown)):
-        x = _MARGIN + column * (tile + _GAP)
-        _text(head, f'{comparison.times[frame]:+.1f} s', (x + 2, len(head) - 8), colour=_FAINT)
-    foot = _blank(_HEAD * len(notes), width)
+        x = _MARGIN_PX + column * (tile + _GAP_PX)
+        _text(
+            head,
+            f'{comparison.times[frame]:+.1f} s',
+            (x + 2, len(head) - 8),
+            colour=_CAPTION_COLOUR,
+        )
+    foot = _blank(_HEAD_PX * len(notes), width)
     for index, note in enumerate(notes):
-        _text(foot, note, (8, 16 + index * _HEAD))
+        _text(foot, note, (8, 16 + index * _HEAD_PX))
     return np.concatenate([head, *bands, foot])
 
 
@@ -103,21 +120,21 @@ def _view_band(
 ) -> ByteArray:
     """The rows of one view: real, trajectory, imagined, and the captions if there are any."""
     height, width = _tile_size(comparison.real.shape[2:4], tile_width)
-    captions = _HEAD - 8 if comparison.captions else 0
-    total = len(comparison.kinds) * (height + _GAP) + captions + 2 * _GAP
-    band = _blank(total, _MARGIN + len(columns) * (width + _GAP))
+    captions = _HEAD_PX - 8 if comparison.captions else 0
+    total = len(comparison.kinds) * (height + _GAP_PX) + captions + 2 * _GAP_PX
+    band = _blank(total, _MARGIN_PX + len(columns) * (width + _GAP_PX))
     for row, kind in enumerate(comparison.kinds):
-        y = row * (height + _GAP)
+        y = row * (height + _GAP_PX)
         _text(band, comparison.views[view], (8, y + height // 2 - 8), scale=0.55)
-        _text(band, kind, (8, y + height // 2 + 12), colour=_FAINT)
+        _text(band, kind, (8, y + height // 2 + 12), colour=_CAPTION_COLOUR)
         for column, frame in enumerate(columns):
-            x = _MARGIN + column * (width + _GAP)
+            x = _MARGIN_PX + column * (width + _GAP_PX)
             tile = comparison.frames(kind)[view, frame]
             band[y : y + height, x : x + width] = _fit(tile, width, height)
     if captions:
         for column, frame in enumerate(columns):
-            place = (_MARGIN + column * (width + _GAP) + 2, total - 2 * _GAP - 4)
-            _text(band, comparison.captions[view][frame], place, colour=_FAINT)
+            place = (_MARGIN_PX + column * (width + _GAP_PX) + 2, total - 2 * _GAP_PX - 4)
+            _text(band, comparison.captions[view][frame], place, colour=_CAPTION_COLOUR)
     return band
 
 
@@ -129,15 +146,15 @@ def side_by_side(comparison: Comparison, *, tile_width: int = 384) -> ByteArray:
     height, width = _tile_size(comparison.real.shape[2:4], tile_width)
     num_views, num_frames = len(comparison.views), len(comparison.times)
     total = (
-        _even(num_views * (_HEAD + height) + _GAP),
-        _even(len(comparison.kinds) * (width + _GAP) + _GAP),
+        _even(num_views * (_HEAD_PX + height) + _GAP_PX),
+        _even(len(comparison.kinds) * (width + _GAP_PX) + _GAP_PX),
     )
     video = np.stack([_blank(*total)] * num_frames)
     for frame in range(num_frames):
         for column, kind in enumerate(comparison.kinds):
-            x = _GAP + column * (width + _GAP)
+            x = _GAP_PX + column * (width + _GAP_PX)
             for v in range(num_views):
-                y = v * (_HEAD + height) + _HEAD
+                y = v * (_HEAD_PX + height) + _HEAD_PX
                 _text(video[frame], _heading(comparison, kind, v, frame), (x + 4, y - 8))
                 tile = comparison.frames(kind)[v, frame]
                 video[frame, y : y + height, x : x + width] = _fit(tile, width, height)
@@ -155,10 +172,10 @@ def _heading(comparison: Comparison, kind: str, view: int, frame: int) -> str:
 def write_video(
     path: Path, frames: ByteArray, fps: float, *, max_bytes: int | None = None
 ) -> None:
-    """Writes (T, H, W, 3) uint8 RGB frames of even size as H.264 in MP4.
+    """Write (T, H, W, 3) uint8 RGB frames of even size as H.264 in MP4.
 
     Args:
-        path: ends in `.mp4`; written beside and renamed.
+        path: ends in `.mp4`; written under a temporary name and renamed.
         frames: (T, H, W, 3) uint8 RGB.
         fps: frames a second.
         max_bytes: the quality is lowered until the file takes no more, down to a limit.
@@ -170,7 +187,7 @@ def write_video(
 
 
 def encode_small_video(frames: ByteArray, fps: float, max_bytes: int) -> bytes:
-    """Returns the first MP4 of falling quality within `max_bytes`, or the last of them."""
+    """Return the MP4 of the best quality within `max_bytes`, else of the lowest quality."""
     data = b''
     for crf in _CRFS:
         data = encode_video(frames, fps, crf=crf)
@@ -207,8 +224,8 @@ def _text(
     text: str,
     place: tuple[int, int],
     *,
-    scale: float = _SCALE,
-    colour: tuple[int, int, int] = _INK,
+    scale: float = _FONT_SCALE,
+    colour: tuple[int, int, int] = _TEXT_COLOUR,
 ) -> None:
     """Draws plain ASCII text in place, its baseline at (x, y)."""
     plain = text.encode('ascii', 'replace').decode()

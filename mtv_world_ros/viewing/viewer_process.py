@@ -119,12 +119,12 @@ def _check_port(host: str, port: int, option: str) -> None:
 
 
 def serve(stream: Any, blueprint: Any, address: PageAddress) -> str:
-    """Serves a recording to browsers for as long as it exists; returns the page's address.
+    """Serve a recording to browsers until the recording is deleted; return the page's address.
 
     Args:
-        stream: recording of Rerun; what it is given from here on is shown.
+        stream: recording of Rerun; data logged after this call is shown.
         blueprint: first layout; None = the viewer's own.
-        address: to listen on.
+        address: address to listen on.
 
     Raises:
         ConfigError: a port is taken, or Rerun's program is missing.
