@@ -1,1 +1,1 @@
-"""Who is where in the frames: segmenters, describers, the Jaccard index."""
+"""Objects in camera frames: segmenters, describers, the Jaccard index."""

@@ -25,31 +25,57 @@ from mtv_world_ros.robot.shape import fill, LinkShape, RobotShape
 
 Status = Literal['fits', 'corrected', 'refused', 'unchecked']
 
-#: pictures are shrunk to these widths, for the pose and for the first shift [px]
-_WIDTH, _COARSE_WIDTH = 384, 128
-#: points of an outline that are looked at; with fewer the arm is hardly in view
-_MOST_POINTS, _FEWEST_POINTS = 300, 50
-#: largest first shift, and how far edges are looked for in turn, as shares of the width
-_REACH, _WINDOWS = 0.16, (0.02, 0.012, 0.008)
-#: blur before edges are taken, as a share of the width, and at least [px]
-_BLUR, _LEAST_BLUR_PX = 0.003, 0.8
-#: edges of this contrast count half [grey levels a pixel]
-_CONTRAST = 6.0
-#: how far cameras usually are off: turns [rad], shifts [m]
-_PRIOR = np.array([0.02] * 3 + [0.015] * 3)
-#: standard deviation of an edge's place as a share of the width, at least [px]; neighbouring
-#: points of an outline are not independent: so many count as one
-_EDGE, _LEAST_EDGE_PX, _ALIKE = 0.003, 0.4, 6.0
-#: an outline is met better than under other shifts by so many deviations, else nothing shows
-_CLEAR = 4.0
-#: an edge is met within a pixel where it is so strong; share of an outline's points that must be
-#: met for a pose to be accepted, and below which the arm is elsewhere
-_MET, _ACCEPTED, _ELSEWHERE = 0.5, 0.62, 0.5
-#: offsets of what the camera looks at, as shares of the width: smaller ones are none, larger ones
-#: are not corrected
-_NONE, _LARGE = 0.006, 0.07
-#: a pose known worse than this, of what is looked at, as a share of the width, says nothing
-_UNSURE = 0.012
+
+@dataclass(frozen=True, slots=True)
+class CameraCheckSettings:
+    """Settings of the check of a camera's pose against the outline of the arms.
+
+    Attributes:
+        image_width_px: width of the images for the pose.
+        coarse_width_px: width of the images for the first shift.
+        max_points: largest number of outline points that are used.
+        min_points: number of outline points below which the arm is hardly visible.
+        max_shift: largest first shift [fraction of image width].
+        search_ranges: search range for edges in each round [fraction of image width].
+        blur: blur before edge detection [fraction of image width].
+        min_blur_px: smallest blur.
+        half_contrast: contrast of an edge with weight 1/2 [grey levels a pixel].
+        edge_std: standard deviation of an edge's position [fraction of image width].
+        min_edge_std_px: smallest standard deviation of an edge's position.
+        points_per_sample: correlated neighbouring outline points that count as one sample.
+        min_z_score: z-score of the best alignment against other alignments for a check.
+        min_edge_strength: strength of an edge within a pixel of a matched outline point.
+        accepted_fraction: fraction of matched outline points of an accepted pose.
+        refused_fraction: fraction of matched points below which the arm is elsewhere.
+        min_offset: offset below which a pose fits [fraction of image width].
+        max_offset: offset from which a pose is not corrected [fraction of image width].
+        max_pose_error: largest standard error of a projected pose [fraction of image width].
+    """
+
+    image_width_px: int = 384
+    coarse_width_px: int = 128
+    max_points: int = 300
+    min_points: int = 50
+    max_shift: float = 0.16
+    search_ranges: tuple[float, ...] = (0.02, 0.012, 0.008)
+    blur: float = 0.003
+    min_blur_px: float = 0.8
+    half_contrast: float = 6.0
+    edge_std: float = 0.003
+    min_edge_std_px: float = 0.4
+    points_per_sample: float = 6.0
+    min_z_score: float = 4.0
+    min_edge_strength: float = 0.5
+    accepted_fraction: float = 0.62
+    refused_fraction: float = 0.5
+    min_offset: float = 0.006
+    max_offset: float = 0.07
+    max_pose_error: float = 0.012
+
+
+_CHECK = CameraCheckSettings()
+#: prior standard deviations of the pose error: three turns [rad], three shifts [m]
+_PRIOR_STD = np.array([0.02] * 3 + [0.015] * 3)
 
 
 class _Edges(NamedTuple):
@@ -196,9 +222,9 @@ def _judged(camera: CameraModel, found: _Found) -> CameraFit:
         f"camera '{camera.view}' shows the arm {found.offset * camera.width:.1f} px from where it "
         f'should be (about {off_m * 1e3:.0f} mm and {off_deg:.1f} degrees)'
     )
-    if found.offset < _NONE:
+    if found.offset < _CHECK.min_offset:
         status, text = 'fits', says
-    elif found.offset < _LARGE:
+    elif found.offset < _CHECK.max_offset:
         status, text = 'corrected', f'{says}; corrected for this episode'
     else:
         status, text = 'refused', f'{says}; calibrate it again (mtv-world fit camera)'
@@ -219,27 +245,34 @@ def _search(
     positions: FloatArray,
 ) -> _Found | str:
     """The pose at which outline and picture agree, or why there is none."""
-    if camera.width > _WIDTH:
-        camera = scaled(camera, _WIDTH, round(camera.height * _WIDTH / camera.width))
+    if camera.width > _CHECK.image_width_px:
+        camera = scaled(
+            camera,
+            _CHECK.image_width_px,
+            round(camera.height * _CHECK.image_width_px / camera.width),
+        )
     edges, links = _edges(frame, camera), _links(robot, parts, positions)
     T_given = camera_poses(camera, robot, positions[None])[0]
     given = _outline(camera, links, T_given)
-    if len(given.pixels) < _FEWEST_POINTS:
+    if len(given.pixels) < _CHECK.min_points:
         return 'the arm is hardly in view'
     shift, clear = _shift(edges, given, camera.width)
-    if clear < _CLEAR:
+    if clear < _CHECK.min_z_score:
         return 'its outline does not stand out in the picture'
-    T, covariance = T_given @ _turned_by(camera, shift), np.diag(_PRIOR**2)
-    for window in _WINDOWS:
+    T, covariance = T_given @ _turned_by(camera, shift), np.diag(_PRIOR_STD**2)
+    for window in _CHECK.search_ranges:
         outline = _outline(camera, links, T)
         T, covariance = _stepped(edges, outline, camera, T_given, T, window * camera.width)
     met = _met(edges, _outline(camera, links, T))
     T_given_found = inverse(T_given) @ T
-    if met < _ELSEWHERE:
+    if met < _CHECK.refused_fraction:
         return _Found(T_given_found, np.nan)
     slopes = _slopes(camera, given.points)
     spread = np.einsum('nij,jk,nik->n', slopes, covariance, slopes).mean()
-    if met < _ACCEPTED or float(np.sqrt(spread)) > _UNSURE * camera.width:
+    if (
+        met < _CHECK.accepted_fraction
+        or float(np.sqrt(spread)) > _CHECK.max_pose_error * camera.width
+    ):
         return f'only {met:.0%} of its outline is met in the picture, which is too little'
     moved, _ = project(camera, T_given_found, given.points)
     offset = float(np.nanmean(np.linalg.norm(moved - given.pixels, axis=-1)))
@@ -249,11 +282,11 @@ def _search(
 def _edges(frame: ByteArray, camera: CameraModel) -> _Edges:
     size = (camera.width, camera.height)
     image = cv2.resize(frame, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    blur = max(_BLUR * camera.width, _LEAST_BLUR_PX)
+    blur = max(_CHECK.blur * camera.width, _CHECK.min_blur_px)
     image = cv2.GaussianBlur(image, (0, 0), blur)
     x, y = (cv2.Sobel(image, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
     xx, xy, yy = ((a * b).sum(-1) for a, b in ((x, x), (x, y), (y, y)))
-    whole = xx + yy + 3 * _CONTRAST**2
+    whole = xx + yy + 3 * _CHECK.half_contrast**2
     return _Edges(xx / whole, xy / whole, yy / whole)
 
 
@@ -279,7 +312,7 @@ def _outline(
         return _Outline(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)))
     at = np.concatenate(lines)[:, 0].astype(np.float64)
     inner = ((at > 1) & (at < np.array([camera.width - 2, camera.height - 2]))).all(-1)
-    at = at[inner][:: max(1, int(inner.sum()) // _MOST_POINTS)]
+    at = at[inner][:: max(1, int(inner.sum()) // _CHECK.max_points)]
     soft = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.5)
     rows, columns = at[:, 1].astype(int), at[:, 0].astype(int)
     slope = np.stack(
@@ -307,9 +340,14 @@ def _strength(edges: _Edges, at: FloatArray, normals: FloatArray) -> FloatArray:
 
 def _shift(edges: _Edges, outline: _Outline, width: int) -> tuple[FloatArray, float]:
     """The shift (2,) [px] at which edges meet an outline, and how clearly it stands out."""
-    step = max(1.0, width / _COARSE_WIDTH)
+    step = max(1.0, width / _CHECK.coarse_width_px)
     blurred = _Edges(*(cv2.GaussianBlur(one, (0, 0), step) for one in edges))
-    reach = np.arange(-round(_REACH * width / step), round(_REACH * width / step) + 1) * step
+    reach = (
+        np.arange(
+            -round(_CHECK.max_shift * width / step), round(_CHECK.max_shift * width / step) + 1
+        )
+        * step
+    )
     shifts = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
     thin = slice(None, None, max(1, len(outline.pixels) // 150))
     at = outline.pixels[thin, None] + shifts[None]
@@ -322,7 +360,9 @@ def _met(edges: _Edges, outline: _Outline) -> float:
     """Share of an outline's points at which the picture has an edge."""
     near = np.array([-1.0, 0.0, 1.0])[None, :, None] * outline.normals[:, None]
     strength = _strength(edges, outline.pixels[:, None] + near, outline.normals)
-    return float((strength.max(axis=1) > _MET).mean()) if len(strength) else 0.0
+    return (
+        float((strength.max(axis=1) > _CHECK.min_edge_strength).mean()) if len(strength) else 0.0
+    )
 
 
 def _turned_by(camera: CameraModel, shift: FloatArray) -> FloatArray:
@@ -367,15 +407,15 @@ def _stepped(
     peaks = strength.argmax(axis=1)
     ways, weights = reach[peaks], strength[np.arange(len(peaks)), peaks]
     rows = np.einsum('ni,nij->nj', outline.normals, _slopes(camera, outline.points))
-    sigma = max(_EDGE * camera.width, _LEAST_EDGE_PX)
+    sigma = max(_CHECK.edge_std * camera.width, _CHECK.min_edge_std_px)
     so_far = inverse(T_given) @ T
     prior = np.concatenate([cv2.Rodrigues(so_far[:3, :3])[0][:, 0], so_far[:3, 3]])
     change = np.zeros(6)
     normal = np.eye(6)
     for _ in range(8):  # reweighted: what is far off is another edge
         off = (ways - rows @ change) / sigma
-        weight = weights / (1 + off**2) / _ALIKE / sigma**2
-        normal = (rows * weight[:, None]).T @ rows + np.diag(1 / _PRIOR**2)
-        gradient = (rows * weight[:, None]).T @ ways - prior / _PRIOR**2
+        weight = weights / (1 + off**2) / _CHECK.points_per_sample / sigma**2
+        normal = (rows * weight[:, None]).T @ rows + np.diag(1 / _PRIOR_STD**2)
+        gradient = (rows * weight[:, None]).T @ ways - prior / _PRIOR_STD**2
         change = np.linalg.solve(normal, gradient)
     return T @ _changed(change), np.asarray(np.linalg.inv(normal), np.float64)

@@ -1,4 +1,4 @@
-"""Where objects are over time, from their masks in calibrated views.
+"""Tracks of object positions, from masks in calibrated views.
 
 Shape letters: V views, N frames, O objects.
 """

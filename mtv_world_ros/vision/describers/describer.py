@@ -89,7 +89,7 @@ def _object(item: Mapping[str, Any], index: int) -> DescribedObject:
 
 
 def _problems(item: Any, complete: bool) -> list[str]:
-    """What is wrong with one object."""
+    """Return the faults of the description of one object."""
     if not isinstance(item, Mapping):
         return [f'expected keys and values, got {_short(item)}']
     problems = [

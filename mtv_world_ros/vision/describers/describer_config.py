@@ -108,7 +108,7 @@ def _known(kind: Any) -> str:
 
 
 class DescriberConfig(Schema):
-    """How the objects of a scene are named."""
+    """Settings of the description of the objects of a scene."""
 
     kind: Annotated[str, BeforeValidator(_known)] = Field(
         default='instruction',

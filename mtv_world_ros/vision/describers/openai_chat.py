@@ -148,7 +148,7 @@ class OpenAIChat:
         return bytes(body)
 
     def _answer(self, body: bytes) -> ChatAnswer:
-        """What a completion says; nothing is taken for granted about its form."""
+        """Return the answer in a completion, whose form is checked."""
         try:
             completion = parse_json(body, 'the answer')
             choice = completion['choices'][0]
@@ -280,7 +280,7 @@ def _attempt(request: Callable[[], bytes], config: OpenAIConfig) -> bytes:
 
 
 def _is_passing(status: int, code: str | None) -> bool:
-    """Whether the same request may succeed later; an account without credit will not."""
+    """Return True if the same request may succeed later; False without credit."""
     return status >= 500 or (status == 429 and code != 'insufficient_quota')
 
 

@@ -125,7 +125,7 @@ _MAX_QUOTED = 4000
 
 
 class ChatAnswer(NamedTuple):
-    """What a model said, and whether it was stopped by a token limit."""
+    """Text of a model, and the flag that a token limit stopped it."""
 
     text: str
     is_cut_off: bool = False

@@ -58,8 +58,8 @@ _HSV_SHARE = 0.6
 _TRACKING = TrackingConfig()
 #: pixels of at least this share of the core's saturation say what colour the object has
 _STRONG_SHARE = 0.8
-#: pixels of a view from which on views are looked at in threads of their own
-_LEAST_FOR_THREADS = 1_000_000
+#: number of pixels of a view at which each view is segmented in a thread of its own
+_MIN_PIXELS_FOR_THREADS = 1_000_000
 
 
 class ColourSegmenter:
@@ -109,9 +109,9 @@ class ColourSegmenter:
                     masks[view, index] = found.masks
             return tuple(found.status for found in tracks)
 
-        if num_frames * height * width < _LEAST_FOR_THREADS or cv2.getNumThreads() < 2:
+        if num_frames * height * width < _MIN_PIXELS_FOR_THREADS or cv2.getNumThreads() < 2:
             status = tuple(map(look_at, range(num_views)))
-        else:  # most of it is OpenCV and numpy, which run beside each other
+        else:  # OpenCV and numpy take most of the time and release the interpreter lock
             with ThreadPoolExecutor(min(num_views, cv2.getNumThreads())) as pool:
                 status = tuple(pool.map(look_at, range(num_views)))
         return ObjectMasks(names=names, masks=masks, status=status)
@@ -232,9 +232,9 @@ class _Images:
 
 
 def _edge(colour: Floats, background: Floats, core: float) -> float:
-    """Saturation of a pixel that is half object, half background.
+    """Return the saturation of a pixel that is half object, half background.
 
-    A dark object's edge pixels look pale beside it, a light one's do not.
+    Edge pixels of a dark object are paler than the object; those of a light object are not.
     """
     mixed = np.round((colour + background) / 2).astype(np.uint8)
     edge = float(_saturation(_lab(mixed[None, None]))[0, 0])

@@ -33,27 +33,31 @@ SUFFIX = '.safetensors'
 _BINS = (16, 64, 64)
 #: standard deviation over which counts are spread, in bins
 _SPREAD = (0.7, 1.0, 1.0)
-#: a colour of which an object has less than this share is none of its own
-_LEAST_SHARE = 2e-5
+#: minimum fraction of the pixels of an object for a colour of the object
+_MIN_COLOUR_SHARE = 2e-5
 #: share of the whole picture's colours in what surrounds an object that may move away
 _ELSEWHERE = 0.03
-#: Jaccard index with the drawn masks from which on an object stands out by its colours
-_STANDS_OUT = 0.5
-#: correlation with an example's picture from which on an object is found by it
-_ALIKE = 0.75
-#: CIELAB in 8 bits may change by so much where an object stands still: L by shadows, a and b
-_STILL = (40, 10, 10)
-#: shares of the first mask: of its own colours, the object is followed by them; unchanged less, it
-#: is hidden
-_OWN, _HIDDEN = 0.5, 0.25
-#: distance that an object may move between frames, as a share of the image's diagonal
-_REACH = 0.05
-#: margin around a mask that is to be cut out, as a share of the frame's width and at least [px]
-_MARGIN, _LEAST_MARGIN = 0.0125, 2
-#: larger masks, by their share of the frame, have little shade for their size, and take long
-_MOST_CUT = 0.01
-#: Jaccard index with what has its colours from which on what was cut out is that object
-_SAME_THING = 0.5
+#: minimum Jaccard index of a colour mask with the drawn masks for tracking by colour
+_MIN_COLOUR_JACCARD = 0.5
+#: minimum correlation with the picture of an example for a detection
+_MIN_CORRELATION = 0.75
+#: maximum change of the CIELAB values (8 bits) of a resting object: shadows change L more than a
+_MAX_RESTING_CHANGE = (40, 10, 10)
+#: minimum share of the object's own colours in the first mask for tracking by colour
+_MIN_COLOUR_FRACTION = 0.5
+#: minimum unchanged share of the first mask; below it the object is hidden
+_MIN_UNCHANGED_FRACTION = 0.25
+#: maximum motion of an object between frames [fraction of the image's diagonal]
+_MAX_MOTION = 0.05
+#: margin around a mask that is cut out [fraction of the frame's width]
+_MARGIN = 0.0125
+#: smallest margin around a mask that is cut out [px]
+_MIN_MARGIN_PX = 2
+#: maximum area of a mask that is cut out [fraction of the frame]: larger masks have little shade
+#: for their size, and take long
+_MAX_CUT_FRACTION = 0.01
+#: minimum Jaccard index of a cut-out mask with the colour mask for being the same object
+_MIN_CUT_JACCARD = 0.5
 #: pixels that are kept of a frame's surroundings
 _KEPT = 4000
 _TRACKING = TrackingConfig()
@@ -119,7 +123,7 @@ class Example:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectExamples:
-    """How objects look.
+    """Appearance of objects in example pictures.
 
     Attributes:
         examples: of all objects.
@@ -168,7 +172,7 @@ class ObjectExamples:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of all: masks by other examples are told apart by it."""
+        """SHA-256 of all examples; it identifies the masks made with them."""
         digest = hashlib.sha256(self.elsewhere.tobytes())
         for one in self.examples:
             shape = (*one.frame.shape, *one.size.tolist())
@@ -260,12 +264,12 @@ class _Look:
             for e in examples
         ]
         own = [jaccard(m[None], e.mask[None])[0] for m, e in zip(found, examples, strict=True)]
-        self.stands_out = bool(np.median(own) >= _STANDS_OUT)
+        self.stands_out = bool(np.median(own) >= _MIN_COLOUR_JACCARD)
 
     def _where(self, others: Floats, share: float) -> BoolArray:
         """Colours more likely the object's, which has this share of the pixels."""
         likely = self.colours * share > others * (1 - share)
-        return likely & (self.colours > _LEAST_SHARE)
+        return likely & (self.colours > _MIN_COLOUR_SHARE)
 
 
 #: an example's frame is little larger than the object
@@ -378,7 +382,7 @@ class _Follower:
         return masks, judge(masks, first, _TRACKING) if masks.any() else 'lost'
 
     def _find(self, frame: ByteArray, taken: BoolArray) -> tuple[BoolArray, str]:
-        """(H, W) the mask in a frame of which nothing is known, and a status."""
+        """Return the mask (H, W) in a frame without a previous mask, and a status."""
         if self.look.stands_out:
             pixels = _opened(self.wide[_bins(frame)] & ~taken)
             found = track(pixels[None], None, _TRACKING)
@@ -390,7 +394,7 @@ class _Follower:
                 continue
             scores = cv2.matchTemplate(frame, picture, cv2.TM_CCOEFF_NORMED)
             _, score, _, (x, y) = cv2.minMaxLoc(scores)
-            if score > max(best, _ALIKE):
+            if score > max(best, _MIN_CORRELATION):
                 best, mask = score, np.zeros_like(mask)
                 mask[y : y + shape.shape[0], x : x + shape.shape[1]] = shape
         return mask & ~taken, 'ok' if best else 'absent'
@@ -407,10 +411,10 @@ class _Follower:
         grown = track(_opened(coloured | seed)[None], seed, _TRACKING).masks[0]
         if not grown.any():
             return seed
-        if np.count_nonzero(grown) > _MOST_CUT * grown.size:
+        if np.count_nonzero(grown) > _MAX_CUT_FRACTION * grown.size:
             return grown
         cut = cut_out(frame, _box_around(grown)) & ~taken
-        return cut if jaccard(cut[None], grown[None])[0] >= _SAME_THING else grown
+        return cut if jaccard(cut[None], grown[None])[0] >= _MIN_CUT_JACCARD else grown
 
     def _continue(
         self,
@@ -423,15 +427,15 @@ class _Follower:
         """Fills masks (T, H, W) of the frames after `start`."""
         lab = _lab(start)
         area = np.count_nonzero(first)
-        by_colour = np.count_nonzero(first & self.near[_bins(start)]) > _OWN * area
+        by_colour = np.count_nonzero(first & self.near[_bins(start)]) > _MIN_COLOUR_FRACTION * area
         last, gap = first, 0
         for frame, others, mask in zip(frames, taken, masks, strict=True):
-            found = first & (np.abs(_lab(frame) - lab) <= _STILL).all(-1) & ~others
+            found = first & (np.abs(_lab(frame) - lab) <= _MAX_RESTING_CHANGE).all(-1) & ~others
             if by_colour:
                 coloured = self.near[_bins(frame)] & ~others
                 pixels = _opened((coloured | found) & _around(last, gap))
                 found = track(pixels[None], last, _TRACKING).masks[0]
-            elif np.count_nonzero(found) < _HIDDEN * area:
+            elif np.count_nonzero(found) < _MIN_UNCHANGED_FRACTION * area:
                 found[...] = False
             gap = 0 if found.any() else gap + 1
             if not gap:
@@ -452,7 +456,7 @@ def _box_around(mask: BoolArray) -> Box:
     """The box of a mask (H, W), a little wider on all sides, within the frame."""
     left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
     rows, columns = mask.shape
-    margin = max(_LEAST_MARGIN, round(_MARGIN * columns))
+    margin = max(_MIN_MARGIN_PX, round(_MARGIN * columns))
     return (
         max(0, left - margin),
         max(0, top - margin),
@@ -468,7 +472,7 @@ def _lab(frame: ByteArray) -> NDArray[np.int16]:
 def _around(mask: BoolArray, gap: int) -> BoolArray:
     """(H, W) where an object may be that was last seen in a mask, `gap` + 1 frames ago."""
     left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
-    reach = round(_REACH * hypot(*mask.shape) * (1 + gap))
+    reach = round(_MAX_MOTION * hypot(*mask.shape) * (1 + gap))
     window = np.zeros_like(mask)
     window[
         max(0, top - reach) : top + height + reach, max(0, left - reach) : left + width + reach

@@ -128,7 +128,7 @@ class GroundingConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detections:
-    """Where the named objects are.
+    """Detected boxes of the named objects.
 
     Attributes:
         boxes: (O, 4) left, top, right, bottom [px]; NaN where there is none.

@@ -43,16 +43,16 @@ def track_masks(
     first_masks: BoolArray,
     frames: Iterable[ByteArray],
 ) -> Iterator[BoolArray]:
-    """Yields the (O, H, W) masks in each frame as it comes.
+    """Yield the masks (O, H, W) of each frame when it arrives.
 
-    Memory does not grow with the number of frames: what lies beyond the model's reach is dropped,
+    Memory does not grow with the number of frames: frames beyond the model's memory are dropped,
     which changes no mask.
 
     Args:
-        model: tracks.
+        model: tracker.
         first_frame: (H, W, 3) uint8 RGB, the frame that the masks belong to.
-        first_masks: (O, H, W), none of them empty.
-        frames: (H, W, 3) uint8 RGB, those that follow.
+        first_masks: (O, H, W), none empty.
+        frames: (H, W, 3) uint8 RGB, the following frames.
     """
     if not len(first_masks):
         for frame in frames:
@@ -115,7 +115,7 @@ def _square_mask(mask: BoolArray, model: SamVideo) -> Tensor:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FirstMasks:
-    """What was found in one frame.
+    """Masks of the objects detected in one frame.
 
     Attributes:
         masks: (O, H, W) bool, empty where nothing was found.

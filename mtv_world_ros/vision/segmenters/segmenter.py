@@ -1,4 +1,4 @@
-"""The segmenters' protocol, and functions that all of them share."""
+"""Protocol of segmenters, and their shared functions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Segmenter(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is, for reports."""
+        """Name of the segmenter, for reports."""
         ...
 
     def segment(

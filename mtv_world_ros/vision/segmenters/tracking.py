@@ -19,7 +19,7 @@ Labels = NDArray[np.integer]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackingConfig:
-    """How pieces are joined and followed.
+    """Settings of joining and tracking pieces of a colour.
 
     Attributes:
         min_area_share: smallest area of a piece, as a share of the image's.
@@ -71,7 +71,7 @@ class ObjectTrack:
 
 @dataclass(slots=True)
 class _State:
-    """Where the object was last seen, how large, and whether at the image's edge.
+    """Last position, size and edge contact of a tracked object.
 
     `shown` counts the frames with the object, `slivers` those with no more than a sliver of it.
     """
@@ -186,11 +186,11 @@ def _doubt_whole(num_frames: int, state: _State, config: TrackingConfig) -> None
 
 
 def _find(patch: _Patch, state: _State, config: TrackingConfig, mask: BoolArray) -> bool:
-    """Finds the object in one frame's pixels and updates the state.
+    """Find the object in the pixels of one frame and update the state.
 
     Args:
         patch: pixels of the object's colour.
-        state: of the track so far.
+        state: state of the track.
         config: thresholds for joining and tracking pieces of a colour.
         mask: (H, W) all False; the object is set in it.
 
@@ -249,7 +249,7 @@ def _join(main: int, pieces: Labels, stats: Labels, config: TrackingConfig) -> l
 
 
 def _has_body(mask: BoolArray) -> bool:
-    """Whether two by two pixels are set anywhere."""
+    """Return True if the mask contains a block of two by two pixels."""
     pairs = mask[1:] & mask[:-1]
     return bool((pairs[:, 1:] & pairs[:, :-1]).any())
 
@@ -286,7 +286,7 @@ def _remember(patch: _Patch, state: _State) -> None:
     state.at_edge = any(map(bool, border))
 
 
-#: noun -> colour word of a part that such things have beside their main colour
+#: noun -> colour of a part that differs from the main colour of the object
 PARTS: MappingProxyType[str, str] = MappingProxyType(
     {'carrot': 'green', 'corn': 'green', 'eggplant': 'green'}
 )

@@ -98,7 +98,7 @@ def import_transformers() -> Any:
 
 
 def load_tokenizer(folder: Path) -> Any:
-    """Returns the tokenizer beside the weights.
+    """Return the tokenizer in the folder of the weights.
 
     Raises:
         CheckpointError: there is none.
