@@ -193,10 +193,18 @@ class LeRobotPolicy:
 
 
 _HELPERS = 'lerobot.async_inference.helpers'
-#: a stream of parts no larger than this, as gRPC's limit is 4 MB
+#: maximum size of a part of a message, because gRPC's limit is 4 MB [bytes]
 _PART_BYTES = 2 * 1024 * 1024
-_BEGIN, _MIDDLE, _END = 1, 2, 3
-_VARINT, _BYTES = 0, 2
+#: transfer state of the first part of a message (LeRobot's enum TransferState)
+_TRANSFER_BEGIN = 1
+#: transfer state of the parts between the first and the last
+_TRANSFER_MIDDLE = 2
+#: transfer state of the last part
+_TRANSFER_END = 3
+#: protobuf wire type of an integer
+_WIRE_VARINT = 0
+#: protobuf wire type of bytes with a length
+_WIRE_BYTES = 2
 
 
 def policy_setup(values: Mapping[str, Any]) -> bytes:
@@ -210,8 +218,8 @@ def observation_parts(values: Mapping[str, Any]) -> Iterator[bytes]:
     for begin in range(0, len(data), _PART_BYTES):
         part = data[begin : begin + _PART_BYTES]
         is_last = begin + _PART_BYTES >= len(data)
-        state = _END if is_last else _MIDDLE if begin else _BEGIN
-        yield bytes((1 << 3 | _VARINT, state)) + _tagged(2, part)
+        state = _TRANSFER_END if is_last else _TRANSFER_MIDDLE if begin else _TRANSFER_BEGIN
+        yield bytes((1 << 3 | _WIRE_VARINT, state)) + _tagged(2, part)
 
 
 def read_actions(message: bytes) -> FloatArray:
@@ -242,7 +250,7 @@ def _pickled(name: str, values: Mapping[str, Any]) -> bytes:
 
 
 def _tagged(field: int, data: bytes) -> bytes:
-    return bytes((field << 3 | _BYTES,)) + _varint(len(data)) + data
+    return bytes((field << 3 | _WIRE_BYTES,)) + _varint(len(data)) + data
 
 
 def _varint(value: int) -> bytes:
@@ -259,7 +267,7 @@ def _first_bytes(message: bytes) -> bytes:
     at = 0
     while at < len(message):
         tag, at = _read_varint(message, at)
-        if tag & 7 != _BYTES:
+        if tag & 7 != _WIRE_BYTES:
             raise PolicyError(f'the answer has a field of wire type {tag & 7}; expected bytes')
         length, at = _read_varint(message, at)
         if tag >> 3 == 1:

@@ -54,10 +54,10 @@ class Policy(Protocol):
         ...
 
     def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
-        """Returns the commands that follow the observation, or None where the episode is over.
+        """Return the commands that follow the observation, or None if the episode is over.
 
-        Times count from the observation's stamp. Whoever runs the policy may execute the first
-        part of them alone and ask again.
+        Times count from the observation's stamp. The caller may execute only the first part of the
+        commands and then call again.
 
         Raises:
             PolicyError: the policy cannot answer, e.g. its server is gone.
@@ -68,7 +68,7 @@ class Policy(Protocol):
 def first_part(
     trajectory: JointTrajectory, start_positions: FloatArray, seconds: float
 ) -> JointTrajectory:
-    """Returns the trajectory up to a time, with a point at that time where it goes on after it.
+    """Return the trajectory up to a time, with a point at that time if the trajectory is longer.
 
     Args:
         trajectory: times count from the observation it answers; joints in any order.

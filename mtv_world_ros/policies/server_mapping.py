@@ -128,7 +128,7 @@ class ActionOutput(JointTable):
 
     @property
     def is_velocity(self) -> bool:
-        """Whether the values of joints are velocities."""
+        """True if the values of joints are velocities."""
         return self.action == 'velocity'
 
     def _of(self, robot: RobotModel) -> tuple[JointColumn, ...]:
@@ -255,7 +255,7 @@ def fitted(frame: ByteArray, width: int, height: int, fit: str = 'pad') -> ByteA
 
 
 def find(answer: Any, key: Key) -> Any:
-    """What stands under a path of keys.
+    """Return the value under a path of keys.
 
     Raises:
         PolicyError: nothing does.

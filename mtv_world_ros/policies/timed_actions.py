@@ -65,7 +65,7 @@ def _stacked(actions: Any) -> FloatArray:
 
 
 class _TimedAction:
-    """What a `TimedAction` is read into."""
+    """Fields of a received `TimedAction`."""
 
     def __init__(self) -> None:
         self.fields: dict[str, Any] = {}
