@@ -81,12 +81,12 @@ Rng = np.random.Generator
 
 
 def _own(rng: Rng) -> Rng:
-    """A generator of the fault's own, so that its draws do not change those of later faults."""
+    """Return a generator of the fault's own, so that later faults draw the same numbers."""
     return np.random.default_rng(rng.integers(2**32))
 
 
 def _read(at: FloatArray, positions: FloatArray) -> FloatArray:
-    """(N, J) positions (T, J) at numbers of rows (N,), between them linear."""
+    """Return positions (N, J): the rows (T, J), interpolated at row numbers (N,)."""
     rows = np.arange(len(positions))
     return np.stack([np.interp(at, rows, column) for column in positions.T], axis=1)
 
@@ -100,7 +100,7 @@ def _blended(before: FloatArray, rest: FloatArray, num: int) -> FloatArray:
 
 
 def delay(c: Commands, size: float, rng: Rng, *, only: str = '') -> FloatArray:
-    """The grippers follow later [s]; `only` where they open: `opening`."""
+    """Delay the grippers by `size` [s]; `only` where they open: `opening`."""
     whole, late = c.delayed(c.num(size))
     opens, follows = np.sign(c.travel), late[:, c.grippers]
     if only == 'opening':
@@ -110,7 +110,7 @@ def delay(c: Commands, size: float, rng: Rng, *, only: str = '') -> FloatArray:
 
 
 def lead(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """The grippers go ahead of the arms [s]."""
+    """Advance the grippers before the arms by `size` [s]."""
     ahead = np.minimum(np.arange(len(c.positions)) + c.num(size), len(c.positions) - 1)
     return c.grippers_of(c.positions[ahead][:, c.grippers])
 
@@ -124,7 +124,7 @@ def _followed(c: Commands, rule: Callable[[FloatArray, FloatArray], FloatArray])
 
 
 def lag(c: Commands, size: float, rng: Rng, *, joints: str) -> FloatArray:
-    """`grippers` or `wrists` follow with a first-order lag, of a time constant [s]."""
+    """Apply a first-order lag with time constant `size` [s] to `grippers` or `wrists`."""
     share = 1 - np.exp(-1 / (size / c.period))
     late = _followed(c, lambda last, now: last + share * (now - last))
     if joints == 'grippers':
@@ -135,20 +135,20 @@ def lag(c: Commands, size: float, rng: Rng, *, joints: str) -> FloatArray:
 
 
 def give_way(c: Commands, size: float, rng: Rng, *, by: str) -> FloatArray:
-    """Grippers open to at least a share of their range, weighted by one of `GIVE_WAY`."""
+    """Open grippers to at least a fraction of their range, weighted by one of `GIVE_WAY`."""
     opens = np.sign(c.travel)
     least = c.closed + np.minimum(size * GIVE_WAY[by](c), 1.0) * c.travel
     return c.grippers_of(np.maximum(c.positions[:, c.grippers] * opens, least * opens) * opens)
 
 
 def _twitches(c: Commands) -> FloatArray:
-    """(T, 1) from 0, which is most of the time, to 1."""
+    """Return jerks (T, 1), 0 to 1; 0 most of the time."""
     knots = _SETTINGS.jump_s * np.arange(4)
     return np.interp(c.times % _SETTINGS.twitch_period_s, knots, [0.0, 1.0, 1.0, 0.0])[:, None]
 
 
 def _haste(c: Commands) -> FloatArray:
-    """(T, G) speed of the arm of each gripper, as a share of its top speed."""
+    """Return the speed (T, G) of the arm of each gripper, as a fraction of its top speed."""
     steps = np.gradient(c.positions, axis=0)
     steps[:, c.grippers] = 0.0
     speeds = np.linalg.norm(steps.reshape(len(steps), c.num_arms, -1), axis=2)
@@ -157,7 +157,7 @@ def _haste(c: Commands) -> FloatArray:
 
 
 def _reach(c: Commands) -> FloatArray:
-    """(T, G) reach of the arm of each gripper over the table, as a share of its largest."""
+    """Return the horizontal reach (T, G) of the arm of each gripper [fraction of its maximum]."""
     tools = np.stack([poses[:, :2, 3] for poses in c.robot.tool_poses(c.positions)], axis=1)
     ways = np.linalg.norm(tools - tools[0], axis=2)
     most = ways.max(axis=0)
@@ -171,7 +171,7 @@ def _arms_of_grippers(c: Commands) -> np.ndarray:
 
 
 def _since_shut(c: Commands) -> FloatArray:
-    """(T, G) time since a gripper was last more open than shut [s]."""
+    """Return the time (T, G) since a gripper was last more than half open [s]."""
     is_open = (c.positions[:, c.grippers] - c.middles) * np.sign(c.travel) > 0
     rows = c.rows[:, None]
     return (rows - np.maximum.accumulate(np.where(is_open, rows, 0))) * c.period
@@ -186,7 +186,7 @@ GIVE_WAY: Mapping[str, Callable[[Commands], FloatArray]] = {
 
 
 def _passes(c: Commands) -> list[tuple[int, float, int]]:
-    """Column, middle and row of every time that a gripper passes its middle."""
+    """Return column, middle and row of each event at which a gripper passes its middle."""
     return [
         (column, float(middle), int(row) + 1)
         for column, middle in zip(c.grippers, c.middles, strict=True)
@@ -195,7 +195,7 @@ def _passes(c: Commands) -> list[tuple[int, float, int]]:
 
 
 def flicker(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """For a while [s] after a gripper has passed its middle, it goes back and forth."""
+    """Move a gripper back and forth for `size` [s] after it passes its middle."""
     own, whole = _own(rng), c.positions.copy()
     for column, _, row in _passes(c):
         since = c.times - c.times[row]
@@ -208,7 +208,7 @@ def flicker(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def pause_half_way(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Whenever a gripper passes its middle, it stands there for a while [s] first."""
+    """Stop a gripper for `size` [s] whenever it passes its middle."""
     whole = c.positions.copy()
     for column, middle, row in _passes(c):
         after = np.maximum(np.arange(len(whole) - row) - c.num(size), 0)
@@ -218,7 +218,7 @@ def pause_half_way(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def hurry(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """While a gripper is shut, all goes faster, by a share."""
+    """Speed up the plan by a fraction while a gripper is closed."""
     is_shut = c.robot.gripper_openings(c.positions).min(axis=0) < 0.5
     times = np.cumsum(np.where(is_shut, 1 / (1 + size), 1.0)) - 1
     at = np.interp(np.arange(int(times[-1]) + 1), times, c.rows)
@@ -226,7 +226,7 @@ def hurry(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def pause(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """From a drawn time on, the arms are later than the grippers [s]."""
+    """Delay the arms relative to the grippers by `size` [s], from a random time on."""
     first, num = int(_own(rng).uniform(0.15, 0.6) * len(c.positions)), c.num(size)
     stands = np.repeat(c.positions[first : first + 1], num, axis=0)
     arms = np.concatenate([c.positions[:first], stands, c.positions[first:]])
@@ -237,7 +237,7 @@ def pause(c: Commands, size: float, rng: Rng) -> FloatArray:
 def jump(
     c: Commands, size: float, rng: Rng, *, between: Sequence[float], back: bool, seconds: float
 ) -> FloatArray:
-    """Once, between shares of the plan, it jumps ahead or back [s], within some seconds."""
+    """Jump ahead or back in the plan [s] once, at a random time within a part of it."""
     at = int(float(_own(rng).uniform(between[0], between[1])) * len(c.positions))
     to = max(at - c.num(size), 0) if back else at + c.num(size)
     rest = _blended(c.positions[at - 1], c.positions[to:], c.num(seconds))
@@ -267,13 +267,13 @@ def flinch(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def mix(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Commands are the mean of those of now and of a while ago, drawn up to the size [s]."""
+    """Average the commands with delayed ones; the delay is random, up to `size` [s]."""
     whole, late = c.delayed(c.num(_own(rng).uniform() * size))
     return (whole + late) / 2
 
 
 def restart(c: Commands, size: float, rng: Rng, *, seconds: float) -> FloatArray:
-    """Once, at a share of the plan up to the size, it goes back and starts all over."""
+    """Go back and restart the plan once, at a random fraction of it up to `size`."""
     share, num = float(size * _own(rng).uniform()), c.num(seconds)
     end = 1 + int(share * (len(c.positions) - 1))
     back = np.repeat(c.positions[:1], num, axis=0)
@@ -282,7 +282,7 @@ def restart(c: Commands, size: float, rng: Rng, *, seconds: float) -> FloatArray
 
 
 def shuffle(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Once, the later one of two chunks [s] comes first."""
+    """Exchange two consecutive chunks of `size` [s] once."""
     share, rows = float(_own(rng).uniform()), np.arange(len(c.positions))
     num = min(c.num(size), (len(rows) - 1) // 2)
     begin = 1 + int(share * (len(rows) - 1 - 2 * num))
@@ -297,7 +297,7 @@ def shuffle(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def seams(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Every chunk of commands but the first is ahead or behind, by up to the size [s]."""
+    """Shift each chunk of commands except the first in time, by up to `size` [s]."""
     own, most = _own(rng), size / c.period
     whole, _ = c.delayed(int(np.ceil(most)))
     rows, num = np.arange(len(whole)), c.num(_SETTINGS.chunk_s)
@@ -313,7 +313,7 @@ def seams(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def delay_each(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Every arm joint follows later, by up to the size [s]."""
+    """Delay each arm joint by a time of its own, up to `size` [s]."""
     own, most = _own(rng), size / c.period
     whole, _ = c.delayed(int(np.ceil(most)))
     rows, behind = np.arange(len(whole)), most * own.uniform(size=whole.shape[1])
@@ -323,7 +323,7 @@ def delay_each(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def gripper_tempo(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """The grippers are faster than the arms, or slower, by a share of up to the size."""
+    """Speed up or slow down the grippers relative to the arms, by a fraction up to `size`."""
     share = size * _own(rng).uniform(-1.0, 1.0)
     tempo = 1 + share if share > 0 else 1 / (1 - share)
     whole, _ = c.delayed(int(np.ceil(max(-share, 0.0) * len(c.positions))))
@@ -334,7 +334,7 @@ def gripper_tempo(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def hold_all(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """The first of the commands of every `size` [s] is held until the next."""
+    """Hold the first command of each period of `size` [s] until the next period."""
     num = c.num(size)
     if num < 2:
         return c.positions
@@ -345,7 +345,7 @@ def hold_all(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def _average(positions: FloatArray, num: int) -> FloatArray:
-    """(T, J) moving average, `num` rows about each."""
+    """Return the moving average (T, J) over `num` rows."""
     if num < 2:
         return positions
     before = np.repeat(positions[:1], num // 2, axis=0)
@@ -355,19 +355,19 @@ def _average(positions: FloatArray, num: int) -> FloatArray:
 
 
 def quantise(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """The arms are at multiples of the size [rad] from the first row on, and jump between them."""
+    """Round the arms to multiples of `size` [rad] from the first row, with jumps between them."""
     steps = size * np.rint((c.positions - c.positions[0]) / size)
     return c.arms_of(_average(c.positions[0] + steps, c.num(_SETTINGS.jump_s)))
 
 
 def play(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """An arm joint stays where it is until its command is more than half the size off [rad]."""
+    """Apply a backlash of `size` [rad] to each arm joint."""
     slack = size / 2
     return c.arms_of(_followed(c, lambda last, now: np.clip(last, now - slack, now + slack)))
 
 
 def stick(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """An arm joint stands until its command is more than the size off [rad], and jumps there."""
+    """Apply stiction to each arm joint: it rests until its command is over `size` [rad] off."""
     whole = _followed(c, lambda last, now: np.where(np.abs(now - last) <= size, last, now))
     return c.arms_of(_average(whole, c.num(_SETTINGS.jump_s)))
 
@@ -375,7 +375,7 @@ def stick(c: Commands, size: float, rng: Rng) -> FloatArray:
 def _of_one(
     change: Callable[[Commands, FloatArray, float, Rng], FloatArray],
 ) -> Callable[[Commands, float, Rng], FloatArray]:
-    """A primitive that changes the way (T,) of one of the arm joints that move, drawn."""
+    """Return a primitive that changes the positions (T,) of a random moving arm joint."""
 
     @wraps(change)
     def primitive(c: Commands, size: float, rng: Rng) -> FloatArray:
@@ -389,13 +389,13 @@ def _of_one(
 
 @_of_one
 def scale_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
-    """The joint lacks a share of its way."""
+    """Scale the motion of the joint down by a fraction."""
     return way - size * (way - way[0])
 
 
 @_of_one
 def stop_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
-    """The joint stands still for a while [s], then catches up."""
+    """Stop the joint for `size` [s]; it then catches up."""
     first = int(rng.uniform(*_SETTINGS.event_window) * len(way))
     after = np.maximum(np.arange(len(way)) - first - c.num(size), 0)
     blend = np.minimum(after * c.period / _SETTINGS.jump_s, 1.0)
@@ -404,14 +404,14 @@ def stop_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
 
 @_of_one
 def limit_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
-    """The joint does not come to the ends of its travel, by a share."""
+    """Limit the joint to a part of its travel, short of both ends by a fraction."""
     far = way - way[0]
     return way[0] + np.clip(far, (1 - size) * far.min(), (1 - size) * far.max())
 
 
 @_of_one
 def bind_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
-    """The joint sticks at one place until its command is the size further [rad]."""
+    """Stop the joint at one position until its command is `size` further [rad]."""
     away = way - rng.uniform(way.min(), way.max())
     side = away[0]
     for row, far in enumerate(away):
@@ -424,13 +424,13 @@ def bind_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
 
 @_of_one
 def slip_one(c: Commands, way: FloatArray, size: float, rng: Rng) -> FloatArray:
-    """The joint skips to one side [rad], and is off from there on."""
+    """Shift the joint by `size` [rad] to one side, from a random time to the end."""
     first = int(rng.uniform(*_SETTINGS.event_window) * len(way))
     return way + rng.choice((-size, size)) * c.ramp(_SETTINGS.jump_s, c.times[first])
 
 
 def tow(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """A joint takes the next one of its arm along, by a share, to a side that is drawn."""
+    """Couple each joint to the next joint of its arm by a fraction, with a random sign."""
     own, whole, ways = _own(rng), c.positions.copy(), size * (c.positions - c.positions[0])
     for arm in c.arms:
         whole[:, arm[1:]] += ways[:, arm[:-1]] * own.choice((-1.0, 1.0), len(arm) - 1)
@@ -438,7 +438,7 @@ def tow(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def lose_one_way(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """An arm joint loses a share of its way to one side, drawn, and its error adds up."""
+    """Lose a fraction of an arm joint's motion in a random direction; the error accumulates."""
     sides = _own(rng).choice((-1.0, 1.0), c.positions.shape[1])
     steps, whole = np.diff(c.positions, axis=0), c.positions.copy()
     whole[1:] -= np.cumsum(np.where(steps * sides > 0, size * steps, 0.0), axis=0)
@@ -446,18 +446,18 @@ def lose_one_way(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def average(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """The commands of the arms are averaged over a time [s]."""
+    """Average the commands of the arms over `size` [s]."""
     return c.arms_of(_average(c.positions, c.num(size)))
 
 
 def limit_speed(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """No arm joint turns faster than at its top speed less a share, and so it is behind."""
+    """Limit each arm joint to its top speed less a fraction, so that it lags behind."""
     most = (1 - size) * np.abs(np.diff(c.positions, axis=0)).max(axis=0)
     return c.arms_of(_followed(c, lambda last, now: last + np.clip(now - last, -most, most)))
 
 
 def lose_steps(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Once, the steps of the arms over a time [s] are lost, and never made up for."""
+    """Drop the motion of the arms over `size` [s] once, without a later correction."""
     share = float(_own(rng).uniform(*_SETTINGS.event_window))
     begin, num = int(share * len(c.positions)), c.num(size)
     steps, lost = np.diff(c.positions, axis=0), np.zeros_like(c.positions)
@@ -466,20 +466,20 @@ def lose_steps(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def sink_once(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Once, all tools sink by the size [m], and rise again."""
+    """Lower all tools by `size` [m] once, and raise them again."""
     share = float(_own(rng).uniform(*_SETTINGS.event_window))
     return _lowered(c, size * c.pulse(share * len(c.positions), *_SETTINGS.slump_s))
 
 
 def heave(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """All tools go up and down in waves [m], once they have set in."""
+    """Add vertical waves of amplitude `size` [m] to all tools, after an onset."""
     phase = float(_own(rng).uniform(0.0, 2 * np.pi))
     waves = np.sin(2 * np.pi * c.times / _SETTINGS.heave_period_s + phase)
     return _lowered(c, size * c.ramp(_SETTINGS.onset_s) * waves)
 
 
 def _lowered(c: Commands, sunk: FloatArray) -> FloatArray:
-    """(T, J): all tools are lower by `sunk` (T,) [m].
+    """Return positions (T, J) with all tools lowered by `sunk` (T,) [m].
 
     A joint gives way by as much as its arm's weight turns it: by how much it lowers the tool.
     """
@@ -498,20 +498,20 @@ def _lowered(c: Commands, sunk: FloatArray) -> FloatArray:
 
 
 def fade(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """The later it is, the less far all arm joints go, by a share at the end."""
+    """Scale down the motion of all arm joints with time, by a fraction at the end."""
     shares = np.linspace(0.0, size, len(c.positions))[:, None]
     return c.arms_of(c.positions - shares * (c.positions - c.positions[0]))
 
 
 def warp(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """An arm joint is off by a wave over its angle [rad]; the plan begins where the arms are."""
+    """Add a periodic error over an arm joint's angle [rad]; the first command is unchanged."""
     phases = _own(rng).uniform(0.0, 2 * np.pi, c.positions.shape[1])
     waves = np.sin(_SETTINGS.num_waves * c.positions + phases)
     return c.arms_of(c.positions + size * (waves - waves[0]))
 
 
 def swap_arms(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Once, the arms take a share of each other's commands."""
+    """Mix a fraction of the commands of the arms with each other's once."""
     first = int(float(_own(rng).uniform(0.1, 0.9)) * len(c.positions))
     weights = size * c.pulse(first, *_SETTINGS.swap_s)[:, None]
     others = c.positions[0] + crossed(c.positions, c.positions.shape[1] // c.num_arms)
@@ -519,7 +519,7 @@ def swap_arms(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def swing(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """The arms follow as masses on springs do, with a period of the size [s]."""
+    """Filter the arms as masses on springs with a period of `size` [s]."""
     angle = 2 * np.pi * c.period / size
     damped = angle * np.sqrt(1 - _SETTINGS.damping_ratio**2)
     decay, cos, sin = np.exp(-_SETTINGS.damping_ratio * angle), np.cos(damped), np.sin(damped)
@@ -533,7 +533,7 @@ def swing(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def freeze(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Commands of a time [s] are lost at a few places, where the last one holds."""
+    """Drop the commands of `size` [s] at a few random times and hold the last one."""
     held, own = np.arange(len(c.positions)), _own(rng)
     for first in (own.uniform(0.1, 0.9, _SETTINGS.num_losses) * len(held)).astype(int):
         held[first : first + c.num(size)] = held[first]
@@ -541,12 +541,12 @@ def freeze(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def glitches(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """A number of glitches, drawn at random."""
+    """Add a number of random glitches."""
     return with_glitches(c, round(size), _own(rng))
 
 
 def error(c: Commands, size: float, rng: Rng, *, of: str) -> FloatArray:
-    """Adds one of `ERRORS` to the arms' commands."""
+    """Add one of `ERRORS` to the commands of the arms."""
     added = ERRORS[of](c, size, rng)
     added[:, c.grippers] = 0.0
     return c.positions + added
@@ -562,7 +562,7 @@ def _drifts(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def _mirrored(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Arms at rest mirror the motion of the arm before them in the order of the joints."""
+    """Mirror the motion of an arm in the next arm, in the order of joints, if that one rests."""
     is_still = (c.positions == c.positions[0]).astype(np.float64)
     at_rest = _average(is_still, c.num(_SETTINGS.onset_s))
     return size * at_rest * crossed(c.positions, c.positions.shape[1] // c.num_arms)
@@ -581,7 +581,7 @@ def _spikes(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def _kicks(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """Whenever a gripper opens or closes, its arm jerks, once."""
+    """Jerk the arm of a gripper once, whenever the gripper opens or closes."""
     is_open, own = c.robot.gripper_openings(c.positions) > 0.5, _own(rng)
     arm = c.positions.shape[1] // len(is_open)
     changes = (np.flatnonzero(np.diff(one)).astype(np.float64) for one in is_open)
@@ -591,7 +591,7 @@ def _kicks(c: Commands, size: float, rng: Rng) -> FloatArray:
 def _triangles(
     c: Commands, middles: FloatArray, num_joints: int, deviation: float, rng: Rng
 ) -> FloatArray:
-    """(T, J) short triangles about some rows, of heights drawn for each joint."""
+    """Return short triangles (T, J) at some rows, with a random height for each joint."""
     away = np.abs(c.rows[:, None] - middles) * c.period / (_SETTINGS.spike_s / 2)
     return np.maximum(1 - away, 0.0) @ rng.normal(0.0, deviation, (len(middles), num_joints))
 
@@ -603,7 +603,7 @@ def _with_grippers(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def _slow_noise(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """(T, J) error, zero at first, drawn every half second and linear in between."""
+    """Return a slow error (T, J), zero at first: random every half second, linear in between."""
     knots = np.arange(0.0, c.times[-1] + 2 * _SETTINGS.drift_knot_s, _SETTINGS.drift_knot_s)
     drawn = rng.normal(0.0, size, (len(knots), c.positions.shape[1]))
     drawn[0] = 0.0
@@ -623,19 +623,19 @@ ERRORS: Mapping[str, Callable[[Commands, float, Rng], FloatArray]] = {
 
 
 def tempo(c: Commands, size: float, rng: Rng, *, faster: bool) -> FloatArray:
-    """All is faster or slower by a share, cut off or held at the end."""
+    """Speed up or slow down the plan by a fraction; its end is cut off or held."""
     last, speed = len(c.positions) - 1, 1 + size if faster else 1 / (1 + size)
     return _read(np.minimum(np.arange(last + 1) * speed, last), c.positions)
 
 
 def opening_noise(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """A slow error of how far the grippers open, as a share of their range."""
+    """Add a slow error to the openings of the grippers [fraction of their range]."""
     added = _slow_noise(c, size, rng)[:, c.grippers] * c.travel
     return c.grippers_of(c.positions[:, c.grippers] + added)
 
 
 def stop(c: Commands, size: float, rng: Rng) -> FloatArray:
-    """After a share of the plan all stands still."""
+    """Stop all joints after a fraction of the plan."""
     whole, last = c.positions.copy(), int(size * (len(c.positions) - 1))
     whole[last:] = whole[last]
     return whole

@@ -31,7 +31,7 @@ ROW = ('place', 'by', 'phase', 'seconds', 'opening', 'yaw', 'lean')
 
 
 def _number(spec: Any, old: float, move: EditedMove, stop: WayPoint, weight: float) -> float:
-    """An opening, yaw or lean: a length, or what becomes of the old one."""
+    """Return an opening, yaw or lean: a length, or a change of the old value."""
     if not isinstance(spec, dict):
         return move.length(spec)
     old = move.stop(spec['like']).opening if 'like' in spec else old
@@ -60,7 +60,7 @@ def changed(
     seconds: Any = _KEPT,
     **shape: Any,
 ) -> WayPoint:
-    """Returns a way point that differs from another one as a row of a program says.
+    """Return a copy of a way point, changed by a row of a program.
 
     Args:
         stop: the other one.
@@ -95,7 +95,7 @@ def edit(
     weight: str = '',
     **row: Any,
 ) -> None:
-    """Changes way points: of phases or names, `moving` (all but the last), `all`, or a span."""
+    """Change way points: by phase or name, `moving` (all but the last), `all`, or a span."""
     numbers = range(len(move.stops) - ('moving' in phases))
     if span:
         first, last = map(move.index, span)
@@ -136,7 +136,7 @@ def made_of(
     repeat: Sequence[float | str],
     base: Mapping[str, Any],
 ) -> Stops:
-    """Returns the way points of rows."""
+    """Return the way points of the rows."""
     made: Stops = []
     for factor in repeat:
         for row in rows:
@@ -158,7 +158,7 @@ def push(
     stroke: float | None = None,
     **base: Any,
 ) -> None:
-    """Shut fingers come down behind something, push it, and rise: four way points.
+    """Push an object with closed fingers: four way points behind it, along the push, and above.
 
     They come `before` farther off and go `far` past where it is; `stroke` is the push's time [s].
     """
@@ -175,14 +175,14 @@ def push(
 
 
 def shake(move: EditedMove, *, at: str, to: str, times: int, **row: Any) -> None:
-    """From the way point before to either side of it by the size and back, several times."""
+    """Move to both sides of the previous way point by `size` and back, several times."""
     stop = changed(move.stops[move.at(at) - 1], move, **row)
     way = move.size * move.way({to: 1}, stop)
     move.put(at, [*(stop.moved(side * way) for side in (1, -1) * times), stop])
 
 
 def rock(move: EditedMove, *, at: str, times: int = 3, least: float = 0.6, **row: Any) -> None:
-    """Leans to either side at the way point before, by drawn angles up to the size, and back."""
+    """Lean to both sides at the previous way point, by random angles up to `size`, and back."""
     stop = changed(move.stops[move.at(at) - 1], move, **row)
     left, right = move.size * move.draws.play.uniform(least, 1.0, 2)
     leans = (stop.lean + lean for lean in (*(left, -right) * times, 0.0))
@@ -202,7 +202,7 @@ def circle(
     turns: bool = False,
     shut: bool = False,
 ) -> None:
-    """Goes round where it grasps, from one radius to another; shut fingers come down first."""
+    """Circle around the grasp, from one radius to another, after a descent with closed fingers."""
     play, (first, last) = move.draws.play, map(move.length, radius)
     angle = play.uniform(0.0, 2 * np.pi) if begin == 'drawn' else move.draws.angle
     angles = move.side(sense) * np.linspace(move.length(arc[0]), move.length(arc[1]), count)
@@ -225,7 +225,7 @@ def circle(
 
 
 def release_on_the_way(move: EditedMove) -> None:
-    """The gripper opens before the last `size` of the way from the lift to the place."""
+    """Open the gripper before the last `size` of the path from the lift to the goal."""
     stops, (begin, end) = move.stops, map(move.index, ('lift', 'lower'))
     at = begin + (1 - move.size) * (end - begin)
     number = min(int(at), end - 1)
@@ -273,7 +273,7 @@ PRIMITIVES: Mapping[str, Callable[..., None]] = {
 
 
 def edited(program: Program, stops: Stops, size: float, draws: Draws) -> Stops:
-    """Returns the way points of a move after a program."""
+    """Return the way points of a move, changed by a program."""
     move = EditedMove(stops, size, draws)
     for step in program:
         for name, options in step.items():

@@ -54,7 +54,7 @@ _GLITCHES = GlitchSettings()
 
 
 def with_glitches(commands: Commands, count: int, rng: np.random.Generator) -> FloatArray:
-    """Returns the positions (T, J) with `count` glitches; they may leave the joints' limits."""
+    """Return the positions (T, J) with `count` glitches; they may exceed the joint limits."""
     changed = commands
     for _ in range(count):
         glitch = _GLITCHES[int(rng.choice(len(_GLITCHES), p=_OFTEN))]
@@ -63,7 +63,7 @@ def with_glitches(commands: Commands, count: int, rng: np.random.Generator) -> F
 
 
 def _published(commands: Commands, changed: FloatArray) -> FloatArray:
-    """(T, J) at the rate of the published points, linear between them where something changed."""
+    """Return commands (T, J) with changed parts interpolated linearly between published points."""
     rows = np.arange(len(changed))
     points = np.append(rows[:: round(_GLITCHES.point_period_s / commands.period)], rows[-1])
     straight = np.stack([np.interp(rows, points, c[points]) for c in changed.T], axis=1)
@@ -77,7 +77,7 @@ def _log_uniform(bounds: tuple[float, float], rng: np.random.Generator) -> float
 
 
 def _presence(commands: Commands, rng: np.random.Generator) -> FloatArray:
-    """(T, 1) weight of the glitch, 0 to 1."""
+    """Return the weight (T, 1) of the glitch, 0 to 1."""
     times = np.arange(len(commands.positions)) * commands.period
     begin, length = rng.uniform(0.0, 0.95) * times[-1], _log_uniform(_GLITCHES.duration_s, rng)
     onset, pause = _log_uniform(_GLITCHES.onset_s, rng), _log_uniform(_GLITCHES.pause_s, rng)
@@ -102,7 +102,7 @@ def _gripper(commands: Commands, rng: np.random.Generator) -> FloatArray:
 
 
 def _joints(commands: Commands, rng: np.random.Generator) -> FloatArray:
-    """Joints are off, or swing."""
+    """Add a constant or an oscillating error to joints."""
     rows, joints = commands.positions.shape
     off = _log_uniform(_GLITCHES.joint_error_rad, rng) * rng.normal(size=joints)
     if rng.random() < _GLITCHES.single_joint_fraction:
@@ -121,12 +121,12 @@ def _joints(commands: Commands, rng: np.random.Generator) -> FloatArray:
 
 
 def _set_in(presence: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Half of the glitches stay once they have set in."""
+    """Return the presence of a glitch; half of the glitches last to the end."""
     return np.maximum.accumulate(presence) if rng.random() < 0.5 else presence
 
 
 def _time(commands: Commands, rng: np.random.Generator) -> FloatArray:
-    """For some time, time runs faster or slower or jumps, or commands are held."""
+    """Change the speed of time for a while, jump in time, or hold commands."""
     rows, period = len(commands.positions), commands.period
     at = np.arange(rows, dtype=np.float64)
     begin = int(rng.uniform(0.05, 0.9) * rows)
@@ -154,7 +154,7 @@ def _time(commands: Commands, rng: np.random.Generator) -> FloatArray:
 
 
 def _other_arm(commands: Commands, rng: np.random.Generator) -> FloatArray:
-    """An arm that rests moves as another does, to this side or that, as some joints do anyway.
+    """Move a resting arm, and some other joints, like another arm, in the same or mirrored sense.
 
     With one arm alone, joints are off.
     """

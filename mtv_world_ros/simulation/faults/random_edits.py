@@ -75,7 +75,7 @@ def _above(stop: WayPoint, floor: float) -> WayPoint:
 
 
 def random_way_points(move: EditedMove) -> None:
-    """Way points drawn at random: before the grasp, on the way to the goal, after the release."""
+    """Insert random way points: before the grasp, on the path to the goal, after the release."""
     rng, floor = move.draws.play, move.floor
     begins = {'grasp': 0.6, 'carry': 0.2, 'retreat': 0.2}
     for _ in range(round(move.size)):
@@ -98,7 +98,7 @@ def random_way_points(move: EditedMove) -> None:
 
 
 def random_runs(move: EditedMove) -> None:
-    """Drawn runs of way points have another opening, place or turn, or a detour."""
+    """Change the opening, position or rotation of random runs of way points, or add a detour."""
     rng, floor = move.draws.play, move.floor
     for _ in range(round(move.size)):
         first = int(rng.integers(len(move.stops) - 1))
@@ -121,7 +121,7 @@ def random_runs(move: EditedMove) -> None:
 
 
 def random_visits(move: EditedMove) -> None:
-    """Before a drawn way point it goes to an object, and through it or past it."""
+    """Insert a visit before a random way point: to an object, and through it or past it."""
     rng, floor = move.draws.play, move.floor
     for _ in range(round(move.size)):
         at = int(rng.integers(len(move.stops)))
@@ -172,7 +172,7 @@ def random_actions_at_object(move: EditedMove) -> None:
 
 
 def _varied(stop: WayPoint, floor: float, rng: np.random.Generator) -> WayPoint:
-    """The next way point, with another opening, height, place, lean or turn."""
+    """Return the next way point, with another opening, height, position, lean or yaw."""
     last = replace(stop, seconds=None)
     match str(rng.choice(['opening', 'height', 'place', 'lean', 'turn'], p=[0.4, *[0.15] * 4])):
         case 'opening':
@@ -189,7 +189,7 @@ def _varied(stop: WayPoint, floor: float, rng: np.random.Generator) -> WayPoint:
 
 
 def random_actions_with_object(move: EditedMove) -> None:
-    """With what the gripper holds, one thing changes after the other, on the table and on objects.
+    """Insert random actions with the held object, on the table and on other objects.
 
     So it is pressed down, dragged, leaned, put on what lies there, let go and taken again.
     """
@@ -245,7 +245,7 @@ def random_carried_contacts(move: EditedMove) -> None:
 
 
 def way_points_left_out(move: EditedMove) -> None:
-    """Way points are left out, and it goes straight to the next one.
+    """Remove random way points, so that the arm moves straight to the next one.
 
     Where it should close or open, it has done so at the next one. Others, drawn anew, where the
     arm does not reach the way between.
@@ -259,7 +259,7 @@ def way_points_left_out(move: EditedMove) -> None:
 
 
 def way_points_swapped(move: EditedMove) -> None:
-    """Way points change places with the next one, so that it does the later thing first.
+    """Exchange random way points with the next one, so that the later action comes first.
 
     Others, drawn anew, where the arm does not reach the way between.
     """
