@@ -33,7 +33,6 @@ from mtv_world_ros.cli.commands import (  # noqa: E402
 )
 from mtv_world_ros.core import entry_points  # noqa: E402
 from mtv_world_ros.core.errors import (  # noqa: E402
-    ConfigError,
     MtvWorldError,
     nearest,
     TrainingInterrupted,
@@ -273,7 +272,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with ended_by_signals('mtv-world'):
             arguments = _parsed(sys.argv[1:] if argv is None else argv)
-    except ConfigError as error:  # of the installation
+    except MtvWorldError as error:  # of the installation, or of an option that only prints
         return _said(str(error), 1)
     try:
         with stopped_by_sigterm():
