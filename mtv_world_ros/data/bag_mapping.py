@@ -123,7 +123,7 @@ class EpisodeSource:
 
 
 def load_source(topics: Path | None, calibration: Path | None) -> EpisodeSource:
-    """Returns the source that `--topics` and `--calibration` name.
+    """Return the source that `--topics` and `--calibration` name.
 
     Raises:
         ConfigError: the mapping file is missing or wrong.
@@ -133,7 +133,7 @@ def load_source(topics: Path | None, calibration: Path | None) -> EpisodeSource:
 
 
 def load_bag_mapping(path: Path) -> BagMapping:
-    """Reads a mapping file; `config/datasets/bag.yaml` describes its keys.
+    """Read a mapping file; `config/datasets/bag.yaml` describes its keys.
 
     Raises:
         ConfigError: the file is missing, not YAML, or has unknown or wrong values.

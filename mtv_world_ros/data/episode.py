@@ -59,7 +59,7 @@ def optical_frame(view: str) -> str:
 
 
 def check_outcome(outcome: str) -> str:
-    """Returns `outcome` if it is one of `OUTCOMES`, else raises EpisodeError."""
+    """Return `outcome` if it is one of `OUTCOMES`, else raise EpisodeError."""
     if outcome not in OUTCOMES:
         raise EpisodeError(
             f"outcome '{outcome}' is not one of {', '.join(OUTCOMES)}{nearest(outcome, OUTCOMES)}"
@@ -223,7 +223,7 @@ class JointStates:
     positions: FloatArray
 
     def at(self, stamps_ns: NDArray[np.int64], robot: RobotModel) -> FloatArray:
-        """Returns (T, J) positions at stamps (T,), interpolated, in the robot's joint order.
+        """Return (T, J) positions at stamps (T,), interpolated, in the robot's joint order.
 
         Raises:
             TrajectoryError: joints of the robot are missing.
@@ -289,7 +289,7 @@ class Episode:
     warnings: tuple[str, ...] = ()
 
     def mask_areas(self) -> dict[str, FloatArray]:
-        """Returns (O, T) areas of the objects in the stored masks by view [share of the image]."""
+        """Return (O, T) areas of the objects in the stored masks by view [share of the image]."""
         found = {}
         for view, track in (self.masks or {}).items():
             ids = np.asarray(track.frames[:])
@@ -299,6 +299,6 @@ class Episode:
         return found
 
     def camera(self, view: str, index: int) -> CameraModel:
-        """Returns the camera of a view as it is at one of its images."""
+        """Return the camera of a view as it is at one of its images."""
         camera, track = self.cameras[view], self.camera_tracks.get(view)
         return camera if track is None else replace(camera, T_mount_camera=track[index])

@@ -103,7 +103,7 @@ def read_episode(
     unknown_mount: str = '',
     window: Window = WHOLE_BAG,
 ) -> Episode:
-    """Reads an episode; frames are decoded later, when asked for.
+    """Read an episode; frames are decoded on access.
 
     Times are the headers' stamps, or the log time where a header has none. Messages that are
     damaged are skipped, and every problem is a line in the result's `warnings`.
@@ -136,7 +136,7 @@ def read_episode(
 
 
 def read_info(path: Path | str) -> EpisodeInfo:
-    """Returns task, outcome and objects, from metadata.yaml where possible.
+    """Return task, outcome and objects, from metadata.yaml where possible.
 
     Raises:
         EpisodeError: no bag, or its metadata cannot be used.
@@ -512,7 +512,7 @@ class _EpisodeReader:
         return replace(plan, joint_names=self._renamed(plan.joint_names))
 
     def _whole_plans(self, topic: str, plans: Stamped, states: JointStates | None) -> Stamped:
-        """Plans of all joints of the robot; those of one point are joined."""
+        """Return the plans of all joints of the robot; those of one point are joined."""
         chunk_s = self.mapping.chunk_s
         plans, count = join_streams(plans, chunk_s)
         if count:
@@ -880,7 +880,7 @@ def _listed(names: Sequence[str]) -> str:
 def in_order(
     topic: str, items: Iterable[tuple[int, Item]], warnings: list[str]
 ) -> list[tuple[int, Item]]:
-    """Sorts (stamp, item) by stamp, keeps the last of equal stamps; reports both in `warnings`."""
+    """Sort (stamp, item) by stamp, keep the last of equal stamps; report both in `warnings`."""
     given = list(items)
     stamps = [stamp for stamp, _ in given]
     late = sum(b < a for a, b in zip(stamps, stamps[1:], strict=False))

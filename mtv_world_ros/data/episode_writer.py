@@ -82,7 +82,7 @@ class EpisodeWriter(BagWriter):
     def write_image(
         self, view: str, stamp_ns: int, rgb: ByteArray, *, compressed: bool = True
     ) -> None:
-        """Records a frame, (H, W, 3) uint8 RGB, as JPEG or raw rgb8."""
+        """Record a frame, (H, W, 3) uint8 RGB, as JPEG or raw rgb8."""
         if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
             raise EpisodeError(
                 f"view '{view}': frame is {rgb.shape} {rgb.dtype}, expected (H, W, 3) uint8"
@@ -98,7 +98,7 @@ class EpisodeWriter(BagWriter):
         self.write_message(topic, kind, stamp_ns, message)
 
     def write_mask(self, view: str, stamp_ns: int, ids: ByteArray) -> None:
-        """Records object masks, (H, W) uint8: 0 = none, i + 1 = objects[i]."""
+        """Record object masks, (H, W) uint8: 0 = none, i + 1 = objects[i]."""
         if ids.dtype != np.uint8 or ids.ndim != 2:
             raise EpisodeError(
                 f"view '{view}': mask is {ids.shape} {ids.dtype}, expected (H, W) uint8"
@@ -109,14 +109,14 @@ class EpisodeWriter(BagWriter):
         self.write_message(mask_topic(view), messages.COMPRESSED_IMAGE, stamp_ns, message)
 
     def write_camera_info(self, view: str, stamp_ns: int, camera: CameraModel) -> None:
-        """Records the view's intrinsics."""
+        """Record the view's intrinsics."""
         message = messages.make_camera_info(stamp_ns, camera, optical_frame(view))
         self.write_message(camera_info_topic(view), messages.CAMERA_INFO, stamp_ns, message)
 
     def write_camera_pose(
         self, view: str, stamp_ns: int, mount_link: str, T_mount_camera: FloatArray
     ) -> None:
-        """Records where a camera is that moves against the robot's links, (4, 4) [m]."""
+        """Record where a camera is that moves against the robot's links, (4, 4) [m]."""
         message = messages.make_tf(stamp_ns, mount_link, optical_frame(view), T_mount_camera)
         self.write_message(TF, messages.TF_MESSAGE, stamp_ns, message)
 
@@ -127,28 +127,28 @@ class EpisodeWriter(BagWriter):
         positions: ArrayLike,
         velocities: ArrayLike | None = None,
     ) -> None:
-        """Records measured positions (J,) [rad or m] and, if known, velocities (J,)."""
+        """Record measured positions (J,) [rad or m] and, if known, velocities (J,)."""
         message = messages.make_joint_state(stamp_ns, names, positions, velocities)
         self.write_message(JOINT_STATES, messages.JOINT_STATE, stamp_ns, message)
 
     def write_trajectory(self, stamp_ns: int, trajectory: JointTrajectory) -> None:
-        """Records a commanded trajectory that starts at `stamp_ns`."""
+        """Record a commanded trajectory that starts at `stamp_ns`."""
         message = messages.make_joint_trajectory(stamp_ns, trajectory)
         self.write_message(JOINT_TRAJECTORY, messages.JOINT_TRAJECTORY, stamp_ns, message)
 
     def write_object_poses(self, stamp_ns: int, T_base_object: ArrayLike) -> None:
-        """Records object poses (O, 4, 4) in the order of their names [m]."""
+        """Record object poses (O, 4, 4) in the order of their names [m]."""
         message = messages.make_pose_array(stamp_ns, 'base_link', T_base_object)
         self.write_message(OBJECT_POSES, messages.POSE_ARRAY, stamp_ns, message)
 
     def write_instruction(self, stamp_ns: int, text: str | None = None) -> None:
-        """Records the instruction (latched); by default the episode's own."""
+        """Record the instruction (latched); by default the episode's own."""
         self.declare(INSTRUCTION, messages.STRING, LATCHED)
         message = messages.make(messages.STRING, data=self.instruction if text is None else text)
         self.write_message(INSTRUCTION, messages.STRING, stamp_ns, message)
 
     def close(self) -> None:
-        """Finishes the record; raises EpisodeError where `outcome` is not a known word."""
+        """Finish the record; raise EpisodeError where `outcome` is not a known word."""
         try:
             self._describe()
         except BaseException:

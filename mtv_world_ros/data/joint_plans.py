@@ -29,7 +29,7 @@ _MOVED = 1e-3
 
 
 def read_plan(message: Any) -> JointTrajectory:
-    """Returns the trajectory of a message, of rclpy's or rosbags' class.
+    """Return the trajectory of a message, of rclpy's or rosbags' class.
 
     Times count from the message's stamp. Velocities are kept where every point has them. Limits
     are not checked, as recorded commands are facts; before a plan is imagined they are
@@ -190,7 +190,7 @@ def join_streams(plans: Sequence[Plan], chunk_s: float) -> tuple[list[Plan], int
 
 
 def _runs(plans: Sequence[Plan]) -> list[list[Plan]]:
-    """Plans of one point of the same joints that follow one another; others are alone."""
+    """Group consecutive plans with one point of the same joints; other plans stay alone."""
     numbers = [0]
     for (before_ns, before), (now_ns, now) in pairwise(plans):
         goes_on = (
@@ -206,7 +206,7 @@ def _runs(plans: Sequence[Plan]) -> list[list[Plan]]:
 def complete_plans(
     plans: Sequence[Plan], states: JointStates | None, robot: RobotModel, chunk_s: float
 ) -> tuple[list[Plan], tuple[str, ...]]:
-    """Completes plans of some of the joints with the positions measured meanwhile.
+    """Complete plans of some of the joints with the positions measured meanwhile.
 
     An example is a gripper that an action drives. Motions of such joints between two plans become
     plans of their own. Plans that name unknown joints are not changed.

@@ -84,7 +84,7 @@ class Recording:
     recorded: tuple[tuple[Track, CameraModel], ...] = ()
 
     def seen_at(self, frame: int) -> tuple[ByteArray, tuple[CameraModel, ...]]:
-        """Returns a frame (V, H, W, 3) and its V cameras, as the robot saw it.
+        """Return a frame (V, H, W, 3) and its V cameras, as the robot saw it.
 
         At the recorded size, which shows better where objects are; at the model's where the views
         differ in size, or are not known any more.
@@ -101,7 +101,7 @@ class Recording:
         )
 
     def observation(self, frame: int) -> Observation:
-        """Returns what the robot saw and where it stood at a recorded frame."""
+        """Return what the robot saw and where it stood at a recorded frame."""
         frames, cameras = self.seen_at(frame)
         return Observation(
             cameras=cameras,
@@ -111,7 +111,7 @@ class Recording:
         )
 
     def cameras_at(self, frame: int) -> tuple[CameraModel, ...]:
-        """Returns the V cameras as they are at a frame.
+        """Return the V cameras as they are at a frame.
 
         What starts there is drawn as if they stayed there, in training as in serving: where a
         camera that no joint of the robot moves will go is not known.
@@ -129,7 +129,7 @@ class Recording:
 
 
 def stitch(trajectories: Sequence[tuple[int, JointTrajectory]], origin_ns: int) -> JointTrajectory:
-    """Joins trajectory messages into one; each counts until the next one starts.
+    """Join trajectory messages into one; each counts until the next one starts.
 
     Args:
         trajectories: (start stamp [ns], trajectory) with equal joint names, in any order.
@@ -167,7 +167,7 @@ def stitch(trajectories: Sequence[tuple[int, JointTrajectory]], origin_ns: int) 
 def load_recording(
     path: Path, spec: WorldModelSpec, robot: RobotModel, *, source: EpisodeSource = DEFAULT
 ) -> Recording:
-    """Reads an episode at the model's size.
+    """Read an episode at the model's size.
 
     Raises:
         EpisodeError: the episode lacks a view, joint states or commands.
@@ -267,7 +267,7 @@ def _middles(episode: Episode, view: str, stamps: np.ndarray) -> FloatArray:
 
 
 def stitched_commands(episode: Episode, robot: RobotModel, origin_ns: int) -> JointTrajectory:
-    """Returns what was commanded in the robot's joint order; see `stitch`, `complete_plans`."""
+    """Return what was commanded in the robot's joint order; see `stitch`, `complete_plans`."""
     chunk_s = BagMapping().chunk_s
     whole, _ = complete_plans(episode.trajectories, episode.joint_states, robot, chunk_s)
     matched = [(s, match_joints(t, robot)) for s, t in whole]
@@ -275,7 +275,7 @@ def stitched_commands(episode: Episode, robot: RobotModel, origin_ns: int) -> Jo
 
 
 def measured_positions(episode: Episode, robot: RobotModel, stamps: np.ndarray) -> FloatArray:
-    """Returns the joint states (T, J) at stamps (T,) [ns], in the robot's joint order.
+    """Return the joint states (T, J) at stamps (T,) [ns], in the robot's joint order.
 
     Raises:
         EpisodeError: the episode has no joint states.

@@ -96,7 +96,7 @@ def clip_starts(recording: Recording, spec: WorldModelSpec) -> np.ndarray:
 def cut_clip(
     recording: Recording, start: int, spec: WorldModelSpec, num_frames: int | None = None
 ) -> Clip:
-    """Cuts the clip that starts at recorded frame `start`.
+    """Cut the clip that starts at recorded frame `start`.
 
     Args:
         recording: the episode.
@@ -166,7 +166,7 @@ def commands_until(recording: Recording, start: int, seconds: float) -> JointTra
 def described_objects(
     path: Path, describer: Describer, view: str, source: EpisodeSource = DEFAULT
 ) -> tuple[str, ...]:
-    """Returns the names that a describer gives to the objects of an episode's first frame.
+    """Return the names that a describer gives to the objects of an episode's first frame.
 
     Raises:
         EpisodeError: the episode cannot be read, the describer failed, or saw no object.
@@ -194,7 +194,7 @@ def cached_recording(
     cache: Path,
     source: EpisodeSource = DEFAULT,
 ) -> Recording:
-    """Returns `load_recording`'s result, from the cache where it is current.
+    """Return `load_recording`'s result, from the cache where it is current.
 
     The key holds the bag's files (name, size, time), views, size, and robot: a changed episode
     or setting misses the cache instead of using stale data.

@@ -29,7 +29,7 @@ _TEST = 'test'
 
 
 def recorded_policy(path: Path) -> str:
-    """Returns the scripted policy of an episode; empty = another one, or not recorded.
+    """Return the scripted policy of an episode; empty = another one, or not recorded.
 
     Raises:
         EpisodeError: the episode's metadata cannot be used.
@@ -39,7 +39,7 @@ def recorded_policy(path: Path) -> str:
 
 
 def recorded_kinds(paths: Iterable[Path]) -> dict[Path, tuple[str, ...]]:
-    """Returns the fault kinds of episodes of scripted policies.
+    """Return the fault kinds of episodes of scripted policies.
 
     Raises:
         ConfigError: the simulator, which knows scripted policies, is not installed.
@@ -55,7 +55,7 @@ def recorded_kinds(paths: Iterable[Path]) -> dict[Path, tuple[str, ...]]:
 
 
 def refuse_test_kinds(paths: Iterable[Path], what: str) -> None:
-    """Refuses episodes of policies with faults of the split `test`.
+    """Refuse episodes of policies with faults of the split `test`.
 
     Args:
         paths: folders of episodes.
@@ -210,7 +210,7 @@ def _card(dataset: Path) -> _Card:
 
 
 def _check_siblings(dataset: Path, card: _Card) -> None:
-    """Refuses siblings of different scenes, and of different splits."""
+    """Refuse siblings of different scenes, and of different splits."""
     places = {name: split for split, names in card.splits.items() for name in names}
     firsts: dict[str, _Entry] = {}
     for entry in card.episodes:
@@ -231,7 +231,7 @@ def _check_siblings(dataset: Path, card: _Card) -> None:
 
 
 def _names(dataset: Path, splits: Mapping[str, Any], split: str) -> set[str] | None:
-    """Names of a split's episodes; None = all."""
+    """Return the names of a split's episodes; None = all."""
     if split == EVERY:
         return None
     if split not in splits:

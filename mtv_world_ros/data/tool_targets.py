@@ -45,7 +45,7 @@ class ToolTargets(Schema):
         return True
 
     def check(self, arm: str, robot: RobotModel) -> Tool:
-        """Returns the tool, whose point is the one that the poses are of.
+        """Return the tool, whose point is the one that the poses are of.
 
         Raises:
             ValueError: the robot has no such arm or link.
@@ -68,7 +68,7 @@ class ToolTargets(Schema):
 
 
 def tool_joints(tools: Mapping[str, ToolTargets], robot: RobotModel) -> set[str]:
-    """Returns the joints whose positions follow from tool poses.
+    """Return the joints whose positions follow from tool poses.
 
     Raises:
         ValueError: the robot has no such arm or link.
@@ -85,7 +85,7 @@ def add_tool_poses(
     poses: ToolTargets,
     wanted: FloatArray,
 ) -> str:
-    """Writes an arm's joints for poses of its tool into `positions` (T, J).
+    """Write an arm's joints for poses of its tool into `positions` (T, J).
 
     Each solution is the one nearest to the row's measured joints. A pose out of reach is replaced
     by the measured positions of the row that follows.
@@ -159,7 +159,7 @@ def joints_of_tools(
     states: JointStates,
     others: Sequence[tuple[int, JointTrajectory]],
 ) -> tuple[JointStates, list[str]]:
-    """Returns joint positions that follow commanded tool poses, and warnings.
+    """Return joint positions that follow commanded tool poses, and warnings.
 
     The first tool's stamps are the clock; of the other tools the newest pose before counts. A
     pose is reached at its own stamp, a difference at the stamp that follows.
@@ -210,7 +210,7 @@ def _add_others(
     stamps: NDArray[np.int64],
     others: Sequence[tuple[int, JointTrajectory]],
 ) -> list[str]:
-    """Writes the commands of joints into `positions` (T, J); returns those that have none."""
+    """Write the commands of joints into `positions` (T, J); return those that have none."""
     without = []
     for name in free:
         points: dict[int, float] = {}

@@ -146,7 +146,7 @@ class TransformTree:
         self._unusable: dict[str, int] = defaultdict(int)
 
     def add(self, message: Any, *, latched: bool = False) -> None:
-        """Takes the transforms of a tf2_msgs/TFMessage.
+        """Take the transforms of a tf2_msgs/TFMessage.
 
         Args:
             message: of /tf or /tf_static.
@@ -193,7 +193,7 @@ class TransformTree:
                 del self._edges[other]
 
     def forget_moving(self) -> None:
-        """Forgets what /tf said (the clock jumped); /tf_static holds for good."""
+        """Forget what /tf said (the clock jumped); /tf_static holds for good."""
         self._edges = {k: edge for k, edge in self._edges.items() if edge.stamp_ns is None}
 
     def name(self, frame: str) -> str:
@@ -245,7 +245,7 @@ class TransformTree:
         return found
 
     def mount(self, frame: str, links: Collection[str]) -> Mount:
-        """Returns the nearest of the robot's links that is fixed to a frame.
+        """Return the nearest of the robot's links that is fixed to a frame.
 
         Args:
             frame: e.g. a camera's optical frame.
@@ -285,7 +285,7 @@ class TransformTree:
     def moving_mount(
         self, frame: str, links: Collection[str], stamp_ns: int | None = None
     ) -> Mount:
-        """Returns the nearest link that TF leads to, at a time [ns] or by the newest transforms.
+        """Return the nearest link that TF leads to, at a time [ns] or by the newest transforms.
 
         Raises:
             CalibrationError: TF does not lead from the frame to a link.
@@ -311,7 +311,7 @@ class TransformTree:
         return self._edges[self.name(link), self.name(frame)].T
 
     def path(self, frame: str, link: str) -> list[tuple[str, str]]:
-        """Returns the transforms, (parent, child), that lead from a frame to a link."""
+        """Return the transforms, (parent, child), that lead from a frame to a link."""
         parents = self._parents()
         chains = []
         for name in (self.name(frame), link):
@@ -345,7 +345,7 @@ class TransformTree:
     def _reachable(
         self, frame: str, *, only_still: bool, stamp_ns: int | None = None
     ) -> Iterator[Mount]:
-        """Yields the frames that TF leads to as mounts, itself and the nearest first.
+        """Yield the frames that TF leads to as mounts, itself and the nearest first.
 
         A breadth-first search that visits a frame once: frames in a circle end it, too.
         """
@@ -386,7 +386,7 @@ def pose_track(
     prefix: str = '',
     static: Sequence[Any] = (),
 ) -> Mount:
-    """Returns the poses of a frame that moves against every link of the robot.
+    """Return the poses of a frame that moves against every link of the robot.
 
     Args:
         messages: TFMessages of /tf.
@@ -417,7 +417,7 @@ def pose_track(
 def _series(
     messages: Sequence[Any], tree: TransformTree, edges: set[tuple[str, str]]
 ) -> dict[tuple[str, str], dict[int, FloatArray]]:
-    """Transforms by stamp [ns] of each edge; of one that never moves the one that holds, at 0."""
+    """Return the transforms by stamp [ns] of each edge; a static edge has one, at stamp 0."""
     found = {edge: {} if tree.moves_in(*edge) else {0: tree.still(*edge)} for edge in edges}
     for item in (item for message in messages for item in message.transforms):
         edge = tree.name(item.header.frame_id), tree.name(item.child_frame_id)

@@ -112,7 +112,7 @@ class _Found:
 
 
 class EpisodeScorer:
-    """Scores episodes with the same instruments, and keeps the last two recordings that it read.
+    """Scorer of episodes with the same instruments; it caches the last two recordings.
 
     Rollouts and features go into `out/episodes`.
     """
@@ -123,7 +123,7 @@ class EpisodeScorer:
         self._load = lru_cache(maxsize=2)(self._read)
 
     def score(self, job: EvaluationJob) -> EpisodeResult:
-        """Imagines and scores an episode.
+        """Imagine and score an episode.
 
         Raises:
             MtvWorldError: the episode cannot be read or imagined.
@@ -195,7 +195,7 @@ class EpisodeScorer:
         names: tuple[str, ...],
         found: _Found,
     ) -> list[Prediction]:
-        """Imagines and scores one stretch; returns its chunks."""
+        """Imagine and score one stretch; return its chunks."""
         chunks = self._imagine(
             recording, stretch, recording, names, found, num_seeds=self.config.num_seeds
         )
@@ -323,7 +323,7 @@ class EpisodeScorer:
         return load_shape(self.pipeline.robot)
 
     def _ceilings(self, stretch: Stretch, truth: Truth, found: _Found) -> dict[str, ObjectScores]:
-        """Scores of the recorded frames: as they are, and through the autoencoder."""
+        """Return the scores of the recorded frames: as they are, and through the autoencoder."""
         if not self.config.ceiling:
             return {}
         scores = {'self': self._scored(stretch.frames[:, 1:], truth, found)}

@@ -74,7 +74,7 @@ def evaluate(
     overwrite: bool = False,
     show_progress: bool = True,
 ) -> EvaluationSummary:
-    """Scores a pipeline and writes `metrics.json`, `rows.csv` and `tables.md`.
+    """Score a pipeline and write `metrics.json`, `rows.csv` and `tables.md`.
 
     Episodes that were scored before with the same settings are taken from `out/episodes`.
     Episodes that cannot be used are listed with their reason.
@@ -133,7 +133,7 @@ def evaluate(
 
 
 def result_names(paths: Sequence[Path]) -> dict[Path, str]:
-    """Returns what results are called: as the folder, or by the whole path if two are alike."""
+    """Return what results are called: as the folder, or by the whole path if two are alike."""
     count = Counter(Path(path).name for path in paths)
     return {
         path: path.name if count[path.name] == 1 else '__'.join(path.parts).strip('/')
@@ -144,7 +144,7 @@ def result_names(paths: Sequence[Path]) -> dict[Path, str]:
 def make_jobs(
     paths: Sequence[Path], zero_shot: Mapping[Path, str], seed: int
 ) -> list[EvaluationJob]:
-    """Returns the episodes in an order in which each lends its actions to the next."""
+    """Return the episodes in an order in which each lends its actions to the next."""
     order = np.random.default_rng(seed).permutation(len(paths))
     shuffled = [Path(paths[index]) for index in order]
     names = result_names(paths)
@@ -160,7 +160,7 @@ def make_jobs(
 
 
 def make_scorer(make_pipeline: MakePipeline, config: EvaluationConfig, out: Path) -> EpisodeScorer:
-    """Returns what scores episodes, with everything that the configuration asks to measure.
+    """Return what scores episodes, with everything that the configuration asks to measure.
 
     Raises:
         ConfigError, CheckpointError: weights or packages for that are missing.
@@ -213,7 +213,7 @@ def _distances(
 
 
 class _Run:
-    """Takes results from earlier runs where they are of the same settings, else scores."""
+    """Scorer that reuses the results of earlier runs with the same settings."""
 
     def __init__(
         self,
@@ -237,7 +237,7 @@ class _Run:
     def results(
         self, jobs: Sequence[EvaluationJob]
     ) -> Iterator[tuple[EvaluationJob, EpisodeResult | str]]:
-        """Yields jobs with their result, or why there is none."""
+        """Yield jobs with their result, or why there is none."""
         left = []
         for job in map(self._described, jobs):
             if isinstance(job, tuple):

@@ -99,18 +99,18 @@ class EvaluationSummary:
         return [*seen, *sorted(sets)] if sets else []
 
     def chosen(self, group: Group = ALL) -> list[EpisodeResult]:
-        """Returns the results of a group."""
+        """Return the results of a group."""
         return [result for result in self.results if group.holds(result)]
 
     def estimates(self, view: str | None, group: Group = ALL) -> dict[str, Estimate]:
-        """Returns the numbers of a view (None = all) and a group."""
+        """Return the numbers of a view (None = all) and a group."""
         means = [result.means(view) for result in self.chosen(group)]
         found = summarise(means)
         measured = self.distances.get((group.zero_shot, view or ''), {})
         return {**found, **(measured if group.task is None else {})}
 
     def rollout(self, episode: str) -> StoredRollout | None:
-        """Returns the frames of a scored episode; None where they were not kept.
+        """Return the frames of a scored episode; None where they were not kept.
 
         Raises:
             EpisodeError: the frames cannot be read.
@@ -197,7 +197,7 @@ class EvaluationSummary:
         ]
 
     def statuses(self, view: str | None, group: Group = ALL) -> dict[str, int]:
-        """Returns how often each status of an object in a stretch was met."""
+        """Return how often each status of an object in a stretch was met."""
         found = [row.status for row in self._rows(view, group)]
         return {word: found.count(word) for word in sorted(set(found))}
 
@@ -236,7 +236,7 @@ class EvaluationSummary:
         return -(-max(frames, default=0) // self.spec.num_frames)
 
     def chunk_curve(self, view: str | None, group: Group = ALL) -> Curve:
-        """Returns J of moving objects by chunk of a view (None = all), with intervals."""
+        """Return J of moving objects by chunk of a view (None = all), with intervals."""
         episodes = [result.rows for result in self.chosen(group)]
         return by_chunk(episodes, view, 'j_frames', self.spec.num_frames)
 

@@ -107,7 +107,7 @@ class Calibrated:
 def samples_of(
     runs: Sequence[Sequence[EpisodeResult]], kinds: Mapping[str, tuple[str, ...]] | None = None
 ) -> list[Sample]:
-    """Returns the episodes of known outcome.
+    """Return the episodes of known outcome.
 
     Args:
         runs: of the same episodes, one run a seed.
@@ -142,7 +142,7 @@ def calibrate(
     l2: float = 1.0,
     made: Mapping[str, str] | None = None,
 ) -> Calibrated:
-    """Fits the calibration to imagined episodes of known outcome, and judges it.
+    """Fit the calibration to imagined episodes of known outcome, and judge it.
 
     Args:
         samples: imagined episodes of known outcome.
@@ -299,7 +299,7 @@ class Logistic:
     bias: float
 
     def probability(self, features: FloatArray) -> FloatArray:
-        """Returns (N,) for features (N, F)."""
+        """Return (N,) for features (N, F)."""
         return expit(features @ self.weights + self.bias)
 
 
@@ -311,7 +311,7 @@ def fit_logistic(
     prior: FloatArray | None = None,
     non_negative: bool = False,
 ) -> Logistic:
-    """Minimises -log likelihood + l2 / 2 * |weights - prior|^2 (scikit-learn's with C = 1 / l2).
+    """Minimise -log likelihood + l2 / 2 * |weights - prior|^2 (scikit-learn's with C = 1 / l2).
 
     The bias is not penalised.
 

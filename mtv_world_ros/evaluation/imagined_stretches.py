@@ -47,7 +47,7 @@ class Stretch:
 
     @classmethod
     def of(cls, recording: Recording, index: int, rows: np.ndarray) -> Stretch:
-        """Returns the stretch of 1 + T recorded frames."""
+        """Return the stretch of 1 + T recorded frames."""
         ids = recording.object_ids
         return cls(
             index=index,
@@ -64,13 +64,13 @@ class Stretch:
 
 
 def check_mode(mode: str) -> None:
-    """Raises ConfigError if it is none of `MODES`."""
+    """Raise ConfigError if it is none of `MODES`."""
     if mode not in MODES:
         raise ConfigError(f"mode is '{mode}'; it must be one of {', '.join(MODES)}")
 
 
 def stretches(recording: Recording, spec: WorldModelSpec, mode: str) -> list[Stretch]:
-    """Cuts an episode into what is imagined at once.
+    """Cut an episode into stretches that are imagined at once.
 
     In mode `observe` each stretch is a chunk; a last one shorter than half a chunk is left out
     unless it is the only one. In mode `imagine` the whole episode is one stretch.
@@ -107,7 +107,7 @@ def _cut(
 
 
 def last_chunk(recording: Recording, stretch: Stretch, spec: WorldModelSpec) -> Stretch | None:
-    """Returns the last chunk of a longer stretch; None = it is no longer than that."""
+    """Return the last chunk of a longer stretch; None = it is no longer than that."""
     rows = frame_indices(recording, stretch.start, spec, stretch.num_frames)
     if rows is None or stretch.num_frames <= spec.num_frames:
         return None
@@ -124,7 +124,7 @@ def imagine_stretch(
     num_inference_steps: int,
     num_seeds: int = 1,
 ) -> list[Prediction]:
-    """Imagines a stretch from the recorded frames until its start; returns its chunks.
+    """Imagine a stretch from the recorded frames until its start; return its chunks.
 
     Args:
         pipeline: the world model and all around it.
@@ -141,7 +141,7 @@ def imagine_stretch(
 
 
 def observe_stretch(pipeline: Pipeline, recording: Recording, stretch: Stretch) -> SuccessEstimate:
-    """Returns what the estimate says of recorded frames, those of a stretch the last ones."""
+    """Return what the estimate says of recorded frames, those of a stretch the last ones."""
     episode = _begin(pipeline, recording, stretch)
     return episode.observe(stretch.frames[:, 1:], stretch.positions).success
 
@@ -179,5 +179,5 @@ def _begin(
 
 
 def predicted_frames(chunks: list[Prediction]) -> ByteArray:
-    """Returns the (V, T, H, W, 3) frames of a rollout's chunks in a row."""
+    """Return the (V, T, H, W, 3) frames of a rollout's chunks in a row."""
     return np.concatenate([chunk.video.frames for chunk in chunks], axis=1)

@@ -22,7 +22,7 @@ Reconstruct = Callable[[ByteArray], ByteArray]
 
 
 def check_actions(actions: Sequence[str]) -> None:
-    """Raises ConfigError unless all are of `ACTIONS` and the true ones are among them."""
+    """Raise ConfigError unless all are of `ACTIONS` and the true ones are among them."""
     for name in actions:
         if name not in ACTIONS:
             raise ConfigError(
@@ -41,7 +41,7 @@ def with_actions(
     stretch: Stretch,
     donor: Recording | None,
 ) -> Recording | None:
-    """Returns the episode whose commands of a kind (of `ACTIONS`) are executed for a stretch.
+    """Return the episode whose commands of a kind (of `ACTIONS`) are executed for a stretch.
 
     None = `shuffled`, but there is no episode, the donor, to lend its commands.
     """
@@ -58,7 +58,7 @@ def with_actions(
 
 
 def round_trip(world_model: WorldModel) -> Reconstruct | None:
-    """Returns the round trip through a world model's autoencoder; None if it has none.
+    """Return the round trip through a world model's autoencoder; None if it has none.
 
     The frames go through in chunks, each after the real frame before it and the last one filled
     up with its last frame, so that the autoencoder sees what it sees in the model.

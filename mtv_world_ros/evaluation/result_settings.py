@@ -19,7 +19,7 @@ def fingerprint(
     adapter: Path | None = None,
     task: str | None = None,
 ) -> str:
-    """Returns the checkpoint's name and a hash of its files: other weights, other name.
+    """Return the checkpoint's name and a hash of its files: other weights, other name.
 
     Args:
         checkpoint: the checkpoint.
@@ -41,7 +41,7 @@ def fingerprint(
 
 
 def check_same_settings(results: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
-    """Refuses a folder of results that were made with other settings.
+    """Refuse a folder of results that were made with other settings.
 
     Args:
         results: folder of JSON files, each with the `settings` it was made with.

@@ -59,14 +59,14 @@ class EpisodeResult:
     resumed: Mapping[str, float] = field(default_factory=dict)
 
     def means(self, view: str | None) -> dict[str, float]:
-        """Returns the numbers of a view (None = all views) that are averaged over episodes."""
+        """Return the numbers of a view (None = all views) that are averaged over episodes."""
         views = [numbers for name, numbers in self.quality.items() if view in (None, name)]
         known = [name for name in QUALITY if views and all(name in numbers for numbers in views)]
         quality = {n: float(np.mean([numbers[n] for numbers in views])) for n in known}
         return {**episode_means(self.rows, view), **quality}
 
     def as_json(self) -> dict[str, Any]:
-        """Returns plain values."""
+        """Return plain values."""
         return {**asdict(self), 'rows': [row.as_json() for row in self.rows]}
 
     @staticmethod
@@ -114,7 +114,7 @@ def stored_stretch(
     masks: ObjectMasks,
     j: FloatArray,
 ) -> StoredRollout:
-    """Returns what is kept of a stretch for later reports.
+    """Return what is kept of a stretch for later reports.
 
     Args:
         chunks: imagined from the stretch's first frame.
@@ -142,5 +142,5 @@ def stored_stretch(
 
 
 def rollout_path(out: Path, episode: str) -> Path:
-    """Returns where the rollout of an episode lies in an evaluation's folder."""
+    """Return where the rollout of an episode lies in an evaluation's folder."""
     return Path(out) / 'episodes' / f'{episode}.rollout.npz'

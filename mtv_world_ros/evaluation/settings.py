@@ -66,7 +66,7 @@ class EvaluationConfig(Schema):
         return self
 
     def as_json(self) -> dict[str, Any]:
-        """Returns plain values."""
+        """Return plain values."""
         values = self.model_dump(mode='json', exclude={'source'})
         if self.source != DEFAULT:
             mapping = self.source.mapping

@@ -60,20 +60,20 @@ QUALITY = {'fid': 'FID', 'fvd': 'FVD', 'psnr': 'PSNR [dB]', 'ssim': 'SSIM', 'lpi
 
 
 def cell(estimate: Estimate | None, digits: int = 3) -> str:
-    """Returns a number with its interval; a dash where it was not measured."""
+    """Return a number with its interval; a dash where it was not measured."""
     found = estimate or NOT_MEASURED
     return with_interval(found.value, found.interval, digits)
 
 
 def write_summary(summary: EvaluationSummary) -> None:
-    """Writes metrics.json, rows.csv and tables.md into the folder of the evaluation."""
+    """Write metrics.json, rows.csv and tables.md into the folder of the evaluation."""
     write_json(summary.folder / 'metrics.json', summary.metrics)
     write_whole(summary.folder / 'rows.csv', rows_csv(summary))
     write_whole(summary.folder / 'tables.md', markdown(summary))
 
 
 def rows_csv(summary: EvaluationSummary) -> str:
-    """Returns a CSV with a line per episode, stretch, view and object."""
+    """Return a CSV with a line per episode, stretch, view and object."""
     stream = io.StringIO()
     writer: csv.DictWriter[str] | None = None
     for result in summary.results:
@@ -90,7 +90,7 @@ def rows_csv(summary: EvaluationSummary) -> str:
 
 
 def markdown(summary: EvaluationSummary) -> str:
-    """Returns the tables: view by number, task and view by number, statuses, failures."""
+    """Return the tables: view by number, task and view by number, statuses, failures."""
     counts = ', '.join(
         f'{len(summary.chosen(Group(task=t)))} of {t or "no task"}' for t in summary.tasks
     )
@@ -118,12 +118,12 @@ def markdown(summary: EvaluationSummary) -> str:
 
 
 def view_table(summary: EvaluationSummary) -> Table:
-    """Returns `COLUMNS` by view."""
+    """Return `COLUMNS` by view."""
     return _numbers('view', [(view, view, ALL) for view in (*summary.spec.views, None)], summary)
 
 
 def group_tables(summary: EvaluationSummary) -> list[Table]:
-    """Returns `COLUMNS` by zero-shot set and view, where there are sets, and by task and view."""
+    """Return `COLUMNS` by zero-shot set and view, where there are sets, and by task and view."""
     views = summary.spec.views
     groups = {
         'zero-shot set': {name: Group(zero_shot=name) for name in summary.zero_shot_sets},
@@ -159,7 +159,7 @@ def controls_table(summary: EvaluationSummary) -> Table:
 
 
 def chunk_table(summary: EvaluationSummary) -> Table | None:
-    """Returns J against the number of the chunk; None where no rollout has two."""
+    """Return J against the number of the chunk; None where no rollout has two."""
     if summary.num_chunks < 2:
         return None
     curves = {view: summary.chunk_curve(view) for view in (*summary.spec.views, None)}
@@ -172,7 +172,7 @@ def chunk_table(summary: EvaluationSummary) -> Table | None:
 
 
 def quality_table(summary: EvaluationSummary) -> Table | None:
-    """Returns the pictures' quality by view; None where nothing was measured."""
+    """Return the pictures' quality by view; None where nothing was measured."""
     views = {view: summary.estimates(view) for view in summary.spec.views}
     measured = [k for k in QUALITY if any(cell(v.get(k)) != DASH for v in views.values())]
     rows = [[view, *(cell(found.get(key)) for key in measured)] for view, found in views.items()]
@@ -193,7 +193,7 @@ def pictures_table(summary: EvaluationSummary) -> Table | None:
 
 
 def status_table(summary: EvaluationSummary) -> Table:
-    """Returns how often each status of an object in a stretch was met, by view."""
+    """Return how often each status of an object in a stretch was met, by view."""
     views = {view: summary.statuses(view) for view in summary.spec.views}
     words = sorted({word for counts in views.values() for word in counts})
     rows = [[word, *(str(counts.get(word, 0)) for counts in views.values())] for word in words]

@@ -63,7 +63,7 @@ class BagPart:
 
 
 def find_bags(paths: Sequence[Path]) -> list[Path]:
-    """Returns bags: files as they are, folders that are bags, and the bags in other folders.
+    """Return bags: files as they are, folders that are bags, and the bags in other folders.
 
     Raises:
         EpisodeError: a path is not there, or there is no bag.
@@ -80,7 +80,7 @@ def find_bags(paths: Sequence[Path]) -> list[Path]:
 
 
 def with_guessed_views(mapping: BagMapping, bag: Path) -> BagMapping:
-    """Returns the mapping with the bag's image topics as views, where it names none.
+    """Return the mapping with the bag's image topics as views, where it names none.
 
     Raises:
         EpisodeError: the bag has no images.
@@ -99,7 +99,7 @@ def with_guessed_views(mapping: BagMapping, bag: Path) -> BagMapping:
 
 
 def guess_views(topics: Collection[str]) -> dict[str, str]:
-    """Returns image topics by a view's name: the last part of the topic that says which it is.
+    """Return image topics by a view's name: the last part of the topic that says which it is.
 
     Depth, infrared and masks are left out; of raw and compressed images of a view the raw ones
     are taken.
@@ -115,7 +115,7 @@ def guess_views(topics: Collection[str]) -> dict[str, str]:
 
 
 def described_robot(bag: Path, mapping: BagMapping, folder: Path) -> tuple[Path, tuple[str, ...]]:
-    """Writes the robot of a bag's `/robot_description` into a folder; fingers and tools guessed.
+    """Write the robot of a bag's `/robot_description` into a folder; fingers and tools guessed.
 
     Returns:
         The robot's YAML, and what was guessed.
@@ -143,7 +143,7 @@ def described_robot(bag: Path, mapping: BagMapping, folder: Path) -> tuple[Path,
 
 
 def robot_description(bag: Path, mapping: BagMapping) -> tuple[str, str, tuple[str, ...]]:
-    """Returns the URDF that a bag holds; of several, the one whose joints are recorded most.
+    """Return the URDF that a bag holds; of several, the one whose joints are recorded most.
 
     Returns:
         The text, its topic, and how it was chosen, where there was a choice.
@@ -278,7 +278,7 @@ def convert_bag(
     key: str = '',
     stage: ObjectStage = AS_RECORDED,
 ) -> tuple[str, ...]:
-    """Writes a bag as an episode; see `write_imported`.
+    """Write a bag as an episode; see `write_imported`.
 
     A part has no outcome: that of the recording is of the whole.
     """
@@ -306,7 +306,7 @@ def write_imported(
     key: str = '',
     stage: ObjectStage = AS_RECORDED,
 ) -> tuple[str, ...]:
-    """Writes a recording as an episode, whose folder appears when it is complete.
+    """Write a recording as an episode, whose folder appears when it is complete.
 
     Args:
         episode: what was read, with cameras.
@@ -440,7 +440,7 @@ def _in_order(
     commands: Sequence[tuple[int, JointTrajectory]],
     mapping: BagMapping,
 ) -> list[Callable[[], Any]]:
-    """Returns the write calls, sorted by stamp."""
+    """Return the write calls, sorted by stamp."""
     entries: list[tuple[int, int, Callable[[], Any]]] = []
 
     def add(stamp: int, rank: int, write: Callable[..., Any], *values: Any) -> None:

@@ -18,7 +18,7 @@ _MOST = 40
 def boxes_page(
     found: Mapping[str, Any], read: Callable[[Any], Episode], names: Sequence[str] = ()
 ) -> str:
-    """Returns the page, in HTML.
+    """Return the page, in HTML.
 
     Args:
         found: the recordings by name.

@@ -122,7 +122,7 @@ def camera_track(
     values: Mapping[str, FloatArray],
     size: tuple[int, int],
 ) -> CameraTrack:
-    """Returns a view's camera for images of a width and height [px].
+    """Return a view's camera for images of a width and height [px].
 
     Args:
         source: calibration file or camera parameters of the view.

@@ -57,7 +57,7 @@ def import_each(
     place: Callable[[Item], Path],
     convert: Callable[[Item, Path], tuple[str, ...]],
 ) -> ImportSummary[Item]:
-    """Converts what is not there yet.
+    """Convert the episodes that do not exist yet.
 
     Args:
         items: e.g. numbers of a data set's episodes.
@@ -87,12 +87,12 @@ def import_each(
 
 
 def episode_name(number: int) -> str:
-    """Returns the name of an imported episode."""
+    """Return the name of an imported episode."""
     return f'episode_{number:06d}'
 
 
 def read_frames(dataset: LeRobotDataset, entry: EpisodeEntry, mapping: DatasetMapping) -> Episode:
-    """Reads an episode's frames alone, each when it is asked for.
+    """Read an episode's frames alone, each when it is asked for.
 
     Raises:
         EpisodeError: its rows cannot be read.
@@ -184,7 +184,7 @@ def import_dataset(
 
 
 def _check_features(source: LeRobotDataset, chosen: DatasetMapping) -> None:
-    """Checks the names of features before the first episode is read."""
+    """Check the names of features before the first episode is read."""
     for name in _stream_features(chosen):
         source.feature(name)
     if chosen.outcome_feature:
@@ -208,7 +208,7 @@ def convert_episode(
     stage: ObjectStage = AS_RECORDED,
     key: str = '',
 ) -> tuple[str, ...]:
-    """Writes the episode's folder `out`, which appears when it is complete.
+    """Write the episode's folder `out`, which appears when it is complete.
 
     Row k has the state and the images of its time; its action is the target that is reached
     `delay_frames` later. Times are the dataset's own.
@@ -404,7 +404,7 @@ _JUMP = 2.0
 
 
 def jumps(commands: Iterable[JointTrajectory], robot: RobotModel) -> list[str]:
-    """Returns joints whose commands are faster than they can move, and how often."""
+    """Return joints whose commands are faster than they can move, and how often."""
     counts, limits = np.zeros(len(robot.joint_names), int), joint_speeds(robot)
     for trajectory in commands:
         if len(trajectory.times) > 1:

@@ -114,7 +114,7 @@ class LeRobotDataset:
             ) from error
 
     def feature(self, name: str, kinds: Sequence[str] = ()) -> dict[str, Any]:
-        """Returns what the dataset says about a feature.
+        """Return what the dataset says about a feature.
 
         Raises:
             ConfigError: there is none of that name and (if any are given) kinds.
@@ -129,7 +129,7 @@ class LeRobotDataset:
         return self.features[name]
 
     def colour_feature(self, name: str) -> dict[str, Any]:
-        """Returns what the dataset says about a camera's video or images.
+        """Return what the dataset says about a camera's video or images.
 
         Raises:
             ConfigError: there is no such feature, or it is a depth map.
@@ -145,7 +145,7 @@ class LeRobotDataset:
         return found
 
     def column_names(self, feature: str) -> list[str]:
-        """Names of a feature's columns, empty where it has none.
+        """Return the names of a feature's columns, empty where it has none.
 
         They are a list, a list in a list, lists under keys (`motors`), which follow each other, or
         numbers of columns by name.
@@ -229,7 +229,7 @@ class LeRobotDataset:
     def frames(
         self, entry: EpisodeEntry, feature: str, timestamps: FloatArray
     ) -> Iterator[ByteArray]:
-        """Yields the (H, W, 3) RGB frames of an episode's rows at `timestamps` (T,) [s].
+        """Yield the (H, W, 3) RGB frames of an episode's rows at `timestamps` (T,) [s].
 
         Raises:
             EpisodeError: a frame is missing or damaged.
@@ -529,7 +529,7 @@ def _check_table(metadata: Any, file: Path, columns: Sequence[str] | None) -> No
 
 
 def pyarrow_modules() -> tuple[Any, Any]:
-    """Returns `pyarrow` and `pyarrow.parquet`, which are optional."""
+    """Return `pyarrow` and `pyarrow.parquet`, which are optional."""
     try:
         import pyarrow
         from pyarrow import parquet

@@ -82,7 +82,7 @@ def export_dataset(
     size: tuple[int, int] | None = None,
     as_videos: bool = True,
 ) -> int:
-    """Writes a dataset folder; returns the number of episodes.
+    """Write a dataset folder; return the number of episodes.
 
     Row k has the state and the images of time k / fps, and as action the command for the row
     after it. The folder is there once it is complete.
@@ -185,7 +185,7 @@ class _Writer:
         self._samples: dict[str, list[np.ndarray]] = {}
 
     def add(self, rows: _Rows) -> None:
-        """Writes an episode's rows, videos and cameras."""
+        """Write an episode's rows, videos and cameras."""
         self._check(rows)
         number = self.num_episodes
         place = {'chunk_index': number // _CHUNK, 'file_index': number % _CHUNK}
@@ -238,7 +238,7 @@ class _Writer:
         self.num_episodes += 1
 
     def finish(self) -> None:
-        """Writes the metadata."""
+        """Write the metadata."""
         if not self._entries:
             raise EpisodeError('there is no episode to export')
         names = list(self._entries[0])

@@ -98,7 +98,7 @@ class ActionStream(Stream):
     def commanded(
         self, values: FloatArray, names: Sequence[str], measured: FloatArray, robot: RobotModel
     ) -> tuple[FloatArray, tuple[str, ...]]:
-        """Returns (T, J) positions of a feature's values (T, C), and what was odd.
+        """Return (T, J) positions of a feature's values (T, C), and what was odd.
 
         Args:
             values: in the dataset's units.
@@ -125,7 +125,7 @@ class ActionStream(Stream):
 
 
 def load_mapped_robot(name: Any, info: ValidationInfo[dict[str, Any]]) -> RobotModel:
-    """Loads the robot that a mapping names; its file is put into the context."""
+    """Load the robot that a mapping names; its file is put into the context."""
     if not isinstance(name, str):
         raise wrong("the name of a bundled robot, or a robot's YAML")
     file = _robot_path(name, info.context['folder'])
@@ -189,7 +189,7 @@ class DatasetMapping(Written):
 
 
 def load_mapping(path: Path) -> DatasetMapping:
-    """Reads a mapping file; `config/datasets/example.yaml` describes its keys.
+    """Read a mapping file; `config/datasets/example.yaml` describes its keys.
 
     Raises:
         ConfigError: the file is missing, not YAML, or has unknown, missing or wrong values.
@@ -266,7 +266,7 @@ def _guess_features(
 
 
 def digest_of(*files: Path | None, start: bytes = b'') -> str:
-    """Returns a key that changes with the contents of the files."""
+    """Return a key that changes with the contents of the files."""
     digest = hashlib.sha256(start)
     for file in files:
         digest.update(b'' if file is None else file.read_bytes())

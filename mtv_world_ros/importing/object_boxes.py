@@ -64,13 +64,13 @@ class ObjectBoxes(Schema):
         return tuple(dict.fromkeys(name for view in self.boxes.values() for name in view))
 
     def names(self, recording: str) -> tuple[str, ...]:
-        """Names of the objects of a recording, in the order of the file."""
+        """Return the names of the objects of a recording, in the order of the file."""
         views = (view.get(recording, {}) for view in self.boxes.values())
         return tuple(dict.fromkeys(name for view in views for name, rows in view.items() if rows))
 
 
 def load_object_boxes(path: Path) -> ObjectBoxes:
-    """Reads a file of boxes.
+    """Read a file of boxes.
 
     Raises:
         ConfigError: it is missing, no YAML, or has an unknown key or a wrong value.
@@ -100,7 +100,7 @@ class BoxedObjects:
 def learn_objects(
     boxes: ObjectBoxes, found: Mapping[str, Any], read: Callable[[Any], Episode]
 ) -> BoxedObjects:
-    """Cuts the objects out of the frames in which they have boxes.
+    """Cut the objects out of the frames in which they have boxes.
 
     Args:
         boxes: as drawn.

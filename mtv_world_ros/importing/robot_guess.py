@@ -63,7 +63,7 @@ class _Arm:
 
 
 def guess_robot(urdf: Path) -> GuessedRobot:
-    """Guesses arms, tools and fingers.
+    """Guess arms, tools and fingers.
 
     An arm is a chain of joints that ends where no joint follows, or where short finger joints
     fork off: those that slide, mimic each other, or are called fingers. The base link is the last

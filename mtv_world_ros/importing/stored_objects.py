@@ -49,7 +49,7 @@ class ObjectStage:
         given: Sequence[str] = (),
         stored: Sequence[str] = (),
     ) -> tuple[str, ...]:
-        """Returns the names to store, by `name_objects`.
+        """Return the names to store, by `name_objects`.
 
         The colour words of an instruction are stored only with masks. Objects with boxes go
         before all others.
@@ -71,7 +71,7 @@ class ObjectStage:
         )
 
     def masks(self, recording: str, writer: EpisodeWriter) -> MaskWriter:
-        """Returns what finds and stores the masks of the episode's objects."""
+        """Return what finds and stores the masks of the episode's objects."""
         if self.segmenter is not None and writer.objects:
             writer.metadata[MASKS_BY] = self.segmenter.name
         starts = {} if self.boxed is None else self.boxed.starts.get(recording, {})
@@ -94,7 +94,7 @@ AS_RECORDED = ObjectStage()
 
 
 def stage_key(describer: Path | None, segmenter: str) -> bytes:
-    """Returns what changes with a describer's file, the list that it names, and a segmenter."""
+    """Return what changes with a describer's file, the list that it names, and a segmenter."""
     if describer is None:
         return segmenter.encode()
     values = read_yaml(describer, 'describer file', '--describer')
@@ -106,7 +106,7 @@ def stage_key(describer: Path | None, segmenter: str) -> bytes:
 
 @dataclass(slots=True, kw_only=True)
 class MaskWriter:
-    """Writes the masks of frames that are added view by view, in order of time.
+    """Writer of the masks of frames that are added view by view, in order of time.
 
     Attributes:
         writer: of the episode; its objects are looked for.
@@ -119,7 +119,7 @@ class MaskWriter:
     _last: dict[str, tuple[BoolArray, ByteArray]] = field(default_factory=dict)
 
     def add(self, view: str, stamp_ns: int, frame: ByteArray) -> None:
-        """Takes a frame (H, W, 3) uint8 RGB; its mask is written now or later."""
+        """Take a frame (H, W, 3) uint8 RGB; its mask is written now or later."""
         if self.segmenter is None or not self.writer.objects:
             return
         waiting = self._waiting.setdefault(view, [])
@@ -128,7 +128,7 @@ class MaskWriter:
             self._write(view)
 
     def finish(self) -> None:
-        """Writes the masks of the frames that wait."""
+        """Write the masks of the frames that wait."""
         for view in self._waiting:
             self._write(view)
 

@@ -101,7 +101,7 @@ def joints_of_poses(
     poses: ToolPoses,
     wanted: FloatArray,
 ) -> str:
-    """Writes an arm's joints for measured poses (T, 4, 4) of its tool into `positions` (T, J).
+    """Write an arm's joints for measured poses (T, 4, 4) of its tool into `positions` (T, J).
 
     Of the solutions of the first pose, the one nearest to the middle of the limits is taken;
     each later one is the nearest to the one before. An arm of more than six joints has more

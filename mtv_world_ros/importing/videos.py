@@ -90,7 +90,7 @@ class VideoMapping(Written):
 
 
 def load_video_mapping(path: Path) -> VideoMapping:
-    """Reads a mapping file; `config/datasets/videos.yaml` describes its keys.
+    """Read a mapping file; `config/datasets/videos.yaml` describes its keys.
 
     Raises:
         ConfigError: the file is missing, not YAML, or has unknown, missing or wrong values.
@@ -129,7 +129,7 @@ class VideoRecording:
 
 
 def find_recordings(folder: Path, mapping: VideoMapping) -> list[VideoRecording]:
-    """Returns the recordings of a folder that have a file of rows, by name.
+    """Return the recordings of a folder that have a file of rows, by name.
 
     Raises:
         EpisodeError: there is none.
@@ -188,7 +188,7 @@ def read_recording(
     mapping: VideoMapping,
     calibration: Path | None = None,
 ) -> Episode:
-    """Reads a recording as an episode whose commands are the positions that follow.
+    """Read a recording as an episode whose commands are the positions that follow.
 
     Frames are matched to rows by `match_frames`. A view without calibration gets a placeholder
     and is named in `unknown`.

@@ -41,7 +41,7 @@ class CameraEstimate:
 
 
 def moved(T: FloatArray, parameters: FloatArray, centre: FloatArray) -> FloatArray:
-    """Returns a pose (4, 4) turned about a point by (3,) [rad] and shifted by (3,) [m].
+    """Return a pose (4, 4) turned about a point by (3,) [rad] and shifted by (3,) [m].
 
     Turns and shifts are along the pose's own axes. Turned about what a camera looks at, its
     picture hardly shifts, so that the parameters act on their own.
@@ -62,7 +62,7 @@ def aligned(
     outlier: float,
     iterations: int = 10,
 ) -> FloatArray:
-    """Returns the pose nearby with the least errors (Levenberg-Marquardt).
+    """Return the pose nearby with the least errors (Levenberg-Marquardt).
 
     Args:
         T: the pose (4, 4) to start from.
@@ -101,12 +101,12 @@ def aligned(
 
 
 def with_pose(camera: CameraModel, T_mount_camera: FloatArray) -> CameraModel:
-    """Returns the camera elsewhere."""
+    """Return the camera elsewhere."""
     return replace(camera, T_mount_camera=T_mount_camera)
 
 
 def shrunk(camera: CameraModel, width: int) -> CameraModel:
-    """Returns the camera for images of at most a width."""
+    """Return the camera for images of at most a width."""
     if camera.width <= width:
         return camera
     return scaled(camera, width, max(1, round(camera.height * width / camera.width)))
@@ -136,7 +136,7 @@ def covered_frames(track: Track, joints: JointTrack) -> np.ndarray:
 
 
 def left_out(total: FloatArray, normal: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Returns (6,) how a pose changes without some measurements: turns [rad], shifts [m].
+    """Return (6,) how a pose changes without some measurements: turns [rad], shifts [m].
 
     One step of Gauss and Newton from the pose that was estimated from all.
 
@@ -161,7 +161,7 @@ def spread(changes: FloatArray) -> tuple[float, float]:
 
 
 def difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
-    """Returns how far two poses are apart [mm, degrees]."""
+    """Return the distance of two poses [mm, degrees]."""
     turn = cv2.Rodrigues(a[:3, :3].T @ b[:3, :3])[0]
     apart = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
     return 1000 * apart, float(np.degrees(np.linalg.norm(turn)))

@@ -150,7 +150,7 @@ def _segmenter_findings(segmenters: dict[str, list[str]]) -> list[Finding]:
 
 
 def _with_strangers(found: FolderInspection) -> FolderInspection:
-    """Names episodes whose pictures share nothing with the others.
+    """Name episodes whose pictures share nothing with the others.
 
     Where the robot moves as it is drawn, the camera is the right one and the scene another.
     """
@@ -274,7 +274,7 @@ def _conclusions(found: FolderInspection) -> list[str]:
 
 
 def broken_parts(found: FolderInspection) -> dict[str, dict[str, str]]:
-    """Returns why views, or the `recording`, are broken, by episode and view."""
+    """Return why views, or the `recording`, are broken, by episode and view."""
     parts: dict[str, dict[str, str]] = {}
     for name, inspection in found.episodes.items():
         texts = {

@@ -65,7 +65,7 @@ class SolidEntry(Schema):
     round: bool = False
 
     def solid(self) -> Solid:
-        """Returns the object as foresight takes it."""
+        """Return the object as foresight takes it."""
         return Solid(
             centre=np.array(self.centre, float),
             size=np.array(self.size, float),
@@ -96,7 +96,7 @@ class SceneFile(Schema):
         return self
 
     def rows(self, num_joints: int) -> FloatArray:
-        """Returns the positions (T, J).
+        """Return the positions (T, J).
 
         Raises:
             TrajectoryError: a row has another number of joints, or there is none for a time.
@@ -114,7 +114,7 @@ class SceneFile(Schema):
 def load_scene(
     path: Path, robot: RobotModel
 ) -> tuple[tuple[str, ...], tuple[Solid, ...], FloatArray]:
-    """Returns names of O objects, the objects, and commands (1 + T * n, J) of a scene file.
+    """Return names of O objects, the objects, and commands (1 + T * n, J) of a scene file.
 
     Raises:
         ConfigError: the file is missing or wrong.
@@ -142,7 +142,7 @@ def load_scene(
 
 
 def in_words(names: Sequence[str], motions: Sequence[ObjectMotion]) -> list[str]:
-    """Returns a line an object: how far it goes in the futures that count."""
+    """Return a line an object: how far it goes in the futures that count."""
     counted = [motion for motion in motions if motion.weight > 0]
     lines = []
     for item, name in enumerate(names):
@@ -160,7 +160,7 @@ def in_words(names: Sequence[str], motions: Sequence[ObjectMotion]) -> list[str]
 
 
 def draw_foreseen(tracked: TrackedSolids, commands: FloatArray, out: Path) -> None:
-    """Writes a PNG of the first future at a few instants, drawn by the engine."""
+    """Write a PNG of the first future at a few instants, drawn by the engine."""
     foresight = tracked.foresight
     alone = SolidForesight(
         foresight.robot,
@@ -199,7 +199,7 @@ def _camera(solids: Sequence[Solid | None]) -> Any:
 
 
 def _paint(model: Any) -> None:
-    """Gives table, robot and objects colours of their own."""
+    """Give table, robot and objects colours of their own."""
     model.geom_rgba[:] = _ROBOT_COLOUR
     model.geom_rgba[0] = _TABLE_COLOUR
     model.vis.headlight.ambient[:] = 0.45

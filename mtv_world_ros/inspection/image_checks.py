@@ -29,7 +29,7 @@ _AXIS_M = 0.08
 
 
 def robot_picture(robot: RobotModel) -> ByteArray:
-    """Returns (H, W, 3) RGB: front and side, above with grippers shut, below with them open."""
+    """Return (H, W, 3) RGB: front and side, above with grippers shut, below with them open."""
     shape = load_shape(robot)
     rows = []
     for share in (0.0, 1.0):
@@ -136,7 +136,7 @@ def check_frozen(track: Track, joints: JointTrack) -> tuple[dict[str, str], list
 
 
 def check_lengths(stamps_ns: Stamps, joints: JointTrack) -> tuple[dict[str, str], list[Finding]]:
-    """Rates too low to follow a motion, and joint states without pictures."""
+    """Return findings on frame rates too low to follow a motion, and on missing pictures."""
     findings = []
     if len(stamps_ns) > 1:
         rate = 1e9 / float(np.median(np.diff(stamps_ns)))
@@ -178,7 +178,7 @@ class MirroredFrames:
 
 
 def mirrored(track: Track, camera: CameraModel) -> tuple[Track, CameraModel]:
-    """Returns a view's frames mirrored left to right, with the camera of such frames."""
+    """Return a view's frames mirrored left to right, with the camera of such frames."""
     K = camera.K.copy()
     K[0, 2] = camera.width - 1 - K[0, 2]
     frames = MirroredFrames(track)

@@ -98,7 +98,7 @@ _ALONE = ResidualSearch(lags_s=(0.0,), rolls_deg=(), zooms=())
 
 
 class Inspector:
-    """Checks recordings of one robot.
+    """Inspector of the recordings of one robot.
 
     Args:
         robot: the robot.
@@ -116,7 +116,7 @@ class Inspector:
     def inspect(
         self, episode: Episode, progress: Callable[[Sequence[str]], Iterable[str]] = iter
     ) -> Inspection:
-        """Checks an episode that was read with its cameras.
+        """Check an episode that was read with its cameras.
 
         Args:
             episode: the recording.
@@ -153,7 +153,7 @@ class Inspector:
         )
 
     def picture(self, episode: Episode, view: str) -> ByteArray:
-        """Returns the overlay picture of a view, (H, W, 3) RGB; bare where its pose is unknown."""
+        """Return the overlay picture of a view, (H, W, 3) RGB; bare where its pose is unknown."""
         assert episode.joint_states is not None
         joints = JointTrack(episode.joint_states, self.robot)
         drawn = view not in episode.unknown
@@ -380,7 +380,7 @@ def delays(measured: Mapping[str, tuple[MotionResidual, Track]]) -> dict[str, li
 
 
 def load_inspector(robot_file: Path, search: ResidualSearch = WHOLE_SEARCH) -> Inspector:
-    """Returns the inspector of a robot YAML.
+    """Return the inspector of a robot YAML.
 
     Raises:
         ConfigError, RobotError: the robot cannot be used.
@@ -417,7 +417,7 @@ def tool_visibility(
     positions: FloatArray,
     T_mount_camera: FloatArray | None = None,
 ) -> ToolVisibility:
-    """Counts where the tool points fall for positions (T, J).
+    """Count where the tool points fall for positions (T, J).
 
     `T_mount_camera` (T, 4, 4) are the poses of a camera that moves by itself.
     """
@@ -438,7 +438,7 @@ def check_visibility(
     positions: FloatArray,
     T_mount_camera: FloatArray | None = None,
 ) -> tuple[dict[str, str], list[Finding]]:
-    """Shares of tool points behind the camera and outside the image, and findings from them."""
+    """Return the shares of tool points behind the camera and outside the image, and findings."""
     seen = tool_visibility(camera, robot, positions, T_mount_camera)
     measures = {
         f"tool '{tool.arm}'": f'{seen.behind[i]:.0%} behind the camera, '
@@ -502,7 +502,7 @@ def overlay_picture(
     *,
     with_robot: bool = True,
 ) -> ByteArray:
-    """Returns (H, W, 3) RGB: frames of a view with the projected robot drawn over them.
+    """Return (H, W, 3) RGB: frames of a view with the projected robot drawn over them.
 
     Per arm the fading trail of the last seconds and a cross at the tool point; white the outline
     of the robot. Frames without joint states, or without `with_robot`, are drawn as they are.

@@ -100,7 +100,7 @@ class Inspection:
 
 
 def to_markdown(inspection: Inspection, pictures: Mapping[str, str]) -> str:
-    """Returns the report; `pictures` has the file of each view's overlay picture."""
+    """Return the report; `pictures` has the file of each view's overlay picture."""
     lines = [
         f'# {inspection.verdict}: {inspection.episode.name}',
         '',
@@ -123,7 +123,7 @@ def to_markdown(inspection: Inspection, pictures: Mapping[str, str]) -> str:
 
 
 def to_text(inspection: Inspection) -> str:
-    """Returns a line for each section, and one for each finding."""
+    """Return a line for each section, and one for each finding."""
     lines = []
     for section in inspection.sections:
         residual = section.measures.get('residual')

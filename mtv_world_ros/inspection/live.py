@@ -27,7 +27,7 @@ from mtv_world_ros.data.episode import (
 def record_topics(
     views: Sequence[str], out: Path, seconds: float, *, wait_s: float = 20.0
 ) -> Path:
-    """Records the views' images, CameraInfo, joint states and commands; returns the bag.
+    """Record the views' images, CameraInfo, joint states and commands; return the bag.
 
     Images may be raw or compressed; commands and instruction are taken if they are published.
 

@@ -73,7 +73,7 @@ def keeps_place(track: Track) -> bool:
 
 
 def find_places(backgrounds: Sequence[ByteArray]) -> CameraPlaces:
-    """Groups recordings whose backgrounds lie at the same pixels.
+    """Group recordings whose backgrounds lie at the same pixels.
 
     A moved camera shifts all of the background; a moved object only a part, which the homography
     of the rest leaves out.

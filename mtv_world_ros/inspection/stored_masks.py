@@ -14,7 +14,7 @@ _LARGE = 0.15
 
 
 def check_masks(episode: Episode) -> tuple[dict[str, str], list[Finding]]:
-    """Returns how often each object is seen, by view, and what is odd; of masks by a segmenter."""
+    """Return how often each object is seen, by view, and what is odd; of masks by a segmenter."""
     by = episode.info.metadata.get(MASKS_BY, '')
     areas = episode.mask_areas() if by else {}
     measures, findings = {}, []

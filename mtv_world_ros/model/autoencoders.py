@@ -30,7 +30,7 @@ def _conv(inputs: int, outputs: int, **options: Any) -> nn.Conv2d:
 
 
 class _Bound(nn.Module):
-    """Soft-clips latents to [-3, 3] (tanh)."""
+    """Soft clipping of latents to [-3, 3] (tanh)."""
 
     def forward(self, x: Tensor) -> Tensor:
         return 3 * torch.tanh(x / 3)
@@ -72,7 +72,7 @@ class _GrowFrames(nn.Module):
 
 
 class TinyAutoencoder(nn.Module):
-    """Maps RGB video in [-1, 1] to Wan's normalised latents and back; approximates Wan's own.
+    """Small autoencoder of RGB video in [-1, 1] that approximates Wan's normalised latents.
 
     It takes the place of a `WanAutoencoder`; at 288x384, 81 frames it costs about a twentieth.
     Layout and weight files are TAEHV's (madebyollin/taehv, `taew2_1`): frames pass convolutions
@@ -99,7 +99,7 @@ class TinyAutoencoder(nn.Module):
 
     @classmethod
     def load(cls, file: Path) -> TinyAutoencoder:
-        """Reads `taew2_1` weights, in safetensors.
+        """Read `taew2_1` weights, in safetensors.
 
         Raises:
             CheckpointError: not readable, a pickle, or of another architecture.
@@ -131,14 +131,14 @@ class TinyAutoencoder(nn.Module):
         return 1 + num_frames // self.frames_per_latent
 
     def encode(self, video: Tensor) -> Tensor:
-        """Returns (B, C, F, h, w) latents of a (B, 3, N, H, W) video."""
+        """Return (B, C, F, h, w) latents of a (B, 3, N, H, W) video."""
         frames = video.add(1).div(2).transpose(1, 2)
         missing = -frames.shape[1] % self.frames_per_latent
         frames = torch.cat([frames, frames[:, -1:].expand(-1, missing, -1, -1, -1)], dim=1)
         return _run(self.encoder, frames, _TOGETHER * self.frames_per_latent).transpose(1, 2)
 
     def decode(self, latents: Tensor) -> Tensor:
-        """Returns the (B, 3, N, H, W) video of (B, C, F, h, w) latents."""
+        """Return the (B, 3, N, H, W) video of (B, C, F, h, w) latents."""
         frames = _run(self.decoder, latents.transpose(1, 2), _TOGETHER)
         # the first latent frame stands for one frame: the last of the four it grew to
         frames = frames[:, self.frames_per_latent - 1 :]
@@ -146,14 +146,14 @@ class TinyAutoencoder(nn.Module):
 
 
 def _run(layers: nn.ModuleList, frames: Tensor, together: int) -> Tensor:
-    """Runs frames (B, T, C, H, W) through layers, a few frames at a time to save memory."""
+    """Run frames (B, T, C, H, W) through layers, a few frames at a time to save memory."""
     memory: dict[int, Tensor] = {}
     parts = [_run_part(layers, part, memory) for part in frames.split(together, dim=1)]
     return torch.cat(parts, dim=1)
 
 
 def _run_part(layers: nn.ModuleList, frames: Tensor, memory: dict[int, Tensor]) -> Tensor:
-    """Runs a part of the frames; `memory` holds the last input of each memory block."""
+    """Run a part of the frames; `memory` holds the last input of each memory block."""
     batch = len(frames)
     x = frames.flatten(0, 1)
     for index, layer in enumerate(layers):
@@ -169,7 +169,7 @@ def _run_part(layers: nn.ModuleList, frames: Tensor, memory: dict[int, Tensor]) 
 
 
 def _fitting(file: Path, name: str, value: Tensor, shape: torch.Size) -> Tensor:
-    """Returns the weight; if the stored layer upsamples time by more, its last frames' part."""
+    """Return the weight; if the stored layer upsamples time by more, its last frames' part."""
     surplus = '.conv.weight' in name and value.shape[0] % shape[0] == 0
     if surplus and value.shape[1:] == shape[1:]:
         return value[-shape[0] :]
@@ -182,7 +182,7 @@ def _fitting(file: Path, name: str, value: Tensor, shape: torch.Size) -> Tensor:
 
 
 class WanAutoencoder(nn.Module):
-    """Maps RGB video in [-1, 1] to normalised latents and back: 8x in space, 4x in time.
+    """Autoencoder of RGB video in [-1, 1]: normalised latents, 8x in space, 4x in time.
 
     The first latent frame holds the first video frame alone, each further one holds four: a video
     has 1 + 4 k frames. So a chunk is encoded together with the observed frame that it starts from
@@ -232,7 +232,7 @@ class WanAutoencoder(nn.Module):
         return self.vae.config
 
     def encode(self, video: Tensor) -> Tensor:
-        """Returns (B, C, F, h, w) latents, zero mean and unit scale, of a (B, 3, N, H, W) video.
+        """Return (B, C, F, h, w) latents, zero mean and unit scale, of a (B, 3, N, H, W) video.
 
         The most likely latents, not a sample: the same video gives the same latents.
         """
@@ -241,12 +241,12 @@ class WanAutoencoder(nn.Module):
         return (latents - mean) / std
 
     def decode(self, latents: Tensor) -> Tensor:
-        """Returns the (B, 3, N, H, W) video of (B, C, F, h, w) latents."""
+        """Return the (B, 3, N, H, W) video of (B, C, F, h, w) latents."""
         mean, std = self._statistics(latents)
         return self.vae.decode(latents * std + mean, return_dict=False)[0]  # type: ignore[index]
 
     def save_pretrained(self, folder: Path, **options: Any) -> None:
-        """Writes it as diffusers' own class."""
+        """Write it as diffusers' own class."""
         self.vae.save_pretrained(folder, **options)
 
     def _statistics(self, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -287,13 +287,13 @@ class SpaceToDepthAutoencoder(ModelMixin, ConfigMixin):
         return num_frames
 
     def encode(self, video: Tensor) -> Tensor:
-        """Returns (B, C, F, h, w) latents of a (B, 3, F, H, W) video."""
+        """Return (B, C, F, h, w) latents of a (B, 3, F, H, W) video."""
         frames = video.transpose(1, 2).flatten(0, 1)
         latents = F.pixel_unshuffle(frames, self.block_size) * self.scale
         return latents.unflatten(0, (video.shape[0], -1)).transpose(1, 2)
 
     def decode(self, latents: Tensor) -> Tensor:
-        """Returns the (B, 3, F, H, W) video of (B, C, F, h, w) latents."""
+        """Return the (B, 3, F, H, W) video of (B, C, F, h, w) latents."""
         frames = latents.transpose(1, 2).flatten(0, 1)
         video = F.pixel_shuffle(frames / self.scale, self.block_size)
         return video.unflatten(0, (latents.shape[0], -1)).transpose(1, 2)

@@ -58,7 +58,7 @@ class HistorySettings(Schema):
         return self.reference == 'first_frame'
 
     def as_card(self) -> dict[str, Any]:
-        """Returns the entry of the checkpoint card; empty without history."""
+        """Return the entry of the checkpoint card; empty without history."""
         names = set(HistorySettings.model_fields)
         return {'history': self.model_dump(include=names)} if self.on else {}
 
@@ -118,11 +118,11 @@ class CheckpointCard(Schema):
         )
 
     def plain(self) -> dict[str, Any]:
-        """Returns the contents of the file, without values that were left to their defaults."""
+        """Return the contents of the file, without values that were left to their defaults."""
         return self.model_dump(mode='json', exclude_unset=True)
 
     def write(self, folder: Path) -> None:
-        """Writes it into a checkpoint's or adapter's folder."""
+        """Write it into a checkpoint's or adapter's folder."""
         (folder / CARD).write_text(json.dumps(self.plain(), indent=2) + '\n')
 
 
@@ -137,7 +137,7 @@ SHARED_KEYS = tuple(
 
 
 def read_card(folder: Path) -> CheckpointCard:
-    """Returns the contents of `world_model.json`.
+    """Return the contents of `world_model.json`.
 
     Raises:
         CheckpointError: missing, not JSON, or with missing, unknown or wrong values.
@@ -156,7 +156,7 @@ def read_card(folder: Path) -> CheckpointCard:
 
 
 def check_same_model(card: CheckpointCard, adapter: Path) -> None:
-    """Checks that an adapter was trained for a model of the same inputs and outputs.
+    """Check that an adapter was trained for a model of the same inputs and outputs.
 
     Args:
         card: of the checkpoint.

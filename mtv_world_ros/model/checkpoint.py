@@ -51,7 +51,7 @@ class Checkpoint:
 
     @classmethod
     def open(cls, name: str | Path | Checkpoint = BUNDLED) -> Checkpoint:
-        """Returns the checkpoint of a name of `BUNDLED_FOLDERS` or of a folder.
+        """Return the checkpoint of a name of `BUNDLED_FOLDERS` or of a folder.
 
         Raises:
             CheckpointError: there is no such folder, or it is no checkpoint.
@@ -62,7 +62,7 @@ class Checkpoint:
         return cls(name=str(name), folder=folder, card=read_card(folder))
 
     def with_adapter(self, adapter: Path | None) -> Checkpoint:
-        """Returns the checkpoint with an adapter, whose control counts where its card names one.
+        """Return the checkpoint with an adapter, whose control counts where its card names one.
 
         Args:
             adapter: folder or file; None = the checkpoint's own adapter, if it has one.
@@ -128,7 +128,7 @@ class Checkpoint:
             ) from error
 
     def load_robot(self, file: str | Path | None = None) -> RobotModel:
-        """Returns the robot that it carries or, of older checkpoints, names.
+        """Return the robot that it carries or, of older checkpoints, names.
 
         Args:
             file: another file of the same robot, or the name of a bundled one.
@@ -150,7 +150,7 @@ class Checkpoint:
         return robot
 
     def load_control(self, robot: RobotModel) -> Control:
-        """Returns how plans of a robot enter the model.
+        """Return how plans of a robot enter the model.
 
         Raises:
             ConfigError: no such control, or it cannot be imported or created.
@@ -162,11 +162,11 @@ class Checkpoint:
         return load_control(self.card.control, options, folder)
 
     def can_foresee(self, robot: RobotModel) -> bool:
-        """Returns whether it foresees object motion and was trained to see it."""
+        """Return whether it foresees object motion and was trained to see it."""
         return self.object_motion is not None and self.load_control(robot).shows_objects
 
     def digest(self, without: Collection[str] = ()) -> str:
-        """Returns a digest of all its files.
+        """Return a digest of all its files.
 
         Args:
             without: names of files that do not count.
@@ -175,7 +175,7 @@ class Checkpoint:
 
 
 def checkpoint_folder(name: str | Path) -> Path:
-    """Returns the folder of a checkpoint, given by path or by a name of `BUNDLED_FOLDERS`.
+    """Return the folder of a checkpoint, given by path or by a name of `BUNDLED_FOLDERS`.
 
     Raises:
         CheckpointError: no folder, and nearly the name of one that ships with the package.

@@ -58,7 +58,7 @@ class Conditioning:
     control_kept: Tensor | None = None
 
     def with_noisy_history(self, noise: Tensor) -> Conditioning:
-        """Returns the same with noise (B, V, C, P, h, w) mixed into the clean history."""
+        """Return the same with noise (B, V, C, P, h, w) mixed into the clean history."""
         assert self.history is not None and self.history_sigmas is not None
         sigma = self.history_sigmas.reshape(-1, 1, 1, 1, 1, 1)
         noisy = (1 - sigma) * self.history.float() + sigma * noise
@@ -70,7 +70,7 @@ class Conditioning:
         return None if self.history_sigmas is None else 1000 * self.history_sigmas
 
     def with_one_start(self) -> Conditioning:
-        """Returns the same with the start image in one place, as Wan2.1-Fun-Control was trained.
+        """Return the same with the start image in one place, as Wan2.1-Fun-Control was trained.
 
         Where the reference tokens would show the start image, its channel slot alone has it and
         the tokens are of zeros; where they show another frame, the slot is zero. (VideoX-Fun,
@@ -89,12 +89,12 @@ class Conditioning:
         return self.context is not None or self.frame is not None
 
     def part(self, samples: slice) -> Conditioning:
-        """Returns that of some samples."""
+        """Return that of some samples."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return replace(self, **{n: v[samples] for n, v in values.items() if v is not None})
 
     def in_dtype(self, dtype: torch.dtype) -> Conditioning:
-        """Returns the same with latents and tokens in a number format."""
+        """Return the same with latents and tokens in a number format."""
         latents = ('control', 'start_control', 'start', 'reference', 'anchor', 'history')
         tokens = ('text', 'negative_text', 'image')
         held = {name: getattr(self, name) for name in (*latents, *tokens)}
@@ -102,20 +102,20 @@ class Conditioning:
 
 
 def encode_frames(autoencoder: Autoencoder, frames: Tensor) -> Tensor:
-    """Returns (B, V, C, F, h, w) latents of (B, V, T, H, W, 3) uint8 RGB frames."""
+    """Return (B, V, C, F, h, w) latents of (B, V, T, H, W, 3) uint8 RGB frames."""
     video = frames.to(autoencoder.dtype).div(127.5).sub(1.0).movedim(-1, 2)
     latents = autoencoder.encode(video.flatten(0, 1))
     return latents.unflatten(0, frames.shape[:2])
 
 
 def encode_chunk(autoencoder: Autoencoder, frames: Tensor) -> Tensor:
-    """Returns (B, V, C, F, h, w), what denoising 1 + T frames (B, V, 1 + T, H, W, 3) gives."""
+    """Return (B, V, C, F, h, w), what denoising 1 + T frames (B, V, 1 + T, H, W, 3) gives."""
     kept = frames if autoencoder.includes_start else frames[:, :, 1:]
     return encode_frames(autoencoder, kept)
 
 
 def decode_frames(autoencoder: Autoencoder, latents: Tensor) -> Tensor:
-    """Returns the (B, V, T, H, W, 3) predicted uint8 RGB frames of (B, V, C, F, h, w) latents."""
+    """Return the (B, V, T, H, W, 3) predicted uint8 RGB frames of (B, V, C, F, h, w) latents."""
     video = autoencoder.decode(latents.flatten(0, 1)).unflatten(0, latents.shape[:2])
     if autoencoder.includes_start:
         video = video[:, :, :, 1:]
@@ -190,7 +190,7 @@ def pad_rows(rows: Sequence[Tensor]) -> Tensor:
 
 
 def condition(autoencoder: Autoencoder, start_frame: Tensor, inputs: ControlBatch) -> Conditioning:
-    """Returns the latents and tokens to denoise under.
+    """Return the latents and tokens to denoise under.
 
     Where the control feeds no video its latents are zero, so that the transformer keeps its shape,
     and with it public weights.
@@ -221,7 +221,7 @@ def condition(autoencoder: Autoencoder, start_frame: Tensor, inputs: ControlBatc
 
 
 def start_slot(reference: Tensor, num_latent_frames: int, includes_start: bool) -> Tensor:
-    """Returns the (B, V, C, F, h, w) start-image slot of (B, V, C, h, w) reference latents.
+    """Return the (B, V, C, F, h, w) start-image slot of (B, V, C, h, w) reference latents.
 
     Where the video begins with the start image, the slot holds it there and is zero behind, as
     Wan2.1-Fun-Control was trained; else it holds it in every frame.
@@ -235,7 +235,7 @@ def start_slot(reference: Tensor, num_latent_frames: int, includes_start: bool) 
 def check_history(
     settings: HistorySettings, autoencoder: Autoencoder, transformer: Mapping[str, Any]
 ) -> None:
-    """Checks that history frames divide into latents and tokens.
+    """Check that history frames divide into latents and tokens.
 
     Args:
         settings: of the model.
@@ -282,7 +282,7 @@ def with_history(
 def without_history(
     autoencoder: Autoencoder, conditioning: Conditioning, num_frames: int
 ) -> Conditioning:
-    """Returns the conditioning of a chunk without history: noise level 1."""
+    """Return the conditioning of a chunk without history: noise level 1."""
     count = autoencoder.num_latent_frames(num_frames - int(autoencoder.includes_start))
     start = conditioning.reference.unsqueeze(3)
     return replace(
@@ -295,6 +295,6 @@ def without_history(
 def with_anchor(
     autoencoder: Autoencoder, conditioning: Conditioning, frame: Tensor
 ) -> Conditioning:
-    """Returns the conditioning with reference tokens of a frame (B, V, H, W, 3) uint8 RGB."""
+    """Return the conditioning with reference tokens of a frame (B, V, H, W, 3) uint8 RGB."""
     anchor = encode_frames(autoencoder, frame.unsqueeze(2))[:, :, :, 0]
     return replace(conditioning, anchor=anchor)

@@ -25,7 +25,7 @@ _FOLDER = 'image_encoder'
 
 
 class TextEncoder:
-    """Encodes prompts, each one once; umT5 is loaded for that and freed again.
+    """Encoder of prompts with a cache; umT5 is loaded for a new prompt and freed again.
 
     umT5-XXL takes 11 GB, and a robot's instruction seldom changes.
 
@@ -42,7 +42,7 @@ class TextEncoder:
         self._encoded: dict[str, Tensor] = {}
 
     def encode(self, prompt: str, device: torch.device | None = None) -> Tensor:
-        """Returns (1, 512, text_dim) tokens of a prompt, zero behind its end.
+        """Return (1, 512, text_dim) tokens of a prompt, zero behind its end.
 
         Raises:
             CheckpointError: umT5 or its tokenizer cannot be loaded.
@@ -85,13 +85,13 @@ class TextEncoder:
             ) from error
 
     def save(self, checkpoint: Path) -> None:
-        """Copies its files into another checkpoint."""
+        """Copy the files of the encoder into another checkpoint."""
         for name in FOLDERS:
             copy_folder(self._checkpoint / name, checkpoint / name)
 
 
 class ImageEncoder:
-    """Encodes images to the tokens before CLIP's last layer, as Wan does.
+    """Encoder of images to the tokens before CLIP's last layer, as in Wan.
 
     The last few images' tokens are kept: the seeds of a start frame and a chain that is anchored
     on one encode it once.
@@ -110,7 +110,7 @@ class ImageEncoder:
 
     @classmethod
     def load(cls, checkpoint: Path, *, dtype: torch.dtype = torch.float32) -> ImageEncoder:
-        """Returns the one of a checkpoint folder.
+        """Return the one of a checkpoint folder.
 
         Raises:
             CheckpointError: the encoder is missing or cannot be loaded.
@@ -127,14 +127,14 @@ class ImageEncoder:
         return cls(model.eval(), checkpoint)
 
     def to(self, device: torch.device, dtype: torch.dtype, *, stays: bool = True) -> ImageEncoder:
-        """Moves it, and returns it; `stays=False`: it is there only while it encodes."""
+        """Move the encoder to a device and return it; `stays=False`: only while it encodes."""
         self._device, self._stays = device, stays
         self.model.to(device=device if stays else 'cpu', dtype=dtype)
         self._kept.clear()
         return self
 
     def encode(self, images: Tensor) -> Tensor:
-        """Returns (V, N, D) tokens of (V, H, W, 3) uint8 RGB images; N = 257 for ViT-H/14."""
+        """Return (V, N, D) tokens of (V, H, W, 3) uint8 RGB images; N = 257 for ViT-H/14."""
         tokens = torch.stack([self._tokens(image) for image in images])
         if not self._stays:
             self.model.to('cpu')
@@ -161,5 +161,5 @@ class ImageEncoder:
         return self.model(pixels, output_hidden_states=True).hidden_states[-2][0]
 
     def save(self, checkpoint: Path) -> None:
-        """Copies its files into another checkpoint."""
+        """Copy the files of the encoder into another checkpoint."""
         copy_folder(self._source / _FOLDER, checkpoint / _FOLDER)

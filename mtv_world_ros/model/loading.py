@@ -21,7 +21,7 @@ def load_world_model(
     serving: str = '',
     layout: InputLayout = VIDEO_ONLY,
 ) -> DiffusionWorldModel:
-    """Returns the world model of a checkpoint.
+    """Return the world model of a checkpoint.
 
     Device, number format, threads and serving options are those of `Pipeline.load`; the adapter is
     the checkpoint's, and the layout has the inputs of its control.

@@ -52,7 +52,7 @@ _NONE = Adapter(None, {}, {})
 
 
 class Adapters:
-    """Exchanges the adapter of a loaded transformer, and restores the weights without it.
+    """Exchange of the adapter of a loaded transformer; it restores the weights without adapter.
 
     Reading one is safe in another thread than the one that exchanges them.
 
@@ -77,7 +77,7 @@ class Adapters:
         return self._held.path
 
     def read(self, path: Path | None) -> Adapter:
-        """Reads an adapter into memory, for `use`.
+        """Read an adapter into memory, for `use`.
 
         Args:
             path: a folder of ours, of diffusers or of peft, or a LoRA file; None = none.
@@ -91,7 +91,7 @@ class Adapters:
             return Adapter(path, *self._read(path))
 
     def use(self, adapter: Adapter | Path | None) -> None:
-        """Activates another adapter, or none; on failure the previous one stays active.
+        """Activate another adapter, or none; on failure the previous one stays active.
 
         Args:
             adapter: the result of `read`, or a path for it.
@@ -110,7 +110,7 @@ class Adapters:
 
     @torch.no_grad()
     def _exchange(self, adapter: Adapter) -> None:
-        """Removes the previous adapter from the weights and adds another one, in place."""
+        """Remove the previous adapter from the weights and add another one, in place."""
         whole = {**self._beside, **adapter.whole}
         for name, parameter in beside(self._transformer).items():
             parameter.copy_(whole[name])
@@ -172,7 +172,7 @@ class Adapters:
 
 
 def base_of(transformer: MultiViewWanTransformer) -> dict[str, Any]:
-    """Returns the configuration that must be equal in training and in use of an adapter."""
+    """Return the configuration that must be equal in training and in use of an adapter."""
     config: Any = transformer.config
     names = ('num_layers', 'num_attention_heads', 'attention_head_dim', 'in_channels', 'num_views')
     return {name: config[name] for name in names}

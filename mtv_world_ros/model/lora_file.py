@@ -90,7 +90,7 @@ class PeftSettings(Schema):
     use_rslora: bool = False
 
     def scale(self, module: str, rank: int) -> float:
-        """Returns the scale of the product of a module's factors.
+        """Return the scale of the product of a module's factors.
 
         Args:
             module: its name in the file.
@@ -140,7 +140,7 @@ def _before(pattern: str) -> list[str]:
 
 
 def read_lora(file: Path, transformer: nn.Module) -> dict[str, Factors]:
-    """Returns the factors by the name of the transformer's module.
+    """Return the factors by the name of the transformer's module.
 
     Raises:
         CheckpointError: a pickle, damaged, for another model, or with settings that are not read:
@@ -224,7 +224,7 @@ def _by_module(file: Path, tensors: Mapping[str, Tensor]) -> dict[str, dict[str,
 
 
 def _names(modules: Mapping[str, Any]) -> dict[str, str]:
-    """Maps the names that files use for a module, also flattened with `_`, to ours."""
+    """Map the names that files use for a module, also flattened with `_`, to ours."""
     from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffusers
 
     attention = [f'{kind}_attn.{n}' for kind in ('self', 'cross') for n in 'qkvo']

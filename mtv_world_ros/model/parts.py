@@ -31,7 +31,7 @@ _SCHEDULERS = {
 
 
 def build_autoencoder(config: Mapping[str, Any]) -> Autoencoder:
-    """Returns the autoencoder of a preset or config file, without trained weights.
+    """Return the autoencoder of a preset or config file, without trained weights.
 
     Args:
         config: its arguments; `_class_name` is `SpaceToDepthAutoencoder` (default) or
@@ -47,7 +47,7 @@ def build_autoencoder(config: Mapping[str, Any]) -> Autoencoder:
 
 
 def build_scheduler(config: Mapping[str, Any]) -> Scheduler:
-    """Returns the noise schedule of a preset or config file.
+    """Return the noise schedule of a preset or config file.
 
     Args:
         config: its arguments; `_class_name` is `FlowMatchEulerDiscreteScheduler` (default) or
@@ -67,7 +67,7 @@ def build_scheduler(config: Mapping[str, Any]) -> Scheduler:
 
 
 def check_video(autoencoder: Autoencoder, transformer: Any, spec: WorldModelSpec) -> None:
-    """Checks that a chunk divides into latents and tokens.
+    """Check that a chunk divides into latents and tokens.
 
     Args:
         autoencoder: its kind decides.

@@ -17,13 +17,13 @@ _DTYPES = {'float32': torch.float32, 'bfloat16': torch.bfloat16}
 
 
 def set_num_threads(num_threads: int) -> None:
-    """Limits torch's threads; 0 = all usable cores but one for callbacks, or both of two."""
+    """Limit torch's threads; 0 = all usable cores but one for callbacks, or both of two."""
     usable = len(os.sched_getaffinity(0))
     torch.set_num_threads(num_threads or max(min(usable, 2), usable - 1))
 
 
 def check_device(name: str) -> None:
-    """Checks that this machine has a device.
+    """Check that this machine has a device.
 
     Raises:
         ConfigError: the machine has no such device, or torch does not know it.
@@ -43,7 +43,7 @@ def check_device(name: str) -> None:
 
 
 def choose_dtype(name: str, device: str) -> torch.dtype:
-    """Returns the number format; `auto` is bfloat16 where the device multiplies it natively.
+    """Return the number format; `auto` is bfloat16 where the device multiplies it natively.
 
     Raises:
         ConfigError: an unknown name.
@@ -57,7 +57,7 @@ def choose_dtype(name: str, device: str) -> torch.dtype:
 
 
 def place(module: Module, device: torch.device, dtype: torch.dtype) -> Module:
-    """Returns the module on a device, in a number format, images channels-last.
+    """Return the module on a device, in a number format, images channels-last.
 
     What the module names in `_keep_in_fp32_modules` stays in float32.
     """

@@ -32,7 +32,7 @@ from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 def prepare(
     transformer: MultiViewWanTransformer, serving: ServingOptions, device: torch.device
 ) -> None:
-    """Changes the transformer in place, with its adapter in it.
+    """Change the transformer in place, with its adapter in it.
 
     Raises:
         ConfigError: an option is not for this machine.
@@ -66,7 +66,7 @@ def _set_attention(transformer: MultiViewWanTransformer, name: str) -> None:
 def decoder_of(
     autoencoder: Autoencoder, serving: ServingOptions, dtype: torch.dtype
 ) -> Autoencoder:
-    """Returns the decoder: the autoencoder, on its device, or the tiny one in its place.
+    """Return the decoder: the autoencoder, on its device, or the tiny one in its place.
 
     Raises:
         CheckpointError: the tiny one's weights cannot be read, or are for other latents.
@@ -87,7 +87,7 @@ _COMPILERS = {'cpu': ('CXX', ('g++', 'clang++')), 'cuda': ('CC', ('gcc', 'clang'
 
 
 def compile_blocks(transformer: MultiViewWanTransformer, device: torch.device) -> None:
-    """Compiles the repeated block once for all; shapes are static, another one compiles again.
+    """Compile the repeated block once for all; shapes are static, another one compiles again.
 
     Raises:
         ConfigError: there is no compiler to do it.
@@ -105,7 +105,7 @@ def compile_blocks(transformer: MultiViewWanTransformer, device: torch.device) -
 
 
 def compile_norms(autoencoder: Autoencoder) -> None:
-    """Makes each norm of Wan's autoencoder one kernel, channels last: on a GPU it waits for them.
+    """Make each norm of Wan's autoencoder one kernel, channels last: on a GPU it waits for them.
 
     On a CPU nothing changes: compiling takes longer there than it gains.
     """
@@ -150,7 +150,7 @@ class ServingOptions(Schema):
 
     @classmethod
     def parse(cls, text: str) -> ServingOptions:
-        """Parses options separated by spaces, such as `compile=true tiny_decoder=FILE`.
+        """Parse options separated by spaces, such as `compile=true tiny_decoder=FILE`.
 
         A value with spaces stands in quotes.
 
@@ -194,7 +194,7 @@ _IMAGE_TOKENS = 257
 def check_memory(
     checkpoint: TrainedModel, serving: ServingOptions, device: torch.device, dtype: torch.dtype
 ) -> None:
-    """Checks that a model fits into the free memory of the device.
+    """Check that a model fits into the free memory of the device.
 
     Raises:
         ModelMemoryError: the model does not fit.
@@ -225,7 +225,7 @@ def _advice(serving: ServingOptions) -> str:
 
 
 def free_bytes(device: torch.device) -> int | None:
-    """Returns the free memory of a device; None = unknown."""
+    """Return the free memory of a device; None = unknown."""
     if device.type == 'cuda':
         return torch.cuda.mem_get_info(device)[0]
     info = Path('/proc/meminfo')
@@ -236,7 +236,7 @@ def free_bytes(device: torch.device) -> int | None:
 
 
 def weight_bytes(checkpoint: TrainedModel, serving: ServingOptions, dtype: torch.dtype) -> int:
-    """Returns the size of the weights that stay on the device."""
+    """Return the size of the weights that stay on the device."""
     blocks = [_weights(block) for block in checkpoint.transformer.blocks]
     numbers = _weights(checkpoint.transformer)
     if serving.offload:  # one computes while the next one comes
@@ -251,7 +251,7 @@ def _weights(module: nn.Module) -> int:
 
 
 def activation_bytes(checkpoint: TrainedModel, serving: ServingOptions, dtype: torch.dtype) -> int:
-    """Returns the peak memory of a pass of the transformer or of decoding, without weights."""
+    """Return the peak memory of a pass of the transformer or of decoding, without weights."""
     config: Any = checkpoint.transformer.config
     spec = checkpoint.card.spec
     shape = (config['latent_channels'], spec.height // 8, spec.width // 8)
@@ -304,14 +304,14 @@ def _default(dtype: torch.dtype) -> Iterator[None]:
 
 
 def peak_bytes(work: Callable[[], object]) -> int:
-    """Returns the peak number of bytes of the tensors that `work` makes."""
+    """Return the peak number of bytes of the tensors that `work` makes."""
     with _Held() as held:
         work()
     return held.peak
 
 
 class _Held(TorchDispatchMode):
-    """Counts the bytes of the tensors that are alive."""
+    """Counter of the bytes of the tensors that are alive."""
 
     def __init__(self) -> None:
         super().__init__()

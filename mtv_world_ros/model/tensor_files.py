@@ -44,7 +44,7 @@ class StoredTensor:
 
 
 def open_tensors(path: Path, stem: str = '') -> dict[str, StoredTensor]:
-    """Returns the tensors of a safetensors file, or of a folder's files or shards, by name.
+    """Return the tensors of a safetensors file, or of a folder's files or shards, by name.
 
     Args:
         path: a `.safetensors` file, an index, or a folder.
@@ -67,7 +67,7 @@ def open_tensors(path: Path, stem: str = '') -> dict[str, StoredTensor]:
 
 
 def pickle_error(files: Iterable[Path]) -> CheckpointError:
-    """Returns the error for pickles, which names the formats to use in their place."""
+    """Return the error for pickles, which names the formats to use in their place."""
     names = sorted(str(file) for file in files)
     return CheckpointError(
         f'{names} may be pickles, which can run code and are never read; expected '
@@ -91,7 +91,7 @@ def _open_folder(folder: Path, stem: str) -> dict[str, StoredTensor]:
 
 
 def _check_shards(files: list[Path]) -> None:
-    """Checks that shards without an index are complete, by the number in their names."""
+    """Check that shards without an index are complete, by the number in their names."""
     numbers = [match for file in files if (match := _SHARD.search(file.name))]
     if not numbers:
         return
@@ -168,7 +168,7 @@ def read_tensors(path: Path, stem: str = '') -> dict[str, Tensor]:
 
 @contextmanager
 def disk_errors() -> Iterator[None]:
-    """Turns what safetensors raises on a full disk into OSError."""
+    """Turn what safetensors raises on a full disk into OSError."""
     try:
         yield
     except SafetensorError as error:
@@ -176,7 +176,7 @@ def disk_errors() -> Iterator[None]:
 
 
 def import_transformers() -> Any:
-    """Returns the package.
+    """Return the package.
 
     Raises:
         ConfigError: the package is not installed.

@@ -68,7 +68,7 @@ class TrainedModel:
 def save_trained_model(
     model: TrainedModel, folder: Path, *, dtype: torch.dtype = torch.float32
 ) -> None:
-    """Writes a checkpoint folder, which appears under its name only when it is complete."""
+    """Write a checkpoint folder, which appears under its name only when it is complete."""
     with disk_errors(), whole_folder(folder) as partial:
         stored = place(copy_of(model.transformer), torch.device('cpu'), dtype)
         stored.save_pretrained(partial / 'transformer', safe_serialization=True)
@@ -99,7 +99,7 @@ def _folders(model: TrainedModel) -> dict[str, Path]:
 def load_trained_model(
     checkpoint: Checkpoint, *, dtype: torch.dtype = torch.float32
 ) -> TrainedModel:
-    """Reads the weights of a checkpoint.
+    """Read the weights of a checkpoint.
 
     Raises:
         CheckpointError: a part is missing, is a pickle, or belongs to another model.
@@ -163,7 +163,7 @@ def _load_autoencoder(folder: Path, dtype: torch.dtype) -> Autoencoder:
 
 
 def _fill(module: Any, folder: Path) -> None:
-    """Replaces the module's meta tensors, which use no memory, by the stored ones."""
+    """Replace the module's meta tensors, which use no memory, by the stored ones."""
     tensors = read_tensors(folder, WEIGHTS)
     try:
         module.load_state_dict(tensors, assign=True)

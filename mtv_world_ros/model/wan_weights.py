@@ -40,7 +40,7 @@ _CLIP_HEADS = 16
 def describe_encoder(
     part: str, source: Path, tensors: Mapping[str, StoredTensor], keys: KeyMap
 ) -> tuple[dict[str, Any], dict[str, tuple[int, ...]]]:
-    """Returns the configuration of `text_encoder` or `image_encoder`, and its tensors' shapes.
+    """Return the configuration of `text_encoder` or `image_encoder`, and its tensors' shapes.
 
     Raises:
         CheckpointError: the tensors are not those of umT5, or of CLIP's image side.
@@ -80,7 +80,7 @@ def describe_encoder(
 
 
 def check_width(part: str, source: Path, config: Mapping[str, Any], expected: int) -> None:
-    """Checks that an encoder's tokens are as wide as the transformer takes them.
+    """Check that an encoder's tokens are as wide as the transformer takes them.
 
     Raises:
         CheckpointError: the encoder has another width.
@@ -167,7 +167,7 @@ def import_weights(
     robot: Path | None = None,
     shard_bytes: int = SHARD_BYTES,
 ) -> list[PartReport]:
-    """Writes a checkpoint folder from public weights, number formats kept.
+    """Write a checkpoint folder from public weights, number formats kept.
 
     No more than one shard is in memory at a time.
 
@@ -236,7 +236,7 @@ def _check_architecture(
     keys: wan_keys.KeyMap,
     model: MultiViewWanTransformer,
 ) -> None:
-    """Names the most common wrong checkpoints in the error."""
+    """Name the most common wrong checkpoints in the error."""
     config: Any = model.config
     patch = keys.takes.get('patch_embedding.weight')
     if patch is None or len(tensors[patch.source].shape) != 5:
@@ -266,7 +266,7 @@ def _check_architecture(
 
 
 def _check_heads(source: Path, expected: int) -> None:
-    """Checks the number of heads, which only the configuration file states, not a tensor shape."""
+    """Check the number of heads, which only the configuration file states, not a tensor shape."""
     file = (source if source.is_dir() else source.parent) / 'config.json'
     if not file.is_file():
         return
@@ -318,7 +318,7 @@ def _write(
     shard_bytes: int,
     stem: str = 'diffusion_pytorch_model',
 ) -> PartReport:
-    """Writes a part's tensors under our names; no tensor of source or target is left over."""
+    """Write a part's tensors under our names; no tensor of source or target is left over."""
     unknown = sorted(set(keys.takes) - set(shapes))
     if unknown:
         names = [keys.takes[name].source for name in unknown]
@@ -353,7 +353,7 @@ def _write(
 def write_tensors(
     tensors: dict[str, StoredTensor], folder: Path, stem: str, *, shard_bytes: int = SHARD_BYTES
 ) -> None:
-    """Writes tensors as diffusers and transformers do: one file, or shards and their index.
+    """Write tensors as diffusers and transformers do: one file, or shards and their index.
 
     Holds no more than one shard in memory.
     """
@@ -448,7 +448,7 @@ PARTS = {
 
 
 def find_sources(path: Path, given: Mapping[str, Path | None]) -> dict[str, Path]:
-    """Returns file or folder of every part.
+    """Return file or folder of every part.
 
     Args:
         path: a folder in VideoX-Fun's or diffusers' layout, or the transformer's file.

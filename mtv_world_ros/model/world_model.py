@@ -41,7 +41,7 @@ from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 
 
 def flow_of(transformer: MultiViewWanTransformer, out: Tensor, noisy: Tensor, sigma: Tensor):
-    """Returns the flow (noise - clean) whatever the transformer predicts.
+    """Return the flow (noise - clean) whatever the transformer predicts.
 
     Args:
         transformer: its `config.prediction` says what `out` is.
@@ -65,7 +65,7 @@ def sample_latents(
     should_stop: Callable[[], bool],
     guidance_scale: float = 1.0,
 ) -> Tensor:
-    """Returns (1, V, C, F, h, w) float32 denoised latents.
+    """Return (1, V, C, F, h, w) float32 denoised latents.
 
     The noise is drawn on the CPU, so a seed gives the same rollout on every device.
 
@@ -110,7 +110,7 @@ def sample_latents(
 
 
 def set_timesteps(scheduler: Scheduler, num_inference_steps: int, device: torch.device) -> None:
-    """Spreads the steps over the noise levels, from 1 down; the scheduler shifts them."""
+    """Spread the steps over the noise levels, from 1 down; the scheduler shifts them."""
     if isinstance(scheduler, FlowMatchEulerDiscreteScheduler):
         sigmas = torch.linspace(1.0, 1.0 / num_inference_steps, num_inference_steps).tolist()
         scheduler.set_timesteps(sigmas=sigmas, device=device)
@@ -161,7 +161,7 @@ _NO_MEMORY = ("can't allocate memory", 'out of memory', 'ALLOC_FAILED', 'ALLOCAT
 
 
 class DiffusionWorldModel:
-    """Denoises one chunk of multi-view video under the inputs of a control.
+    """Pipeline that denoises one chunk of multi-view video under the inputs of a control.
 
     Args:
         checkpoint: the trained parts.
@@ -214,7 +214,7 @@ class DiffusionWorldModel:
             self._warm_up()
 
     def _warm_up(self) -> None:
-        """Runs one prediction and discards it, so that the first real one does not wait."""
+        """Run one prediction and discard it, so that the first real one does not wait."""
         spec = self.spec
         shape = (len(spec.views), 1 + spec.num_frames, spec.height, spec.width, 3)
         config: Any = self.transformer.config
@@ -238,7 +238,7 @@ class DiffusionWorldModel:
         )
 
     def read_adapter(self, path: Path | None) -> Adapter:
-        """Reads and checks an adapter, for `use_adapter`; safe while a prediction runs.
+        """Read and check an adapter, for `use_adapter`; safe while a prediction runs.
 
         Args:
             path: see `Adapters.read`; None = none.
@@ -251,7 +251,7 @@ class DiffusionWorldModel:
         return self._adapters.read(path)
 
     def use_adapter(self, adapter: Adapter | Path | None) -> None:
-        """Exchanges the LoRA adapter; not to be called while a prediction runs. None = none.
+        """Exchange the LoRA adapter; not to be called while a prediction runs. None = none.
 
         Raises:
             CheckpointError: it cannot be read or is for another model; the one before stays.
@@ -273,7 +273,7 @@ class DiffusionWorldModel:
         should_stop: Callable[[], bool],
         history: History | None = None,
     ) -> ByteArray:
-        """Returns (V, T, H, W, 3) uint8 RGB frames; see `pipeline.WorldModel.predict`."""
+        """Return (V, T, H, W, 3) uint8 RGB frames; see `pipeline.WorldModel.predict`."""
         del positions  # this model knows the plan by its control alone
         self._check_size(len(start_frame), control.num_frames)
         try:
@@ -315,7 +315,7 @@ class DiffusionWorldModel:
         return self._with_context(latents, start)
 
     def _with_history(self, latents: Conditioning, history: History) -> Conditioning:
-        """Adds the history frames, in models that are conditioned on them."""
+        """Add the history frames, in models that are conditioned on them."""
         count, level = self.history.num_frames, self.history.noise_level
         if self.history.anchored:
             latents = with_anchor(self.autoencoder, latents, self._tensor(history.anchor))
@@ -328,7 +328,7 @@ class DiffusionWorldModel:
         return with_history(self.autoencoder, latents, frames, sigmas)
 
     def _with_context(self, latents: Conditioning, start: torch.Tensor) -> Conditioning:
-        """Adds the prompt's and the start images' tokens, in models with text."""
+        """Add the prompt's and the start images' tokens, in models with text."""
         if self.text_encoder is None or self.image_encoder is None:
             return latents
         dtype = self.transformer.dtype

@@ -27,7 +27,7 @@ _NAME = 'adapter'
 
 
 def add_adapter(transformer: MultiViewWanTransformer, rank: int = 32, alpha: float = 32) -> None:
-    """Freezes the transformer and adds a trainable adapter that changes nothing yet.
+    """Freeze the transformer and add a trainable adapter that changes nothing yet.
 
     Args:
         transformer: whose phi, view embedding and patch embedding stay trainable as they are.
@@ -59,7 +59,7 @@ def save_adapter(
     card: CheckpointCard | None = None,
     control: Control | None = None,
 ) -> None:
-    """Writes the adapter's folder; it appears under its name only when it is whole.
+    """Write the adapter's folder; it appears under its name only when it is whole.
 
     The adapter itself is in diffusers' layout.
 

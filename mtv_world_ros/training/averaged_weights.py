@@ -49,20 +49,20 @@ class AveragedWeights:
 
     @torch.no_grad()
     def load(self, weights: dict[str, Tensor]) -> None:
-        """Loads float32 weights by name, also into the working copy."""
+        """Load float32 weights by name, also into the working copy."""
         for name, master in self.master.items():
             master.copy_(weights[name])
         self.share()
 
     @torch.no_grad()
     def share(self) -> None:
-        """Copies the float32 weights into the working copy."""
+        """Copy the float32 weights into the working copy."""
         for worker, master in self._pairs:
             worker.copy_(master)
 
     @torch.no_grad()
     def collect(self) -> None:
-        """Adds the working copy's gradients to those in float32, and clears them."""
+        """Add the working copy's gradients to those in float32, and clear them."""
         for worker, master in self._pairs:
             if master.grad is None:
                 # zeros if there is no gradient: all processes must sum the same tensors
@@ -73,7 +73,7 @@ class AveragedWeights:
 
     @contextmanager
     def averaged_worker(self) -> Iterator[MultiViewWanTransformer]:
-        """Yields the working copy with the averaged weights, which are those that will serve."""
+        """Yield the working copy with the averaged weights, which are those that will serve."""
         with torch.no_grad():
             for (worker, _), average in zip(self._pairs, self.ema.shadow_params, strict=True):
                 worker.copy_(average)
@@ -83,11 +83,11 @@ class AveragedWeights:
             self.share()
 
     def averages(self) -> dict[str, Tensor]:
-        """Returns the averaged float32 weights by name."""
+        """Return the averaged float32 weights by name."""
         return dict(zip(self.master, self.ema.shadow_params, strict=True))
 
     def averaged(self) -> MultiViewWanTransformer:
-        """Returns a float32 transformer with the averaged weights."""
+        """Return a float32 transformer with the averaged weights."""
         whole = copy_of(self.worker)
         parameters = dict(whole.named_parameters())
         self.ema.copy_to([parameters[name] for name in self.master])

@@ -55,7 +55,7 @@ def load_base(
     seed: int,
     layout: InputLayout = VIDEO_ONLY,
 ) -> Base:
-    """Loads a checkpoint and adds a new adapter, drawn by the seed, where the preset trains one.
+    """Load a checkpoint and add a new adapter, drawn by the seed, where the preset trains one.
 
     Encoders have the number format of forward and backward, as in serving. umT5 is loaded to
     encode the prompt, then freed.
@@ -137,5 +137,5 @@ def _digest(transformer: MultiViewWanTransformer) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Returns the value as JSON stores it: tuples become lists."""
+    """Return the value as JSON stores it: tuples become lists."""
     return json.loads(json.dumps(value))

@@ -70,7 +70,7 @@ class ClipBatch:
     numbers: Sequence[int] = ()
 
     def parts(self, count: int) -> Iterator[ClipBatch]:
-        """Yields its clips in `count` batches of nearly equal size."""
+        """Yield its clips in `count` batches of nearly equal size."""
         size = len(self.numbers)
         for index in range(count):
             chosen = slice(size * index // count, size * (index + 1) // count)
@@ -150,7 +150,7 @@ class BatchSource:
         return sum(len(starts) for _, starts in self._starts)
 
     def batch(self, step: int) -> ClipBatch:
-        """Returns the batch of a step, and starts preparing the next one."""
+        """Return the batch of a step, and start preparing the next one."""
         if self._ahead is not None and self._ahead[0] == step:
             result = self._ahead[1].result()
         else:
@@ -159,7 +159,7 @@ class BatchSource:
         return result
 
     def close(self) -> None:
-        """Stops preparing."""
+        """Stop preparing."""
         self._pool.shutdown(cancel_futures=True)
         if self._workers is not None:
             self._workers.close()
@@ -223,7 +223,7 @@ class BatchSource:
         return draw_past(history, self._history, rng)
 
     def _choose(self, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:
-        """Draws an episode with the starts of its clips; failed ones with the configured share."""
+        """Draw an episode with the starts of its clips; failed ones with the configured share."""
         share = self._augment.failure_share
         pool = self._starts
         if share is not None and self._failed and rng.random() < share:
@@ -232,7 +232,7 @@ class BatchSource:
 
 
 def pasts(given: Sequence[Past | None]) -> dict[str, Tensor]:
-    """Returns fields of a batch: anchors and histories of its clips."""
+    """Return fields of a batch: anchors and histories of its clips."""
     known = [past for past in given if past is not None]
     if not known:
         return {}
@@ -244,7 +244,7 @@ def pasts(given: Sequence[Past | None]) -> dict[str, Tensor]:
 
 
 def _spaced(recording: Recording, starts: np.ndarray, stride_s: float) -> np.ndarray:
-    """Starts that are at least a stride [s] apart."""
+    """Return the starts that are at least a stride [s] apart."""
     kept: list[int] = []
     for start in starts:
         if not kept or recording.times[start] >= recording.times[kept[-1]] + stride_s - 1e-6:
@@ -276,13 +276,13 @@ MakeClip = Callable[[int, int], Any]
 
 
 class ClipWorkers:
-    """Makes clips in processes, forked so that they share the recordings; none uses a GPU."""
+    """Source of clips made in forked processes, which share the recordings and use no GPU."""
 
     def __init__(self, make_clip: MakeClip, count: int) -> None:
         self._pool = WorkerPool(partial(_on_one_thread, make_clip), count, method='fork')
 
     def clips(self, step: int, numbers: Sequence[int]) -> list[Any]:
-        """Returns the clips of a step.
+        """Return the clips of a step.
 
         Raises:
             TrainingError: a process was killed.
@@ -297,7 +297,7 @@ class ClipWorkers:
             ) from error
 
     def close(self) -> None:
-        """Ends the processes."""
+        """End the processes."""
         self._pool.shutdown(cancel_futures=True)
 
 

@@ -40,7 +40,7 @@ def history_before(
     config: HistoryConfig,
     rng: np.random.Generator,
 ) -> History:
-    """Returns the past of a rollout that began some frames before recorded frame `start`."""
+    """Return the past of a rollout that began some frames before recorded frame `start`."""
     begins = rng.random() < config.first_share
     longest = int((recording.times[start] - recording.times[0]) * spec.fps + 1e-3)
     if begins or not longest:
@@ -55,14 +55,14 @@ def history_before(
 
 
 def draw_past(history: History, config: HistoryConfig, rng: np.random.Generator) -> Past:
-    """Returns the history of a clip, with a noise level drawn for it."""
+    """Return the history of a clip, with a noise level drawn for it."""
     known = history.frames.shape[1] > 0 and rng.random() >= config.dropout
     sigma = float(rng.uniform(0.0, config.max_noise)) if known else 1.0
     return Past(history.anchor, history.filled(config.num_frames), sigma)
 
 
 def frame_before(recording: Recording, start: int, seconds: float) -> int | None:
-    """Returns the recorded frame nearest to a time before another; None = before the first."""
+    """Return the recorded frame nearest to a time before another; None = before the first."""
     wanted = recording.times[start] - seconds
     if wanted < recording.times[0] - 1e-6:
         return None
@@ -93,7 +93,7 @@ class LeadIn:
         return (len(self.clip.times) - 1) // (self.num_chunks + 1)
 
     def chunk(self, index: int) -> Clip:
-        """Returns one of the chunks with the frame before it.
+        """Return one of the chunks with the frame before it.
 
         Its first position is the command of that frame, as in a rollout of chained chunks.
         """
@@ -110,7 +110,7 @@ class LeadIn:
         )
 
     def history(self, num_frames: int) -> History:
-        """Returns the recorded frames before the chunk that is trained on."""
+        """Return the recorded frames before the chunk that is trained on."""
         shown = self.clip.frames[:, : self.num_chunks * self.num_frames]
         kept = max(shown.shape[1] - num_frames, 0)
         return History(anchor=shown[:, 0], frames=shown[:, kept:])
@@ -124,7 +124,7 @@ def draw_lead_in(
     step: int,
     rng: np.random.Generator,
 ) -> LeadIn | None:
-    """Returns the chunks to imagine before the clip at recorded frame `start`.
+    """Return the chunks to imagine before the clip at recorded frame `start`.
 
     A rollout is shorter where the episode is too short before the clip. The clip that is trained
     on then starts at the recorded frame next to `start` on the rollout's clock.
@@ -146,7 +146,7 @@ def draw_lead_in(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlMaker:
-    """Makes the control input of a clip, as serving does.
+    """Maker of the control input of a clip, equal to that of serving.
 
     Attributes:
         robot: of the episodes.
@@ -168,7 +168,7 @@ class ControlMaker:
         *,
         foresees: bool = True,
     ) -> ControlInputs:
-        """Returns the control's inputs of a clip.
+        """Return the control's inputs of a clip.
 
         Objects are searched in its first frame, unless this segmenter made the masks that are
         stored with the episode.

@@ -23,7 +23,7 @@ _BUCKET = 2**24
 
 @contextmanager
 def memory_errors_named(device: torch.device) -> Iterator[None]:
-    """Turns an out-of-memory error into one that says what to set.
+    """Turn an out-of-memory error into one that says what to set.
 
     Raises:
         TrainingError: in place of torch's error.
@@ -64,11 +64,11 @@ class Processes:
         return self.number == 0
 
     def share(self, count: int) -> range:
-        """Returns this process's part of `count` clips; parts have nearly equal sizes."""
+        """Return this process's part of `count` clips; parts have nearly equal sizes."""
         return range(count * self.number // self.count, count * (self.number + 1) // self.count)
 
     def summed(self, tensor: Tensor) -> Tensor:
-        """Returns the sum of a tensor over the processes.
+        """Return the sum of a tensor over the processes.
 
         Raises:
             TrainingError: another process is gone.
@@ -94,7 +94,7 @@ class Processes:
         return self.summed(torch.tensor([float(flag)], device=self.device)).item() > 0
 
     def sum_into(self, tensors: Sequence[Tensor]) -> None:
-        """Replaces tensors, all of one number format, by their sums over the processes."""
+        """Replace tensors, all of one number format, by their sums over the processes."""
         if self.count == 1:
             return
         for bucket in _buckets(tensors):
@@ -105,7 +105,7 @@ class Processes:
 
     @contextmanager
     def main_first(self) -> Iterator[None]:
-        """Runs the block in the main process first; the others then use its results."""
+        """Run the block in the main process first; the others then use its results."""
         with self._state.main_process_first():
             yield
 

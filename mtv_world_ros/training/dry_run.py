@@ -62,7 +62,7 @@ class StepCost:
         return self.weight_bytes + self.training_bytes + self.activation_bytes
 
     def lines(self) -> list[str]:
-        """Returns the table as lines."""
+        """Return the table as lines."""
         share = 100 * self.trainable / self.parameters
         return [
             f'parameters          {self.parameters / 1e6:12.2f} M',
@@ -83,7 +83,7 @@ def step_cost(
     dtype: torch.dtype,
     fake: bool = True,
 ) -> StepCost:
-    """Counts operations and bytes of a step on shapes only; `fake=False` computes it on a CPU."""
+    """Count operations and bytes of a step on shapes only; `fake=False` computes it on a CPU."""
     # fake tensors have shapes and no numbers; said to be on the CPU, they take the attention that
     # keeps no attention matrix, as a GPU does (on `meta` they would take the one that does)
     with torch.device('meta' if fake else 'cpu'):
@@ -117,7 +117,7 @@ def step_cost(
 
 
 def attention_operations() -> dict[Any, Any]:
-    """Returns counters of the CPU's attention, which torch's own leaves out."""
+    """Return counters of the CPU's attention, which torch's own leaves out."""
     forward = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
     backward = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu_backward
     return {
@@ -127,7 +127,7 @@ def attention_operations() -> dict[Any, Any]:
 
 
 def fill(module: nn.Module, dtype: torch.dtype) -> None:
-    """Replaces `meta` weights by zeros in a number format, in place."""
+    """Replace `meta` weights by zeros in a number format, in place."""
     for part in module.modules():
         for name, parameter in list(part.named_parameters(recurse=False)):
             trained = parameter.requires_grad
@@ -139,7 +139,7 @@ def fill(module: nn.Module, dtype: torch.dtype) -> None:
 
 @contextmanager
 def _kept(parameters: list[torch.nn.Parameter]) -> Iterator[dict[int, int]]:
-    """Collects the bytes by storage that autograd keeps within the block, weights left out."""
+    """Collect the bytes by storage that autograd keeps within the block, weights left out."""
     known = {_storage(p) for p in parameters}
     sizes: dict[int, int] = {}
     alive: list[Tensor] = []  # a freed storage's address would be used again
@@ -221,7 +221,7 @@ def _latent_size(config: TrainingConfig) -> tuple[int, int, int, int]:
 
 
 def measured_peak(device: torch.device, dtype: torch.dtype) -> float:
-    """Returns the highest rate [operations/s] of several products of large matrices.
+    """Return the highest rate [operations/s] of several products of large matrices.
 
     On a CPU with torch's current number of threads; other running processes lower it.
     """
@@ -241,7 +241,7 @@ def measured_peak(device: torch.device, dtype: torch.dtype) -> float:
 def ideal_seconds(
     config: TrainingConfig, dtype: torch.dtype, flops: float, layout: InputLayout = VIDEO_ONLY
 ) -> float:
-    """Returns the time of a step whose forward and backward run at a peak of operations a second.
+    """Return the time of a step whose forward and backward run at a peak of operations a second.
 
     The transformer's alone: encoding, and what gradient checkpointing computes again, is not the
     model's arithmetic.

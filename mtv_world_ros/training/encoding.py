@@ -68,7 +68,7 @@ class EncodedBatch:
     numbers: Sequence[int] = ()
 
     def parts(self, count: int) -> Iterator[EncodedBatch]:
-        """Yields its clips in `count` batches of nearly equal size."""
+        """Yield its clips in `count` batches of nearly equal size."""
         size = len(self.numbers)
         for index in range(count):
             chosen = slice(size * index // count, size * (index + 1) // count)
@@ -85,7 +85,7 @@ class EncodedBatch:
 def encode_batch(
     encoders: Encoders, batch: ClipBatch, objective: ObjectiveConfig, device: torch.device
 ) -> EncodedBatch:
-    """Returns a batch of clips in latents, on a device."""
+    """Return a batch of clips in latents, on a device."""
     frames = batch.frames.to(device)
     clean = encode_chunk(encoders.autoencoder, frames).float()
     ids = None if batch.object_ids is None else batch.object_ids.to(device)
@@ -97,7 +97,7 @@ def encode_batch(
 
 
 def condition_batch(encoders: Encoders, batch: ClipBatch, device: torch.device) -> Conditioning:
-    """Returns the conditioning of a batch."""
+    """Return the conditioning of a batch."""
     autoencoder, start = encoders.autoencoder, batch.start_frame.to(device)
     latents = condition(autoencoder, start, batch.inputs.to(device))
     latents = _with_past(encoders, latents, batch, device)
@@ -111,7 +111,7 @@ def condition_batch(encoders: Encoders, batch: ClipBatch, device: torch.device) 
 def _with_past(
     encoders: Encoders, latents: Conditioning, batch: ClipBatch, device: torch.device
 ) -> Conditioning:
-    """Adds anchor and history, in models that take them."""
+    """Add anchor and history, in models that take them."""
     settings = encoders.history
     if settings.anchored:
         assert batch.anchor is not None
@@ -136,7 +136,7 @@ def drop_conditions(
     draws: NoiseDraws,
     control_dropout: float = 0.0,
 ) -> Conditioning:
-    """Drops control, reference, start slot or CLIP tokens in random samples, each independently.
+    """Drop control, reference, start slot or CLIP tokens in random samples, each independently.
 
     Dropped latents are zero, dropped tokens of a control are left out. VideoX-Fun drops one in ten
     samples; classifier-free guidance needs a model trained without its condition.

@@ -45,7 +45,7 @@ _LABELS = 'labels'
 
 
 def digest_of(*values: Any) -> str:
-    """Returns 32 hexadecimal digits for plain values."""
+    """Return 32 hexadecimal digits for plain values."""
     text = json.dumps(values, sort_keys=True, default=list)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
@@ -87,7 +87,7 @@ class LatentCache:
         return len(self._shards)
 
     def read(self, key: str) -> dict[str, Tensor]:
-        """Returns the tensors of a clip by name.
+        """Return the tensors of a clip by name.
 
         Raises:
             TrainingError: the latents are missing.
@@ -100,14 +100,14 @@ class LatentCache:
         return {name.partition('/')[2]: shard.get_tensor(name) for name in mine}
 
     def changed(self, labels: Mapping[str, str]) -> list[str]:
-        """Returns those of the labels (by key) whose clips are here with another content."""
+        """Return those of the labels (by key) whose clips are here with another content."""
         held = {label: key for key, label in self._labels.items()}
         return sorted(
             label for key, label in labels.items() if key not in self._shards and label in held
         )
 
     def add(self, key: str, label: str, tensors: Mapping[str, Tensor]) -> None:
-        """Adds the tensors of a clip; they are on disk once a shard is full, or after `flush`."""
+        """Add the tensors of a clip; they are on disk once a shard is full, or after `flush`."""
         for name, tensor in tensors.items():
             self._waiting[f'{key}/{name}'] = tensor.detach().cpu().contiguous()
         self._waiting_labels[key] = label
@@ -115,7 +115,7 @@ class LatentCache:
             self.flush()
 
     def flush(self) -> None:
-        """Writes the clips that wait.
+        """Write the clips that wait.
 
         Raises:
             TrainingError: the disk is full, or the folder cannot be written.
@@ -204,7 +204,7 @@ class CachedClip:
 def settings_of(
     config: TrainingConfig, base: Path, controls: ControlMaker, dtype: torch.dtype
 ) -> dict[str, Any]:
-    """Returns everything that the latents of all clips depend on, as plain values.
+    """Return everything that the latents of all clips depend on, as plain values.
 
     That is the preset, the encoders of the base checkpoint, the control, the robot's kinematics,
     the segmenter, and the number format of the encoders and of what is kept.
@@ -229,7 +229,7 @@ def settings_of(
 
 
 def _robot_digest(robot: RobotModel) -> str:
-    """Changes with the robot's kinematics, tools and grippers."""
+    """Return a digest that changes with the robot's kinematics, tools and grippers."""
     lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
     rows = np.random.default_rng(0).uniform(lower, upper, (8, len(lower)))
     poses, openings = robot.tool_poses(rows), robot.gripper_openings(rows)
@@ -238,7 +238,7 @@ def _robot_digest(robot: RobotModel) -> str:
 
 
 def list_clips(recordings: Sequence[tuple[Recording, np.ndarray]]) -> list[CachedClip]:
-    """Returns the clips of recordings and starts, keyed by the content of their episodes."""
+    """Return the clips of recordings and starts, keyed by the content of their episodes."""
     clips = []
     for recording, starts in recordings:
         content = content_digest(recording.path)
@@ -254,7 +254,7 @@ def list_clips(recordings: Sequence[tuple[Recording, np.ndarray]]) -> list[Cache
 def read_clip(
     clip: CachedClip, spec: WorldModelSpec, controls: ControlMaker, history: HistoryConfig
 ) -> ClipBatch:
-    """Returns a clip as it was recorded, as a batch of one.
+    """Return a clip as it was recorded, as a batch of one.
 
     Its anchor and history are drawn once, by its start.
     """
@@ -286,7 +286,7 @@ def fill(
     device: torch.device,
     dtype: torch.dtype,
 ) -> Iterator[str]:
-    """Encodes the missing clips of a cache; yields after each how many are, and how fast.
+    """Encode the missing clips of a cache; yield after each how many are, and how fast.
 
     Raises:
         TrainingError: the disk is full, or will be before all clips are there.
@@ -354,7 +354,7 @@ def cached(
     dtype: torch.dtype,
     processes: Processes,
 ) -> CachedSource:
-    """Encodes missing clips, reports what it did, and returns batches from the cache.
+    """Encode missing clips, report what was done, and return batches from the cache.
 
     The source of the same clips, which encodes nothing, is closed.
 
@@ -397,7 +397,7 @@ def cached(
 
 
 def _check(config: TrainingConfig) -> None:
-    """Raises ConfigError if cached latents would differ from those of uncached training."""
+    """Raise ConfigError if cached latents would differ from those of uncached training."""
     if config.autoencoder.get('_class_name', 'SpaceToDepthAutoencoder') != 'AutoencoderKLWan':
         raise ConfigError(
             "--latent-cache is for presets with Wan's autoencoder; this one's only rearranges "
@@ -465,7 +465,7 @@ class CachedSource:
         return len(self._clips)
 
     def batch(self, step: int) -> EncodedBatch:
-        """Returns the batch of a step."""
+        """Return the batch of a step."""
         clips = [self._clip(step, number) for number in self._numbers]
         rows = [self._cache.read(clip.key) for clip in clips]
         held = {
@@ -497,7 +497,7 @@ class CachedSource:
         )
 
     def close(self) -> None:
-        """Does nothing: other sources have processes to end."""
+        """Do nothing: a cache has no processes, unlike other sources."""
 
     def _clip(self, step: int, number: int) -> CachedClip:
         epoch, place = divmod(step * self._batch_size + number, len(self._clips))

@@ -19,7 +19,7 @@ _EVERY = 10
 
 
 class TrainingLog:
-    """Writes the log; a resumed training continues it after the saved state.
+    """Writer of the log; a resumed training continues it after the saved state.
 
     Args:
         folder: gets `log.jsonl` and `tensorboard/`.
@@ -62,7 +62,7 @@ class TrainingLog:
             self._board.close()
 
     def add(self, report: StepReport) -> None:
-        """Counts a step; writes every tenth and the last one."""
+        """Count a step; write every tenth and the last one."""
         self._bar.update()
         self._steps += 1
         self._seconds += report.seconds
@@ -92,7 +92,7 @@ class TrainingLog:
         return found
 
     def write(self, step: int, row: dict[str, Any]) -> None:
-        """Writes numbers of a step."""
+        """Write numbers of a step."""
         if not self._active:
             return
         self._file.write(json.dumps({'step': step, **row}) + '\n')
@@ -103,7 +103,7 @@ class TrainingLog:
 
 
 def _cut(file: Path, step: int) -> Path:
-    """Drops the rows after a step, and one that was cut off in the middle."""
+    """Drop the rows after a step, and one that was cut off in the middle."""
     if file.is_file():
         kept = []
         for line in file.read_text(errors='replace').splitlines(keepends=True):

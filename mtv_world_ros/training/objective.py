@@ -31,11 +31,11 @@ class NoiseDraws:
         ]
 
     def uniform(self, *shape: int) -> Tensor:
-        """Returns (B, *shape) numbers in [0, 1), on the CPU."""
+        """Return (B, *shape) numbers in [0, 1), on the CPU."""
         return torch.stack([torch.rand(shape, generator=g) for g in self._generators])
 
     def normal(self, *shape: int) -> Tensor:
-        """Returns (B, *shape) normally distributed numbers, on the CPU."""
+        """Return (B, *shape) normally distributed numbers, on the CPU."""
         return torch.stack([torch.randn(shape, generator=g) for g in self._generators])
 
 
@@ -60,7 +60,7 @@ class Loss(NamedTuple):
 
 
 def draw_sigmas(draws: NoiseDraws, config: ObjectiveConfig) -> Tensor:
-    """Returns (B,) noise levels in (0, 1], shifted towards high noise.
+    """Return (B,) noise levels in (0, 1], shifted towards high noise.
 
     `sigma' = s * sigma / (1 + (s - 1) * sigma)` as in Wan's schedule.
     """
@@ -71,7 +71,7 @@ def draw_sigmas(draws: NoiseDraws, config: ObjectiveConfig) -> Tensor:
 
 
 def pixel_weights(frames: Tensor, object_ids: Tensor | None, config: ObjectiveConfig) -> Tensor:
-    """Returns (B, V, T, H, W) weights of the future frames' pixels, at least 1.
+    """Return (B, V, T, H, W) weights of the future frames' pixels, at least 1.
 
     Args:
         frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
@@ -88,14 +88,14 @@ def pixel_weights(frames: Tensor, object_ids: Tensor | None, config: ObjectiveCo
 
 
 def latent_weights(weights: Tensor, block_size: int) -> Tensor:
-    """Returns (B, V, 3 * block_size**2, T, h, w) weights for space-to-depth latents."""
+    """Return (B, V, 3 * block_size**2, T, h, w) weights for space-to-depth latents."""
     blocks = F.pixel_unshuffle(weights.flatten(0, 1).flatten(0, 1)[:, None], block_size)
     blocks = blocks.repeat(1, 3, 1, 1)  # latent channels are colour-major
     return blocks.unflatten(0, weights.shape[:3]).movedim(3, 2)
 
 
 def pooled_weights(weights: Tensor, shape: Sequence[int]) -> Tensor:
-    """Returns weights of shape (B, V, C, 1 + k, h, w) for latents that begin with the start frame.
+    """Return weights of shape (B, V, C, 1 + k, h, w) for latents that begin with the start frame.
 
     Args:
         weights: (B, V, T, H, W) of the pixels of the T frames after it; each latent gets the mean
@@ -109,13 +109,13 @@ def pooled_weights(weights: Tensor, shape: Sequence[int]) -> Tensor:
 
 
 def add_noise(clean: Tensor, noise: Tensor, sigmas: Tensor) -> Tensor:
-    """Returns `(1 - sigma) * clean + sigma * noise`; sigmas (B,)."""
+    """Return `(1 - sigma) * clean + sigma * noise`; sigmas (B,)."""
     sigma = sigmas.reshape(-1, *[1] * (clean.ndim - 1)).to(clean.dtype)
     return (1 - sigma) * clean + sigma * noise
 
 
 def sigma_weights(sigmas: Tensor, config: ObjectiveConfig) -> Tensor:
-    """Returns weights of samples by their noise level, in the shape of `sigmas`.
+    """Return weights of samples by their noise level, in the shape of `sigmas`.
 
     `middle` is DiffSynth-Studio's weighting: `exp(-2 ((t - 500) / 1000)^2)` for t = 1000 sigma,
     less its least value, with a mean of 1 over the 1000 steps of the shifted schedule.

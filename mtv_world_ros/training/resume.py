@@ -28,12 +28,12 @@ _CARD_FILE = 'state.json'
 
 
 class DiskError(TrainingError):
-    """Files cannot be read or written; the previous state is intact."""
+    """Error of a full or broken disk; the previous state is intact."""
 
 
 @contextmanager
 def disk_errors_named(folder: Path) -> Iterator[None]:
-    """Turns errors of the file system, such as a full disk, into `DiskError`.
+    """Turn errors of the file system, such as a full disk, into `DiskError`.
 
     Raises:
         DiskError: in place of the error.
@@ -53,7 +53,7 @@ def save_state(
     optimizer: torch.optim.Optimizer,
     card: Mapping[str, Any],
 ) -> None:
-    """Replaces the state in `folder/state` atomically.
+    """Replace the state in `folder/state` atomically.
 
     Raises:
         DiskError: the state could not be written; the old one stays.
@@ -70,7 +70,7 @@ def save_state(
 
 
 def read_card(folder: Path) -> dict[str, Any] | None:
-    """Returns the metadata of the saved state; None if there is none.
+    """Return the metadata of the saved state; None if there is none.
 
     Raises:
         TrainingError: the state is damaged.
@@ -86,7 +86,7 @@ def read_card(folder: Path) -> dict[str, Any] | None:
 
 
 def architecture(config: TrainingConfig) -> dict[str, Any]:
-    """Returns what of a preset decides weights and videos, by dotted name, as JSON has it."""
+    """Return the values of a preset that determine weights and videos, by dotted name (JSON)."""
     values = {
         **{f'transformer.{name}': value for name, value in config.transformer.items()},
         **{f'autoencoder.{name}': value for name, value in config.autoencoder.items()},
@@ -97,7 +97,7 @@ def architecture(config: TrainingConfig) -> dict[str, Any]:
 
 
 def check_architecture(folder: Path, config: TrainingConfig) -> None:
-    """Checks that a preset has the architecture of the state in a folder, if there is one.
+    """Check that a preset has the architecture of the state in a folder, if there is one.
 
     Raises:
         TrainingError: the architectures differ; names the first difference.
@@ -115,7 +115,7 @@ def check_architecture(folder: Path, config: TrainingConfig) -> None:
 
 
 def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
-    """Checks that a saved state is of this run's seed and base (a digest, or None).
+    """Check that a saved state is of this run's seed and base (a digest, or None).
 
     Raises:
         TrainingError: seed or base of the state differ from this run's.
@@ -134,7 +134,7 @@ def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -
 
 
 def load_state(folder: Path, weights: AveragedWeights, optimizer: torch.optim.Optimizer) -> None:
-    """Loads the tensors of the saved state.
+    """Load the tensors of the saved state.
 
     Raises:
         TrainingError: the state is damaged, or of another model.

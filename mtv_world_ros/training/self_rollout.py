@@ -28,7 +28,7 @@ from mtv_world_ros.training.encoding import condition_batch, Encoders
 
 
 class SelfRollout:
-    """Replaces the start frames of clips that have a lead-in.
+    """Replacement of the start frames of clips that have a lead-in.
 
     Args:
         controls: makes the inputs of what was imagined.
@@ -53,7 +53,7 @@ class SelfRollout:
         self._steps, self._seed, self._device = num_inference_steps, seed, device
 
     def apply(self, batch: ClipBatch, transformer: MultiViewWanTransformer) -> ClipBatch:
-        """Returns the batch with the lead-ins imagined; the same step gives the same batch.
+        """Return the batch with the lead-ins imagined; the same step gives the same batch.
 
         Args:
             batch: clips of a step.

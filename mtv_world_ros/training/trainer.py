@@ -87,7 +87,7 @@ def learning_rate(step: int, config: OptimizerConfig) -> float:
 
 
 class Trainer:
-    """Trains the transformer of a preset.
+    """Trainer of the transformer of a preset.
 
     Every process computes the clips of `clips`, a share of each step's; errors, weights and
     float32 gradients are summed over the processes, so that all make the same step.
@@ -163,7 +163,7 @@ class Trainer:
         return self.processes.share(settings.batch_size)
 
     def start_from(self, folder: Path) -> None:
-        """Loads the weights of a checkpoint of the same architecture; the optimizer state is new.
+        """Load the weights of a checkpoint of the same architecture; the optimizer state is new.
 
         Its physics (`object_motion/`) comes along where robot and views are the same and
         `rendering.object_motion` is on.
@@ -210,7 +210,7 @@ class Trainer:
         save_seconds: float = math.inf,
         should_stop: Callable[[], bool] = lambda: False,
     ) -> Iterator[StepReport]:
-        """Trains to `config.optimizer.steps`, yielding a report for each step.
+        """Train to `config.optimizer.steps`, yielding a report for each step.
 
         When `should_stop` says so in any of the processes, the state is saved and the reports
         end early.
@@ -267,7 +267,7 @@ class Trainer:
         return batch_loss(worker, self.encoders, batch, self.config, draws, self.device)
 
     def gradients(self, batch: ClipBatch | EncodedBatch) -> float:
-        """Leaves the gradients of a step in the float32 weights and returns the step's loss.
+        """Leave the gradients of a step in the float32 weights and return the step's loss.
 
         Raises:
             TrainingError: the loss is not finite, or another process is gone.
@@ -292,7 +292,7 @@ class Trainer:
         return total / weight
 
     def train_step(self, batch: ClipBatch | EncodedBatch) -> StepReport:
-        """Makes a step with this process's part of its clips."""
+        """Make a step with this process's part of its clips."""
         loss = self.gradients(batch)
         settings, parameters = self.config.optimizer, self.weights.parameters
         norm = torch.nn.utils.clip_grad_norm_(parameters, settings.max_grad_norm)
@@ -312,7 +312,7 @@ class Trainer:
         )
 
     def save_state(self) -> None:
-        """Writes everything a resumed run needs, atomically."""
+        """Write everything a resumed run needs, atomically."""
         card = {'step': self.step, 'recent': list(self._recent), **self._identity()}
         save_state(self.folder, self.weights, self.optimizer, card)
 
@@ -325,7 +325,7 @@ class Trainer:
         }
 
     def load_state(self) -> bool:
-        """Continues from the saved state; returns whether there was one.
+        """Continue from the saved state; return whether there was one.
 
         Raises:
             TrainingError: the state is damaged, or of another model, seed or base.
@@ -389,7 +389,7 @@ def batch_loss(
     draws: NoiseDraws,
     device: torch.device,
 ) -> Loss:
-    """Returns the loss of a batch, or of what a latent cache holds of one, as sums over its clips.
+    """Return the loss of a batch, or of what a latent cache holds of one, as sums over its clips.
 
     Transformer and encoders are on the device; noise levels, noise and what is dropped are drawn
     for each clip.

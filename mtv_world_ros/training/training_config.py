@@ -269,7 +269,7 @@ class TrainingConfig(Schema):
         return self.card({}).spec
 
     def control_options(self, robot: RobotModel) -> ControlOptions:
-        """Returns what the control is created for."""
+        """Return what the control is created for."""
         return ControlOptions(
             robot=robot,
             rendering=self.rendering.model_dump(),
@@ -278,7 +278,7 @@ class TrainingConfig(Schema):
         )
 
     def with_steps(self, num_clips: int) -> TrainingConfig:
-        """Returns a copy with `epochs` converted to steps, if it counts in epochs."""
+        """Return a copy with `epochs` converted to steps, if it counts in epochs."""
         optimizer = self.optimizer
         if optimizer.epochs is None:
             return self
@@ -286,7 +286,7 @@ class TrainingConfig(Schema):
         return self.replace(optimizer=optimizer.replace(steps=steps))
 
     def card(self, trained_on: Mapping[str, Any], **text: Any) -> CheckpointCard:
-        """Returns the checkpoint's card; `trained_on` says where weights come from."""
+        """Return the checkpoint's card; `trained_on` says where weights come from."""
         return CheckpointCard(
             **self.video.model_dump(mode='json', exclude={'clip_stride_s'}),
             rendering=self.rendering.model_dump(),
@@ -355,7 +355,7 @@ class TrainingRun(Schema):
 def load_training_config(
     preset: str | Path, overrides: Mapping[str, Any] | None = None
 ) -> TrainingConfig:
-    """Reads a preset by name (`small`) or path, and lays overrides like `optimizer.steps` on it.
+    """Read a preset by name (`small`) or path, and lay overrides like `optimizer.steps` on it.
 
     Raises:
         ConfigError: no such preset, an unknown key (names the nearest known one) or wrong value.

@@ -54,7 +54,7 @@ from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 
 def find_episodes(dataset: Path) -> list[Path]:
-    """Returns the episode folders (those with a `metadata.yaml`) below a folder, sorted.
+    """Return the episode folders (those with a `metadata.yaml`) below a folder, sorted.
 
     Raises:
         TrainingError: there is none.
@@ -87,7 +87,7 @@ def load_recordings(
     describer: Describer | None = None,
     broken: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[list[Recording], dict[str, str]]:
-    """Returns the usable recordings, and the reason for each one left out, by path.
+    """Return the usable recordings, and the reason for each one left out, by path.
 
     Args:
         paths: folders of episodes.
@@ -142,7 +142,7 @@ _NAMED = 3
 
 
 def check_recording(recording: Recording, robot: RobotModel) -> None:
-    """Refuses what would teach nonsense: joints in another unit, views that show no robot.
+    """Refuse unusable recordings: joints in another unit, views that show no robot.
 
     Raises:
         TrajectoryError: measured joints are far outside their limits.
@@ -203,7 +203,7 @@ def train(
     describer: Describer | None = None,
     held_out: HeldOut | None = None,
 ) -> Path:
-    """Trains, resuming what `run.out` holds, and returns the folder of the result.
+    """Train, resuming what `run.out` holds, and return the folder of the result.
 
     That is a checkpoint, or an adapter for the checkpoint `run.initial` where the preset trains
     one. Started by `torchrun` or `accelerate launch`, each process trains a share of every step's
@@ -318,7 +318,7 @@ def train(
 def _save_robot(
     robot: RobotModel, recordings: Sequence[Recording], folder: Path, processes: Processes
 ) -> None:
-    """Puts what checkpoints carry of the robot and its cameras into a folder."""
+    """Save the robot and its cameras into a folder, as checkpoints carry them."""
     if robot.file is None or not processes.is_main:
         return
     with disk_errors_named(folder):
@@ -386,7 +386,7 @@ def _drawn_otherwise(now: TrajectoryVideoConfig, before: Mapping[str, Any]) -> l
 
 
 def common_cameras(recordings: Sequence[Recording]) -> tuple[CameraModel, ...] | None:
-    """Returns the calibration that more than half of the recordings have, or None."""
+    """Return the calibration that more than half of the recordings have, or None."""
     keys = [tuple(_camera_key(camera) for camera in r.cameras) for r in recordings]
     key, count = Counter(keys).most_common(1)[0]
     return recordings[keys.index(key)].cameras if 2 * count > len(keys) else None
@@ -442,7 +442,7 @@ def _loop(
 
 
 class StopSignals:
-    """Notes SIGINT and SIGTERM in place of their effect; a second one has its effect again.
+    """Handler that records SIGINT and SIGTERM; a second signal has its usual effect.
 
     A context manager; outside the main thread, which alone gets signals, it does nothing.
 
@@ -476,7 +476,7 @@ class StopSignals:
 
 
 def check_clips(recording: Recording, spec: WorldModelSpec) -> None:
-    """Refuses an episode too short for a clip.
+    """Refuse an episode too short for a clip.
 
     Raises:
         EpisodeError: the episode is too short, or frames are missing everywhere.
@@ -497,7 +497,7 @@ def check_clips(recording: Recording, spec: WorldModelSpec) -> None:
 
 
 def counted(skipped: Mapping[str, str]) -> list[str]:
-    """Returns a line for each reason with the names of its first episodes, the frequent first.
+    """Return a line for each reason with the names of its first episodes, the frequent first.
 
     Args:
         skipped: reasons by the episode's path.
@@ -515,7 +515,7 @@ def counted(skipped: Mapping[str, str]) -> list[str]:
 
 
 def num_dropped(recordings: Sequence[Recording], spec: WorldModelSpec) -> int:
-    """Returns how many clips cannot be cut because frames are missing within them."""
+    """Return how many clips cannot be cut because frames are missing within them."""
     dropped = 0
     for recording in recordings:
         last = recording.times[-1] - spec.chunk_seconds + 1e-6
@@ -556,7 +556,7 @@ class HeldOut:
         self._judge, self._every = judge, every
 
     def after(self, step: int, trainer: Trainer, log: TrainingLog) -> None:
-        """Scores the averaged weights if due; the best go to the result's folder with `-best`."""
+        """Score the averaged weights if due; the best go to the result's folder with `-best`."""
         if step % self._every and step != trainer.config.optimizer.steps:
             return
         folder = trainer.folder

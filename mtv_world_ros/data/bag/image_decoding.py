@@ -59,7 +59,7 @@ _MAX_PADDING = 4096
 
 
 def check_image(message: Any) -> None:
-    """Checks the fields of a sensor_msgs/Image or CompressedImage, without decoding it.
+    """Check the fields of a sensor_msgs/Image or CompressedImage, without decoding it.
 
     Raises:
         ObservationError: see `check_raw` and `check_compressed`.
@@ -71,7 +71,7 @@ def check_image(message: Any) -> None:
 
 
 def to_rgb(message: Any) -> ByteArray:
-    """Returns (H, W, 3) RGB of a sensor_msgs/Image or CompressedImage.
+    """Return (H, W, 3) RGB of a sensor_msgs/Image or CompressedImage.
 
     Raises:
         ObservationError: see `raw_to_rgb` and `compressed_to_rgb`.
@@ -82,7 +82,7 @@ def to_rgb(message: Any) -> ByteArray:
 
 
 def to_ids(message: Any) -> ByteArray:
-    """Returns (H, W) object numbers of a sensor_msgs/Image (mono8) or CompressedImage.
+    """Return (H, W) object numbers of a sensor_msgs/Image (mono8) or CompressedImage.
 
     Raises:
         ObservationError: too little data, or see `compressed_to_ids`.
@@ -106,7 +106,7 @@ def _bytes(message: Any) -> NDArray[np.uint8]:
 
 
 def check_raw(message: Any) -> None:
-    """Checks the fields of a sensor_msgs/Image.
+    """Check the fields of a sensor_msgs/Image.
 
     Raises:
         ObservationError: unknown encoding, rows shorter than the width, or too little data.
@@ -141,7 +141,7 @@ def _data_rows(encoding: str, height: int) -> int:
 
 
 def raw_to_rgb(message: Any) -> ByteArray:
-    """Returns (H, W, 3) RGB of a sensor_msgs/Image; of 16 bits the upper 8 are taken.
+    """Return (H, W, 3) RGB of a sensor_msgs/Image; of 16 bits the upper 8 are taken.
 
     Raises:
         ObservationError: an unknown encoding, or too little data; see `check_raw`.
@@ -159,7 +159,7 @@ def raw_to_rgb(message: Any) -> ByteArray:
 
 
 def check_compressed(layout: str, data: NDArray[np.uint8]) -> None:
-    """Checks the fields of a sensor_msgs/CompressedImage by the data's signature and header.
+    """Check the fields of a sensor_msgs/CompressedImage by the data's signature and header.
 
     Raises:
         ObservationError: neither a JPEG nor a PNG of 8 bits, whatever `format` says, or cut.
@@ -242,7 +242,7 @@ def _damaged(layout: str, data: NDArray[np.uint8], why: str = '') -> Observation
 
 
 def _check_size(layout: str, data: NDArray[np.uint8]) -> None:
-    """Reads width and height from the file's header, before anything is decoded."""
+    """Read width and height from the file's header, before anything is decoded."""
     try:
         check_limit('image_bytes', len(data), 'the file')
         content = data.tobytes()

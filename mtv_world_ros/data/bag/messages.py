@@ -59,7 +59,7 @@ def is_standard(msgtype: str) -> bool:
 
 
 def check_type(msgtype: str) -> str:
-    """Returns `msgtype` if it is known.
+    """Return `msgtype` if it is known.
 
     Raises:
         EpisodeError: the type is not among the standard message packages.

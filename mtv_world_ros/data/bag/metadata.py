@@ -119,12 +119,12 @@ def _topic_entry(topic: TopicRecord) -> dict[str, Any]:
 
 
 class _Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):  # type: ignore[misc]
-    """Writes repeated values in full: rosbag2's reader gets no anchors."""
+    """YAML writer without anchors, which rosbag2's reader does not support."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
 
 def dump(content: Any) -> str:
-    """Returns the YAML text of metadata, without anchors."""
+    """Return the YAML text of metadata, without anchors."""
     return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=1000)

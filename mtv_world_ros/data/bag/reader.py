@@ -93,7 +93,7 @@ class BagReader:
         return {message.topic: message.msgtype for message in self.messages()}
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
-        """Yields the messages of `topics` (default: all) in the order they were recorded.
+        """Yield the messages of `topics` (default: all) in the order they were recorded.
 
         Messages that are not in CDR are skipped and named in `problems`.
 
@@ -224,7 +224,7 @@ class BagReader:
                     yield from self._take(inner, part, topics)
 
     def _records(self, stream: BinaryIO, file: Path, size: int) -> Iterator[tuple[int, bytes]]:
-        """Records up to the footer; what is left of a chunk that was cut comes out as one."""
+        """Yield the records up to the footer; the rest of a truncated chunk is a record, too."""
         data_ended = False
         while True:
             start = stream.tell()
@@ -362,7 +362,7 @@ def _decompressed(file: Path) -> Iterator[Path]:
 
 
 def _unpacked(message: BagMessage) -> BagMessage:
-    """Undoes `compression_mode: message`; CDR never begins like a zstd frame."""
+    """Undo `compression_mode: message`; CDR never begins like a zstd frame."""
     if not message.data.startswith(_ZSTD_MAGIC):
         return message
     try:
@@ -385,7 +385,7 @@ def _split(records: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _decompress(body: bytes, end: int, most: int) -> bytes:
-    """Records of a chunk; as many as there are if the chunk was cut; never more than it states."""
+    """Return the records of a chunk, at most its stated size; fewer if it was truncated."""
     if len(body) < _CHUNK.size:
         return b''
     _, _, size, crc, name_length = _CHUNK.unpack_from(body)

@@ -35,7 +35,7 @@ _HARDWARE = ('_nvenc', '_vaapi', '_qsv', '_nvmpi', '_v4l2m2m', '_videotoolbox', 
 
 
 def codec_of(encoding: str) -> str:
-    """Returns the decoder of a packet's `encoding`, e.g. `h264_nvenc` or `h264;yuv420p;bgr8`.
+    """Return the decoder of a packet's `encoding`, e.g. `h264_nvenc` or `h264;yuv420p;bgr8`.
 
     Raises:
         ObservationError: no decoder is known for it.
@@ -54,7 +54,7 @@ def codec_of(encoding: str) -> str:
 
 
 def check_packet(message: Any) -> None:
-    """Checks the fields of an FFMPEGPacket.
+    """Check the fields of an FFMPEGPacket.
 
     Raises:
         ObservationError: no such decoder, no data, or too large.
@@ -71,7 +71,7 @@ def check_packet(message: Any) -> None:
 
 
 def from_first_key(messages: Sequence[tuple[int, Any]]) -> list[tuple[int, Any]]:
-    """Returns the (stamp, packet) from the first one on that needs no other."""
+    """Return the (stamp, packet) from the first one on that needs no other."""
     first = next((i for i, (_, m) in enumerate(messages) if m.flags & _KEY), len(messages))
     return list(messages[first:])
 
@@ -104,7 +104,7 @@ class VideoFrames(LazyFrames):
         return self._last[1]
 
     def _decoded(self, key: int) -> Iterator[tuple[int, ByteArray]]:
-        """Yields number and image of the frames from a key frame on."""
+        """Yield number and image of the frames from a key frame on."""
         context = av.CodecContext.create(self._codec, 'r')
         assert isinstance(context, VideoCodecContext)
         try:

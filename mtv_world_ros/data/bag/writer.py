@@ -81,7 +81,7 @@ class BagWriter:
     def declare(
         self, topic: str, msgtype: str, qos: Qos | None = None, definition: str = ''
     ) -> None:
-        """Adds a topic, with the QoS profile that `ros2 bag play` will offer.
+        """Add a topic, with the QoS profile that `ros2 bag play` will offer.
 
         `definition` is the `.msg` text of a type outside of the standard packages. Topics that are
         not declared get a reliable profile of depth 10 at their first message.
@@ -101,7 +101,7 @@ class BagWriter:
         *,
         publish_ns: int | None = None,
     ) -> None:
-        """Records one message.
+        """Record one message.
 
         Args:
             topic: absolute topic name.
@@ -133,11 +133,11 @@ class BagWriter:
             self._store(self._file.flush)
 
     def write_message(self, topic: str, msgtype: str, stamp_ns: int, message: object) -> None:
-        """Records a message of `messages.make`; see `write_raw`."""
+        """Record a message of `messages.make`; see `write_raw`."""
         self.write_raw(topic, msgtype, stamp_ns, messages.serialize(msgtype, message))
 
     def flush(self) -> None:
-        """Hands what was recorded to the operating system: a kill loses nothing of it.
+        """Hand what was recorded to the operating system: a kill loses nothing of it.
 
         Raises:
             EpisodeError: the disk does not take it.
@@ -147,11 +147,11 @@ class BagWriter:
                 self._store(self._writer.flush)
 
     def set_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Sets the MCAP metadata record `name`, also found in metadata.yaml's custom_data."""
+        """Set the MCAP metadata record `name`, also found in metadata.yaml's custom_data."""
         self._metadata[name] = {key: str(value) for key, value in values.items()}
 
     def close(self) -> None:
-        """Finishes the record and gives it its name; a second call does nothing.
+        """Finish the record and give it its name; a second call does nothing.
 
         Raises:
             EpisodeError: something else took the name meanwhile, or the disk does not take the
@@ -172,7 +172,7 @@ class BagWriter:
                     self._drop()
 
     def abort(self) -> None:
-        """Deletes the unfinished recording. Does nothing after `close()`."""
+        """Delete the unfinished recording. Does nothing after `close()`."""
         with self._lock:
             if not self._file.closed:
                 self._drop()
@@ -327,7 +327,7 @@ class _Spool:
         return self._size + len(self._pending)
 
     def flush(self) -> None:
-        """Writes what is pending, whole or not at all.
+        """Write what is pending, whole or not at all.
 
         Raises:
             OSError: the disk does not take it; it stays pending.
@@ -350,7 +350,7 @@ class _Spool:
         self._pending.clear()
 
     def release(self) -> None:
-        """Gives the reserved space back, for the index; nothing is reserved from now on."""
+        """Give the reserved space back, for the index; nothing is reserved from now on."""
         self._reserved = -1
         self._reserve_path.unlink(missing_ok=True)
 

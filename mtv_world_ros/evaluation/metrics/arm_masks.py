@@ -72,7 +72,7 @@ class ArmScene:
     parts: Sequence[LinkShape]
 
     def masks(self, positions: FloatArray) -> ArmMasks:
-        """Returns the arm at joint positions (T, J) [rad or m]."""
+        """Return the arm at joint positions (T, J) [rad or m]."""
         arm = draw_silhouettes(self.parts, self.camera, self.robot, positions)
         size = 2 * round(_MARGIN * self.camera.width) + 1
         near = cv2.dilate(arm.max(axis=0), np.ones((size, size), np.uint8)) > 0
@@ -82,7 +82,7 @@ class ArmScene:
 def arm_scenes(
     recording: Recording, robot: RobotModel, parts: Sequence[LinkShape]
 ) -> list[ArmScene | None]:
-    """Returns the scene of each view of a recording; None of a camera that moves."""
+    """Return the scene of each view of a recording; None of a camera that moves."""
     rows = np.linspace(0, len(recording.times) - 1, _MOST_FRAMES).astype(int)
     rows, moving = np.unique(rows), moving_links(robot)
     found: list[ArmScene | None] = []

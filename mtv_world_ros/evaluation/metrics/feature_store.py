@@ -22,7 +22,7 @@ MAX_GROUPS = 10
 
 
 def frechet_distance(real: FloatArray, predicted: FloatArray) -> float:
-    """Returns |m1 - m2|^2 + tr(C1 + C2 - 2 (C1 C2)^(1/2)) of the sample means and covariances.
+    """Return |m1 - m2|^2 + tr(C1 + C2 - 2 (C1 C2)^(1/2)) of the sample means and covariances.
 
     With C = A^T A the trace of the root is the sum of the singular values of A1 A2^T, so no root
     of a matrix is taken: the result is real and not negative whatever the rank of C, also with
@@ -65,7 +65,7 @@ def _moments(features: FloatArray) -> tuple[FloatArray, FloatArray]:
 def frechet_interval(
     real: Sequence[FloatArray], predicted: Sequence[FloatArray]
 ) -> tuple[float, float]:
-    """Returns a 95 % interval of the distance of (N, D) and (M, D) features of each episode.
+    """Return a 95 % interval of the distance of (N, D) and (M, D) features of each episode.
 
     Groups of episodes are left out in turn (jackknife): a resample of a bootstrap holds some
     samples twice, has a smaller covariance, and lies further from the other set. The interval is
@@ -93,7 +93,7 @@ _SIDES = ('predicted', 'real')
 
 
 def feature_path(out: Path, episode: str) -> Path:
-    """Returns where the features of an episode lie in an evaluation's folder."""
+    """Return where the features of an episode lie in an evaluation's folder."""
     return out / 'episodes' / f'{episode}.features.npz'
 
 
@@ -114,11 +114,11 @@ class FeatureTaker:
     clips: ClipFeatures | None = None
 
     def start(self) -> EpisodeFeatures:
-        """Returns an empty collection for one episode."""
+        """Return an empty collection for one episode."""
         return EpisodeFeatures(self)
 
     def take(self, video: ByteArray) -> dict[str, FloatArray]:
-        """Returns the features of a (T, H, W, 3) video by the name of the distance."""
+        """Return the features of a (T, H, W, 3) video by the name of the distance."""
         found = {}
         if self.frames is not None:
             found['fid'] = self.frames(video)
@@ -138,7 +138,7 @@ class EpisodeFeatures:
         self._found: dict[str, list[FloatArray]] = {}
 
     def add(self, predicted: ByteArray, real: ByteArray) -> None:
-        """Takes the features of a stretch, (V, T, H, W, 3) each."""
+        """Take the features of a stretch, (V, T, H, W, 3) each."""
         for side, videos in zip(_SIDES, (predicted, real), strict=True):
             for view, video in zip(self._taker.views, videos, strict=True):
                 for name, features in self._taker.take(video).items():
@@ -155,7 +155,7 @@ class EpisodeFeatures:
 
 
 def load_features(path: Path) -> dict[str, FloatArray]:
-    """Returns the features by `distance/view/side`; none if there is no file.
+    """Return the features by `distance/view/side`; none if there is no file.
 
     Raises:
         EpisodeError: the file cannot be read.

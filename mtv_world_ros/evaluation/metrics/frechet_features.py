@@ -84,7 +84,7 @@ class _Block(nn.Module):
 
 
 class I3D(nn.Module):
-    """Maps (N, 3, T, H, W) video of 0..255, T >= 9, to (N, 400) logits, the mean over time."""
+    """Network from (N, 3, T, H, W) video of 0..255, T >= 9, to mean logits (N, 400)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -99,7 +99,7 @@ class I3D(nn.Module):
         self.logits = _Unit(width, NUM_FEATURES, last=True)
 
     def forward(self, video: Tensor) -> Tensor:
-        """Returns the logits."""
+        """Return the logits."""
         count, _, num_frames, _, _ = video.shape
         frames = F.interpolate(video.transpose(1, 2).flatten(0, 1), (SIZE, SIZE), mode='bilinear')
         x = (frames / 127.5 - 1).unflatten(0, (count, num_frames)).transpose(1, 2)
@@ -124,7 +124,7 @@ ClipFeatures = Callable[[ByteArray], FloatArray]
 
 
 def frame_features(weights: Path, device: str = 'cpu') -> FrameFeatures:
-    """Returns the 2,048 features of the Inception-v3 that FID is defined by.
+    """Return the 2,048 features of the Inception-v3 that FID is defined by.
 
     Args:
         weights: `pt_inception-2015-12-05-*.pth` or `weights-inception-2015-12-05-*.pth`, or the
@@ -146,7 +146,7 @@ def frame_features(weights: Path, device: str = 'cpu') -> FrameFeatures:
 
 
 def clip_features(weights: Path, device: str = 'cpu') -> ClipFeatures:
-    """Returns the features that FVD is measured with.
+    """Return the features that FVD is measured with.
 
     Args:
         weights: the state dict of an I3D (400 logits).

@@ -27,7 +27,7 @@ class Curve:
     band: tuple[tuple[float, float], ...]
 
     def at(self, index: int) -> tuple[float | None, tuple[float, float] | None]:
-        """Returns a value and its interval; None where the curve does not reach."""
+        """Return a value and its interval; None where the curve does not reach."""
         reached = index < len(self.values)
         return (self.values[index], self.band[index]) if reached else (None, None)
 
@@ -39,7 +39,7 @@ def curve(
     *,
     min_share: float = MIN_SHARE,
 ) -> Curve:
-    """Returns J of the moving objects of a view against the horizon; rows weigh equally.
+    """Return J of the moving objects of a view against the horizon; rows weigh equally.
 
     Args:
         episodes: rows of each episode.
@@ -59,7 +59,7 @@ def by_chunk(
     field: str,
     num_frames: int,
 ) -> Curve:
-    """Returns J of the moving objects of a view for each chunk of its rollouts: how it drifts.
+    """Return J of the moving objects of a view for each chunk of its rollouts: how it drifts.
 
     All frames of a chunk, `num_frames`, weigh equally; the other arguments are those of `curve`.
     """

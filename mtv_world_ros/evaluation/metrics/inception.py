@@ -196,7 +196,7 @@ _POOLS = {'average': _average, 'maximum': _maximum, 'halve': _halve}
 
 
 class InceptionV3(nn.Module):
-    """Maps (N, 3, H, W) images of 0..255 to (N, 2048) features: the mean over the last map."""
+    """Network from (N, 3, H, W) images of 0..255 to (N, 2048) features: mean of the last map."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -212,7 +212,7 @@ class InceptionV3(nn.Module):
         self.fc = nn.Linear(width, 1008)  # in the weights; FID does not use it
 
     def forward(self, images: Tensor) -> Tensor:
-        """Returns the features."""
+        """Return the features."""
         x = (_resized(images) - 128) / 128
         for step in _STEM:
             x = self.get_submodule(step.name)(x) if isinstance(step, _Step) else _halve(x)

@@ -77,7 +77,7 @@ class ScoreRow:
     f_self: float = np.nan
 
     def as_json(self) -> dict[str, Any]:
-        """Returns plain values, None for NaN."""
+        """Return plain values, None for NaN."""
         values = asdict(self)
         for field in FRAME_FIELDS:
             values[field] = [_known(value) for value in values[field]]
@@ -132,7 +132,7 @@ def true_masks(
     *,
     use_ids: bool,
 ) -> Truth:
-    """Returns the masks that predictions are scored against.
+    """Return the masks that predictions are scored against.
 
     Args:
         stretch: recorded frames.
@@ -161,7 +161,7 @@ def true_masks(
 
 
 def keep_doubts(first: ObjectMasks, masks: ObjectMasks) -> ObjectMasks:
-    """Returns `masks` with the doubts about the objects from which they start.
+    """Return `masks` with the doubts about the objects from which they start.
 
     Args:
         first: masks of the start frame.
@@ -178,7 +178,7 @@ def keep_doubts(first: ObjectMasks, masks: ObjectMasks) -> ObjectMasks:
 
 
 def find_masks(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> ObjectMasks:
-    """Segments (V, T, H, W, 3) frames, starting from the recorded first frame and masks."""
+    """Segment (V, T, H, W, 3) frames, starting from the recorded first frame and masks."""
     return segmenter.segment(
         frames,
         truth.names,
@@ -188,7 +188,7 @@ def find_masks(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> ObjectM
 
 
 def score_frames(frames: ByteArray, truth: Truth, segmenter: Segmenter) -> ObjectScores:
-    """Scores (V, T, H, W, 3) frames; the segmenter starts from the recorded first masks."""
+    """Score (V, T, H, W, 3) frames; the segmenter starts from the recorded first masks."""
     return object_scores(find_masks(frames, truth, segmenter), truth.masks)
 
 
@@ -204,7 +204,7 @@ def score_rows(
     others: Mapping[str, ObjectScores],
     masks: ObjectMasks | None = None,
 ) -> list[ScoreRow]:
-    """Returns a row per view and object, and one per view for the union of objects.
+    """Return a row per view and object, and one per view for the union of objects.
 
     Args:
         stretch: the imagined stretch.
@@ -314,7 +314,7 @@ MARGINS = {
 
 
 def episode_means(rows: Sequence[ScoreRow], view: str | None) -> dict[str, float]:
-    """Returns `MEANS` and `MARGINS` of an episode in a view (None = all); frames weigh equally.
+    """Return `MEANS` and `MARGINS` of an episode in a view (None = all); frames weigh equally.
 
     Only rows with a J count, also in the baselines, so that the differences are paired.
     """

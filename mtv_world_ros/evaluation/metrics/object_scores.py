@@ -42,7 +42,7 @@ class ObjectScores:
 
 
 def object_scores(pred: ObjectMasks, true: ObjectMasks) -> ObjectScores:
-    """Scores predicted against true masks; see `object_jaccard` for what is not scored.
+    """Score predicted against true masks; see `object_jaccard` for what is not scored.
 
     Args:
         pred: masks in the predicted frames 1..T.
@@ -81,7 +81,7 @@ BOUNDARY_SHARE = 0.008
 
 
 def boundary_f(pred: BoolArray, true: BoolArray) -> FloatArray:
-    """Returns F of the boundaries of masks: the harmonic mean of their precision and recall.
+    """Return F of the boundaries of masks: the harmonic mean of their precision and recall.
 
     A pixel of one boundary counts where the other boundary is at most `BOUNDARY_SHARE` of the
     image's diagonal away. Both empty gives 1, one empty 0 (DAVIS 2017, `db_eval_boundary`).
@@ -120,7 +120,7 @@ def _boundary(mask: BoolArray) -> BoolArray:
 
 
 def moves(true: BoolArray, first: BoolArray) -> BoolArray:
-    """Returns (V, O) whether an object moves in the recording.
+    """Return (V, O) whether an object moves in the recording.
 
     It moves if in some frame its mask and its first mask share less than half of the smaller of
     the two. Hiding it, wholly or in part, leaves that share at 1. Frames that show

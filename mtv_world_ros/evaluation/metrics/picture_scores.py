@@ -55,7 +55,7 @@ _SSIM_C2 = (0.03 * 255) ** 2
 
 
 def picture_scores(frames: ByteArray, real: ByteArray, first: ByteArray) -> dict[str, float]:
-    """Returns `MEASURES` of a view but `j_arm`, means over frames; NaN where nothing changes.
+    """Return `MEASURES` of a view but `j_arm`, means over frames; NaN where nothing changes.
 
     Args:
         frames: (T, H, W, 3) uint8 RGB imagined.
@@ -95,7 +95,7 @@ def _psnr(error: NDArray[np.float64]) -> float:
 
 
 def changed(frame: ByteArray, first: ByteArray) -> NDArray[np.bool_]:
-    """Returns (H, W) whether a pixel differs between two frames (H, W, 3)."""
+    """Return (H, W) whether a pixel differs between two frames (H, W, 3)."""
     apart = np.abs(frame.astype(np.float32) - first.astype(np.float32)).max(axis=-1)
     return np.asarray(cv2.GaussianBlur(apart, (0, 0), 0.8) > _CHANGED)
 
@@ -120,7 +120,7 @@ PictureScores = Mapping[str, Mapping[str, float]]
 
 
 def episode_pictures(episode: PictureScores, view: str | None) -> dict[str, float]:
-    """Returns an episode's numbers of a view (None = mean of all), and margins."""
+    """Return an episode's numbers of a view (None = mean of all), and margins."""
     views = [numbers for name, numbers in episode.items() if view in (None, name)]
     names = dict.fromkeys(name for numbers in views for name in numbers)
     found = {name: _mean([numbers.get(name, nan) for numbers in views]) for name in names}
@@ -139,7 +139,7 @@ def _mean(values: Sequence[float]) -> float:
 def picture_estimates(
     episodes: Sequence[PictureScores], view: str | None = None
 ) -> dict[str, Estimate]:
-    """Returns means over episodes with 95 % intervals, by name; margins are paired."""
+    """Return means over episodes with 95 % intervals, by name; margins are paired."""
     rows = [episode_pictures(episode, view) for episode in episodes if episode]
     found = {}
     for name in dict.fromkeys(name for row in rows for name in row):
@@ -169,7 +169,7 @@ class Following:
 
 
 def following(estimates: Mapping[str, Estimate], objects: Estimate | None = None) -> Following:
-    """Decides by PSNR where the picture changes, against held frame and shuffled commands.
+    """Decide by PSNR where the picture changes, against held frame and shuffled commands.
 
     Args:
         estimates: of `picture_estimates`.

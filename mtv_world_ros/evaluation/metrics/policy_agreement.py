@@ -34,7 +34,7 @@ _TWO_GROUPS = 0.3
 def draw_rates(
     judged: FloatArray, true: FloatArray, num_draws: int = 1000, seed: int = 0
 ) -> FloatArray:
-    """Returns draws (2, D, P) of the judged and true rates of P policies on endless scenes.
+    """Return draws (2, D, P) of the judged and true rates of P policies on endless scenes.
 
     Args:
         judged: (P, K, E) outcomes on E scenes of each of K tasks, each 0 or 1, or estimates in
@@ -90,7 +90,7 @@ def _grid() -> tuple[FloatArray, FloatArray]:
 
 
 def _observed(outcomes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rates (2, P) that outcomes (2, P, K, E) give, arcsine scale, and covariance of their noise.
+    """Return the rates (2, P) of outcomes (2, P, K, E), arcsine scale, and their noise covariance.
 
     A scene that is hard for all policies moves all rates alike, which neither r nor a rank
     violation sees: what the policies have in common is taken out. How large the rest is, as a
@@ -197,7 +197,7 @@ _MANY_EPISODES = 60
 
 
 def pearson(judged: Sequence[float] | FloatArray, true: Sequence[float] | FloatArray) -> float:
-    """Returns Pearson's r of two lists of success rates, one entry a policy.
+    """Return Pearson's r of two lists of success rates, one entry a policy.
 
     Pairs in which one is NaN do not count. NaN where less than two are left, or all of one list
     are equal.
@@ -211,7 +211,7 @@ def pearson(judged: Sequence[float] | FloatArray, true: Sequence[float] | FloatA
 def mean_maximum_rank_violation(
     judged: Sequence[float] | FloatArray, true: Sequence[float] | FloatArray
 ) -> float:
-    """Returns MMRV: for each policy the worst pair that is ranked wrongly, on average.
+    """Return MMRV: for each policy the worst pair that is ranked wrongly, on average.
 
     A wrongly ranked pair weighs by how far the true success rates lie apart, so the order of the
     arguments matters (SIMPLER, arXiv 2405.05941; ties as in its published code: the better one
@@ -237,7 +237,7 @@ def _known(
 
 
 def rates(outcomes: FloatArray) -> FloatArray:
-    """Returns the success rate (P,) of outcomes (P, ...); NaN does not count."""
+    """Return the success rate (P,) of outcomes (P, ...); NaN does not count."""
     flat = outcomes.reshape(len(outcomes), -1)
     with warnings.catch_warnings():
         warnings.simplefilter('ignore', RuntimeWarning)
@@ -295,7 +295,7 @@ def _tails_of_pearson(true: FloatArray) -> FloatArray:
 
 
 def _draws(judged: FloatArray, true: FloatArray) -> FloatArray | None:
-    """Rates (2, D, P) without the noise of few scenes; None where there is too little."""
+    """Return the rates (2, D, P) without the noise of few scenes; None if there are too few."""
     both = np.stack([judged, true])
     is_known = np.isfinite(both)
     policies = is_known.any(axis=(2, 3)).all(axis=0)

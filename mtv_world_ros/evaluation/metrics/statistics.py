@@ -50,7 +50,7 @@ class Estimate:
 
 
 def t_quantile(degrees: FloatArray | float) -> FloatArray:
-    """Returns the factor of the standard error in a 95 % interval, NaN below one degree."""
+    """Return the factor of the standard error in a 95 % interval, NaN below one degree."""
     with np.errstate(invalid='ignore'):
         return np.where(np.asarray(degrees) >= 1, stdtrit(np.maximum(degrees, 1), 0.975), nan)
 
@@ -58,7 +58,7 @@ def t_quantile(degrees: FloatArray | float) -> FloatArray:
 def mean_interval(
     sums: FloatArray, counts: FloatArray, *, low: float = 0.0, high: float = 1.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns the means of columns and their 95 % t intervals over the rows.
+    """Return the means of columns and their 95 % t intervals over the rows.
 
     A row is an episode, which is drawn as a whole; it brings the sum of several values, so the
     mean is a ratio of sums, whose variance is that of the episodes' residuals (linearised). With
@@ -86,7 +86,7 @@ def mean_interval(
 
 
 def summarise(episodes: Sequence[dict[str, float]]) -> dict[str, Estimate]:
-    """Returns the mean over episodes of every number, and the skills, with 95 % intervals.
+    """Return the mean over episodes of every number, and the skills, with 95 % intervals.
 
     The interval of a margin is that of differences paired within each episode. Episodes are given
     by their `episode_means`, and `QUALITY` where it was measured.
@@ -122,7 +122,7 @@ def _estimate(values: FloatArray, weights: FloatArray, limits: Interval) -> Esti
 
 
 def wilson(hits: float, count: float, quantile: float = float(ndtri(0.975))) -> Interval:
-    """Returns the 95 % Wilson score interval of a share of independent trials; NaN without any.
+    """Return the 95 % Wilson score interval of a share of independent trials; NaN without any.
 
     `quantile` is the factor of the standard error.
     """
@@ -137,7 +137,7 @@ def wilson(hits: float, count: float, quantile: float = float(ndtri(0.975))) -> 
 
 
 def clustered_wilson(hits: FloatArray, counts: FloatArray) -> Interval:
-    """Returns the 95 % interval of a share of trials that come in clusters.
+    """Return the 95 % interval of a share of trials that come in clusters.
 
     Wilson's interval of the effective number of trials, with the t quantile of the clusters
     (Korn and Graubard, 1998). Rollouts that share a scene are a cluster. NaN for fewer than

@@ -29,7 +29,7 @@ NUM_CHART_BINS = 5
 
 
 def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
-    """Returns counts and scores of the estimates; None = unknown.
+    """Return counts and score of the estimates; None = unknown.
 
     The false-success rate is the share of real failures that were called a success. It and the
     accuracies are of those with a `verdict`, the others of those with a probability.
@@ -58,7 +58,7 @@ def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
 
 
 def expected_calibration_error(probability: FloatArray, real: BoolArray) -> float:
-    """Returns how far estimates (N,) are from the share of successes, over bins of estimates.
+    """Return how far estimates (N,) are from the share of successes, over bins of estimates.
 
     Bins weigh by how many estimates lie in them (Guo et al., 2017). An estimate is the probability
     of success, not of the likelier outcome.
@@ -74,7 +74,7 @@ def _binned(probability: FloatArray, num_bins: int) -> list[tuple[float, BoolArr
 
 
 def area_under_roc(probability: FloatArray, real: BoolArray) -> float | None:
-    """Returns how often a success was given more than a failure, ties half; None without both."""
+    """Return the AUC: probability that a success is rated above a failure; None without both."""
     gained, lost = probability[real], probability[~real]
     if not len(gained) or not len(lost):
         return None
@@ -105,7 +105,7 @@ class Bin:
 
 
 def reliability_bins(judgements: Sequence[Judgement]) -> list[Bin]:
-    """Returns the bins that hold an estimate of known outcome; empty = there is none."""
+    """Return the bins that hold an estimate of known outcome; empty = there is none."""
     judged = [
         item
         for item in judgements

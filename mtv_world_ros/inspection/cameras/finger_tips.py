@@ -19,7 +19,7 @@ _MAX_SHORTER_BY_M = 0.015
 def tip_middles(
     robot: RobotModel, shapes: Sequence[LinkShape], positions: FloatArray, arm: int = 0
 ) -> FloatArray:
-    """Returns (T, 3) the middle between the finger tips, in the base link [m].
+    """Return (T, 3) the middle between the finger tips, in the base link [m].
 
     Fingers that turn reach less far when they open: those of a Robotiq 2F-85 by 13 mm. Of a tool
     without fingers, or of fingers without shapes, it is the tool point.
@@ -38,7 +38,7 @@ def tip_middles(
 
 
 def num_tips(robot: RobotModel, shapes: Sequence[LinkShape], arm: int = 0) -> int:
-    """Returns how many finger tips the tool has, halfway open; 1 = the tool point alone."""
+    """Return how many finger tips the tool has, halfway open; 1 = the tool point alone."""
     tool = robot.tools[arm]
     positions = np.clip(np.zeros((1, len(robot.joint_names))), robot.lower, robot.upper)
     if tool.gripper_joint is not None:

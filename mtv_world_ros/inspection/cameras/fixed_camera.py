@@ -125,7 +125,7 @@ class Changes:
 
 
 class FixedCamera:
-    """Estimates the pose of one view.
+    """Estimator of the camera pose of one view.
 
     Args:
         track: its frames.
@@ -184,7 +184,7 @@ class FixedCamera:
         seed: int = 0,
         progress: Callable[[Sequence[Any]], Iterable[Any]] = iter,
     ) -> CameraEstimate:
-        """Estimates the pose, in the robot's base link.
+        """Estimate the pose, in the robot's base link.
 
         Args:
             guess: start from the camera's pose; False = from cameras all around the robot.
@@ -458,7 +458,7 @@ def random_camera(
 def best_apart(
     tried: Sequence[tuple[float, int, FloatArray, _Item]], reach: float
 ) -> list[tuple[FloatArray, _Item]]:
-    """Returns the best of some poses that stand apart, with what each was tried with.
+    """Return the best of some poses that stand apart, with what each was tried with.
 
     Args:
         tried: fit, number, T_base_camera (4, 4) and what it was tried with.

@@ -69,7 +69,7 @@ LEAST_REACH = 0.25
 
 
 def through(camera: CameraModel, lens: FloatArray) -> CameraModel:
-    """Returns the camera with another lens.
+    """Return the camera with another lens.
 
     Args:
         camera: with the lens that `lens` changes.
@@ -131,7 +131,7 @@ class _Step:
 
 
 class JointCamera:
-    """Estimates poses by place, and one lens.
+    """Estimator of the camera poses of all places, and of one lens.
 
     Args:
         recordings: one of each recording and view.
@@ -167,7 +167,7 @@ class JointCamera:
         *,
         rough: bool = False,
     ) -> JointState:
-        """Estimates all poses and the lens.
+        """Estimate all poses and the lens.
 
         Args:
             places: of the recordings.
@@ -426,7 +426,7 @@ class JointCamera:
         return np.nan_to_num(apart / (_POINT_STD * camera.width), nan=_BEHIND)
 
     def _add_points(self, state: JointState, found: dict[int, _Step]) -> None:
-        """Adds the seen points to the normal equations of their places."""
+        """Add the seen points to the normal equations of their places."""
         for place in self._points.keys() & found.keys():
             T, lens = state.poses[place], state.lens
             now = self._point_errors(place, T, lens)

@@ -155,7 +155,7 @@ def estimate_shared(
     focal_known: bool = True,
     seed: int = 0,
 ) -> tuple[SharedEstimate, ...]:
-    """Estimates fixed cameras of one make, each from several recordings.
+    """Estimate fixed cameras of one make, each from several recordings.
 
     Args:
         episodes: with cameras of the views, whose intrinsics and, with `guess`, poses are starts.
@@ -412,7 +412,7 @@ def seen_points(
     robot: RobotModel,
     shapes: Sequence[LinkShape],
 ) -> list[SeenPoint]:
-    """Returns where what was seen is by the joint states.
+    """Return where what was seen is by the joint states.
 
     Args:
         points: by the name of the episode: (time [s], x, y [px]).
@@ -450,7 +450,7 @@ def seen_points(
 
 
 def load_points(path: Path, view: str) -> dict[str, list[FloatArray]]:
-    """Reads seen tool points: `{<view>: {<episode>: [[seconds, x, y], ...]}}` [s, px].
+    """Read seen tool points: `{<view>: {<episode>: [[seconds, x, y], ...]}}` [s, px].
 
     Raises:
         ConfigError: the file is no such table, or has fewer than four points of the view.

@@ -127,7 +127,7 @@ class SceneTracks:
 
 
 class WristCamera:
-    """Estimates the pose of one view on the link that carries it.
+    """Estimator of the pose of a camera on the link that carries it.
 
     Args:
         tracks: points seen by it.
@@ -143,7 +143,7 @@ class WristCamera:
         self._poses = poses.reshape(*shape[:2], 4, 4)
 
     def estimate(self, *, guess: bool = True) -> CameraEstimate:
-        """Estimates the pose in the carrying link.
+        """Estimate the pose in the carrying link.
 
         Args:
             guess: start from the camera's pose; False = find its direction first.
@@ -266,7 +266,7 @@ class WristCamera:
 
 
 def find_mount(tracks: SceneTracks, camera: CameraModel, robot: RobotModel) -> CameraEstimate:
-    """Returns the estimate on the moving link whose motion fits the camera's best, without guess.
+    """Return the estimate on the moving link whose motion fits the camera's best, without guess.
 
     Of links that move alike in the recording, the first one from the base.
 
@@ -306,7 +306,7 @@ def _agree(R: FloatArray, turns: FloatArray) -> np.ndarray:
 def follow_scene(
     track: Track, camera: CameraModel, robot: RobotModel, joints: JointTrack
 ) -> SceneTracks:
-    """Tracks corners of the scene over stretches of frames in which the camera moves.
+    """Track corners of the scene over stretches of frames in which the camera moves.
 
     Args:
         track: frames of the camera.
@@ -373,7 +373,7 @@ def _vector(R: FloatArray) -> FloatArray:
 
 
 def _still_scene(rays: FloatArray, camera: CameraModel) -> tuple[np.ndarray, FloatArray]:
-    """Tracks (N,) that move as one still scene would, and ways (K, 3) to turn that explain it.
+    """Return True for each track (N,) of the still scene, and the rotations (K, 3) that fit.
 
     Of a flat scene the essential matrix is not unique; its homography has up to four solutions.
     """

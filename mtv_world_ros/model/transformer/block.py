@@ -22,7 +22,7 @@ NUM_TEXT_TOKENS = 512
 def check_tokens(
     text: Tensor | None, image: Tensor | None, takes_image: bool, num_views: int
 ) -> None:
-    """Checks umT5 and CLIP tokens (B, N, any width) for Wan's own cross-attention.
+    """Check umT5 and CLIP tokens (B, N, any width) for Wan's own cross-attention.
 
     Raises:
         CheckpointError: missing, or of another number than the attention counts on.
@@ -42,21 +42,21 @@ def check_tokens(
 
 
 class _NoContext(nn.Module):
-    """Replaces cross-attention in models without context tokens."""
+    """Replacement of cross-attention in models without context tokens."""
 
     def forward(self, hidden_states: Tensor, *_: Any) -> Tensor:
         return torch.zeros_like(hidden_states)
 
 
 def without_cross_attention(blocks: Any) -> None:
-    """Takes the cross-attention out of the blocks of a model without context tokens."""
+    """Take the cross-attention out of the blocks of a model without context tokens."""
     for block in blocks:
         block.attn2 = _NoContext()
         block.norm2 = nn.Identity()
 
 
 class RunwiseBlock(WanTransformerBlock):
-    """Equals its base class; modulation is stored once per run of tokens, not per token."""
+    """Block equal to its base class whose modulation is stored once per run of tokens."""
 
     def forward(
         self,
@@ -65,7 +65,7 @@ class RunwiseBlock(WanTransformerBlock):
         temb: Tensor,
         rotary_emb: tuple[Tensor, Tensor],
     ) -> Tensor:
-        """Returns (B, S, D).
+        """Return (B, S, D).
 
         Args:
             hidden_states: (B, S, D).
@@ -104,7 +104,7 @@ class SelfAttnProcessor:
         attention_mask: None = None,
         rotary_emb: tuple[Tensor, Tensor] | None = None,
     ) -> Tensor:
-        """Returns (B, S, D) of (B, S, D) tokens at places of `rotary_emb`."""
+        """Return (B, S, D) of (B, S, D) tokens at places of `rotary_emb`."""
         del encoder_hidden_states, attention_mask
         assert rotary_emb is not None
         query = attn.norm_q(attn.to_q(hidden_states)).unflatten(2, (attn.heads, -1))
@@ -128,7 +128,7 @@ def _turned(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
 
 
 def hold_levels_by_run(blocks: nn.ModuleList) -> None:
-    """Makes blocks of the base class `RunwiseBlock`s, in place; weights and names stay."""
+    """Make blocks of the base class `RunwiseBlock`s, in place; weights and names stay."""
     block: Any
     for block in blocks:
         block.__class__ = RunwiseBlock

@@ -39,7 +39,7 @@ class ResBlock(nn.Module):
         nn.init.zeros_(self.conv2.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor, temb: Tensor) -> Tensor:
-        """Returns (N, channels, h, w) for x (N, in_channels, h, w) and temb (B, D), B | N."""
+        """Return (N, channels, h, w) for x (N, in_channels, h, w) and temb (B, D), B | N."""
         hidden = self.conv1(F.silu(self.norm(x)))
         scale, shift = self.modulation(temb).chunk(2, dim=1)
         repeats = x.shape[0] // temb.shape[0]
@@ -67,7 +67,7 @@ class ConvStem(nn.Module):
         self.to_tokens = nn.Linear(merge * c3, dim)
 
     def forward(self, x: Tensor, temb: Tensor, views: int) -> tuple[Tensor, list[Tensor]]:
-        """Returns tokens (B, V, F/G, h4, w4, D) and the features to skip with, fine to coarse.
+        """Return tokens (B, V, F/G, h4, w4, D) and the features to skip with, fine to coarse.
 
         Args:
             x: (N, in_channels, h, w), frames in the order B, V, F.
@@ -84,7 +84,7 @@ class ConvStem(nn.Module):
 
 
 class ReferenceStem(nn.Module):
-    """Encodes reference latents (phi of the paper) as tokens, and as keys for copying."""
+    """Encoder of reference latents (phi of the paper) to tokens and to keys for copying."""
 
     def __init__(self, in_channels: int, widths: tuple[int, int, int], dim: int) -> None:
         super().__init__()
@@ -96,7 +96,7 @@ class ReferenceStem(nn.Module):
         self.to_tokens = nn.Conv2d(c2, dim, 2, stride=2)
 
     def forward(self, x: Tensor, temb: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns tokens (R, D, h4, w4) and keys (R, c2, h2, w2)."""
+        """Return tokens (R, D, h4, w4) and keys (R, c2, h2, w2)."""
         x = self.block1(self.conv_in(x), temb)
         keys = self.block2(self.down1(x), temb)
         return self.to_tokens(keys), keys
@@ -113,7 +113,7 @@ class CopyAttention(nn.Module):
         self.place = nn.Linear(18, NUM_COPIES * head_dim)
 
     def forward(self, x: Tensor, keys: Tensor, values: Tensor) -> Tensor:
-        """Returns (N, NUM_COPIES * P, h2, w2) copied patches.
+        """Return (N, NUM_COPIES * P, h2, w2) copied patches.
 
         Args:
             x: (N, channels, h2, w2) decoder features.
@@ -187,7 +187,7 @@ class ReferenceDecoder(nn.Module):
         reference: Tensor,
         control: Tensor,
     ) -> Tensor:
-        """Returns (N, out_channels, h, w) clean latents.
+        """Return (N, out_channels, h, w) clean latents.
 
         Args:
             tokens: (B, V, F/G, h4, w4, D).
@@ -211,7 +211,7 @@ class ReferenceDecoder(nn.Module):
         return self._mix(out, copies.float(), reference, control)
 
     def _mix(self, out: Tensor, copies: Tensor, reference: Tensor, control: Tensor) -> Tensor:
-        """Weighs the sources; channels of a latent are ordered colour-major (C, positions)."""
+        """Weigh the sources; channels of a latent are ordered colour-major (C, positions)."""
         c, p = self.out_channels, self.num_positions
         n, _, h, w = out.shape
         drawn = out[:, :c]

@@ -21,7 +21,7 @@ START_IMAGES = ('both', 'either')
 
 
 def embed_video(transformer: Any, x: Tensor, temb: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Returns tokens (B, V, f, h, w, D) of x (B, V, C_in, F, H, W), and what is skipped with.
+    """Return tokens (B, V, f, h, w, D) of x (B, V, C_in, F, H, W), and what is skipped with.
 
     Args:
         transformer: its `patch_embedding` is used.
@@ -37,7 +37,7 @@ def embed_video(transformer: Any, x: Tensor, temb: Tensor) -> tuple[Tensor, list
 
 
 def embed_history(transformer: Any, history: Tensor, start: Tensor, temb: Tensor) -> Tensor:
-    """Returns tokens (B, V, p, h, w, D) of the history, as of a video's later frames.
+    """Return tokens (B, V, p, h, w, D) of the history, as of a video's later frames.
 
     Its control is zero: the commands that led through it are done with.
 
@@ -61,7 +61,7 @@ def embed_reference(
     anchor: Tensor | None,
     temb: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Returns tokens (B, V, 1, h, w, D) of the anchor or start image; keys for copying the latter.
+    """Return tokens (B, V, 1, h, w, D) of the anchor or start image; keys for copying the latter.
 
     The convolutional stem sees the start image with its control frame; for an anchor from long
     ago there is none.
@@ -104,7 +104,7 @@ def unembed(
     reference: Tensor,
     control: Tensor,
 ) -> Tensor:
-    """Returns (B, V, C, F, H, W) of the kept tokens (B, V, f, h, w, D).
+    """Return (B, V, C, F, H, W) of the kept tokens (B, V, f, h, w, D).
 
     Args:
         transformer: its `proj_out` is used.
@@ -157,7 +157,7 @@ class MultiViewRotaryPosEmbed(WanRotaryPosEmbed):
     def forward(
         self, hidden_states: Tensor, times: Sequence[int] | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Returns cosines and sines, each (1, V*F*h*w, 1, head_dim).
+        """Return cosines and sines, each (1, V*F*h*w, 1, head_dim).
 
         Args:
             hidden_states: a (B, V, F, h, w, D) token grid; only its shape is read.
@@ -225,7 +225,7 @@ class TokenGrid(NamedTuple):
 
 
 def check_start_image(name: str) -> str:
-    """Returns the name, or raises CheckpointError if it is none of `START_IMAGES`."""
+    """Return the name, or raise CheckpointError if it is none of `START_IMAGES`."""
     if name not in START_IMAGES:
         raise CheckpointError(
             f"transformer.start_image '{name}' is not one of {', '.join(START_IMAGES)}"
@@ -234,7 +234,7 @@ def check_start_image(name: str) -> str:
 
 
 def arrange(video: Tensor, reference: Tensor, history: Tensor | None) -> TokenGrid:
-    """Returns the grid of (B, V, f | 1 | p, h, w, D) tokens."""
+    """Return the grid of (B, V, f | 1 | p, h, w, D) tokens."""
     num_history = 0 if history is None else history.shape[2]
     parts = [part for part in (history, reference, video) if part is not None]
     return TokenGrid(
@@ -245,7 +245,7 @@ def arrange(video: Tensor, reference: Tensor, history: Tensor | None) -> TokenGr
 
 
 def by_run(time_proj: Tensor, grid: TokenGrid) -> Tensor:
-    """Returns the blocks' modulation (B, R, 6, D) of R runs of tokens.
+    """Return the blocks' modulation (B, R, 6, D) of R runs of tokens.
 
     There is one run, or V * F frames if noise levels differ. The reference shares the video's
     level, as in Wan.

@@ -163,7 +163,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         context_input: dict[str, Any] | None = None,
         frame_input: dict[str, Any] | None = None,
     ) -> None:
-        """Adds inputs of a control to a model with text; other weights stay as they are.
+        """Add inputs of a control to a model with text; other weights stay as they are.
 
         Args:
             context_input: fields of `control.ContextInput`; None = no such input.
@@ -227,7 +227,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         control_frame: Tensor | None = None,
         control_kept: Tensor | None = None,
     ) -> Tensor:
-        """Returns (B, V, C, F, H, W): flow or clean latents, as `config.prediction` says.
+        """Return (B, V, C, F, H, W): flow or clean latents, as `config.prediction` says.
 
         Args:
             hidden_states: (B, V, C, F, H, W) noisy latents.
@@ -334,7 +334,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
 
 
 def copy_of(transformer: MultiViewWanTransformer) -> MultiViewWanTransformer:
-    """Returns another transformer of the same configuration and weights."""
+    """Return another transformer of the same configuration and weights."""
     other: Any = MultiViewWanTransformer.from_config(transformer.config)
     other.load_state_dict(transformer.state_dict())
     return other
