@@ -81,7 +81,7 @@ def _put(request: dict[str, Any], key: Key, value: Any) -> None:
     request[key[-1]] = value
 
 
-#: a server that does not close the connection is waited for this long [s]
+#: timeout of a server that does not close the connection [s]
 _GOODBYE_S = 1.0
 
 

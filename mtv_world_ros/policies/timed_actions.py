@@ -20,10 +20,10 @@ from mtv_world_ros.core.bounded_input import check_limit, limits
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import PolicyError
 
-#: instructions of one pickle; a chunk of 50 actions has about 3,000
+#: maximum number of instructions of a pickle; a chunk of 50 actions has about 3,000
 _MOST_STEPS = 200_000
 _MOST_DIMENSIONS = 8
-#: numbers in `torch.save`'s older format, which pickles of tensors hold
+#: magic number of `torch.save`'s older format, in pickles of tensors
 _MAGIC = 0x1950A86A20F9469CFC6C
 #: number formats by torch's classes of storages; bfloat16 is the upper half of a float32
 _FORMATS = {

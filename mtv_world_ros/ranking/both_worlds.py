@@ -32,9 +32,9 @@ VIDEO = '.mp4'
 SHEET = '.webp'
 #: suffix of the file with the frames and masks of both worlds
 FRAMES = '.rollout.npz'
-#: quality of a video is lowered until it is smaller [bytes]
+#: maximum size of a video, for which its quality is lowered [bytes]
 _VIDEO_BYTES = 150_000
-#: where a world has ended
+#: grey level of frames after the end of a world
 _BLANK = 225
 
 

@@ -15,10 +15,10 @@ from mtv_world_ros.ranking.rollout_jobs import Result
 from mtv_world_ros.simulation.collect.contact_sheet import titled
 from mtv_world_ros.simulation.faults.catalogue import EXPERT
 
-#: end of the names of pictures of where objects are
+#: suffix of pictures with object masks
 OBJECTS = '.objects.png'
-#: paper between the pictures [px]
-_GAP = 6
+#: gap between pictures [px]
+_GAP_PX = 6
 
 
 def find_flips(results: Sequence[Result], folder: Path) -> dict[str, bool]:
@@ -112,9 +112,9 @@ def flip_sheet(
             titled(f'{scene}, expert: {_word(expert)}', _picture(expert, folder)),
             titled(f'{result.policy}: {_word(result)}; {word}', _picture(result, folder)),
         ]
-        gap = np.full((len(blocks[0]), _GAP, 3), 255, np.uint8)
+        gap = np.full((len(blocks[0]), _GAP_PX, 3), 255, np.uint8)
         row = np.concatenate([blocks[0], gap, blocks[1]], axis=1)
-        rows += [row, np.full((_GAP, row.shape[1], 3), 255, np.uint8)]
+        rows += [row, np.full((_GAP_PX, row.shape[1], 3), 255, np.uint8)]
     return np.concatenate(rows) if rows else None
 
 

@@ -41,7 +41,7 @@ class Judge:
 
 #: the judge that sees the commands and the first frame alone
 RULE = 'no_picture'
-#: by field of a result
+#: judges by field of a result
 JUDGES: Mapping[str, Judge] = {
     'foreseen': Judge(title='foreseen motions alone'),
     'pictures': Judge(title='pictures alone'),
@@ -53,7 +53,7 @@ JUDGES: Mapping[str, Judge] = {
         episodes="the same estimator on the simulator's frames",
     ),
 }
-#: words of those in the optimism table, and of those in the ranking's own tables
+#: headings of judges in the optimism table; in `REPORTED`, in the ranking's own tables
 COLUMNS = {key: judge.column for key, judge in JUDGES.items() if judge.column}
 REPORTED = {key: judge.episodes for key, judge in JUDGES.items() if judge.episodes}
 #: scores of a judge, in the order of the tables

@@ -35,9 +35,9 @@ from mtv_world_ros.simulation.tasks import tasks_named
 
 #: names are parts of file names
 _NAME = r'^[A-Za-z0-9][A-Za-z0-9._-]*$'
-#: what says nothing about which policy it is
-_WAITS = ('timeout_s', 'setup_timeout_s', 'start_timeout_s')
-#: where a server listens that is started here
+#: settings that do not distinguish policies
+_TIMEOUTS = ('timeout_s', 'setup_timeout_s', 'start_timeout_s')
+#: addresses of servers that are started by a ranking
 _ADDRESSES = {'openpi': 'ws://127.0.0.1:{port}', 'lerobot': '127.0.0.1:{port}'}
 
 
@@ -135,7 +135,7 @@ def _listed(entry: PolicyEntry, path: Path, robot: RobotModel) -> ListedPolicy:
             f"{where} has a 'command', but is of kind '{config.kind}'; only policies of the kinds "
             f'{", ".join(_ADDRESSES)} have a server'
         )
-    known = {key: value for key, value in values.items() if key not in _WAITS}
+    known = {key: value for key, value in values.items() if key not in _TIMEOUTS}
     text = json.dumps([known, entry.command], sort_keys=True, default=str)
     return ListedPolicy(
         name=entry.name,

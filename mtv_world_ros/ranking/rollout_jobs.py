@@ -20,7 +20,7 @@ from mtv_world_ros.success.estimator import verdict
 
 #: NaN is null in a file
 _Float = Annotated[float, BeforeValidator(lambda value: nan if value is None else value)]
-#: of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
+#: tasks of a ranking on the fault catalogue: grasps across the middle, stacking, plates, two moves
 BENCHMARK_TASKS = (
     'place_block_a2b_left',
     'stack_blocks_two',
@@ -29,7 +29,7 @@ BENCHMARK_TASKS = (
     'move_object_two',
     'collect_toy',
 )
-#: from the expert to one that never finishes; in between, faults of several kinds and sizes
+#: policies from the expert to one that never finishes, with faults of several kinds and sizes
 DEFAULT_POLICIES = (
     'expert',
     'expert-noise-0.03',
@@ -43,11 +43,11 @@ DEFAULT_POLICIES = (
     'expert-stop-0.5',
 )
 DEFAULT_TASKS = ('place_block_a2b_left', 'place_bread_plate', 'stack_blocks_two')
-#: scenes drawn until the expert reaches everything in one
+#: maximum number of sampled scenes until the expert reaches all objects of a scene
 _MAX_ATTEMPTS = 25
-#: commands that differ by more have parted [rad or m]
+#: difference from which commands of the two worlds have parted [rad or m]
 COMMANDS_PART = 0.02
-#: an object has parted where its masks in the two worlds overlap by less in every view, J
+#: J of an object's masks in the two worlds, in every view, below which the object has parted
 OBJECTS_PART = 0.5
 
 

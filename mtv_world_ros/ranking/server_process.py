@@ -19,9 +19,9 @@ from mtv_world_ros.core.processes import (
     StoppedProcesses,
 )
 
-#: stands for the port in a command
+#: placeholder of the port in a command
 PORT = '{port}'
-#: starts without one good answer in between, after which the server is given up
+#: number of consecutive starts without a valid answer after which the server is given up
 MAX_STARTS = 3
 _POLL_S = 0.1
 _STOP_S = 5.0

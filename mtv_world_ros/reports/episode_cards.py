@@ -21,15 +21,15 @@ from mtv_world_ros.success.estimator import verdict
 from mtv_world_ros.viewing.rollout_clips import make_clip, RolloutClip
 from mtv_world_ros.vision.jaccard import mean_of_known
 
-#: of all embedded videos [bytes]; base64 adds a third
+#: maximum size of all embedded videos [bytes]; base64 adds a third
 VIDEO_BUDGET = 24_000_000
-#: of the best, the median and the worst episode alone
+#: maximum size of the videos of the best, median and worst episode [bytes]
 _PICKED_BUDGET = 6_000_000
 #: width up to which small frames of the best, median and worst episode are enlarged [px]
 _PICKED_TILE_PX = 320
 #: width up to which small frames of other episodes are enlarged [px]
 _TILE_PX = 192
-#: episodes with a contact sheet where none can be ranked
+#: number of episodes with a contact sheet if none can be ranked
 _NUM_UNRANKED = 3
 _BINS = ('0 to .2', '.2 to .4', '.4 to .6', '.6 to .8', '.8 to 1')
 _UNKNOWN = 'not scored'

@@ -18,12 +18,12 @@ from mtv_world_ros.reports.charts import ChartLine, Dot, dot_chart, line_chart
 from mtv_world_ros.reports.comparison import all_views
 from mtv_world_ros.reports.read_back import ranked_by, scores
 
-#: what is imagined, held and shuffled: (of objects that move, of all objects)
+#: keys of J of the imagined, held and shuffled video: (moving objects, all objects)
 _KEYS = (
     ('j_moving', 'j_copy_moving', 'j_shuffled_moving'),
     ('j_object_mean', 'j_copy_mean', 'j_shuffled_mean'),
 )
-#: shown where they were measured
+#: additional rows, shown if they were measured
 _MORE = {
     'j_zero_moving': 'joints held',
     'j_ceiling_moving': 'round trip',

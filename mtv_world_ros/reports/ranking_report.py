@@ -28,9 +28,9 @@ from mtv_world_ros.simulation.faults.catalogue import FAULTS
 from mtv_world_ros.success.estimator import FAILURE_BELOW, SUCCESS_FROM
 
 TITLE = 'Policy ranking'
-#: hues of the report's style sheet
+#: number of hues of the report's style sheet
 _NUM_HUES = 6
-#: characters in the head of a column
+#: maximum number of characters in the head of a column
 _NAME_LENGTH = 17
 
 

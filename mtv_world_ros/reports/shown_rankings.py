@@ -21,11 +21,11 @@ from mtv_world_ros.viewing import rerun_log
 from mtv_world_ros.viewing.scored_rollout import ScoredRollout
 from mtv_world_ros.viewing.stored_rollout import load_rollout
 
-#: says that a folder is a ranking's
+#: name of the file that marks the folder of a ranking
 FILE = 'ranking.json'
 #: path of the table, and the name of its tab
 TABLE = '/rates so far'
-#: rollouts that have a tab; earlier ones stay in the viewer's list
+#: maximum number of rollouts with a tab; earlier ones stay in the viewer's list
 _MAX_TABS = 8
 
 

@@ -10,7 +10,7 @@ from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.reports.read_back import read_evaluations
 from mtv_world_ros.viewing.scored_rollout import ScoredRollout, StoredRollout
 
-#: says that a folder is an evaluation's
+#: name of the file that marks the folder of an evaluation
 FILE = 'metrics.json'
 
 

@@ -17,14 +17,14 @@ from mtv_world_ros.success.evidence import MAX_MARGIN
 #: an object nearer than this to one of its futures moved as foreseen [m]; masks of small pictures
 #: are no more exact
 NEAR_M = 0.035
-#: a smaller motion is no evidence about contact [m]
-_MOVES_M = 0.03
-#: largest share of chunks that end unforeseen under the fitted physics
-_USUAL = 0.15
-#: p-value below which the physics is taken to be another one
-_SURE = 0.01
-#: chunks in the test
-_MOST = 24
+#: minimum object motion for evidence about contact [m]
+_MIN_MOTION_M = 0.03
+#: maximum fraction of chunks with unforeseen ends under the fitted physics
+_MAX_UNFORESEEN_FRACTION = 0.15
+#: p-value below which the fitted physics is rejected
+_MAX_P_VALUE = 0.01
+#: number of last chunks in the test
+_NUM_CHUNKS = 24
 SAYS = 'the physics here is not the one that was fitted'
 
 
@@ -40,7 +40,7 @@ def unforeseen(foreseen: FloatArray, real: FloatArray) -> float:
     gaps = np.linalg.norm(ahead - came, axis=-1)
     known = np.isfinite(gaps).all(0)
     moved = np.maximum(np.linalg.norm(ahead, axis=-1).max(0, initial=0.0),
-                       np.linalg.norm(came, axis=-1)) > _MOVES_M  # fmt: skip
+                       np.linalg.norm(came, axis=-1)) > _MIN_MOTION_M  # fmt: skip
     counts = known & moved
     return float(gaps.min(0)[counts].max()) if counts.any() else nan
 
@@ -49,7 +49,7 @@ class PhysicsWatch:
     """Tests whether executed chunks end as foreseen, by a binomial test over the last ones."""
 
     def __init__(self) -> None:
-        self._unforeseen: deque[bool] = deque(maxlen=_MOST)
+        self._unforeseen: deque[bool] = deque(maxlen=_NUM_CHUNKS)
 
     def take(self, away_m: float) -> None:
         """Adds the distance of a chunk's end from the nearest future [m]; NaN = no evidence."""
@@ -64,7 +64,7 @@ class PhysicsWatch:
     def doubt(self) -> str:
         """Reason why the fitted physics does not hold here; empty if it holds."""
         count, of = sum(self._unforeseen), len(self._unforeseen)
-        if not of or bdtrc(count - 1, of, _USUAL) >= _SURE:
+        if not of or bdtrc(count - 1, of, _MAX_UNFORESEEN_FRACTION) >= _MAX_P_VALUE:
             return ''
         return (
             f'{SAYS}: {count} of the last {of} executed chunks in which an object moved ended '
@@ -125,7 +125,7 @@ def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
     return replace(estimate, probability=middle, interval=interval, reasons=reasons)
 
 
-#: how an estimate that rests on nothing is mended
+#: commands that calibrate an estimate
 _CALIBRATE = 'mtv-world fit success CHECKPOINT EPISODES on episodes of known outcome'
 _FIT = 'mtv-world fit contact RECORDINGS --checkpoint CHECKPOINT on recordings of this robot'
 

@@ -105,19 +105,19 @@ class ImaginedScene:
         return np.concatenate([[0.0], counts])[np.cumsum(known)]
 
 
-#: margins are clipped to this many softness lengths
+#: limit of margins [softness lengths]
 MAX_MARGIN = 3.0
-#: an object this far from its start has moved [m]
+#: minimum distance of a moved object from its start [m]
 MOVED_M = 0.03
-#: a tool this far from an object's centre, in the table plane, can still have grasped it [m]
+#: maximum horizontal distance of a tool from the centre of an object that it grasped [m]
 GRASP_M = 0.02
-#: the same for the distance outside the mask of an object that is held by its rim [m]
+#: maximum distance of a tool from the mask of an object that it grasped at the rim [m]
 RIM_GAP_M = 0.01
-#: largest distance of a carried object from where its tool carried it [m]
+#: maximum distance of a carried object from its position in the tool [m]
 CARRY_ERROR_M = 0.025
-#: larger J of the start with the goal mask count as this much
+#: upper limit of J between the start mask and the goal mask
 MAX_START_JACCARD = 0.5
-#: what the features are called, in order; the last is not of the masks, see `foreseen`
+#: names of the features, in order; the last comes from `foreseen`, not from masks
 FEATURES: tuple[str, ...] = (
     'margin',
     'mean_margin',

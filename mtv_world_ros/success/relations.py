@@ -25,7 +25,7 @@ OVER_WALL_M = 0.03
 _SWINGS = (0.25, 0.5, 0.625, 0.75, 0.875, 1.0, 1.125, 1.25, 1.5, 2.0, 3.0)
 _SOFT_SWING = 0.25
 
-#: a placeholder, and where the centre (3,) of its object should be at the end [m]
+#: placeholder of an object, and goal position (3,) of its centre [m]
 Goal = tuple[str, FloatArray]
 
 
@@ -58,7 +58,7 @@ def plane_distance(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.linalg.norm((np.asarray(a) - np.asarray(b))[..., :2], axis=-1)
 
 
-#: stands between a wrong value and what is valid
+#: text between a wrong value and the valid values
 EXPECTED = '; expected'
 _Positive = Annotated[float, Field(gt=0, lt=1e3)]
 _Signed = Annotated[float, Field(gt=-1e3, lt=1e3)]

@@ -13,9 +13,9 @@ from mtv_world_ros.cameras.mask_geometry import centroids, lean, locate_all
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.core.data_types import BoolArray, CameraModel, FloatArray, ObjectMasks
 
-#: frames whose places are kept; the start is kept whatever follows
+#: maximum number of frames with kept positions; the start is always kept
 MAX_FRAMES = 2000
-#: grasps that are kept
+#: maximum number of kept grasps
 MAX_GRASPS = 64
 #: decrease of the opening at which a gripper has grasped [fraction of its range]
 CLOSES_BY = 0.15
@@ -23,7 +23,7 @@ CLOSES_BY = 0.15
 OPENS_BY = 0.1
 #: opening at the start below which a gripper may already hold an object [fraction of its range]
 HOLDING_BELOW = 0.8
-#: an object that shows this share of its largest area is not hidden
+#: minimum visible area of an object that is not hidden [fraction of its largest area]
 UNHIDDEN_SHARE = 0.9
 
 

@@ -12,7 +12,7 @@ from mtv_world_ros.cameras.mask_geometry import count_reversals, widest_swing
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import CannotTell
 
-#: a gripper counts as open above this share of its range
+#: minimum opening of an open gripper [fraction of its range]
 OPEN_SHARE = 0.8
 
 

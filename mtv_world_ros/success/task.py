@@ -18,9 +18,9 @@ from mtv_world_ros.success.situation import grippers_open, Situation
 from mtv_world_ros.vision.describers.describer import ends_phrase
 
 GRIPPERS = ('open', 'any')
-#: `final` means true in each of this many last samples (0.5 s at 10 Hz)
+#: number of last samples in which a `final` task is done (0.5 s at 10 Hz)
 HELD_SAMPLES = 5
-#: characters of an object's name in an instruction: what matches it takes bounded time
+#: maximum length of an object's name in an instruction; it bounds the matching time [characters]
 _LONGEST_NAME = 64
 
 
@@ -49,7 +49,7 @@ def _by_role(what: str) -> BeforeValidator:
 
 
 _Words = Annotated[ListOf[str], expected('a list of words', EXPECTED)]
-#: (x, y, z) [m]
+#: extents (x, y, z) [m]
 _Extents = Annotated[Lengths3, expected('3 positive length(s) in metres', EXPECTED, parts=2)]
 _Nouns = Annotated[ListOf[str], expected('a list of words', EXPECTED, parts=2)]
 

@@ -12,13 +12,13 @@ from mtv_world_ros.core.errors import CannotTell
 from mtv_world_ros.success.rollout_memory import Footage, RolloutMemory
 from mtv_world_ros.vision.jaccard import jaccard
 
-#: frames at the end whose median counts
+#: number of frames at the end whose median is used
 _LAST_FRAMES = 3
-#: largest miss of the views' rays, as a share of the image's diagonal
+#: maximum distance between the rays of views [fraction of the image's diagonal]
 _MAX_RESIDUAL = 0.02
-#: largest difference between views of the subject's J with its goal
+#: maximum difference between views of the subject's J with its goal
 _MAX_DISAGREEMENT = 0.7
-#: smallest area of the subject at the end, as a share of its largest
+#: minimum area of the subject at the end [fraction of its largest area]
 _MIN_VISIBLE = 0.3
 #: an object that shows less than this share of its last unhidden area, and lies within that mask,
 #: is taken to stand where it stood then

@@ -12,7 +12,7 @@ from mtv_world_ros.viewing.scored_rollout import StoredRollout
 from mtv_world_ros.viewing.video import Comparison, contact_sheet, encode_small_video, side_by_side
 from mtv_world_ros.vision.jaccard import mean_of_known
 
-#: of objects, one after the other: bright ones that few real things have
+#: outline colours of objects, in order: bright colours that few real objects have
 OUTLINES = (
     (255, 0, 255),  # magenta
     (0, 255, 255),  # cyan

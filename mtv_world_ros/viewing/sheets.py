@@ -25,8 +25,8 @@ SHEET = 'contact_sheet.png'
 VIDEO = 'comparison.mp4'
 #: grey level of a missing frame
 _BLANK = 225
-#: frames that may stand for a moment, in imagined frame periods around it
-_REACH = 0.6
+#: maximum time between a frame and the moment that it represents [imagined frame periods]
+_MAX_TIME_OFFSET = 0.6
 
 
 def write_pictures(bags: Sequence[Path], out: Path, *, has_video: bool = True) -> list[Path]:
@@ -84,7 +84,7 @@ def compared(streams: Streams) -> Comparison:
         raise EpisodeError('the recording holds no imagined frames')
     stamps = np.unique([stamp for stamp, _ in streams.images['imagined', views[0]]])
     size = streams.images['imagined', views[0]][0][1].shape[:2]
-    reach = _REACH * float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
+    reach = _MAX_TIME_OFFSET * float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
     frames = {
         kind: np.stack([_at(streams, kind, view, stamps, size, reach) for view in views])
         for kind in KINDS

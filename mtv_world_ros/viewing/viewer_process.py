@@ -30,11 +30,11 @@ from mtv_world_ros.core.processes import ending_with_this_process, last_line
 LOOPBACK = '127.0.0.1'
 #: port on which Rerun's window takes data
 _WINDOW_PORT = 9876
-#: longest wait until the program listens [s]; a first start reads its 300 MB from a slow disk
+#: timeout of the start [s]; a first start reads 300 MB from a slow disk
 _START_TIMEOUT_S = 30.0
 _STOP_S = 2.0
 _POLL_S = 0.05
-#: Rerun's program is part of another one: it asks nothing at its first start
+#: environment of Rerun's program, so that it asks no questions at its first start
 _ENVIRONMENT = {'RERUN_APP_ONLY': 'true'}
 
 

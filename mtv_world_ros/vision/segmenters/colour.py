@@ -47,16 +47,16 @@ Floats = NDArray[np.floating]
 # Saturation is CIELAB chroma / (lightness + 16): it keeps its value when a surface is shaded.
 #: largest distance to the colour word's hue [degrees]; hues nearer to another word are that word's
 _MAX_HUE_ERROR = 28.0
-#: share of the palette colour's saturation below which nothing is found
+#: minimum saturation of a detected pixel [fraction of the palette colour's saturation]
 _MIN_SATURATION = 0.3
-#: shares of the object's own saturation between which its edge may lie
+#: range of the saturation at the edge of an object [fraction of its own saturation]
 _EDGE_RANGE = (0.25, 0.6)
-#: darker pixels have no hue [0-255]
+#: minimum lightness of a pixel with a hue [0-255]
 _MIN_LIGHTNESS_8BIT = ceil(0.08 * 255)
 #: of pixels with the hue of a word, saturation in HSV as a share of that in CIELAB, at the least
 _HSV_SHARE = 0.6
 _TRACKING = TrackingConfig()
-#: pixels of at least this share of the core's saturation say what colour the object has
+#: minimum saturation of pixels that define the colour of an object [fraction of the core's]
 _STRONG_SHARE = 0.8
 #: number of pixels of a view at which each view is segmented in a thread of its own
 _MIN_PIXELS_FOR_THREADS = 1_000_000

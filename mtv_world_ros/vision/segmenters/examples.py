@@ -27,21 +27,21 @@ from mtv_world_ros.vision.segmenters.tracking import judge, track, TrackingConfi
 Box = tuple[float, float, float, float]
 
 Floats = NDArray[np.floating]
-#: of examples on disk
+#: suffix of files with examples
 SUFFIX = '.safetensors'
 #: bins of a histogram of CIELAB in 8 bits
 _BINS = (16, 64, 64)
-#: standard deviation over which counts are spread, in bins
+#: standard deviation of the smoothing of a histogram [bins]
 _SPREAD = (0.7, 1.0, 1.0)
 #: minimum fraction of the pixels of an object for a colour of the object
 _MIN_COLOUR_SHARE = 2e-5
-#: share of the whole picture's colours in what surrounds an object that may move away
+#: weight of the colours of the whole picture in the surroundings of an object that may move away
 _ELSEWHERE = 0.03
 #: minimum Jaccard index of a colour mask with the drawn masks for tracking by colour
 _MIN_COLOUR_JACCARD = 0.5
 #: minimum correlation with the picture of an example for a detection
 _MIN_CORRELATION = 0.75
-#: maximum change of the CIELAB values (8 bits) of a resting object: shadows change L more than a
+#: maximum change of the CIELAB values L, a, b (8 bits) of a resting object; shadows change L most
 _MAX_RESTING_CHANGE = (40, 10, 10)
 #: minimum share of the object's own colours in the first mask for tracking by colour
 _MIN_COLOUR_FRACTION = 0.5
@@ -58,7 +58,7 @@ _MIN_MARGIN_PX = 2
 _MAX_CUT_FRACTION = 0.01
 #: minimum Jaccard index of a cut-out mask with the colour mask for being the same object
 _MIN_CUT_JACCARD = 0.5
-#: pixels that are kept of a frame's surroundings
+#: maximum number of kept pixels of the surroundings in a frame
 _KEPT = 4000
 _TRACKING = TrackingConfig()
 
@@ -272,7 +272,7 @@ class _Look:
         return likely & (self.colours > _MIN_COLOUR_SHARE)
 
 
-#: an example's frame is little larger than the object
+#: an object may fill the frame of an example
 _WITHIN = TrackingConfig(max_area_share=1.0)
 
 

@@ -27,9 +27,9 @@ class Normalisation:
     std: tuple[float, float, float]
 
 
-#: of SAM 2 and MM-Grounding-DINO: the channels of ImageNet
+#: image normalisation of SAM 2 and MM-Grounding-DINO: the channels of ImageNet
 IMAGENET = Normalisation(mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225))
-#: of SAM 3
+#: image normalisation of SAM 3
 SYMMETRIC = Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
 #: of MM-Grounding-DINO: shorter edge, and what the longer one may not exceed [px]
 DINO_EDGES = (800, 1333)

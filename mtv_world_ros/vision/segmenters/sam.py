@@ -25,7 +25,7 @@ from mtv_world_ros.vision.segmenters.weights import (
     preprocessor_config,
 )
 
-#: what SAM 2 calls the corners of a box among the points of a prompt
+#: labels of SAM 2 for the two corners of a box among the points of a prompt
 _BOX_LABELS = (2, 3)
 
 
@@ -120,7 +120,7 @@ def sam2_segmenter(
     )
 
 
-#: tokens that SAM 3's text encoder reads of a name
+#: maximum number of tokens of a name in SAM 3's text encoder
 _TEXT_LENGTH = 32
 #: SAM 3's own threshold for detections is .5; it adds an object to a video from .7 on
 SAM3_SCORES = GroundingConfig(min_score=0.5, sure_score=0.7)

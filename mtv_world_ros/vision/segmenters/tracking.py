@@ -290,10 +290,10 @@ def _remember(patch: _Patch, state: _State) -> None:
 PARTS: MappingProxyType[str, str] = MappingProxyType(
     {'carrot': 'green', 'corn': 'green', 'eggplant': 'green'}
 )
-#: a part lies this near to the main piece, as a share of the image's diagonal
-_GAP = 0.008
-#: a larger piece, relative to the largest main piece, is another thing
-_MAX_SHARE = 3.0
+#: maximum distance of a part from the main piece [fraction of the image's diagonal]
+_MAX_PART_GAP = 0.008
+#: maximum area of a piece of the same object [largest main pieces]
+_MAX_AREA_RATIO = 3.0
 
 
 def part_of(name: str, colour: str | None) -> str | None:
@@ -321,7 +321,7 @@ def with_part(
     free = pixels & ~np.any(others, axis=0) if others else pixels
     masks = np.array(found.masks)
     largest = masks.sum((1, 2)).max(initial=0)
-    reach = ceil(_GAP * hypot(*masks.shape[1:]))
+    reach = ceil(_MAX_PART_GAP * hypot(*masks.shape[1:]))
     kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     for mask, frame in zip(masks, free, strict=True):
         if not mask.any() or not frame.any():
@@ -329,7 +329,9 @@ def with_part(
         labels = np.asarray(cv2.connectedComponents(frame.view(np.uint8), connectivity=8)[1])
         near = cv2.dilate(mask.view(np.uint8), kernel) > 0
         areas = np.bincount(labels.ravel())
-        pieces = [n for n in np.unique(labels[near]) if n and areas[n] <= _MAX_SHARE * largest]
+        pieces = [
+            n for n in np.unique(labels[near]) if n and areas[n] <= _MAX_AREA_RATIO * largest
+        ]
         mask |= np.isin(labels, pieces)
     status = found.status
     if status == 'ok':
