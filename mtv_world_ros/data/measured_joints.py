@@ -40,7 +40,7 @@ class ReachSettings:
     glitch_ratio: float = 0.05
     #: fraction of the samples of the largest source up to which all is taken as of a wrong unit
     scattered_ratio: float = 0.3
-    #: a publisher whose joints vary by less stands still [rad or m]
+    #: motion below which the joints of a publisher stand still [rad or m]
     still: float = 1e-3
     #: maximum number of publishers that are distinguished
     num_publishers: int = 32

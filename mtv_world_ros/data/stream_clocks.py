@@ -52,7 +52,7 @@ class ClockSettings:
     #: difference of two steps that are of one clock [s], and as a fraction of their size
     same_size_s: float = 0.1
     same_size_ratio: float = 0.1
-    #: how exactly a wrapping counter is met [s]
+    #: tolerance of a step that equals the range of a wrapping counter [s]
     wrap_s: float = 0.5
     #: offset against the reference that is named [s]: ahead, which no delay explains, and behind
     named_ahead_s: float = 0.1

@@ -17,7 +17,7 @@ from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import CalibrationError, nearest
 from mtv_world_ros.core.transforms import inverse, pose
 
-#: a transform on /tf that varies by less than this is static [m, entries of the rotation]
+#: variation below which a transform on /tf is static [m, entries of the rotation]
 STILL = 1e-4
 #: frames kept; a publisher that makes up a name a message must not fill the memory
 _MOST_FRAMES = 2000
@@ -27,7 +27,7 @@ _NUM_RECENT = 256
 _Numbers = tuple[float, ...]
 
 
-#: a pose between two transforms that are further apart is not known [s]
+#: maximum time between two transforms that are interpolated [s]
 MAX_GAP_S = 0.5
 
 

@@ -49,7 +49,7 @@ from mtv_world_ros.rollout.prediction import Prediction
 from mtv_world_ros.viewing.scored_rollout import StoredRollout
 from mtv_world_ros.viewing.stored_rollout import join, save_rollout
 
-#: what the time of an episode goes into
+#: stages whose run time is measured
 STAGES = ('reading', 'imagining', 'segmenting', 'scoring', 'features', 'storing')
 
 

@@ -19,9 +19,9 @@ from mtv_world_ros.success.calibration import Calibration, weighed, Weights
 from mtv_world_ros.success.estimator import capped, STATED_WEIGHTS
 from mtv_world_ros.success.evidence import FEATURES
 
-#: fewer episodes of known outcome than this say nothing
+#: minimum number of episodes of known outcome
 MIN_EPISODES = 8
-#: of a fitted logistic; all labels equal would have no finite one
+#: maximum absolute bias of a fitted logistic; with equal labels it would be infinite
 MAX_BIAS = 30.0
 #: judgements with the stated weights, before the fit
 BEFORE = 'before'

@@ -34,7 +34,7 @@ from mtv_world_ros.robot.resample import match_joints
 #: parts of an image topic's name that say nothing of the view
 _NOT_A_VIEW = {'image', 'image_raw', 'image_rect', 'image_color', 'image_rect_color', 'color',
                'rgb', 'compressed', 'ffmpeg', 'camera', 'image_rect_raw'}  # fmt: skip
-#: no pictures of the scene
+#: words in the names of image topics that are not colour images of the scene
 _NO_COLOURS = ('depth', 'infra', 'mask', 'confidence', 'disparity')
 
 

@@ -399,7 +399,7 @@ def _commands(
     return found
 
 
-#: a command this many times faster than the joint's limit is a jump
+#: speed of a command that counts as a jump [joint speed limits]
 _JUMP = 2.0
 
 

@@ -35,7 +35,7 @@ _PICTURES = ('video', 'image')
 #: bytes 24 and 25 of a PNG: 16 bits, grey
 _PNG_DEPTH = bytes([16, 0])
 _INFO = Path('meta/info.json')
-#: a video frame may be this share of the period away from its row
+#: maximum time between a video frame and its row [periods]
 _TIME_TOLERANCE = 0.25
 #: rows a second that no recording exceeds [Hz]
 _MOST_HZ = 10_000.0

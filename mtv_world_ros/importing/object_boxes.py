@@ -16,9 +16,9 @@ from mtv_world_ros.core.errors import ConfigError, nearest
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.vision.segmenters.examples import Box, Example, ObjectExamples
 
-#: of a box [px]
+#: minimum side length of a box [px]
 LEAST_SIDE = 3
-#: a box belongs to the frame nearest to its time, at most this far away [s]
+#: maximum time between a box and the nearest frame, which it belongs to [s]
 _NEAR_S = 0.5
 #: recordings that an error names
 _LISTED = 12

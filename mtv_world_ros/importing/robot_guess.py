@@ -23,11 +23,11 @@ from mtv_world_ros.robot.xml_file import parse_xml
 MOST_ARMS = 8
 #: joints of the largest hand that is guessed; hands of five fingers have up to 24
 MOST_FINGER_JOINTS = 24
-#: a tree with a fork at most this far from its ends is a gripper [joints]
+#: maximum depth of the fork of a gripper, from the ends of its fingers [joints]
 _FINGER_JOINTS = 6
 #: the tool point is this far inside the finger tips [m]
 _TIP_M = 0.0085
-#: finger links that end this far behind the others have no tip [m]
+#: finger links that end farther than this behind the others have no tip [m]
 _BESIDE_TIP_M = 0.015
 #: minimum number of joints of an arm
 _ARM_JOINTS = 3

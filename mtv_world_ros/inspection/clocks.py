@@ -17,11 +17,11 @@ from mtv_world_ros.robot.resample import interpolated, match_joints
 Stamps = NDArray[np.int64]
 
 
-#: a pause this many times the median period is a gap
+#: minimum length of a gap [median periods]
 _GAP = 2.5
 #: views further apart are refused by the node [s]
 _MAX_SKEW_S = 0.05
-#: a frame's nearest joint state may be this far away [s]
+#: maximum time between a frame and its nearest joint state [s]
 _MAX_JOINT_AGE_S = 0.1
 #: share of the frames within the joint states; below half of it is broken
 _MIN_COVERAGE = 0.95

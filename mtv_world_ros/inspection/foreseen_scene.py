@@ -47,7 +47,7 @@ _ROBOT_COLOUR = (0.45, 0.47, 0.5, 1.0)
 _COLOURS = ((0.8, 0.2, 0.2, 1.0), (0.2, 0.4, 0.8, 1.0), (0.2, 0.6, 0.3, 1.0), (0.8, 0.6, 0.1, 1.0))
 #: instants that a picture shows, as shares of the plan
 _SHOWN = (0.0, 0.5, 1.0)
-#: a plan that is longer is of another unit [s]
+#: maximum duration of a plan; a longer one probably has another unit [s]
 LONGEST_S = 120.0
 
 

@@ -23,7 +23,7 @@ from mtv_world_ros.robot.shape import fill, LinkShape, moving_links
 
 FloatImage = NDArray[np.float32]
 
-#: an image whose joints moved less than this in any pair shows no motion [px]
+#: minimum area of drawn motion in a pair of frames; smaller areas show no motion [px]
 _LEAST_AREA_PX = 20
 #: share of the drawn motion that must stay in the image under a shift
 _LEAST_INSIDE = 0.5

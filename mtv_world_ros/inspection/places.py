@@ -20,9 +20,9 @@ _WIDTH_PX = 640
 _MAX_FEATURES = 1500
 #: minimum number of matches of two backgrounds that are comparable
 _MIN_MATCHES = 12
-#: a match is this near to where the others put it [px of the width above]
+#: inlier threshold of a match against the homography of all matches [px at the width above]
 _INLIER_PX = 3.0
-#: backgrounds that are this far apart are of different places [share of the width]
+#: background shift above which two camera places differ [fraction of image width]
 SAME_PLACE = 0.004
 
 

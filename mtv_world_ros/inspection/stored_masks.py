@@ -7,9 +7,9 @@ import numpy as np
 from mtv_world_ros.data.episode import Episode, MASKS_BY
 from mtv_world_ros.inspection.inspection_report import Finding, suspicious
 
-#: in less than this share of the frames of any view an object is as good as not found
+#: minimum fraction of the frames of a view in which an object must have a mask
 _SEEN = 0.5
-#: an object that fills more of the frames of a still camera is rather its background
+#: maximum fraction of a still camera's image that an object fills; more is probably background
 _LARGE = 0.15
 
 

@@ -19,7 +19,7 @@ from mtv_world_ros.model.tensor_files import read_tensors
 
 _CHANNELS = 16
 _WIDTH = 64
-#: of the decoder's three levels, from small to large
+#: channels of the decoder's levels, from small to large images
 _WIDTHS = (256, 128, 64, 64)
 #: number of latent frames that are encoded or decoded in one call, limited to save memory
 _TOGETHER = 7

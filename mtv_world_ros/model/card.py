@@ -126,9 +126,9 @@ class CheckpointCard(Schema):
         (folder / CARD).write_text(json.dumps(self.plain(), indent=2) + '\n')
 
 
-#: what only some checkpoints have
+#: keys that only some checkpoints have
 OPTIONAL_KEYS = tuple(k for k, f in CheckpointCard.model_fields.items() if not f.is_required())
-#: what an adapter and the checkpoint that it is used on have in common
+#: keys whose values must be equal in an adapter and its checkpoint
 SHARED_KEYS = tuple(
     key
     for key in CheckpointCard.model_fields

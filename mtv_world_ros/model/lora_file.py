@@ -23,7 +23,7 @@ from mtv_world_ros.model.tensor_files import pickle_error, PICKLES
 METADATA = 'lora_adapter_metadata'
 PEFT_CONFIG = 'adapter_config.json'
 _PEFT_PREFIX = 'base_model.model.'
-#: what files put before module names: peft, DiffSynth-Studio, ComfyUI, diffusers, Kohya (with
+#: prefixes of module names in files of peft, DiffSynth-Studio, ComfyUI, diffusers, Kohya (with
 #: another `_`: VideoX-Fun), LyCORIS, OneTrainer
 _PREFIX = re.compile(
     r'(base_model\.model\.)?'

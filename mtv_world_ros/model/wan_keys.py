@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 import re
 
-#: what repackaged files put before every name
+#: prefixes of tensor names in repackaged files
 _PREFIXES = ('model.diffusion_model.', 'diffusion_model.', 'model.', 'vae.', 'pipe.dit.')
 
 

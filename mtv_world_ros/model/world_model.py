@@ -189,7 +189,7 @@ class DiffusionWorldModel:
         home = torch.device('cpu') if serving.offload else self.device
         self.transformer = place(checkpoint.transformer, home, dtype).eval()
         self._adapters = Adapters(self.transformer)
-        #: of the checkpoint; None = it has none
+        #: adapter of the checkpoint; None = no adapter
         self.own_adapter = checkpoint.adapter
         if checkpoint.adapter is not None:
             check_same_model(self.card, checkpoint.adapter)

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from mtv_world_ros.core.errors import TrainingError
 
-#: how long processes wait for the main one, which alone reads, encodes and scores: NCCL's default
-#: of 10 minutes would end the training
+#: timeout of processes that wait for the main one, which alone reads, encodes and scores; NCCL's
+#: default of 10 minutes would end the training
 _PATIENCE = timedelta(days=1)
 #: numbers that are summed over the processes in one call
 _BUCKET = 2**24

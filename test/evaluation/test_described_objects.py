@@ -55,11 +55,11 @@ def test_objects_are_drawn_into_the_trajectory_video_as_they_are_scored(
     for name in ('red block', 'blue block'):
         pipeline = make_pipeline()
         seen, predict = [], pipeline.world_model.predict
-        pipeline.world_model.predict = lambda start, frames, seen=seen, predict=predict, **rest: (
-            seen.append(frames) or predict(start, frames, **rest)
+        pipeline.world_model.predict = lambda start, inputs, seen=seen, predict=predict, **rest: (
+            seen.append(inputs) or predict(start, inputs, **rest)
         )
         _run(pipeline, episodes[:1], tmp_path / name, describer=Reader(name))
-        drawn[name] = np.concatenate([frames[:, 0] for frames in seen])
+        drawn[name] = np.concatenate([inputs.video[:, 0] for inputs in seen])
     assert (drawn['red block'] != drawn['blue block']).any()
 
 

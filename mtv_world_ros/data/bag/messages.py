@@ -20,7 +20,7 @@ from mtv_world_ros.data.bag.video_packets import FFMPEG_PACKET, FFMPEG_PACKET_DE
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
-#: of a view's images
+#: message types of a view's images
 IMAGE_TYPES = (IMAGE, COMPRESSED_IMAGE, FFMPEG_PACKET)
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 JOINT_STATE = 'sensor_msgs/msg/JointState'

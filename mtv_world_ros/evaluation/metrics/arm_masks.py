@@ -21,7 +21,7 @@ from mtv_world_ros.robot.shape import LinkShape, moving_links
 
 #: frames of a recording whose median the scene without the arm is
 _MOST_FRAMES = 60
-#: how far around the drawn arm a frame is compared [image width]
+#: margin around the drawn arm in which frames are compared [fraction of image width]
 _MARGIN = 0.06
 #: frames in which less of the drawn arm can be compared are not scored [share of the image]
 _LEAST_ARM = 0.002

@@ -11,7 +11,7 @@ import numpy as np
 from mtv_world_ros.core.data_types import ByteArray
 from mtv_world_ros.core.errors import ConfigError
 
-#: what can be measured; LPIPS needs torchvision too, whose AlexNet weights it downloads
+#: names of the measures; LPIPS also needs torchvision and downloads its AlexNet weights
 MEASURES = ('psnr', 'ssim', 'lpips')
 
 #: (T, H, W, 3) uint8 RGB predicted and real frames to numbers by name

@@ -14,14 +14,14 @@ from mtv_world_ros.evaluation.metrics.object_scores import moves, object_scores,
 from mtv_world_ros.vision.jaccard import held_masks
 from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, Segmenter
 
-#: what `moving` means, for whoever reads the numbers
+#: definition of `moving`, for readers of the numbers
 MOVING_RULE = (
     'an object moves in a stretch if in some recorded frame its mask and its first mask share '
     'less than half of the smaller of the two; {source} masks; frames that show less than a '
     'quarter of its largest area do not count'
 )
 
-#: a start mask of such a status may be another object's; nothing that follows it can tell
+#: statuses of a start mask that may belong to another object; later frames cannot correct it
 START_DOUBTS = frozenset({'ambiguous', 'low_confidence'})
 
 #: fields of a row that hold a value per frame

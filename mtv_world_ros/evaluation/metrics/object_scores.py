@@ -76,7 +76,7 @@ def _union(pred: BoolArray, true: BoolArray, scored: BoolArray) -> FloatArray:
     return np.where(scored.any(1), frames.mean(1), np.nan)
 
 
-#: how far boundaries may lie apart and still match, as a share of the image's diagonal
+#: maximum distance of matching boundaries [fraction of the image diagonal]
 BOUNDARY_SHARE = 0.008
 
 

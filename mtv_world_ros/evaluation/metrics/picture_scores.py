@@ -40,7 +40,7 @@ MEASURES = {
     'j_changed': 'J of changed pixels',
     'j_arm': 'J of the arm',
 }
-#: a pixel has changed if a channel of it, blurred, differs by more [grey levels]
+#: threshold of a changed pixel: difference of a blurred channel [grey levels]
 _CHANGED = 20.0
 #: frames in which fewer pixels change are not scored by them [share]
 _LEAST_CHANGED = 0.002

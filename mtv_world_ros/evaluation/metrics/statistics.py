@@ -22,7 +22,7 @@ UNKNOWN: Interval = (nan, nan)
 MIN_EPISODES = 3
 #: fewer scenes than this have no interval of r, MMRV or a prediction-powered rate
 MIN_SCENES = 4
-#: what tables and pages say about the brackets
+#: explanation of the intervals in tables and pages
 METHOD = (
     f'95 % t intervals over episodes, none below {MIN_EPISODES} episodes or where all are equal'
 )

@@ -63,7 +63,7 @@ _NEAR_STAGE = ImageStage(160, 1.0)
 _FINE_STAGE = ImageStage(240, 1.5)
 #: outlier threshold: a pixel counts less where drawn and seen change differ by more than this
 _OUTLIER = 0.3
-#: where the robot is in both frames, a pixel may change or not
+#: drawn change of a pixel that the robot covers in both frames, where the image may change or not
 _INSIDE = 0.3
 _NUM_FRAMES = 24
 #: directions in which a part's outermost points are drawn

@@ -49,7 +49,7 @@ _LEAST_MATCH = 0.335
 #: of the points of a recording each third is left out of a first fit, and tells how good it is: on
 #: ten real recordings points that poses were fitted to are .5 and .9 px away, others 1.3 and 3.2
 _LEFT_OUT = 3
-#: of a view, to begin a search with
+#: minimum number of clicked points of a view
 _LEAST_POINTS = 4
 #: outlier threshold of clicked points, as a factor of the median error; of 80 hasty clicks on real
 #: video two are outliers (4 and 10 px of 320: a finger was hidden), of 87 careful ones none

@@ -82,9 +82,9 @@ _TRACKING = TrackingSettings()
 _ROTATION = RotationSettings()
 #: blocks of stretches that are left out in turn for the standard error
 _NUM_GROUPS = 8
-#: a track that is off by more than this forwards and backwards is lost [px]
+#: maximum error of a track after tracking it forwards and backwards [px]
 _LOST_PX = 0.7
-#: a point is moved to a corner that is this near [px]
+#: maximum distance between a tracked point and the corner that corrects its drift [px]
 _LEAST_DRIFT_PX = 1.0
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 10, 0.02)
 #: points that move less are on the hand [px]
