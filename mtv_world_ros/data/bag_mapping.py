@@ -92,13 +92,13 @@ class BagMapping(Written):
     instruction: str = Field(default='', description='of the robot; empty = the topic')
 
     def topic(self, name: str) -> str:
-        """The absolute name of a topic."""
+        """Return the absolute name of a topic."""
         if name.startswith('/'):
             return name
         return '/'.join(['', *filter(None, self.namespace.strip('/').split('/')), name])
 
     def streams(self) -> dict[str, str]:
-        """Topics by view and by stream, as `read_episode` takes them."""
+        """Return the topics by view and by stream, as `read_episode` takes them."""
         return {
             **{view: self.topic(row.image) for view, row in self.views.items()},
             'joint_states': self.topic(self.joint_states),

@@ -376,7 +376,7 @@ class _EpisodeReader:
         return Track(stamps, VideoFrames(topic, [message for _, message in whole]))
 
     def _take(self, topic: str, msgtype: str) -> Stamped:
-        """Messages of a topic, in recorded order; those of another type are refused."""
+        """Return the messages of a topic, in recorded order; those of another type are refused."""
         taken: Stamped = []
         for stamp, (kind, message) in self.received.get(topic, []):
             if kind == msgtype:
@@ -590,7 +590,7 @@ class _EpisodeReader:
         return replace(camera, T_mount_camera=found.T_link_frame[0])
 
     def _tf(self) -> tuple[list[Any], list[Any]]:
-        """Messages of /tf and of /tf_static."""
+        """Return the messages of /tf and of /tf_static."""
         moving, static = (
             [message for _, message in self._take(topic, messages.TF_MESSAGE)]
             for topic in TF_TOPICS
@@ -606,7 +606,7 @@ class _EpisodeReader:
     def _from_tree(
         self, tree: TransformTree, view: str, unknown_mount: str, images: Track
     ) -> CameraModel:
-        """The camera's pose by TF; its intrinsics come from CameraInfo."""
+        """Return the camera's pose by TF; its intrinsics come from CameraInfo."""
         infos = self._camera_infos(view)
         if not infos and unknown_mount:
             return self._placeholder(view, unknown_mount, images)
@@ -658,7 +658,7 @@ class _EpisodeReader:
         return unknown_camera(view, width, height, mount)
 
     def _camera_info(self, view: str) -> str:
-        """The topic of a view's CameraInfo."""
+        """Return the topic of a view's CameraInfo."""
         row = self.mapping.views.get(view)
         given = row.camera_info if row else ''
         return self.mapping.topic(given) if given else self.topics.views[view].camera_info

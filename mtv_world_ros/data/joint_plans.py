@@ -250,12 +250,12 @@ class _Measured:
         self._robot = robot
 
     def at(self, stamp_ns: int, seconds: FloatArray) -> FloatArray:
-        """(N, J) at times after a stamp [s]."""
+        """Return the positions (N, J) at times after a stamp [s]."""
         known = np.asarray((self._stamps - stamp_ns) * 1e-9, np.float64)
         return interpolated(seconds, known, self._rows, self._robot.is_endless)
 
     def times(self, stamp_ns: int, begin_s: float, end_s: float) -> FloatArray:
-        """Times of samples after a stamp [s], no denser than needed."""
+        """Return the times of samples after a stamp [s], no denser than needed."""
         if end_s <= begin_s:
             return np.zeros(0)
         known = (self._stamps - stamp_ns) * 1e-9

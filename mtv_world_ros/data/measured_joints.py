@@ -195,7 +195,7 @@ def find_unreachable(
 def _short_runs(
     times: FloatArray, sources: NDArray[np.intp], settings: ReachSettings
 ) -> BoolArray:
-    """(N,) samples of runs of one source that are too short for a robot."""
+    """Return (N,) samples of runs of one source that are too short for a robot."""
     edges = np.flatnonzero(np.diff(sources)) + 1
     is_short = np.zeros(len(times), bool)
     for first, last in zip([0, *edges], [*edges, len(times)], strict=True):

@@ -88,7 +88,7 @@ def _observation(
     state: int,
     stamp_ns: int,
 ) -> Observation:
-    """The observation of a frame of each view and one joint state, by their indices."""
+    """Return the observation of a frame of each view and one joint state, by their indices."""
     chosen = list(zip(views, frames, strict=True))
     return Observation(
         cameras=tuple(episode.camera(view, index) for view, index in chosen),

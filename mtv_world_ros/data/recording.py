@@ -258,7 +258,7 @@ def _object_poses(
 
 
 def _middles(episode: Episode, view: str, stamps: np.ndarray) -> FloatArray:
-    """(N, O, 2) middles of a view's masks at the frames [px], NaN = not seen."""
+    """Return (N, O, 2) middles of a view's masks at the frames [px], NaN = not seen."""
     assert episode.masks is not None
     own_stamps, ids = episode.masks[view]
     numbers = np.arange(len(episode.info.objects))[:, None, None] + 1
@@ -303,7 +303,7 @@ def frame_indices(
 
 
 def commands_from(recording: Recording, start: int) -> JointTrajectory:
-    """The commands that are due after frame `start`, counted from it."""
+    """Return the commands that are due after frame `start`, counted from it."""
     times = recording.commands.times - recording.times[start]
     due = times > 1e-6
     if not due.any():

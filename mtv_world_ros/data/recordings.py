@@ -87,7 +87,7 @@ class Origin:
 
 
 def clip_starts(recording: Recording, spec: WorldModelSpec) -> np.ndarray:
-    """Frames from which a whole clip can be cut."""
+    """Return the frames from which a whole clip can be cut."""
     count = len(recording.times)
     whole = [i for i in range(count) if frame_indices(recording, i, spec) is not None]
     return np.array(whole, dtype=int)
@@ -142,7 +142,7 @@ def _origin(recording: Recording) -> Origin | None:
 
 
 def commanded(recording: Recording, start: int, times: FloatArray) -> FloatArray:
-    """(len(times), J) positions: measured at frame `start`, commanded after it.
+    """Return (len(times), J) positions: measured at frame `start`, commanded after it.
 
     Args:
         recording: the episode.

@@ -197,7 +197,7 @@ def settle_clocks(
 
 
 def _part(stream: StampedStream, stamps: Stamps, rows: BoolArray) -> StampedStream:
-    """Rows of a stream, with mended stamps."""
+    """Return the rows of a stream, with mended stamps."""
     return replace(
         stream,
         stamps_ns=stamps[rows],
@@ -377,7 +377,7 @@ def _scatter(
 
 
 def _upper(offsets: FloatArray) -> float:
-    """The offset of messages that are neither late nor wrong: delays only lower it."""
+    """Return the offset of messages that are neither late nor wrong: delays only lower it."""
     return float(np.quantile(offsets, 0.8, method='lower'))
 
 
@@ -511,7 +511,7 @@ def _follows(stream: StampedStream, step: ClockStep, settings: ClockSettings) ->
 
 
 def _reference(streams: Sequence[StampedStream]) -> StampedStream | None:
-    """The stream whose clock the others are compared with: joint states, else images."""
+    """Return the stream whose clock the others are compared with: joint states, else images."""
     able = [
         s
         for s in streams
@@ -522,7 +522,7 @@ def _reference(streams: Sequence[StampedStream]) -> StampedStream | None:
 
 
 def _offset_at(stream: StampedStream, received_ns: Stamps) -> FloatArray:
-    """Offsets of a stream [s] at receive times."""
+    """Return the offsets of a stream [s] at receive times."""
     order = np.argsort(stream.received_ns, kind='stable')
     zero = stream.received_ns[order[0]]
     known = (stream.received_ns[order] - zero) * 1e-9

@@ -123,7 +123,7 @@ def add_tool_poses(
 def _goals(
     measured: FloatArray, robot: RobotModel, tool: Tool, poses: ToolTargets, wanted: FloatArray
 ) -> FloatArray:
-    """(T, 4, 4) of the tool in the base link."""
+    """Return the poses (T, 4, 4) of the tool in the base link."""
     frame = poses.frame or robot.base_link
     T_base_frame = robot.link_poses(frame, measured)
     now = np.linalg.inv(T_base_frame) @ robot.link_poses(tool.link, measured) @ tool.T_link_tool
@@ -230,7 +230,7 @@ def _add_others(
 
 
 def _scaled(poses: FloatArray, scale: tuple[float, float]) -> FloatArray:
-    """Poses (T, 4, 4) with positions and angles multiplied."""
+    """Return the poses (T, 4, 4) with positions and angles multiplied."""
     if scale == (1.0, 1.0):
         return poses
     scaled = poses.copy()

@@ -84,7 +84,7 @@ class _Edge:
             self.recent.append((stamp_ns or 0, numbers))
 
     def at(self, stamp_ns: int | None) -> FloatArray:
-        """(4, 4) the transform at a time, between two interpolated; None = the last one."""
+        """Return the interpolated transform (4, 4) at a time [ns]; None = the last one."""
         if self.is_still:
             return self.T
         if stamp_ns is None:
@@ -197,7 +197,7 @@ class TransformTree:
         self._edges = {k: edge for k, edge in self._edges.items() if edge.stamp_ns is None}
 
     def name(self, frame: str) -> str:
-        """A frame's name without slash and prefix."""
+        """Return a frame's name without slash and prefix."""
         return frame.lstrip('/').removeprefix(self._prefix)
 
     @property
@@ -334,11 +334,11 @@ class TransformTree:
         return frame in self.frames and any(mount.link in links for mount in reached)
 
     def parent(self, frame: str) -> str | None:
-        """A frame's parent; None = it has none."""
+        """Return a frame's parent; None = it has none."""
         return self._parents().get(self.name(frame))
 
     def _parents(self) -> dict[str, str]:
-        """The parent of each frame; of several, the one that is published most."""
+        """Return the parent of each frame; of several, the one that is published most."""
         ordered = sorted(self._edges, key=lambda names: self._edges[names].count)
         return {child: parent for parent, child in ordered}
 
@@ -432,7 +432,7 @@ def _series(
 def _interpolated(
     edge: tuple[str, str], known: dict[int, FloatArray], stamps_ns: NDArray[np.int64]
 ) -> FloatArray:
-    """(N, 4, 4)."""
+    """Return the interpolated poses (N, 4, 4)."""
     if list(known) == [0]:
         return np.repeat(known[0][None], len(stamps_ns), axis=0)
     times = np.array(sorted(known), np.int64)
@@ -456,7 +456,7 @@ def _interpolated(
 def _between(
     low: FloatArray, high: FloatArray, stamp_ns: int, low_ns: int, high_ns: int
 ) -> FloatArray:
-    """(4, 4) a pose between two, or the nearer one of a time outside of theirs."""
+    """Return the pose (4, 4) interpolated between two poses; outside of their times the nearer."""
     span_ns = high_ns - low_ns
     share = min(max((stamp_ns - low_ns) / span_ns, 0.0), 1.0) if span_ns > 0 else 0.0
     return np.array(pin.SE3.Interpolate(pin.SE3(low), pin.SE3(high), share).homogeneous)

@@ -179,7 +179,7 @@ class EpisodeScorer:
         return load_recording(path, pipeline.spec, pipeline.robot, source=self.config.source)
 
     def _donor(self, job: EvaluationJob) -> Recording | None:
-        """The episode that lends its actions; None if there is none that can be read."""
+        """Return the episode that lends its actions; None if there is none that can be read."""
         if job.donor is None or 'shuffled' not in self.config.actions:
             return None
         try:

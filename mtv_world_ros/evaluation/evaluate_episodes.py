@@ -257,7 +257,7 @@ class _Run:
             yield job, EpisodeResult.from_json(outcome)
 
     def _described(self, job: EvaluationJob) -> EvaluationJob | tuple[EvaluationJob, str]:
-        """The episode with its objects named, or why they could not be."""
+        """Return the episode with its objects named, or why they could not be."""
         if self.describer is None:
             return job
         try:

@@ -230,7 +230,7 @@ def _judged_by(
 
 
 def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]:
-    """Fields of `Calibration`."""
+    """Return the fields of `Calibration`."""
     return {
         **_weights(samples, l2),
         'segmenter': segmenter,
@@ -242,7 +242,7 @@ def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]
 
 
 def _weights(samples: Sequence[Sample], l2: float) -> dict[str, Any]:
-    """Fields of `Weights`."""
+    """Return the fields of `Weights`."""
     rows, labels = _design(samples)
     with np.errstate(invalid='ignore'):
         known = np.isfinite(rows)

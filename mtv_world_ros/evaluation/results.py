@@ -71,7 +71,7 @@ class EpisodeResult:
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> EpisodeResult:
-        """The inverse of `as_json`, read back from a file."""
+        """Return the inverse of `as_json`, read back from a file."""
         read: dict[str, Any] = dict(values)
         read['rows'] = tuple(ScoreRow.from_json(row) for row in values['rows'])
         read['reasons'], read['notes'] = tuple(values['reasons']), tuple(values['notes'])

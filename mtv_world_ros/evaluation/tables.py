@@ -139,7 +139,7 @@ def group_tables(summary: EvaluationSummary) -> list[Table]:
 def _numbers(
     head: str, rows: Iterable[tuple[str | None, str | None, Group]], summary: EvaluationSummary
 ) -> Table:
-    """A row for each label, view and group."""
+    """Return a row for each label, view and group."""
     lines = []
     for label, view, group in rows:
         found = summary.estimates(view, group)

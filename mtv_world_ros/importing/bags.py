@@ -380,7 +380,7 @@ def _check_views(episode: Episode) -> None:
 def _measured(
     episode: Episode, robot: RobotModel, mapping: BagMapping
 ) -> tuple[np.ndarray, FloatArray]:
-    """Stamps (N,) and positions (N, J) in the robot's order."""
+    """Return the stamps (N,) and positions (N, J) in the robot's order."""
     states = episode.joint_states
     if states is None:
         hints = [text for text in episode.warnings if 'joint states' in text]
@@ -468,7 +468,7 @@ def _in_order(
 
 
 def _instructions(episode: Episode, mapping: BagMapping, start_ns: int) -> list[tuple[int, str]]:
-    """Instructions by stamp, at least one."""
+    """Return the instructions by stamp, at least one."""
     if mapping.instruction or not episode.instructions:
         return [(start_ns, mapping.instruction or episode.info.instruction)]
     return list(episode.instructions)

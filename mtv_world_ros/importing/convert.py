@@ -293,7 +293,7 @@ def _read_rows(
 def _measured(
     dataset: LeRobotDataset, rows: dict[str, FloatArray], mapping: DatasetMapping
 ) -> tuple[FloatArray, list[str]]:
-    """(T, J), and what was odd."""
+    """Return the measured positions (T, J), and notes on repaired values."""
     stream = mapping.state
     values, names = _table(dataset, rows, stream)
     positions = to_positions(values, names, stream.columns, stream.label)
@@ -364,7 +364,7 @@ def _cameras(
 def _instructions(
     dataset: LeRobotDataset, rows: dict[str, FloatArray], mapping: DatasetMapping
 ) -> list[str]:
-    """The instruction at each row."""
+    """Return the instruction at each row."""
     numbers = rows['task_index'].ravel().astype(int)
     if mapping.instruction:
         return [mapping.instruction] * len(numbers)
@@ -383,7 +383,7 @@ def _outcome(rows: dict[str, FloatArray], mapping: DatasetMapping) -> str:
 def _commands(
     times: FloatArray, positions: FloatArray, mapping: DatasetMapping, fps: float
 ) -> list[tuple[int, JointTrajectory]]:
-    """Trajectories of `chunk_s`, each with its first row."""
+    """Return the trajectories of `chunk_s`, each with its first row."""
     if mapping.action is None:  # the measured positions of the rows that follow
         reached, targets = times[1:], positions[1:]
     else:

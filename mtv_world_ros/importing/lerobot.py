@@ -204,7 +204,7 @@ class LeRobotDataset:
         return '; '.join(filter(None, notes))
 
     def rows(self, entry: EpisodeEntry, features: Sequence[str]) -> dict[str, FloatArray]:
-        """Numbers of an episode by feature, (T, ...) each, in order.
+        """Return the numbers of an episode by feature, (T, ...) each, in order.
 
         Raises:
             EpisodeError: the file cannot be read, or does not hold what the metadata say.

@@ -159,7 +159,7 @@ def _resized(rows: _Rows, size: tuple[int, int] | None) -> _Rows:
 
 
 def _commanded(recording: Recording, times: FloatArray) -> FloatArray:
-    """(T, J) commands; before the first one where the robot stood."""
+    """Return the commands (T, J); before the first command the measured start position."""
     return resample(recording.commands, recording.positions[0], times)
 
 
@@ -382,7 +382,7 @@ def _write_table(
 
 
 def _cells(frames: ByteArray) -> list[dict[str, bytes | str]]:
-    """Images of a table, as `datasets.Image` stores them."""
+    """Return the images of a table, as `datasets.Image` stores them."""
     return [
         {'bytes': encode_png(frame), 'path': f'frame-{k:06d}.png'}
         for k, frame in enumerate(frames)

@@ -134,7 +134,7 @@ def learn_objects(
 def _by_frame(
     episode: Episode, recording: str, view: str, rows: Mapping[str, tuple[Any, ...]]
 ) -> dict[int, dict[str, Box]]:
-    """Boxes by name, by number of the frame."""
+    """Return the boxes by name, by number of the frame."""
     if rows and view not in episode.images:
         raise ConfigError(
             f"objects: there is no view '{view}'{nearest(view, episode.views)}; there are "
@@ -171,7 +171,7 @@ def _check_inside(drawn: Mapping[str, Box], frame: ByteArray, recording: str, vi
 
 
 def _whole_mask(name: str, frame: ByteArray, box: Box) -> BoolArray:
-    """(H, W) of the object in a box."""
+    """Return the mask (H, W) of the object in a box."""
     example = Example.in_box(name, frame, box)
     left, top, right, bottom = (round(edge) for edge in box)
     x, y = max(0, left - (right - left)), max(0, top - (bottom - top))

@@ -213,7 +213,7 @@ def _below(joint: int, children: dict[int, list[int]]) -> list[int]:
 
 
 def _base_link(model: pin.Model, arms: Sequence[_Arm]) -> str:
-    """The link that carries the first joint all arms share, or both arms' first joints."""
+    """Return the link that carries the first joint all arms share, or both arms' first joints."""
     roots = {model.parents[arm.chain[0]] for arm in arms}
     joint = roots.pop() if len(roots) == 1 else 0
     frames = [f for f in model.frames if f.type == pin.FrameType.BODY and f.parentJoint == joint]
@@ -280,7 +280,7 @@ class _Hand:
         self.travel_m = round(travel_m, 5)
 
     def tool_pose(self) -> FloatArray:
-        """A frame near the finger tips: z away from the arm, y along a finger's motion."""
+        """Return a frame near the finger tips: z away from the arm, y along a finger's motion."""
         shut, opened = self._tips()
         T = np.eye(4)
         middle = np.mean([points.mean(axis=0) for points in shut], axis=0)
@@ -302,7 +302,7 @@ class _Hand:
         return float(np.mean([abs((wide - shut).mean(axis=0) @ y) for shut, wide in pairs]))
 
     def _tips(self) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Points of the finger links that reach farthest, shut and open."""
+        """Return the points of the finger links that reach farthest, shut and open."""
         shut, opened = self._fingers(self.closed), self._fingers(self.open)
         ahead = np.mean([points.mean(axis=0) for points in opened], axis=0)
         ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
@@ -334,7 +334,7 @@ class _Hand:
         return x, y, z
 
     def _axis(self) -> FloatArray:
-        """(3,) the axis that the gripper's joint turns about, in the arm's last joint."""
+        """Return the axis (3,) of the gripper's joint, in the frame of the arm's last joint."""
         model, data = self._model, self._model.createData()
         configuration = pin.neutral(model)
         pin.computeJointJacobians(model, data, configuration)
@@ -348,7 +348,7 @@ class _Hand:
         return float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
 
     def _fingers(self, value: float) -> list[FloatArray]:
-        """Points (N, 3) of each outermost finger link."""
+        """Return the points (N, 3) of each outermost finger link."""
         model, data = self._model, self._model.createData()
         configuration = pin.neutral(model)
         for joint in self._arm.fingers:
@@ -427,7 +427,7 @@ def _tool_link(model: pin.Model, arm: _Arm) -> tuple[str, Any]:
 
 
 def _gripper_joint(model: pin.Model, arm: _Arm, mimics: Sequence[Mimic]) -> int:
-    """The joint that the others follow, or else the first one."""
+    """Return the joint that the others follow, or else the first one."""
     sources = [mimic.source for mimic in mimics]
     names = {model.names[j]: j for j in arm.fingers}
     led = max(names, key=sources.count)

@@ -61,7 +61,7 @@ class ToolPoses(ToolTargets):
         return self
 
     def wanted(self, values: FloatArray, names: Sequence[str], feature: str) -> FloatArray:
-        """(T, 4, 4) poses or differences of a feature's values (T, C).
+        """Return (T, 4, 4) poses or differences of a feature's values (T, C).
 
         Raises:
             ConfigError: a column is not there.
@@ -142,7 +142,7 @@ def joints_of_poses(
 
 
 def _first(solver: ArmSolver, robot: RobotModel, goal: FloatArray) -> FloatArray | None:
-    """The solution nearest to the middle of the limits; None where there is none."""
+    """Return the solution nearest to the middle of the limits; None where there is none."""
     lower = np.maximum(robot.lower[solver.indices], -np.pi)
     upper = np.minimum(robot.upper[solver.indices], np.pi)
     middle, generator = (lower + upper) / 2, np.random.default_rng(0)
@@ -160,7 +160,7 @@ def _first(solver: ArmSolver, robot: RobotModel, goal: FloatArray) -> FloatArray
 def _left(
     positions: FloatArray, robot: RobotModel, tool: Tool, goals: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """(T,) distances of the solved poses from the measured ones [mm, degrees]."""
+    """Return (T,) distances of the solved poses from the measured ones [mm, degrees]."""
     reached = robot.link_poses(tool.link, positions) @ tool.T_link_tool
     apart = np.linalg.inv(reached) @ goals
     cosine = (np.trace(apart[:, :3, :3], axis1=1, axis2=2) - 1) / 2

@@ -124,7 +124,7 @@ class VideoRecording:
     name: str
 
     def file(self, pattern: str) -> Path:
-        """A file of it."""
+        """Return a file of it."""
         return self.folder / pattern.replace('{name}', self.name)
 
 
@@ -256,7 +256,7 @@ def _track(
 
 
 def _positions(table: NumberTable, mapping: VideoMapping) -> tuple[FloatArray, list[str]]:
-    """(T, J) [rad or m], and what was odd; joints of tool poses by inverse kinematics."""
+    """Return the positions (T, J) [rad or m], and notes; tool poses by inverse kinematics."""
     stream, robot, values, names = mapping.state, mapping.robot, table.values, table.names
     what = ', '.join(filter(None, stream.features)) or table.path.name
     count = values.shape[1]

@@ -113,7 +113,7 @@ def shrunk(camera: CameraModel, width: int) -> CameraModel:
 
 
 def grey(frame: ByteArray, camera: CameraModel) -> ByteArray:
-    """(H, W) uint8 at the camera's size."""
+    """Return the grey image (H, W) uint8 at the camera's size."""
     size = (camera.width, camera.height)
     return np.asarray(
         cv2.cvtColor(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY),
@@ -122,7 +122,7 @@ def grey(frame: ByteArray, camera: CameraModel) -> ByteArray:
 
 
 def covered_frames(track: Track, joints: JointTrack) -> np.ndarray:
-    """Indices of the frames within the joint states.
+    """Return the indices of the frames within the joint states.
 
     Raises:
         CalibrationError: there are fewer than ten.

@@ -167,7 +167,7 @@ def response(
 
 
 def nearest_distance_s(stamps_ns: Stamps, others_ns: Stamps) -> FloatArray:
-    """(N,) distance of each stamp to the nearest of others [s]."""
+    """Return (N,) distance of each stamp to the nearest of others [s]."""
     right = np.searchsorted(others_ns, stamps_ns).clip(0, len(others_ns) - 1)
     left = (right - 1).clip(0)
     away = np.minimum(np.abs(others_ns[right] - stamps_ns), np.abs(others_ns[left] - stamps_ns))
@@ -208,13 +208,13 @@ class JointTrack:
         self._is_endless = robot.is_endless
 
     def at(self, stamps_ns: NDArray[np.int64]) -> FloatArray:
-        """(len(stamps_ns), J) positions; the first or last one beyond the ends."""
+        """Return (len(stamps_ns), J) positions; the first or last one beyond the ends."""
         wanted = np.asarray(stamps_ns - self.stamps_ns[0], float)
         have = np.asarray(self.stamps_ns - self.stamps_ns[0], float)
         return interpolated(wanted, have, self.positions, self._is_endless)
 
     def swapped(self, robot: RobotModel, tool: Tool) -> JointTrack:
-        """The track with open and closed of a gripper swapped."""
+        """Return the track with open and closed of a gripper swapped."""
         other = copy(self)
         column = robot.joint_names.index(tool.gripper_joint)
         other.positions = self.positions.copy()

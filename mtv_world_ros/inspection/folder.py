@@ -66,7 +66,7 @@ class FolderInspection:
         return worst([*found, *(finding.verdict for finding in self.findings)])
 
     def place(self, view: str, name: str) -> str:
-        """The place of an episode's camera, in a word."""
+        """Return the place of an episode's camera, in a word."""
         if name not in self.members.get(view, []):
             return '-'
         return str(self.places[view].place[self.members[view].index(name)])
@@ -286,7 +286,7 @@ def broken_parts(found: FolderInspection) -> dict[str, dict[str, str]]:
 
 
 def folder_text(found: FolderInspection) -> str:
-    """The table as text, with what concerns all episodes below."""
+    """Return the table as text, with what concerns all episodes below."""
     rows = table(found)
     widths = [max(len(row[n]) for row in rows) for n in range(len(rows[0]) - 1)]
     lines = [
@@ -300,7 +300,7 @@ def folder_text(found: FolderInspection) -> str:
 
 
 def folder_markdown(found: FolderInspection, picture: str) -> str:
-    """The report of all episodes, in Markdown."""
+    """Return the report of all episodes, in Markdown."""
     head, *rows = table(found)
     lines = [f'# {found.verdict}', '', *(f'- {line}' for line in _conclusions(found))]
     lines += ['', f'| {" | ".join(head)} |', f'|{"---|" * len(head)}']
@@ -327,7 +327,7 @@ def _row(name: str, views: dict[str, ByteArray]) -> ByteArray:
 
 
 def _small(picture: ByteArray) -> ByteArray:
-    """The first of the picture's frames, small."""
+    """Return the first of the picture's frames, small."""
     half = picture[: picture.shape[0] // 2, : picture.shape[1] // 2]
     height = round(half.shape[0] * _TILE_WIDTH_PX / half.shape[1])
     return np.asarray(

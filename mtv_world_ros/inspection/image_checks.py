@@ -39,7 +39,7 @@ def robot_picture(robot: RobotModel) -> ByteArray:
 
 
 def middle_positions(robot: RobotModel, opening: float) -> FloatArray:
-    """(1, J) all joints half-way between their limits, at most a radian from zero."""
+    """Return the middle (1, J) of the joint limits, at most a radian from zero."""
     lower, upper = (np.clip(limit, -np.pi, np.pi) for limit in (robot.lower, robot.upper))
     positions = np.clip((lower + upper) / 2, -1.0, 1.0).clip(robot.lower, robot.upper)
     for tool in robot.tools:
@@ -73,7 +73,7 @@ def _tile(
 
 
 def _camera(cloud: FloatArray, angle: float) -> CameraModel:
-    """A camera that sees all points, from a direction and slightly above."""
+    """Return a camera that sees all points, from a direction and slightly above."""
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 0.05)
     ahead = -np.array([np.cos(angle), np.sin(angle), 0.45])

@@ -352,7 +352,7 @@ def _instead(text: str, there: float, here: float) -> str:
 
 
 def delays(measured: Mapping[str, tuple[MotionResidual, Track]]) -> dict[str, list[Finding]]:
-    """Delays of the images that the data show, by view.
+    """Return the delays of the images that the data show, by view.
 
     Both halves of a recording must fit better with the delay, and no view may say the contrary.
     A delay of one frame must stand out: on real recordings at 5 Hz, motions fitted better one

@@ -31,22 +31,22 @@ class Finding:
 
 
 def not_checked(text: str) -> Finding:
-    """A check that could not be made, and why."""
+    """Return a check that could not be made, and why."""
     return Finding(verdict='not checked', text=text)
 
 
 def suspicious(text: str) -> Finding:
-    """A finding that may be harmless."""
+    """Return a finding that may be harmless."""
     return Finding(verdict='suspicious', text=text)
 
 
 def broken(text: str) -> Finding:
-    """A finding that makes the view or the recording useless."""
+    """Return a finding that makes the view or the recording useless."""
     return Finding(verdict='broken', text=text)
 
 
 def worst(verdicts: Sequence[str]) -> str:
-    """The worst of some verdicts; `ok` if there is none."""
+    """Return the worst of some verdicts; `ok` if there is none."""
     return max(verdicts, key=VERDICTS.index, default='ok')
 
 

@@ -172,7 +172,7 @@ def _delay(
 
 
 def _changes(camera: CameraModel, search: ResidualSearch) -> dict[str, CameraModel]:
-    """Cameras that are rolled, or have another focal length, by name."""
+    """Return the cameras that are rolled, or have another focal length, by name."""
     found = {}
     for degrees in search.rolls_deg:
         turn = np.eye(4)
@@ -193,7 +193,7 @@ def _top(surface: FloatArray | None) -> float:
 
 
 def _pairs(stamps_ns: NDArray[np.int64], joints: JointTrack, count: int) -> np.ndarray:
-    """(P, 2) indices of frames between which a joint moves."""
+    """Return (P, 2) indices of frames between which a joint moves."""
     later = np.searchsorted(stamps_ns, stamps_ns + round(_STEP_S * 1e9) - 1000)
     first = np.flatnonzero(later < len(stamps_ns))
     pairs = np.stack([first, later[first]], axis=-1)
@@ -238,7 +238,7 @@ def _surface(
     robot: RobotModel,
     shapes: Sequence[LinkShape],
 ) -> FloatArray | None:
-    """(2R + 1, 2R + 1) mean correlation of the links over shifts; None where none moves."""
+    """Return (2R + 1, 2R + 1) mean correlation of the links over shifts; None where none moves."""
     poses = robot.forward_kinematics(positions)
     T_base_camera = camera_poses(small, robot, positions)
     radius = _radius(small.width)
@@ -295,7 +295,7 @@ def _correlate(
 
 
 def _pairwise(silhouettes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(P, 2, H, W) of (2 P, H, W)."""
+    """Return (P, 2, H, W) of (2 P, H, W)."""
     return silhouettes.reshape(-1, 2, *silhouettes.shape[1:])
 
 
@@ -337,7 +337,7 @@ def _over_shifts(window: FloatImage, template: FloatImage) -> FloatArray:
 
 
 def _peak(surface: FloatArray) -> FloatArray:
-    """(x, y) of the maximum from the centre, refined by a parabola [px]."""
+    """Return (x, y) of the maximum from the centre, refined by a parabola [px]."""
     radius = len(surface) // 2
     row, column = np.unravel_index(int(surface.argmax()), surface.shape)
     x = _refined(surface[row], int(column)) - radius

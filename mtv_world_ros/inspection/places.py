@@ -54,7 +54,7 @@ class CameraPlaces:
 
 
 def background(track: Track) -> ByteArray:
-    """(H, W, 3) median over the recording: what does not move for most of it."""
+    """Return the median (H, W, 3) of a recording: the scene without moving objects."""
     count = len(track.stamps_ns)
     chosen = np.unique(np.linspace(0, count - 1, _NUM_FRAMES).astype(int))
     frames = np.stack([np.asarray(track.frames[int(n)]) for n in chosen])
@@ -108,7 +108,7 @@ def turn_between(pairs: FloatArray, focal: float) -> FloatArray:
 
 
 def _corners(sift: cv2.Feature2D, image: ByteArray) -> tuple[FloatArray, NDArray[np.float32]]:
-    """Places (N, 2) [share of the width, from the middle] and descriptors."""
+    """Return the places (N, 2) [share of the width, from the middle] and descriptors."""
     height, width = image.shape[:2]
     size = _WIDTH_PX, round(height * _WIDTH_PX / width)
     grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), cv2.COLOR_RGB2GRAY)
@@ -122,7 +122,7 @@ def _corners(sift: cv2.Feature2D, image: ByteArray) -> tuple[FloatArray, NDArray
 def _matched(
     a: tuple[FloatArray, NDArray[np.float32]], b: tuple[FloatArray, NDArray[np.float32]]
 ) -> FloatArray:
-    """(M, 2, 2) points of both backgrounds that move together."""
+    """Return (M, 2, 2) points of both backgrounds that move together."""
     none = np.zeros((0, 2, 2))
     if min(len(a[0]), len(b[0])) < _MIN_MATCHES:
         return none
@@ -137,7 +137,7 @@ def _matched(
 
 
 def _groups(same: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(R,) numbers of the connected groups."""
+    """Return (R,) numbers of the connected groups."""
     place = np.full(len(same), -1)
     for first in range(len(same)):
         if place[first] >= 0:

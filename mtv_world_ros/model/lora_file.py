@@ -109,7 +109,7 @@ class PeftSettings(Schema):
 
 
 def _matching(pattern: Mapping[str, Any], module: str, default: Any) -> Any:
-    """The value of the first pattern that matches, as peft matches them."""
+    """Return the value of the first pattern that matches, as peft matches them."""
     try:
         found = (v for key, v in pattern.items() if _expression(key).match(module))
         return next(found, default)

@@ -87,7 +87,7 @@ def save_trained_model(
 
 
 def _folders(model: TrainedModel) -> dict[str, Path]:
-    """Folders of parts that are copied unchanged."""
+    """Return the folders of parts that are copied unchanged."""
     parts = {
         ADAPTER_FOLDER: model.adapter,
         OBJECT_MOTION_FOLDER: model.object_motion,

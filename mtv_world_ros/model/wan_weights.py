@@ -413,7 +413,7 @@ def _zeros(shape: tuple[int, ...]) -> StoredTensor:
 
 
 def _some(names: list[str]) -> str:
-    """The first few names."""
+    """Return the first few names."""
     return ', '.join(names[:8]) + (', ...' if len(names) > 8 else '')
 
 

@@ -196,7 +196,7 @@ class ControlMaker:
     def _start_masks(
         self, clip: Clip, names: tuple[str, ...], start: ByteArray | None
     ) -> BoolArray:
-        """(V, O, H, W) of a clip's start frame, or of an imagined one."""
+        """Return the masks (V, O, H, W) of a clip's start frame, recorded or imagined."""
         if start is not None:
             return self._masks(start, names)
         ids = clip.object_ids
@@ -212,7 +212,7 @@ class ControlMaker:
         return masks_from_ids(ids[:, None], clip.objects, names).masks[:, :, 0]
 
     def _masks(self, frames: ByteArray, names: tuple[str, ...]) -> BoolArray:
-        """(V, O, H, W) of frames (V, H, W, 3)."""
+        """Return the masks (V, O, H, W) of frames (V, H, W, 3)."""
         with self._lock:
             return self.segmenter.segment(frames[:, None], names).masks[:, :, 0]
 

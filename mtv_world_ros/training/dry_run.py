@@ -164,7 +164,7 @@ def _inputs(
     transformer: MultiViewWanTransformer,
     dtype: torch.dtype,
 ) -> dict[str, Tensor]:
-    """Arguments of the transformer for one batch, all zero."""
+    """Return the arguments of the transformer for one batch, all zero."""
     video, batch = config.video, config.optimizer.batch_size
     views, dim = len(video.views), transformer.config['latent_channels']
     frames, num_history, height, width = _latent_size(config)

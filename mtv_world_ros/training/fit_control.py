@@ -62,7 +62,7 @@ def fitted_control(
 def _motions(
     config: TrainingConfig, recordings: Sequence[Recording], robot: RobotModel
 ) -> list[Motion]:
-    """Motions of clips that are spread evenly over the recordings."""
+    """Return the motions of clips that are spread evenly over the recordings."""
     spec = config.spec
     clips = [(one, int(start)) for one in recordings for start in clip_starts(one, spec)]
     if not clips:

@@ -156,7 +156,7 @@ class LatentCache:
 
 
 def _other_settings(root: Path, mine: Mapping[str, Any]) -> list[str]:
-    """Settings in which the neighbouring caches differ."""
+    """Return the settings in which the neighbouring caches differ."""
     notes = []
     for file in sorted(root.glob(f'*/{SETTINGS}')):
         try:
@@ -320,7 +320,7 @@ def _check_space(root: Path, clip_bytes: int, count: int) -> None:
 def _encode(
     batch: ClipBatch, encoders: Encoders, device: torch.device, dtype: torch.dtype
 ) -> dict[str, Tensor]:
-    """The tensors of one clip, without the batch axis."""
+    """Return the tensors of one clip, without the batch axis."""
     encoded = encode_batch(encoders, batch, ObjectiveConfig(), device)
     cond = encoded.conditioning
     tensors = {'clean': encoded.clean, 'reference': cond.reference, 'image': cond.image}
@@ -420,7 +420,7 @@ def _check(config: TrainingConfig) -> None:
 
 
 def _changed(cache: LatentCache, clips: list[CachedClip]) -> list[str]:
-    """A note on cached clips whose episodes have changed since."""
+    """Return a note on cached clips whose episodes have changed since."""
     stale = cache.changed({clip.key: clip.label for clip in clips})
     if not stale:
         return []

@@ -77,7 +77,7 @@ class SelfRollout:
     def _last_chunk(
         self, lead_in: LeadIn, noise: tuple[int, int, int], transformer: MultiViewWanTransformer
     ) -> ClipBatch:
-        """The chunk that is trained on, after the rollout of those before it (B = 1)."""
+        """Return the chunk that is trained on, after the rollout of those before it (B = 1)."""
         start = np.ascontiguousarray(lead_in.clip.frames[:, 0])
         past = History.begin(start)
         for chunk in range(lead_in.num_chunks):
@@ -101,7 +101,7 @@ class SelfRollout:
         )
 
     def _past(self, past: History) -> dict[str, Any]:
-        """The fields of a batch that show the past, at the noise level of serving."""
+        """Return the fields of a batch that show the past, at the noise level of serving."""
         settings = self._encoders.history
         if not settings.on:
             return {}
@@ -115,7 +115,7 @@ class SelfRollout:
     def _imagine(
         self, batch: ClipBatch, seed: int, transformer: MultiViewWanTransformer
     ) -> ByteArray:
-        """(V, T, H, W, 3) frames of the chunk."""
+        """Return (V, T, H, W, 3) frames of the chunk."""
         with torch.inference_mode():
             conditioning = condition_batch(self._encoders, batch, self._device)
             latents = sample_latents(

@@ -261,7 +261,7 @@ class Trainer:
         )
 
     def loss(self, batch: ClipBatch | EncodedBatch) -> Loss:
-        """The loss of a batch, or of a part of one."""
+        """Return the loss of a batch, or of a part of one."""
         draws = NoiseDraws(self.seed, batch.step, batch.numbers)
         worker = self.weights.worker
         return batch_loss(worker, self.encoders, batch, self.config, draws, self.device)
@@ -317,7 +317,7 @@ class Trainer:
         save_state(self.folder, self.weights, self.optimizer, card)
 
     def _identity(self) -> dict[str, Any]:
-        """Values that must be the same in a resumed run."""
+        """Return the values that must be the same in a resumed run."""
         return {
             **architecture(self.config),
             'seed': self.seed,

@@ -407,7 +407,7 @@ def _best_score(file: Path) -> float:
 
 
 def _steps_of(result: Path) -> int | None:
-    """Steps that a checkpoint or adapter was trained for; None if there is none."""
+    """Return the steps that a checkpoint or adapter was trained for; None if there is none."""
     card = result / CARD
     return read_card(result).trained_on['steps'] if card.is_file() else None
 

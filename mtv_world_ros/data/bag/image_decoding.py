@@ -183,7 +183,7 @@ def check_compressed(layout: str, data: NDArray[np.uint8]) -> None:
 
 
 def compressed_to_rgb(layout: str, data: NDArray[np.uint8]) -> ByteArray:
-    """(H, W, 3) RGB of a sensor_msgs/CompressedImage.
+    """Return (H, W, 3) RGB of a sensor_msgs/CompressedImage.
 
     Raises:
         ObservationError: as `check_compressed`, or the file is damaged.
@@ -201,7 +201,7 @@ def compressed_to_rgb(layout: str, data: NDArray[np.uint8]) -> ByteArray:
 
 
 def compressed_to_ids(layout: str, data: NDArray[np.uint8]) -> ByteArray:
-    """(H, W) values of a one-channel sensor_msgs/CompressedImage (object masks).
+    """Return (H, W) values of a one-channel sensor_msgs/CompressedImage (object masks).
 
     Raises:
         ObservationError: as `compressed_to_rgb`, or it has another number of channels.

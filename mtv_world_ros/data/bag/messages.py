@@ -75,13 +75,13 @@ def check_type(msgtype: str) -> str:
 
 @cache
 def definition(msgtype: str) -> str:
-    """The type's `.msg` text and those of the types in it, as rosbag2 writes them."""
+    """Return the type's `.msg` text and those of the types in it, as rosbag2 writes them."""
     return typestore().generate_msgdef(check_type(msgtype), ros_version=2)[0]
 
 
 @cache
 def type_hash(msgtype: str) -> str:
-    """The type's RIHS01 hash."""
+    """Return the type's RIHS01 hash."""
     return typestore().hash_rihs01(check_type(msgtype))
 
 
@@ -114,7 +114,7 @@ def deserialize(msgtype: str, data: bytes) -> Any:
 
 
 def make(msgtype: str, **fields: Any) -> Any:
-    """A typed message; every field must be given."""
+    """Return a typed message; every field must be given."""
     return typestore().types[check_type(msgtype)](**fields)
 
 
@@ -128,7 +128,7 @@ def make_header(stamp_ns: int, frame_id: str) -> Any:
 
 
 def header_stamp(message: Any) -> int:
-    """The header's stamp [ns]; 0 = not stamped."""
+    """Return the header's stamp [ns]; 0 = not stamped."""
     return message.header.stamp.sec * NANO + message.header.stamp.nanosec
 
 
@@ -218,7 +218,7 @@ def make_pose_array(stamp_ns: int, frame_id: str, poses: ArrayLike) -> Any:
 
 
 def parse_pose_array(message: Any) -> NDArray[np.float64]:
-    """Poses (O, 4, 4) of a geometry_msgs/PoseArray."""
+    """Return the poses (O, 4, 4) of a geometry_msgs/PoseArray."""
     return np.array([parse_pose(item) for item in message.poses]).reshape(-1, 4, 4)
 
 

@@ -47,12 +47,12 @@ class TopicRecord:
 
 
 def dump_qos(qos: Qos) -> str:
-    """The profile list as the MCAP channel's metadata holds it."""
+    """Return the profile list as the MCAP channel's metadata holds it."""
     return dump([_qos_entry(qos)]).strip()
 
 
 def parse_qos(text: str) -> Qos:
-    """The first profile of such a list; the default where it cannot be read."""
+    """Return the first profile of such a list; the default where it cannot be read."""
     try:
         entry = parse_yaml(text)[0]
         words = {key: entry[key] for key in ('reliability', 'durability', 'history')}

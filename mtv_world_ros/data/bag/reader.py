@@ -338,7 +338,7 @@ def _open_sqlite(file: Path, most_bytes: int, *, is_cut: bool) -> sqlite3.Connec
 
 
 def _typed(row: tuple[Any, ...], *types: type) -> tuple[Any, ...]:
-    """The values of a row; SQLite keeps whatever type was put into a column."""
+    """Return the values of a row; SQLite keeps whatever type was put into a column."""
     for value, kind in zip(row, types, strict=True):
         if not isinstance(value, kind):
             raise _Cut(f'a row holds {type(value).__name__} where {kind.__name__} belongs')
@@ -347,7 +347,7 @@ def _typed(row: tuple[Any, ...], *types: type) -> tuple[Any, ...]:
 
 @contextmanager
 def _decompressed(file: Path) -> Iterator[Path]:
-    """The file, or where it is compressed as a whole a temporary copy that is not."""
+    """Return the file, or a decompressed temporary copy if the whole file is compressed."""
     if file.suffix != '.zstd':
         yield file
         return

@@ -172,7 +172,7 @@ def clip_features(weights: Path, device: str = 'cpu') -> ClipFeatures:
 def _loaded(
     kind: type[nn.Module], path: Path, device: str, option: str
 ) -> Callable[[ByteArray], FloatArray]:
-    """A network with its weights from a file, from arrays to arrays."""
+    """Return a network with its weights from a file, from arrays to arrays."""
     if not path.is_file():
         raise ConfigError(
             f"{option} '{path}' does not exist; nothing is downloaded, name a file that you have"
@@ -197,7 +197,7 @@ def _loaded(
 
 
 def _of_network(state: dict[str, Any], network: torch.nn.Module) -> dict[str, Any]:
-    """The tensors whose shapes fit; others count as missing and unknown."""
+    """Return the tensors whose shapes fit; others count as missing and unknown."""
     wanted = {name: tensor.shape for name, tensor in network.state_dict().items()}
     return {
         (name if name not in wanted or wanted[name] == tensor.shape else f'{name} (shape)'): tensor

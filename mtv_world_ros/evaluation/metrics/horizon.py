@@ -75,7 +75,7 @@ def by_chunk(
 def _moving(
     episodes: Sequence[Sequence[ScoreRow]], view: str | None, field: str
 ) -> list[list[Sequence[float]]]:
-    """Values per frame of each episode's rows of objects that move."""
+    """Return the values per frame of each episode's rows of objects that move."""
     return [
         [
             getattr(row, field)
@@ -96,7 +96,7 @@ def _curve(sums: np.ndarray, counts: np.ndarray) -> Curve:
 
 
 def _sums(episodes: Sequence[Sequence[Sequence[float]]]) -> tuple[np.ndarray, np.ndarray]:
-    """(E, T) sums of the known values of each episode's rows, and how many they are."""
+    """Return sums and counts (E, T) of the known values of each episode's rows."""
     longest = max((len(frames) for rows in episodes for frames in rows), default=0)
     sums, counts = np.zeros((len(episodes), longest)), np.zeros((len(episodes), longest))
     for index, rows in enumerate(episodes):

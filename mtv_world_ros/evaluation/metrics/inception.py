@@ -228,7 +228,7 @@ def _resized(images: Tensor) -> Tensor:
 
 
 def _weights(count: int, like: Tensor) -> Tensor:
-    """(299, count) shares of the old pixels in each new one."""
+    """Return (299, count) shares of the old pixels in each new one."""
     places = torch.arange(SIZE, dtype=torch.float64) * (count / SIZE)
     lower = places.floor().long().clamp(max=count - 1)
     upper = (lower + 1).clamp(max=count - 1)

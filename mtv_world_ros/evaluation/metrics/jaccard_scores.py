@@ -88,7 +88,7 @@ class ScoreRow:
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> ScoreRow:
-        """The inverse of `as_json`."""
+        """Return the inverse of `as_json`."""
         read: dict[str, Any] = {
             key: np.nan if value is None else value for key, value in values.items()
         }

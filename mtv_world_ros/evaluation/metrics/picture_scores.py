@@ -101,7 +101,7 @@ def changed(frame: ByteArray, first: ByteArray) -> NDArray[np.bool_]:
 
 
 def ssim_map(a: ByteArray, b: ByteArray) -> NDArray[np.float64]:
-    """(H, W) structural similarity of two frames (H, W, 3), the mean of the channels."""
+    """Return (H, W) structural similarity of two frames (H, W, 3), the mean of the channels."""
 
     def blurred(x: NDArray[np.float64]) -> NDArray[np.float64]:
         found = cv2.GaussianBlur(x, (11, 11), _SSIM_SIGMA_PX, borderType=cv2.BORDER_REFLECT_101)

@@ -176,7 +176,7 @@ def _times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 def _root_times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
-    """A triangular root of a covariance times standard normals: a draw."""
+    """Return a triangular root of a covariance times standard normals: a draw."""
     a, b, d = matrix
     low = b / np.sqrt(a)
     second = np.sqrt(np.maximum(d - low**2, 1e-15))
@@ -310,7 +310,7 @@ def _draws(judged: FloatArray, true: FloatArray) -> FloatArray | None:
 
 
 def _pearson_of(judged: FloatArray, true: FloatArray) -> FloatArray:
-    """(D,) of draws (D, P)."""
+    """Return (D,) of draws (D, P)."""
     a, b = (rates - rates.mean(axis=1, keepdims=True) for rates in (judged, true))
     return (a * b).sum(axis=1) / np.maximum(
         np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1)), 1e-12
@@ -318,7 +318,7 @@ def _pearson_of(judged: FloatArray, true: FloatArray) -> FloatArray:
 
 
 def _violation_of(judged: FloatArray, true: FloatArray) -> FloatArray:
-    """(D,) of draws (D, P)."""
+    """Return (D,) of draws (D, P)."""
     gaps = true[:, :, None] - true[:, None]
     is_violated = (judged[:, :, None] > judged[:, None]) != (gaps > 0)
     return np.where(is_violated, np.abs(gaps), 0.0).max(axis=2).mean(axis=1)
@@ -399,7 +399,7 @@ def powered_mean(
 
 
 def _best_weight(y: FloatArray, f: FloatArray, u: FloatArray) -> float:
-    """The weight of the shortest interval, within [0, 1]."""
+    """Return the weight of the shortest interval, within [0, 1]."""
     spread = float(np.concatenate([f, u]).var(ddof=1)) if len(f) + len(u) > 1 else 0.0
     if len(y) < 2 or spread < 1e-12:
         return 0.0

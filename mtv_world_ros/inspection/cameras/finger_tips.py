@@ -65,7 +65,7 @@ def _tips(
 def _ends(
     parts: Sequence[LinkShape], poses: dict[str, FloatArray], tool: FloatArray
 ) -> list[FloatArray]:
-    """(3,) of each tip in one state; the tool's z axis points away from the arm."""
+    """Return the position (3,) of each tip in one state; the tool's z points away from the arm."""
     by_link: dict[str, list[FloatArray]] = {}
     for part in parts:
         T = poses[part.link]

@@ -229,7 +229,7 @@ class FixedCamera:
         )
 
     def _far_pairs(self) -> np.ndarray:
-        """(P, 2) pairs of frames between which the robot moves most."""
+        """Return (P, 2) pairs of frames between which the robot moves most."""
         count = len(self._positions)
         rows, columns = np.triu_indices(count, 1)
         apart = np.linalg.norm(self.points[rows] - self.points[columns], axis=-1).mean(axis=1)
@@ -271,7 +271,7 @@ class FixedCamera:
         return float(along / (np.linalg.norm(drawn) * changes.deviation))
 
     def _drawn(self, T: FloatArray, changes: Changes) -> NDArray[np.float32]:
-        """(P, H, W) where the pictures of each pair should differ, 0 .. 1."""
+        """Return the expected change (P, H, W) between the images of each pair, 0 .. 1."""
         before, after = self._silhouettes(T, changes, self._parts)
         differs = (before ^ after) + np.float32(_INSIDE) * (before & after)
         return np.stack([cv2.GaussianBlur(one, (0, 0), changes.blur) for one in differs])
@@ -279,7 +279,7 @@ class FixedCamera:
     def _silhouettes(
         self, T: FloatArray, changes: Changes, parts: Sequence[LinkShape]
     ) -> NDArray[np.uint8]:
-        """(2, P, H, W) 1 where parts are drawn in the frames of each pair."""
+        """Return the silhouettes (2, P, H, W) of the links in the frames of each pair, 0 or 1."""
         rows = np.unique(changes.pairs)
         wanted = {id(part) for part in parts}
         corners = [
@@ -291,7 +291,7 @@ class FixedCamera:
         return fill(pixels, changes.camera)[np.searchsorted(rows, changes.pairs.T)]
 
     def _aligned(self, T: FloatArray, changes: Changes) -> FloatArray:
-        """The pose nearby at which drawn and seen changes differ least.
+        """Return the pose nearby at which drawn and seen changes differ least.
 
         Pixels that differ much, e.g. shadows and parts of the background's colour, count less.
         """
@@ -299,7 +299,7 @@ class FixedCamera:
                        outlier=_OUTLIER)  # fmt: skip
 
     def errors(self, T: FloatArray, changes: Changes) -> NDArray[np.float32]:
-        """(P, H W) drawn minus seen changes."""
+        """Return (P, H W) drawn minus seen changes."""
         return (self._drawn(T, changes) - changes.seen).reshape(len(changes.pairs), -1)
 
     def _standard_errors(self, T: FloatArray, changes: Changes) -> tuple[float, float]:
@@ -356,7 +356,7 @@ class FixedCamera:
         return np.asarray(steps.T * UNITS, np.float64)
 
     def _pixels_of_links(self, T: FloatArray, changes: Changes) -> list[np.ndarray]:
-        """Indices of the pixels at which each link is drawn, each pixel at one link."""
+        """Return the indices of the pixels at which each link is drawn, each pixel at one link."""
         owner = np.full(changes.seen.size, -1)
         links = list(dict.fromkeys(part.link for part in self._parts))
         kernel = np.ones((2 * round(2 * changes.blur) + 1,) * 2, np.uint8)
@@ -432,7 +432,7 @@ class FixedCamera:
 
 
 def roughened(changes: Changes) -> NDArray[np.float32]:
-    """(P, cells) seen changes of a part of the size, without their means, of length 1."""
+    """Return (P, cells) seen changes of a part of the size, without their means, of length 1."""
     pairs, height, width = changes.seen.shape
     height, width = height // _ROUGH, width // _ROUGH
     cropped = changes.seen[:, : height * _ROUGH, : width * _ROUGH]
@@ -445,7 +445,7 @@ def roughened(changes: Changes) -> NDArray[np.float32]:
 def random_camera(
     centre: FloatArray, away: float, reach: float, generator: np.random.Generator
 ) -> FloatArray:
-    """A random upright camera around and above a point that looks near it."""
+    """Return a random upright camera around and above a point that looks near it."""
     turn, up = generator.uniform(0, 2 * np.pi), np.arcsin(generator.uniform(-0.15, 0.98))
     ahead = -np.array([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)])
     T = np.eye(4)
@@ -497,7 +497,7 @@ def _way(part: LinkShape, poses: FloatArray) -> float:
 
 
 def _in_base(points: FloatArray, poses: FloatArray) -> FloatArray:
-    """(F, N, 3) a link's points (N, 3) where its poses (F, 4, 4) put them."""
+    """Return the points (F, N, 3) of a link, transformed by its poses (F, 4, 4)."""
     return points @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
 
 

@@ -118,7 +118,7 @@ class JointState:
     own_steps: Mapping[int, FloatArray] = field(default_factory=dict)
 
     def own(self, place: int) -> FloatArray:
-        """The own steps of a place, (6,)."""
+        """Return the own steps of a place, (6,)."""
         return self.own_steps.get(place, np.zeros(6))
 
 
@@ -201,7 +201,7 @@ class JointCamera:
     def together(
         self, starts: Sequence[JointState], points: Sequence[SeenPoint] = ()
     ) -> JointState:
-        """The best state near some that were found view by view.
+        """Return the best state near some that were found view by view.
 
         Args:
             starts: with the poses of all places. A camera farther away with a longer lens looks
@@ -237,7 +237,7 @@ class JointCamera:
         seed: int = 0,
         lens: FloatArray | None = None,
     ) -> JointState:
-        """The state at which tool points are seen where somebody saw them.
+        """Return the state at which tool points are seen where somebody saw them.
 
         Args:
             places: of the recordings.
@@ -295,7 +295,7 @@ class JointCamera:
     def _spread(
         self, number: int, T: FloatArray, lens: FloatArray, places: CameraPlaces
     ) -> JointState:
-        """The state with a recording's pose, the others turned as their backgrounds say."""
+        """Return the state with a recording's pose, the others turned as their backgrounds say."""
         focal = through(self._recordings[0].camera, lens).K[[0, 1], [0, 1]]
         poses = {}
         for other, place in enumerate(self._places):
@@ -351,7 +351,7 @@ class JointCamera:
         stage: tuple[int, float] = _STAGES[1],
         members: Sequence[int] | None = None,
     ) -> FloatArray:
-        """(R,) correlation of drawn and seen changes of recordings; None = of all."""
+        """Return (R,) correlation of drawn and seen changes of recordings; None = of all."""
         found = []
         for number in range(len(self._recordings)) if members is None else members:
             one, T = self._recordings[number], state.poses[self._places[number]]
@@ -366,7 +366,7 @@ class JointCamera:
         iterations: int = 8,
         members: Sequence[int] | None = None,
     ) -> JointState:
-        """The state nearby at which drawn and seen changes differ least."""
+        """Return the state nearby at which drawn and seen changes differ least."""
         numbers = range(len(self._recordings)) if members is None else members
         for stage in stages:
             changes = {n: self._read(n, state, stage) for n in numbers}
@@ -374,7 +374,7 @@ class JointCamera:
         return state
 
     def _read(self, number: int, state: JointState, stage: tuple[int, float]) -> Changes:
-        """The changes of a recording, read in the way that fits better."""
+        """Return the changes of a recording, read in the way that fits better."""
         one, T = self._recordings[number], state.poses[self._places[number]]
         read = [self._changes(number, stage, reading) for reading in READINGS]
         return max(read, key=lambda found: one.fit(T, _through(found, state.lens)))
@@ -480,7 +480,7 @@ class JointCamera:
         return found
 
     def _moved(self, state: JointState, steps: Mapping[int, _Step], damping: float) -> JointState:
-        """The state after a damped step of what is shared and of each place's own.
+        """Return the state after a damped step of what is shared and of each place's own.
 
         All share the lens, the places of a view a pose. A place's own six numbers are eliminated
         first (Schur complement).
@@ -515,7 +515,7 @@ class JointCamera:
         return JointState(poses=poses, lens=lens, own_steps=own_steps)
 
     def _shared_rows(self, place: int, size: int) -> list[int]:
-        """Rows of what a place shares: its view's pose, and the lens."""
+        """Return the rows of what a place shares: its view's pose, and the lens."""
         first = 6 * self._view_of[place]
         return [*range(first, first + 6), *range(size - len(self._free), size)]
 

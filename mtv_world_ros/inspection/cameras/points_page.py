@@ -60,7 +60,7 @@ def _frames(episode: Episode, view: str, robot: RobotModel) -> list[dict[str, ob
 
 
 def _far_apart(places: FloatArray) -> list[int]:
-    """Rows whose places (T, 3) are far from each other, the first among them."""
+    """Return the rows whose places (T, 3) are far from each other, the first among them."""
     chosen = [0]
     away = np.linalg.norm(places - places[0], axis=1)
     while len(chosen) < min(_NUM_FRAMES, len(places)) and away.max() > 0.02:

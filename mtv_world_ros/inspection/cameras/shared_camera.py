@@ -253,7 +253,7 @@ class _Together:
         return zip(self._each, self._places, strict=False)
 
     def found(self, guess: bool, seed: int) -> list[JointState]:
-        """The state of each view, by the points that are not left out."""
+        """Return the state of each view, by the points that are not left out."""
         if len(self._each) == 1:
             view = self._each[0]
             start = view.given if guess else None
@@ -302,7 +302,7 @@ class _Together:
 
 
 def _start(view: _View, guess: bool, seed: int) -> JointState:
-    """A view's own state, roughly."""
+    """Return a view's own state, roughly."""
     start = view.given if guess else None
     return view.joint.estimate(view.places, start, view.points, seed, rough=True)
 
@@ -318,7 +318,7 @@ def _judged(
     *,
     guess: bool,
 ) -> SharedEstimate:
-    """The better of guess and result by the doctor's measure.
+    """Return the better of guess and result by the doctor's measure.
 
     Its error is that of the state that was fitted without the points that were left out.
     """
@@ -358,7 +358,7 @@ def _judged(
 def _strays(
     points: Sequence[SeenPoint], cameras: Sequence[CameraModel]
 ) -> tuple[tuple[SeenPoint, float], ...]:
-    """Points that contradict the others, the worst first."""
+    """Return the points that contradict the others, the worst first."""
     apart = [_apart(point, cameras[point.recording]) for point in points]
     if not apart:
         return ()
@@ -397,7 +397,7 @@ def _on_base(camera: CameraModel, robot: RobotModel) -> CameraModel:
 def _parted(
     points: Mapping[str, Sequence[Any]],
 ) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
-    """Rows that poses are fitted to, and those that are left out."""
+    """Return the rows that poses are fitted to, and those that are left out."""
     parts: tuple[dict[str, list[Any]], dict[str, list[Any]]] = ({}, {})
     for name, rows in points.items():
         for number, row in enumerate(rows, start=1):

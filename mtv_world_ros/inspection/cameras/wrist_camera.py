@@ -172,7 +172,7 @@ class WristCamera:
         )
 
     def _direction(self) -> FloatArray:
-        """The pose at the link's origin whose turns are the link's.
+        """Return the pose at the link's origin whose turns are the link's.
 
         A turn of the link by a vector is one of the camera by the same vector, seen in its frame.
         """
@@ -229,7 +229,7 @@ class WristCamera:
         return np.asarray((there - seen) * tracks.focal_px, np.float64)
 
     def _refined(self, T: FloatArray) -> tuple[FloatArray, float]:
-        """The pose nearby at which the points fit best, and their median distance [px]."""
+        """Return the pose nearby at which the points fit best, and their median distance [px]."""
         for outlier in (10.0, 2.0, 0.7):
             T = aligned(T, lambda pose: self._errors(pose).clip(-1e3, 1e3).ravel(),
                         outlier=outlier, iterations=15)  # fmt: skip
@@ -298,7 +298,7 @@ def _rotation_between(turns: FloatArray) -> FloatArray | None:
 
 
 def _agree(R: FloatArray, turns: FloatArray) -> np.ndarray:
-    """(N,) whether the turned second vectors point as the first do."""
+    """Return True for each pair (N,) whose rotated second vector points like the first."""
     apart = np.linalg.norm(turns[:, 0] - turns[:, 1] @ R.T, axis=-1)
     return apart < _AGREE * np.linalg.norm(turns[:, 0], axis=-1) + _ROTATION.tolerance_rad
 
@@ -402,7 +402,7 @@ def _still_scene(rays: FloatArray, camera: CameraModel) -> tuple[np.ndarray, Flo
 
 
 def _tracked(track: Track, chosen: np.ndarray, camera: CameraModel) -> FloatArray:
-    """(M, frames, 2) pixels of corners that are found again forwards and backwards.
+    """Return (M, frames, 2) pixels of corners that are found again forwards and backwards.
 
     It ends where too few are left.
     """

@@ -121,7 +121,7 @@ class SelfAttnProcessor:
 
 
 def _turned(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """(B, S, H, d) with pairs of channels turned; cos and sin have each value twice."""
+    """Return x (B, S, H, d) with rotated pairs of channels; cos and sin have each value twice."""
     even, odd = x.unflatten(-1, (-1, 2)).unbind(-1)
     crossed = torch.stack((-odd, even), dim=-1).flatten(-2)
     return torch.addcmul(x * cos, crossed.to(sin.dtype), sin).type_as(x)

@@ -227,7 +227,7 @@ class _ContextEmbedding(nn.Module):
 
 
 def _place_codes(length: int, like: Tensor) -> Tensor:
-    """(length, D) sines and cosines of the places, as in "Attention is all you need"."""
+    """Return (length, D) sines and cosines of the places, as in "Attention is all you need"."""
     half = like.shape[-1] // 2
     rates = LONGEST_PERIOD ** -(torch.arange(half, device=like.device) / half)
     angles = torch.arange(length, device=like.device)[:, None] * rates

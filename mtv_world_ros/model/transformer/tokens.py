@@ -85,7 +85,7 @@ def embed_reference(
 def _tokens_and_keys(
     transformer: Any, image: Tensor, control: Tensor | None, temb: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Tokens and keys that phi gives for (B, V, C, H, W) latents."""
+    """Return the tokens and keys that phi gives for (B, V, C, H, W) latents."""
     flat = image.flatten(0, 1)
     if transformer.stem == 'conv':
         assert control is not None
@@ -185,7 +185,7 @@ class MultiViewRotaryPosEmbed(WanRotaryPosEmbed):
             )
 
     def _table(self, freqs: Tensor, frames: Tensor, v: int, h: int, w: int) -> Tensor:
-        """The angles of a (V, F, h, w) grid; frames (F, t_dim) are those of time."""
+        """Return the angles of a (V, F, h, w) grid; frames (F, t_dim) are those of time."""
         f = len(frames)
         _, row, column = freqs.split([self.t_dim, self.h_dim, self.w_dim], dim=1)
         if self.view_offset == 'width':
@@ -201,7 +201,7 @@ class MultiViewRotaryPosEmbed(WanRotaryPosEmbed):
 
 
 def _rows(table: Tensor, places: Sequence[int], sign: int) -> Tensor:
-    """(F, D) rows of a table (N, D); those of negative places times the sign.
+    """Return (F, D) rows of a table (N, D); those of negative places times the sign.
 
     Cut out, not indexed with a tensor: that would have to be copied to the device first.
     """
