@@ -427,7 +427,7 @@ def test_options_and_commands_in_the_text_exist(page):
     known |= {o for path in shared for o in re.findall(r"'(--[\w-]+)'", path.read_text())}
     for code in _CODE.findall(TEXTS[page]):
         words = code.split()
-        if words[:1] == ['mtv-world'] and len(words) > 1 and words[1].isidentifier():
+        if words[:1] == ['mtv-world'] and len(words) > 1 and re.fullmatch('[a-z]+', words[1]):
             assert words[1] in {name.split()[0] for name in COMMANDS}, code
         options = {word for word in re.findall(r'--[a-z][\w-]*', code) if words[0] != 'pip'}
         assert options <= known | FOREIGN_OPTIONS, code

@@ -202,7 +202,9 @@ def test_drawn_faults_change_the_plan_and_a_size_of_none_does_not(expert, seed):
 
 
 def test_the_command_prints_kinds(capsys):
-    assert main(['rank', '--list-faults', 'high,drawn_5_0']) == 0
+    with pytest.raises(SystemExit) as end:
+        main(['rank', '--list-faults', 'high,drawn_5_0'])
+    assert not end.value.code
     said = capsys.readouterr().out
     assert 'grasp_height (high): height, train; 0.02 m, at most 0.1 m' in said
     assert 'drawn_5_0: drawn, test; 1, at most 3' in said
