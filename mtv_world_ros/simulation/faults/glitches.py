@@ -50,7 +50,7 @@ class GlitchSettings:
     max_mirror_delay_s: float = 1.0
 
 
-_GLITCHES = GlitchSettings()
+_SETTINGS = GlitchSettings()
 
 
 def with_glitches(commands: Commands, count: int, rng: np.random.Generator) -> FloatArray:
@@ -65,7 +65,7 @@ def with_glitches(commands: Commands, count: int, rng: np.random.Generator) -> F
 def _published(commands: Commands, changed: FloatArray) -> FloatArray:
     """Return commands (T, J) with changed parts interpolated linearly between published points."""
     rows = np.arange(len(changed))
-    points = np.append(rows[:: round(_GLITCHES.point_period_s / commands.period)], rows[-1])
+    points = np.append(rows[:: round(_SETTINGS.point_period_s / commands.period)], rows[-1])
     straight = np.stack([np.interp(rows, points, c[points]) for c in changed.T], axis=1)
     differs = np.abs(changed - commands.positions).max(axis=1) > 0
     between = np.searchsorted(points, rows, side='right')
@@ -79,10 +79,10 @@ def _log_uniform(bounds: tuple[float, float], rng: np.random.Generator) -> float
 def _presence(commands: Commands, rng: np.random.Generator) -> FloatArray:
     """Return the weight (T, 1) of the glitch, 0 to 1."""
     times = np.arange(len(commands.positions)) * commands.period
-    begin, length = rng.uniform(0.0, 0.95) * times[-1], _log_uniform(_GLITCHES.duration_s, rng)
-    onset, pause = _log_uniform(_GLITCHES.onset_s, rng), _log_uniform(_GLITCHES.pause_s, rng)
+    begin, length = rng.uniform(0.0, 0.95) * times[-1], _log_uniform(_SETTINGS.duration_s, rng)
+    onset, pause = _log_uniform(_SETTINGS.onset_s, rng), _log_uniform(_SETTINGS.pause_s, rng)
     since = times - begin
-    if rng.random() < _GLITCHES.repeated_fraction:
+    if rng.random() < _SETTINGS.repeated_fraction:
         since = np.where(since > 0, since % (length + 2 * onset + pause), since)
     shape = np.interp(since, np.cumsum([0.0, onset, length, onset]), [0.0, 1.0, 1.0, 0.0])
     return np.asarray(shape)[:, None]
@@ -104,15 +104,15 @@ def _gripper(commands: Commands, rng: np.random.Generator) -> FloatArray:
 def _joints(commands: Commands, rng: np.random.Generator) -> FloatArray:
     """Add a constant or an oscillating error to joints."""
     rows, joints = commands.positions.shape
-    off = _log_uniform(_GLITCHES.joint_error_rad, rng) * rng.normal(size=joints)
-    if rng.random() < _GLITCHES.single_joint_fraction:
+    off = _log_uniform(_SETTINGS.joint_error_rad, rng) * rng.normal(size=joints)
+    if rng.random() < _SETTINGS.single_joint_fraction:
         off *= np.arange(joints) == rng.choice(np.delete(np.arange(joints), commands.grippers))
     off[commands.grippers] = 0.0
     frequency, phases = (
-        _log_uniform(_GLITCHES.oscillation_hz, rng),
+        _log_uniform(_SETTINGS.oscillation_hz, rng),
         rng.uniform(0.0, 2 * np.pi, joints),
     )
-    if rng.random() < _GLITCHES.oscillating_fraction:
+    if rng.random() < _SETTINGS.oscillating_fraction:
         times = np.arange(rows)[:, None] * commands.period
         wave = np.sin(2 * np.pi * frequency * times + phases)
         # swings go on
@@ -130,23 +130,23 @@ def _time(commands: Commands, rng: np.random.Generator) -> FloatArray:
     rows, period = len(commands.positions), commands.period
     at = np.arange(rows, dtype=np.float64)
     begin = int(rng.uniform(0.05, 0.9) * rows)
-    length = max(round(_log_uniform(_GLITCHES.duration_s, rng) / period), 2)
+    length = max(round(_log_uniform(_SETTINGS.duration_s, rng) / period), 2)
     during = slice(begin, begin + length)
     match int(rng.integers(4)):
         case 0:  # the rest of the plan is delayed or advanced
             rates = np.ones(rows)
-            rates[during] = _log_uniform(_GLITCHES.speed_factor, rng)
+            rates[during] = _log_uniform(_SETTINGS.speed_factor, rng)
             at = np.cumsum(rates) - rates[0]
         case 1:  # commands are lost, and the last one held
             at[during] = begin
         case 2:  # left out, or carried out again
             at[begin:] += length * rng.choice((-1.0, 1.0))
         case _:
-            held = max(round(_log_uniform(_GLITCHES.hold_s, rng) / period), 2)
+            held = max(round(_log_uniform(_SETTINGS.hold_s, rng) / period), 2)
             span = slice(begin, None) if rng.random() < 0.5 else during
             at[span] = at[span] // held * held
     at = np.clip(at, 0, rows - 1)
-    ramp = max(round(_log_uniform(_GLITCHES.onset_s, rng) / period), 1)
+    ramp = max(round(_log_uniform(_SETTINGS.onset_s, rng) / period), 1)
     warped = np.stack([np.interp(at, np.arange(rows), c) for c in commands.positions.T], axis=1)
     before = np.repeat(warped[:1], ramp - 1, axis=0)
     padded = np.concatenate([before, warped])
@@ -167,13 +167,13 @@ def _other_arm(commands: Commands, rng: np.random.Generator) -> FloatArray:
     if rng.random() < 0.5:
         signs = rng.choice((-1.0, 1.0), joints, p=(0.2, 0.8))
     late = np.maximum(
-        np.arange(len(ways)) - int(rng.uniform(0, _GLITCHES.max_mirror_delay_s) / commands.period),
+        np.arange(len(ways)) - int(rng.uniform(0, _SETTINGS.max_mirror_delay_s) / commands.period),
         0,
     )
     resting = (np.abs(ways) < 1e-9).all(axis=0) | (rng.random(joints) < 0.3)
     there = (ways == 0) | resting
-    error = rng.uniform(*_GLITCHES.mirror_gain) * signs * crossed(positions, to_next)[late]
-    num = max(round(_log_uniform(_GLITCHES.onset_s, rng) / commands.period), 1)
+    error = rng.uniform(*_SETTINGS.mirror_gain) * signs * crossed(positions, to_next)[late]
+    num = max(round(_log_uniform(_SETTINGS.onset_s, rng) / commands.period), 1)
     sets_in = [np.convolve(column, np.ones(num) / num, 'same') for column in there.T]
     error = error * np.stack(sets_in, axis=1, dtype=np.float64)
     error[:, commands.grippers] = 0.0
