@@ -97,7 +97,6 @@ CASES = {
     'a joint that is not there': Case('wrist', names=(*ARM[:4], 'wrist')),
     'a joint of another robot beside the arm': Case('ur_elbow', names=(*ARM, 'ur_elbow')),
     'no joints': Case('0 joint names', names=()),
-    'no points': Case('0 points', times=()),
     'a name twice': Case('more than once', names=(*JOINTS, 'yaw')),
     'not a number': Case('must be finite', rows=changed(float('nan'))),
     'infinite velocity': Case('must be finite', velocities=((0.0,) * 6, (float('inf'),) * 6)),
