@@ -1,1 +1,1 @@
-"""How a plan enters the model: the trajectory video and what it draws."""
+"""Controls: methods by which a plan enters the model, one file each."""

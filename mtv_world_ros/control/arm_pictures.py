@@ -17,7 +17,7 @@ from mtv_world_ros.cameras.silhouettes import project_part
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, CameraModel, FloatArray
 from mtv_world_ros.robot.shape import LinkShape
 
-#: RGB of a robot of which the start frame shows nothing
+#: RGB of a robot that the start frame does not show
 _GREY = 128
 #: points further than this many image sizes from its middle say nothing of a link's motion
 _FARTHEST = 4.0

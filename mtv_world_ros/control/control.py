@@ -1,4 +1,4 @@
-"""How a plan enters the world model: the protocol of a control, its source and its inputs.
+"""Protocol of a control (a way for a plan to enter the model), its source and its inputs.
 
 Shape letters: V views, T frames of a chunk, O objects, H W pixels, L context tokens, D numbers of
 a token or vector.

@@ -49,7 +49,7 @@ from mtv_world_ros.core.data_types import (
 from mtv_world_ros.core.errors import ObservationError, TrajectoryError
 from mtv_world_ros.robot.shape import LinkShape, load_shape
 
-#: grey level of the canvas by which a model of both kinds tells that nothing is foreseen
+#: grey level of the canvas that marks clips without simulated objects, for a model of both kinds
 UNFORESEEN_GREY = 24
 #: drawn length of a finger [m]
 _FINGER_LENGTH_M = 0.03

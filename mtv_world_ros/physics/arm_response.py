@@ -31,17 +31,25 @@ from mtv_world_ros.robot.model import RobotModel
 PERIOD_S = 0.02
 #: integration steps in it
 _SUBSTEPS = 2
-#: of the table, under a fingertip: stiffness [N/m], damping [N s/m], friction, and the speed below
-#: which that is viscous [m/s]
-_STIFFNESS, _DAMPING, _FRICTION, _SLOW = 5000.0, 100.0, 0.9, 0.02
-#: fingertips that are higher over the table do not get there within a period [m]
+#: stiffness of the table under a fingertip [N/m]
+TABLE_STIFFNESS_N_M = 5000.0
+#: damping of the table under a fingertip [N s/m]
+TABLE_DAMPING_N_S_M = 100.0
+#: friction of the table under a fingertip
+TABLE_FRICTION = 0.9
+#: sliding speed below which that friction is viscous [m/s]
+VISCOUS_SPEED_M_S = 0.02
+#: height above the table from which a fingertip does not reach it within a period [m]
 _NEAR_M = 0.03
 #: joints that are faster have run away from their commands [rad/s or m/s]
 _WILD = 500.0
 #: of each joint
 NUMBERS = ('compliance', 'armature', 'damping', 'lead')
 _LARGEST = {'compliance': 10.0, 'armature': 1.0, 'damping': 1.0, 'lead': 1.0}
-_FLOOR, _HIGHEST_M = 'floor', 100.0
+#: key of the table's height in a file
+_FLOOR = 'floor'
+#: largest height of a table that a file may state [m]
+_HIGHEST_M = 100.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,12 +214,14 @@ class _Tips:
         if not touching.any():
             return None
         up, depths, sinks = up[touching], depths[touching], sinks[touching]
-        push = np.maximum(_STIFFNESS * (depths + step_s / 2 * sinks) + _DAMPING * sinks, 0.0)
+        stiffness, damping = TABLE_STIFFNESS_N_M, TABLE_DAMPING_N_S_M
+        push = np.maximum(stiffness * (depths + step_s / 2 * sinks) + damping * sinks, 0.0)
         forces = up.T @ push
-        resists = (_STIFFNESS * step_s**2 / 4 + _DAMPING * step_s / 2) * up.T @ up
+        resists = (stiffness * step_s**2 / 4 + damping * step_s / 2) * up.T @ up
         for along, depth in zip(self.jacobians[touching, :2], depths, strict=True):
             slip = along @ velocities
-            rubs = _FRICTION * _STIFFNESS * max(depth, 0.0) / max(float(np.hypot(*slip)), _SLOW)
+            speed = max(float(np.hypot(*slip)), VISCOUS_SPEED_M_S)
+            rubs = TABLE_FRICTION * stiffness * max(depth, 0.0) / speed
             forces = forces - rubs * along.T @ slip
             resists = resists + rubs * step_s / 2 * along.T @ along
         return forces, resists

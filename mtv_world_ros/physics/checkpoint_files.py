@@ -16,8 +16,10 @@ from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.physics.solid_foresight import SolidForesight
 from mtv_world_ros.robot.model import RobotModel
 
-#: numbers of contact, and how arms follow their commands
-CONTACT_FILE, RESPONSE_FILE = 'contact.json', 'arm_response.json'
+#: file of the contact settings
+CONTACT_FILE = 'contact.json'
+#: file of the arms' response to commands
+RESPONSE_FILE = 'arm_response.json'
 
 
 def load_foresight(folder: Path, robot: RobotModel, threads: int = 1) -> SolidForesight | None:

@@ -41,7 +41,7 @@ ENOUGH_TELLING = 3
 
 
 class ContactOrigin(Schema):
-    """What compared numbers of contact with recordings."""
+    """Recordings that contact settings were fitted to."""
 
     by: str = Field(description='the command')
     recordings: int = Field(ge=0, description='that were looked at')
@@ -94,7 +94,7 @@ class ContactSettings(Schema):
 
     @property
     def doubt(self) -> str:
-        """Why these numbers say nothing of a real place; empty = recordings there bear them."""
+        """Reason why these settings do not hold for a real place; empty if fitted there."""
         if self.fitted is None:
             return 'numbers of contact (contact.json) were never fitted on recordings'
         telling, count = self.fitted.telling, self.fitted.recordings

@@ -40,7 +40,7 @@ class FreeMotion:
     velocities: FloatArray
 
     def late(self, steps: int, last: FreeMotion | None) -> FreeMotion:
-        """Returns the course, delayed by so many steps.
+        """Return the course, delayed by a number of steps.
 
         Args:
             steps: of the engine.
@@ -64,7 +64,7 @@ class FreeMotion:
         )
 
     def _rest(self, steps: int) -> FreeMotion:
-        """So many steps in which the arms hold the start of this course."""
+        """Return a course of the given number of steps that holds the start of this one."""
         where = np.repeat(self.positions[:1], steps + 1, axis=0)
         still = np.zeros_like(where)
         return FreeMotion(controls=where[1:], pushes=still[1:], positions=where, velocities=still)

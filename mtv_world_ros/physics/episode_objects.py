@@ -126,7 +126,7 @@ class ObjectForesight:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """What speaks against what is foreseen, in words."""
+        """Doubts about the simulated motion, in words."""
         return () if self.found is None else self.found.tracked.reasons
 
     @property

@@ -15,13 +15,13 @@ from mtv_world_ros.physics.arms import Drives
 from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.physics.solids import Solid
 
-#: what is found as near to the table stands on it [m]
+#: largest distance from the table of an object that stands on it [m]
 STANDS_M = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Future:
-    """One sample of what is not known.
+    """Sample of the unknown quantities: one future.
 
     Attributes:
         settings: of contact.

@@ -17,11 +17,15 @@ from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, CameraModel, FloatArray
 from mtv_world_ros.robot.model import RobotModel
 
-#: smaller displacements and turns count as standing still
-_STILL_M, _STILL_RAD = 0.004, 0.08
-#: largest distance that counts between two ends; lever arm by which turns count as distances
-_ELSEWHERE_M, _RADIUS_M = 0.05, 0.02
-#: duration of the blend from one motion to another in the pictures
+#: displacement below which an object stands still [m]
+_STILL_M = 0.004
+#: rotation below which an object stands still [rad]
+_STILL_RAD = 0.08
+#: distance between two ends beyond which all distances count the same [m]
+_ELSEWHERE_M = 0.05
+#: lever arm that turns a rotation into a distance [m]
+_RADIUS_M = 0.02
+#: duration of the blend from one motion to another in the pictures [s]
 _PASSAGE_S = 1.0
 #: entries of equal poses differ by less
 _SAME_POSE = 1e-4
@@ -103,7 +107,7 @@ class TrackedObjects(Protocol):
 
     @property
     def commands_a_step(self) -> int:
-        """How many joint positions `advance` takes a step."""
+        """Number of joint positions that `advance` takes per step."""
         ...
 
     @property
@@ -123,7 +127,7 @@ class TrackedObjects(Protocol):
 
     @property
     def refusal(self) -> str:
-        """Why the foreseen motions allow no verdict; empty = they do."""
+        """Reason why the simulated motions allow no verdict; empty if they do."""
         ...
 
     def advance(

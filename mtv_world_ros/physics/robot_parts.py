@@ -34,8 +34,10 @@ from mtv_world_ros.robot.shape import (
 DENSITY = 1000.0
 #: a hull of less is no body [m^3]
 _LEAST_M3 = 1e-9
-#: what a link that has neither inertia nor shape weighs [kg], and its radius of gyration [m]
-_LEAST_KG, _LEAST_RADIUS_M = 1e-3, 5e-3
+#: mass of a link that has neither inertia nor shape [kg]
+_LEAST_KG = 1e-3
+#: radius of gyration of such a link [m]
+_LEAST_RADIUS_M = 5e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,7 +136,7 @@ def with_inertias(robot: RobotModel, parts: Sequence[Part]) -> tuple[RobotModel,
 
 
 def _inertia(points: FloatArray) -> pin.Inertia:
-    """Of a convex hull; none where it has no volume."""
+    """Return the inertia of a convex hull; zero if it has no volume."""
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):

@@ -1,4 +1,4 @@
-"""How a robot's arms follow their commands, from recordings of both.
+"""Response of a robot's arms to commands, fitted to recordings of both.
 
 An equation-error fit (Gautier and Khalil 1992): accelerations are taken from the joint states, so
 that the numbers of each joint are a linear least-squares problem. What touches something does not
@@ -32,21 +32,26 @@ Recording = tuple[FloatArray, FloatArray]
 _ROUNDS = 5
 #: a row is left out where it is further from the fit than this many median errors
 _FAR = 4.0
-#: joints that are quicker cannot be integrated; damping that is added is led as much [s^2, s]
-_LEAST_ARMATURE, _LEAST_DAMPING = 1e-4, 0.02
+#: smallest armature that can be integrated [s^2]
+_LEAST_ARMATURE = 1e-4
+#: smallest damping; what is added is compensated by the lead [s]
+_LEAST_DAMPING = 0.02
 #: largest compliance, armature, damping and lead
 _LARGEST = np.array([10.0, 1.0, 1.0, 1.0])
 #: a joint that moves in fewer rows is not fitted
 _LEAST_ROWS = 100
-#: slower joints tell nothing [rad/s or m/s]
+#: speed below which a row of a joint is not used [rad/s or m/s]
 _MOVES = 0.02
 #: joint states further apart do not show how joints accelerate [s]
 _LONGEST_PERIOD_S = 0.035
 #: episodes that are read
 _MOST = 100
-#: a fingertip was stopped where it is so much higher than expected [m]; of their heights, the
-#: table's; rows of a recording that are looked at
-_STOPPED_M, _LOWEST_PERCENT, _EVERY = 0.005, 5.0, 5
+#: height above the expected one from which a fingertip was stopped by the table [m]
+_STOPPED_M = 0.005
+#: percentile of the heights of stopped fingertips that is the table's height
+_LOWEST_PERCENT = 5.0
+#: stride of the rows of a recording that are used
+_EVERY = 5
 #: slower tools do not count in the error [m/s]
 _TOOL_MOVES = 0.02
 
@@ -169,7 +174,7 @@ def with_floor(
 def _equations(
     robot: RobotModel, commands: FloatArray, positions: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Of each inner row: what the four numbers of each joint multiply, and their sum."""
+    """Return the regression matrix of the joint response and its right-hand side, by inner row."""
     inner = slice(1, -1)
     velocity = (positions[2:] - positions[:-2]) / (2 * PERIOD_S)
     acceleration = np.diff(positions, n=2, axis=0) / PERIOD_S**2

@@ -1,4 +1,4 @@
-"""Where objects went in recorded episodes, and under which commands.
+"""Tracks of objects in recorded episodes, and the commands they moved under.
 
 T steps, O objects, V views, J joints.
 """
