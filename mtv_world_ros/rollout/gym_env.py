@@ -70,9 +70,10 @@ class WorldEnv(gymnasium.Env[State, NDArray[np.float32]]):
         )
         image = gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8)
         joints = gymnasium.spaces.Box(-np.inf, np.inf, (len(robot.joint_names),), np.float64)
-        self.observation_space = gymnasium.spaces.Dict(
+        seen: Any = gymnasium.spaces.Dict(
             {**dict.fromkeys(self._seen.views, image), 'joint_positions': joints}
         )
+        self.observation_space = seen
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

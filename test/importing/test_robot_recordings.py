@@ -101,9 +101,9 @@ def record(tmp_path):
         change: Callable[[str, float, Any], None] = lambda *_: None,
     ) -> Path:
         with BagWriter(tmp_path / name) as writer:
-            for seconds, topic, kind, message in sorted(
-                [*events(), *(more or [])], key=lambda event: event[0]
-            ):
+            recorded: list[Event] = [*events(), *(more or [])]
+            recorded.sort(key=lambda event: event[0])
+            for seconds, topic, kind, message in recorded:
                 told: Any = message
                 items = [told] if hasattr(told, 'header') else told.transforms
                 stamps = [messages.header_stamp(item) for item in items]

@@ -278,7 +278,7 @@ class Rollouts:
     def _offer_action(self, undo: ExitStack) -> FollowJointTrajectory | None:
         kind, node = find_action(), self._node
         if kind is None:
-            node.get_logger().info(f'control_msgs is not installed: no {NAME}', once=True)
+            node.get_logger().info(f'control_msgs is not installed: no {NAME}')
             return None
         action = FollowJointTrajectory(kind, node, self._robot, self)
         undo.callback(action.close)
