@@ -64,6 +64,8 @@ ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
 NUM_FRAMES = 4
 CHUNK_S = 0.8
 ASK_AGAIN_S = 3.0
+#: an answer that has not come after this time is lost [s]
+ANSWER_LOST_S = 10.0
 TIMEOUT_S = 60.0  # a busy machine takes long to start a node
 
 
@@ -201,8 +203,10 @@ class Client:
         asked = []
 
         def is_answered():
-            # a request may have gone to a node that was killed
-            if not asked or (self.gone and time.monotonic() > asked[-1][0] + ASK_AGAIN_S):
+            # a request may have gone to a node that was killed, and the answer is lost where the
+            # node has not yet discovered the client's reader (rmw_fastrtps drops it)
+            patience_s = ASK_AGAIN_S if self.gone else ANSWER_LOST_S
+            if not asked or time.monotonic() > asked[-1][0] + patience_s:
                 asked.append((time.monotonic(), client.call_async(request)))
             return any(future.done() for _, future in asked)
 
