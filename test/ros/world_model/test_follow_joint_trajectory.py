@@ -45,6 +45,8 @@ class Controller:
         self.tolerance = lambda name, position: tolerance(name=name, position=position)
         self.actions = ActionClient(client.node, self.messages, NAME)
         client.wait(self.actions.server_is_ready, 'the action')
+        # the node discovers this client's readers a moment later; before, feedback is lost
+        client.spin_for(0.5)
         self.feedback = []
 
     def send(self, trajectory, **fields):
