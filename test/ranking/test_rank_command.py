@@ -50,7 +50,7 @@ def test_a_ranking_is_watched_while_it_runs(tmp_path, capsys):
     assert '--watch shows what --no-video leaves out' in capsys.readouterr().err
     with pytest.raises(SystemExit, match='2'):
         main([*command, 'here'])
-    assert "'here' is neither a port" in capsys.readouterr().err
+    assert "'here' does not end in a port" in capsys.readouterr().err
 
 
 def test_rates_so_far_count_what_has_an_estimate(make_result):

@@ -71,8 +71,8 @@ def fill(source: BatchSource, root: Path, config: TrainingConfig, base: Base) ->
     return cached(source, root, config, base, seed=0, dtype=torch.float32, processes=processes)
 
 
-def test_a_batch_is_what_encoding_the_recorded_clips_gives(source, root, config, base, capsys):
-    held = fill(source, root, config, base)
+def test_a_batch_is_what_encoding_the_recorded_clips_gives(source, tmp_path, config, base, capsys):
+    held = fill(source, tmp_path, config, base)
     said = capsys.readouterr().out
     assert f'0 of {source.num_clips} clips were there, {source.num_clips} encoded in' in said
     assert 'clips/s' in said
@@ -133,7 +133,9 @@ def test_an_epoch_takes_every_clip_once_and_the_next_in_another_order(source, ro
 
 
 @pytest.mark.slow
-def test_other_encoder_weights_are_noticed(source, root, config, folder, tmp_path, capsys):
+def test_other_encoder_weights_are_noticed(source, root, config, folder, base, tmp_path, capsys):
+    fill(source, root, config, base)
+    capsys.readouterr()
     other = Path(shutil.copytree(folder, tmp_path / 'other'))
     file = other / 'autoencoder' / 'diffusion_pytorch_model.safetensors'
     tensors = load_file(file)
