@@ -15,6 +15,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl import rcutils_logger
+from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 
 from mtv_world_ros.ros.run_node import guard_node
@@ -79,6 +80,8 @@ class NodeInProcess:
         self._error: BaseException | None = None
         self._context = Context()
         rclpy.init(args=['node', *words], context=self._context)
+        # the level is the process's: a node of another test may have set it to FATAL
+        rclpy.logging.set_logger_level('', LoggingSeverity.INFO)
         self._name = ''
         _listeners.append(self._listen)
         try:

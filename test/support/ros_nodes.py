@@ -260,7 +260,17 @@ class Client:
     def send_trajectory_and_wait_until_it_runs(self):
         self.received['/diagnostics'].clear()
         self.send_trajectory()
-        self.wait(lambda: self.diagnostic_values().get('busy') == 'true', 'the model')
+        sent_s = time.monotonic()
+
+        def is_busy():
+            nonlocal sent_s
+            if time.monotonic() > sent_s + ANSWER_LOST_S:  # sent before the readers were matched
+                sent_s = time.monotonic()
+                self.send_scene()
+                self.send_trajectory()
+            return self.diagnostic_values().get('busy') == 'true'
+
+        self.wait(is_busy, 'the model')
 
     # what the node said
 

@@ -214,8 +214,11 @@ def test_ends_cleanly_in_the_middle_of_a_rollout(tmp_path, new_client, ros, numb
     process = ros.start_node_process(
         tmp_path, 'pace:=burst', 'seed:=1200'
     )  # the fake model goes on until it is told to stop
-    client.connect_inputs(ros.INPUTS)
-    client.send_scene()
-    client.send_trajectory_and_wait_until_it_runs()
-    assert process.stop(number) == 0
-    assert 'Traceback' not in process.output()
+    try:
+        client.connect_inputs(ros.INPUTS)
+        client.send_scene()
+        client.send_trajectory_and_wait_until_it_runs()
+        assert process.stop(number) == 0
+        assert 'Traceback' not in process.output()
+    finally:  # a node that is left would answer other tests
+        process.process.kill()
