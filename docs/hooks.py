@@ -21,7 +21,7 @@ _FOLDER = 'repository'
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Adds the files that pages link to; a missing one is left to MkDocs' own check of links."""
+    """Add the files that pages link to; a missing one is left to MkDocs' own check of links."""
     root = Path(config.docs_dir).parent
     texts = [page.content_string for page in files.documentation_pages()]
     names = {match[2] for text in texts for match in _LINK.finditer(text)}
@@ -36,7 +36,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, *, page: Page, **_: object) -> str:
-    """Points the links to the copies, and those of copied pages back into docs/."""
+    """Point the links to the copies, and those of copied pages back into docs/."""
     if page.file.src_uri.startswith(_FOLDER):
         return markdown.replace('](docs/', '](../')
     return _LINK.sub(rf'\1{_FOLDER}/\2', markdown)

@@ -18,7 +18,7 @@ _TABLE = re.compile(r'(<!-- parameters: (\w+) -->\n\n)(?:\|.*\n)*')
 
 
 def filled(page: str) -> str:
-    """Returns the page with its tables as the nodes' settings have them."""
+    """Return the page with its tables as the nodes' settings have them."""
     return _TABLE.sub(lambda match: match[1] + _table(NODES[match[2]]), page)
 
 

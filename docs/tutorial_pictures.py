@@ -47,7 +47,7 @@ VIEWS = {
 
 
 def save(picture: Path, name: str) -> None:
-    """Writes a picture at most `WIDTH` wide, in few colours, as docs/tutorial_NAME.png."""
+    """Write a picture at most `WIDTH` wide, in few colours, as docs/tutorial_NAME.png."""
     from PIL import Image
 
     shown = cv2.imread(str(picture))
@@ -61,7 +61,7 @@ def save(picture: Path, name: str) -> None:
 
 
 def page_picture(folder: Path, page: str, picture: Path) -> None:
-    """Opens a page of a folder."""
+    """Open a page of a folder."""
     with served(folder) as address, opened(picture.parent) as browser:
         browser.open(f'{address}/{page}')
         browser.picture(picture)
@@ -98,7 +98,7 @@ class opened:
 
 
 def free_ports() -> tuple[int, int]:
-    """Returns two ports that nobody serves: an earlier viewer would be the picture."""
+    """Return two ports that nobody serves: an earlier viewer would be the picture."""
     with socket.socket() as page, socket.socket() as data:
         for one in (page, data):
             one.bind(('127.0.0.1', 0))
@@ -106,7 +106,7 @@ def free_ports() -> tuple[int, int]:
 
 
 def viewer_picture(file: Path, picture: Path, wait_s: float) -> None:
-    """Opens a file in Rerun's viewer for browsers."""
+    """Open a file in Rerun's viewer for browsers."""
     page, data = free_ports()
     command = [sys.executable, '-m', 'rerun', str(file), '--serve-web', '--port', str(data)]
     command += ['--web-viewer-port', str(page)]
@@ -125,7 +125,7 @@ def viewer_picture(file: Path, picture: Path, wait_s: float) -> None:
 
 
 def main() -> None:
-    """Makes them all."""
+    """Make them all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('folder', type=Path)
     parser.add_argument('--only', nargs='*', help='names of pictures')

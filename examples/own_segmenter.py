@@ -33,7 +33,7 @@ class HueSegmenter:
         first_masks: np.ndarray | None = None,
         first_frames: np.ndarray | None = None,
     ) -> ObjectMasks:
-        """Returns (V, O, T, H, W) masks of (V, T, H, W, 3) uint8 RGB frames."""
+        """Return (V, O, T, H, W) masks of (V, T, H, W, 3) uint8 RGB frames."""
         del first_masks, first_frames  # every frame is looked at by itself
         hsv = cv2.cvtColor(frames.reshape(-1, frames.shape[3], 3), cv2.COLOR_RGB2HSV)
         hue, saturation, _ = np.moveaxis(hsv.reshape(frames.shape).astype(int), -1, 0)

@@ -34,7 +34,7 @@ class HeldFrame:
     def predict(
         self, start_frame: np.ndarray, control: ControlInputs, **options: object
     ) -> np.ndarray:
-        """Returns (V, T, H, W, 3) uint8 RGB frames: the (V, H, W, 3) start frame, T times."""
+        """Return (V, T, H, W, 3) uint8 RGB frames: the (V, H, W, 3) start frame, T times."""
         del control, options  # positions, seed, steps, ...: see `WorldModel`
         return np.repeat(start_frame[:, None], self.spec.num_frames, axis=1)
 

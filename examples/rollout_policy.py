@@ -37,12 +37,12 @@ class SwingingPolicy:
         self._way = 0.2
 
     def reset(self, *, seed: int) -> None:
-        """Begins an episode."""
+        """Begin an episode."""
         del seed
         self._way = 0.2
 
     def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
-        """Returns commands for 3.2 s; their times count from the observation's stamp."""
+        """Return commands for 3.2 s; their times count from the observation's stamp."""
         del instruction
         self._way = -self._way
         times = np.linspace(0.2, 3.2, 16)
@@ -62,7 +62,7 @@ recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
 
 
 def tell(prediction: Prediction) -> None:
-    """Prints the estimate at the end of a chunk."""
+    """Print the estimate at the end of a chunk."""
     success = prediction.success
     print(
         f'{prediction.imagined_seconds:.1f} s imagined: '

@@ -43,7 +43,7 @@ GRIPPERS = (6, 13)
 
 
 def main() -> None:
-    """Trains, and saves a checkpoint at every --save-at."""
+    """Train, and save a checkpoint at every --save-at."""
     options = _options()
     torch.manual_seed(options.seed)
     data, held = _data(options), _data(options, held=True)
@@ -98,7 +98,7 @@ def main() -> None:
 
 
 def thaw(policy: ACTPolicy) -> None:
-    """Replaces the ResNet's frozen batch normalisation by one that learns."""
+    """Replace the ResNet's frozen batch normalisation by one that learns."""
     for name, module in list(policy.model.backbone.named_modules()):
         if isinstance(module, FrozenBatchNorm2d):
             live = nn.BatchNorm2d(len(module.weight), momentum=0.05)
@@ -107,7 +107,7 @@ def thaw(policy: ACTPolicy) -> None:
 
 
 def freeze(policy: ACTPolicy) -> ACTPolicy:
-    """Returns a copy with the frozen batch normalisation of ACT."""
+    """Return a copy with the frozen batch normalisation of ACT."""
     policy = copy.deepcopy(policy)
     for name, module in list(policy.model.backbone.named_modules()):
         if isinstance(module, nn.BatchNorm2d):

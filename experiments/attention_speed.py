@@ -41,14 +41,14 @@ KERNELS = {'fused kernel': False, 'two products': True}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Adds what other benchmarks do not have."""
+    """Add what other benchmarks do not have."""
     parser.add_argument('--threads', type=int, default=1)
     parser.add_argument('--batch-size', type=int, default=2)
 
 
 @contextmanager
 def kernel(name: str) -> Iterator[None]:
-    """Attends by one of `KERNELS` for the time being."""
+    """Attend by one of `KERNELS` for the time being."""
     before = attention.cpu_multiplies_bfloat16
     attention.cpu_multiplies_bfloat16 = lambda: KERNELS[name]  # type: ignore[assignment]
     try:
@@ -82,7 +82,7 @@ class Clips:
         self._source.close()
 
     def trainer(self) -> Trainer:
-        """Returns a trainer that starts from the checkpoint's weights."""
+        """Return a trainer that starts from the checkpoint's weights."""
         made = Trainer(
             self.config,
             self.options.work,
@@ -108,7 +108,7 @@ class Steps:
         self.losses: list[float] = []
 
     def __call__(self) -> None:
-        """Makes a step; both kernels see the same clips."""
+        """Make a step; both kernels see the same clips."""
         step = len(self.losses)
         with kernel(self._name):
             self.losses.append(self._trainer.train_step(self._batches[step]).loss)
@@ -132,7 +132,7 @@ class Chunks:
         self.frames: ByteArray | None = None
 
     def __call__(self) -> None:
-        """Imagines a chunk."""
+        """Imagine a chunk."""
         with kernel(self._name):
             self.frames = self._model.predict(
                 self._start,
@@ -145,14 +145,14 @@ class Chunks:
 
 
 def compare(works: dict[str, Callable[[], None]], repeats: int) -> list[str]:
-    """Returns the cells of a row: CPU time of both kernels [s], and their ratio."""
+    """Return the cells of a row: CPU time of both kernels [s], and their ratio."""
     times = in_turns(works, repeats, clock=time.process_time, warm_up=WARM_UP)
     old, new = (times[name] for name in KERNELS)
     return [f'{np.median(t):.3f}' for t in (old, new)] + [f'{ratio(old, new):.2f}']
 
 
 def measured(options: argparse.Namespace) -> str:
-    """Returns the tables of the page."""
+    """Return the tables of the page."""
     clips = Clips(options)
     steps = {name: Steps(name, clips) for name in KERNELS}
     rows = [[f'training step, {options.batch_size} clips', *compare(steps, options.repeats)]]
@@ -184,7 +184,7 @@ def measured(options: argparse.Namespace) -> str:
 
 
 def main() -> None:
-    """Measures and publishes."""
+    """Measure and publish."""
     options = parse_arguments(__doc__, 20, add_options)
     torch.set_num_threads(options.threads)
     with tempfile.TemporaryDirectory() as work:

@@ -193,7 +193,7 @@ class Kept:
         return any((r['name'], r['number']) == (name, number) for r in self.results)
 
     def add(self, **result: Any) -> None:
-        """Keeps an estimate."""
+        """Keep an estimate."""
         print(json.dumps(result), flush=True)
         self.results.append(result)
         if self._file is not None:
@@ -266,7 +266,7 @@ def _measured(truth: CameraModel, estimate: Callable[[], CameraEstimate]) -> dic
 
 
 def main() -> None:
-    """Measures and publishes."""
+    """Measure and publish."""
 
     def more(parser: object) -> None:
         parser.add_argument('--robots', default='franka,ur5e_pair,yam_bimanual')  # type: ignore[attr-defined]

@@ -39,7 +39,7 @@ HEAD = (
 
 
 def off(camera: CameraModel, metres: float, degrees: float, rng: np.random.Generator):
-    """Returns a camera elsewhere."""
+    """Return a camera elsewhere."""
     way, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     pose = np.array(camera.T_mount_camera)
     pose[:3, :3] = cv2.Rodrigues(axis * np.deg2rad(degrees))[0] @ pose[:3, :3]
@@ -48,13 +48,13 @@ def off(camera: CameraModel, metres: float, degrees: float, rng: np.random.Gener
 
 
 def apart(one: CameraModel, other: CameraModel) -> float:
-    """Returns how far apart both show what lies where objects do [px]."""
+    """Return how far apart both show what lies where objects do [px]."""
     ends = [project(camera, camera.T_mount_camera, PLACES)[0] for camera in (one, other)]
     return float(np.linalg.norm(ends[0] - ends[1], axis=-1).mean())
 
 
 def main() -> None:
-    """Prints a row for each size of the error, and writes them as a page."""
+    """Print a row for each size of the error, and write them as a page."""
     options = parse_arguments(__doc__, 20)
     robot = load_robot(bundled('robots', 'yam_bimanual', '--robot'))
     checker, rng = CameraChecker(robot, load_shape(robot)), np.random.default_rng(options.seed)

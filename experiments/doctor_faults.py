@@ -273,7 +273,7 @@ class Kept:
         self._done = {tuple(row[:4]) for row in self.rows}
 
     def verdict(self, case: tuple[str, str, str, str], judge: Callable[[], list[str]]) -> None:
-        """Judges a case (robot, episode, view, fault) unless it was judged."""
+        """Judge a case (robot, episode, view, fault) unless it was judged."""
         if case in self._done:
             return
         row = [*case, *judge()]
@@ -294,7 +294,7 @@ class Kept:
 
 
 def fixed_views(inspector: Inspector, path: Path, width: int) -> Episode:
-    """Returns an episode with the views that stand still, decoded and shrunk to a width [px]."""
+    """Return an episode with the views that stand still, decoded and shrunk to a width [px]."""
     base = inspector.robot.base_link
     episode = read_episode(path, with_masks=False, robot=inspector.robot, unknown_mount=base)
     moving = moving_links(inspector.robot)
@@ -320,7 +320,7 @@ def fixed_views(inspector: Inspector, path: Path, width: int) -> Episode:
 
 
 def judge_views(dataset: Path, options: argparse.Namespace, kept: Kept) -> Iterator[None]:
-    """Judges all faults of a view before each step."""
+    """Judge all faults of a view before each step."""
     paths = shuffled(dataset, options.seed)
     file = recorded_robot(paths[0], read_info(paths[0]).robot)
     inspector = load_inspector(file)
@@ -351,7 +351,7 @@ def _view(
 
 
 def judge_folder(dataset: Path, options: argparse.Namespace, kept: Kept) -> Iterator[None]:
-    """Judges all faults of a recording, in a folder with the others, before each step."""
+    """Judge all faults of a recording, in a folder with the others, before each step."""
     paths = shuffled(dataset, options.seed)[: options.repeats]
     file = recorded_robot(paths[0], read_info(paths[0]).robot)
     robot = load_robot(file)
@@ -403,7 +403,7 @@ def shuffled(dataset: Path, seed: int) -> list[Path]:
 
 
 def main() -> None:
-    """Publishes a row a fault and a column a robot."""
+    """Publish a row a fault and a column a robot."""
 
     def more(parser: argparse.ArgumentParser) -> None:
         parser.add_argument('datasets', type=Path, nargs='+')

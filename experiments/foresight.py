@@ -79,14 +79,14 @@ class Robot:
         self.state = values_of(next(iter(message.status)))
 
     def connect(self) -> None:
-        """Waits for the node and tells it the instruction."""
+        """Wait for the node and tell it the instruction."""
         keys = [f'publishers.{topic}' for topic in self._publishers]
         while not all(self.state.get(key, '0') != '0' for key in keys):
             self._executor.spin_once(timeout_sec=0.05)
         self._publishers['/instruction'].publish(String(data=self._recording.instruction))
 
     def live(self, seconds: float, rate: float, plan_s: float = PLAN_S) -> None:
-        """Plays for a while and sends plans at a rate; ends when all plans have ended.
+        """Play for a while and send plans at a rate; end when all plans have ended.
 
         Long plans begin in the first frame, which is shown all the time.
         """
@@ -204,12 +204,12 @@ class Played:
         self.robot = Robot(self._node, recording, executor)
 
     def warm_up(self) -> None:
-        """Waits for the node, and lets it imagine a few plans: the first ones take longer."""
+        """Wait for the node, and let it imagine a few plans: the first ones take longer."""
         self.robot.connect()
         self.robot.live(2 * PLAN_S, 1 / PLAN_S)
 
     def line(self, seconds: float, head: list[str], rate: float, plan_s: float) -> list[str]:
-        """Returns a line of the table."""
+        """Return a line of the table."""
         before_s = page.cpu_s(self.process.pid)
         self.robot.live(seconds, rate, plan_s)
         head = [*head, f'{rate:g}', f'{plan_s:g}', f'{os.getloadavg()[0]:.1f}']
@@ -217,7 +217,7 @@ class Played:
         return row(self.robot.reports, head, plan_s, spent_s)
 
     def close(self) -> None:
-        """Ends the node."""
+        """End the node."""
         self._node.destroy_node()
         self.process.terminate()
         self.process.wait()
@@ -247,14 +247,14 @@ def measure(options: argparse.Namespace, old: Path | None) -> list[list[str]]:
 
 
 def more(parser: argparse.ArgumentParser) -> None:
-    """Adds options."""
+    """Add options."""
     parser.add_argument('--seconds', type=float, default=10.0, help='of each line')
     parser.add_argument('--paces', nargs='+', choices=PACES, default=PACES)
     parser.add_argument('--old', action='store_true', help=f'{page.OLD_TAG} beside it, in turns')
 
 
 def main() -> int:
-    """Measures and prints the page."""
+    """Measure and print the page."""
     options = page.parse_arguments(
         __doc__,
         repeats=1,

@@ -136,7 +136,7 @@ for line in sys.stdin:
 
 
 def more(parser: argparse.ArgumentParser) -> None:
-    """Adds options."""
+    """Add options."""
     parser.add_argument('dataset', type=Path, nargs='?', help='episodes to judge')
     parser.add_argument('--no-old', action='store_true', help='this version alone')
     parser.add_argument('--robot', help="YAML file or bundled name; default: the checkpoint's")
@@ -169,14 +169,14 @@ class Worker:
         self._answer()
 
     def ask(self, line: object) -> Any:
-        """Returns what it answers."""
+        """Return what it answers."""
         assert self._process.stdin is not None
         self._process.stdin.write(f'{line}\n')
         self._process.stdin.flush()
         return json.loads(self._answer())
 
     def close(self) -> None:
-        """Ends it."""
+        """End it."""
         self._process.terminate()
         self._process.wait()
 
@@ -195,7 +195,7 @@ class Old:
         self._worker = Worker(folder, _WORKER)
 
     def ask(self, path: Path) -> dict[str, tuple[float, float]]:
-        """Returns share and seconds by row of the table; empty = it cannot tell."""
+        """Return share and seconds by row of the table; empty = it cannot tell."""
         answer = self._worker.ask(path.resolve())
         if not answer.get('said'):
             return {}
@@ -242,7 +242,7 @@ class New:
     def ask(
         self, path: Path, views: tuple[str, ...]
     ) -> tuple[bool, dict[str, tuple[float, float]]]:
-        """Returns the outcome, and share and seconds by row; none = it cannot tell."""
+        """Return the outcome, and share and seconds by row; none = it cannot tell."""
         episode = read_episode(path, views=views)
         found = match_task(self._tasks, episode.info.instruction)
         success = episode.info.outcome == 'success'
@@ -280,7 +280,7 @@ Said = dict[str, tuple[float, float]]
 
 
 def answers(options: argparse.Namespace, folder: Path | None) -> Iterator[tuple[bool, Said]]:
-    """Yields outcomes and what all say of them, of plans of which all can tell."""
+    """Yield outcomes and what all say of them, of plans of which all can tell."""
     paths = list_episodes(options.dataset)
     refuse_test_kinds(paths, 'the choice of an engine')
     order = np.random.default_rng(options.seed).permutation(len(paths))[: options.repeats]
@@ -297,7 +297,7 @@ def answers(options: argparse.Namespace, folder: Path | None) -> Iterator[tuple[
 def row(
     name: str, said: FloatArray, real: BoolArray, seconds: FloatArray, ratio: str
 ) -> list[str]:
-    """Returns a row of the table, with intervals: Wilson of shares, bootstrap of AUROC."""
+    """Return a row of the table, with intervals: Wilson of shares, bootstrap of AUROC."""
     called, sure = said >= 0.5, said >= VERDICT
 
     def share(hits: BoolArray) -> str:
@@ -320,7 +320,7 @@ def row(
 
 
 def judged(options: argparse.Namespace, folder: Path | None) -> str:
-    """Returns the table of what engines say of episodes."""
+    """Return the table of what engines say of episodes."""
     found = list(answers(options, folder))
     real = np.array([success for success, _ in found])
     if not found:
@@ -344,7 +344,7 @@ def judged(options: argparse.Namespace, folder: Path | None) -> str:
 
 
 def imagined(options: argparse.Namespace, folder: Path) -> str:
-    """Returns the table of what chunks take, old and new in turns."""
+    """Return the table of what chunks take, old and new in turns."""
     workers = {OLD: Worker(folder, _CHUNKS)}
     for number in options.futures:
         workers[f'MuJoCo, {number} futures'] = Worker(ROOT, _CHUNKS, number)
@@ -382,7 +382,7 @@ def imagined(options: argparse.Namespace, folder: Path) -> str:
 
 
 def main() -> None:
-    """Prints what was asked for, and writes it as a page."""
+    """Print what was asked for, and write it as a page."""
     options = parse_arguments(__doc__, 120, more)
     if options.dataset is None and not options.chunks:
         raise MtvWorldError('nothing to do: give a folder of episodes, --chunks, or both')

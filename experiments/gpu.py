@@ -97,7 +97,7 @@ def _training(device: tuple[str, ...], tiny: bool, *values: str) -> tuple[str, .
 
 
 def run(options: argparse.Namespace) -> int:
-    """Runs the parts; prints and writes the page. Returns how many of them failed."""
+    """Run the parts; print and write the page. Return how many of them failed."""
     options.out.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, **_environment(options.out)}
     head, sections, failed = f'# Run on a GPU, {date.today()}\n\n{_machine()}', [], 0
@@ -210,7 +210,7 @@ def _machine() -> str:
 
 
 def pack(options: argparse.Namespace) -> int:
-    """Packs this commit's tree and the packages."""
+    """Pack this commit's tree and the packages."""
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
         tree = work / 'gpu'
@@ -254,7 +254,7 @@ def _install(site: Path, python: str) -> None:
 
 
 def main() -> int:
-    """Runs a command."""
+    """Run a command."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -181,7 +181,7 @@ SCORES = {
 def coverage(
     name: str, num: int, sets: int, seed: int, differs: bool = False
 ) -> tuple[float, int]:
-    """Returns how often an interval of `INTERVALS` holds the truth, and sets without one."""
+    """Return how often an interval of `INTERVALS` holds the truth, and sets without one."""
     rng = np.random.default_rng([seed, list(INTERVALS).index(name), num, int(differs)])
     held = []
     for _ in range(sets):
@@ -239,7 +239,7 @@ def _marginal(kind: int, z: np.ndarray) -> np.ndarray:
 def ranking_scores(
     num: int, sets: int, seed: int, differs: bool
 ) -> dict[str, list[tuple[ScoreOfRates, float]]]:
-    """Returns r and MMRV of simulated rankings on n scenes, each with the truth."""
+    """Return r and MMRV of simulated rankings on n scenes, each with the truth."""
     rng = np.random.default_rng([seed, len(INTERVALS), num, int(differs)])
     found: dict[str, list[tuple[ScoreOfRates, float]]] = {name: [] for name in SCORES}
     for _ in range(sets):
@@ -251,7 +251,7 @@ def ranking_scores(
 
 
 def held(scores: list[tuple[ScoreOfRates, float]]) -> float:
-    """Returns the share of intervals that hold the truth."""
+    """Return the share of intervals that hold the truth."""
     return float(np.mean([s.interval[0] <= true <= s.interval[1] for s, true in scores]))
 
 
@@ -262,7 +262,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def main() -> None:
-    """Simulates, and prints the page."""
+    """Simulate, and print the page."""
     options = parse_arguments(
         __doc__,
         repeats=1000,

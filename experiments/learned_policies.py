@@ -104,7 +104,7 @@ RUNS = (
 
 
 def main() -> None:
-    """Makes what is missing, up to the stage that is asked for."""
+    """Make what is missing, up to the stage that is asked for."""
     options = parse_arguments(__doc__, repeats=20, more=_add)
     root, tasks = options.data.resolve(), options.tasks.split(',')
     stages = STAGES[: STAGES.index(options.until) + 1]
@@ -220,7 +220,7 @@ _STAGES = {'collect': _collect, 'pack': _pack}
 
 
 def _train(root: Path, task: str, run: Run, options: argparse.Namespace) -> None:
-    """Trains to the end; goes on where it was stopped."""
+    """Train to the end; go on where it was stopped."""
     steps = [_step(at, options) for _, at in run.ranked]
     if _checkpoint(root, task, run.name, steps[-1]).exists():
         return
@@ -238,7 +238,7 @@ def _train(root: Path, task: str, run: Run, options: argparse.Namespace) -> None
 
 
 def _rank(root: Path, tasks: Sequence[str], options: argparse.Namespace) -> None:
-    """Ranks task by task, so that the servers of one task alone are alive, then all together."""
+    """Rank task by task, so that the servers of one task alone are alive, then all together."""
     found = {task: list(_policies(root, task, options)) for task in tasks}
     lists = {f'policies_{task}.yaml': entries for task, entries in found.items() if entries}
     if not lists:
@@ -505,7 +505,7 @@ def _mtv_world(*words: str) -> None:
 
 
 def _call(words: Sequence[str], log: Path | None = None) -> None:
-    """Prints a command and runs it; ends with its status where it fails."""
+    """Print a command and run it; end with its status where it fails."""
     print('$', shlex.join(map(str, words)), flush=True)
     environment = os.environ | {'HF_HUB_OFFLINE': '1'}
     if log is None:

@@ -94,7 +94,7 @@ def parse_arguments(
 def measure(
     candidates: Mapping[str, Callable[[], object]], repeats: int
 ) -> dict[str, tuple[float, float, float]]:
-    """Returns median, 5th and 95th percentile of the CPU time [ms] of each candidate.
+    """Return median, 5th and 95th percentile of the CPU time [ms] of each candidate.
 
     CPU time of this process, which other work on the machine lengthens less than wall time.
     """
@@ -112,7 +112,7 @@ def in_turns(
     clock: Callable[[], float] = time.perf_counter,
     warm_up: int = 1,
 ) -> dict[str, list[float]]:
-    """Returns the times [s] of pieces of work that take turns, so that they can be compared.
+    """Return the times [s] of pieces of work that take turns, so that they can be compared.
 
     Whatever else the machine does, heat included, meets all of them alike. Every other turn goes
     backwards: whoever comes first in a turn is not always the same.
@@ -133,7 +133,7 @@ def in_turns(
 
 
 def ratio(above: Sequence[float], below: Sequence[float]) -> float:
-    """Returns the median of the ratios of two works' times of the same turns."""
+    """Return the median of the ratios of two works' times of the same turns."""
     return float(np.median([a / b for a, b in zip(above, below, strict=True)]))
 
 
@@ -160,7 +160,7 @@ def machine_line() -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Returns a Markdown table."""
+    """Return a Markdown table."""
     lines = [header, ['---'] * len(header), *rows]
     return '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
 
@@ -168,7 +168,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def publish(
     what: str, title: str, command: str, body: str, options: argparse.Namespace, versions: str
 ) -> None:
-    """Prints the page, and writes `<what>_<machine>_<date>.md` where --out is given."""
+    """Print the page, and write `<what>_<machine>_<date>.md` where --out is given."""
     today = date.today().isoformat()
     page = (
         f'# {title}\n\n`{command}`, machine `{options.machine}` ({machine_line()}, {versions}), '
@@ -208,7 +208,7 @@ def made_line(what: str, checkpoint: str | Path | None = None) -> str:
 
 
 def why_stale(page: Path, root: Path = ROOT, bundled: str = '') -> list[str]:
-    """Returns why a page is older than what it describes; empty = it is not, as far as is known.
+    """Return why a page is older than what it describes; empty = it is not, as far as is known.
 
     Args:
         page: its path.
@@ -245,7 +245,7 @@ def _git(folder: Path, *words: str) -> str:
 
 
 def main() -> None:
-    """Prints what the command line asks for."""
+    """Print what the command line asks for."""
     if sys.argv[1:]:
         print(made_line(sys.argv[1]))
         return

@@ -214,7 +214,7 @@ def attacks_text(options: argparse.Namespace) -> list[str]:
 
 
 def main() -> None:
-    """Makes the page."""
+    """Make the page."""
 
     def more(parser: argparse.ArgumentParser) -> None:
         parser.add_argument('rows', type=Path, nargs='+', help='what --json and kills wrote')

@@ -126,7 +126,7 @@ class Recordings:
 
 
 def main() -> None:
-    """Prints a row for each way and view."""
+    """Print a row for each way and view."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -155,7 +155,7 @@ def main() -> None:
 
 
 def recordings(options: argparse.Namespace, views: Sequence[str]) -> Recordings:
-    """Reads the episodes; cameras may be unknown."""
+    """Read the episodes; cameras may be unknown."""
     paths = list_episodes(options.episodes)
     file = recorded_robot(paths[0], read_info(paths[0]).robot)
     robot = load_robot(robot_path(options.robot) if options.robot else file)
@@ -176,7 +176,7 @@ def recordings(options: argparse.Namespace, views: Sequence[str]) -> Recordings:
 def judged(
     way: str, read: Recordings, fitted: Points, others: Points, seed: int
 ) -> Iterator[list[str]]:
-    """Yields the row of each view."""
+    """Yield the row of each view."""
     views = list(fitted)
     if way == 'recorded':
         for view in views:

@@ -154,7 +154,7 @@ def _by(rows: Sequence[Row], key: Callable[[Row], str]) -> str:
 
 
 def main() -> None:
-    """Reads the arguments, scores, prints."""
+    """Read the arguments, score and print."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

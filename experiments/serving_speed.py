@@ -24,7 +24,7 @@ from mtv_world_ros.rollout.prediction import Prediction
 
 
 def main() -> None:
-    """Measures and prints a Markdown table."""
+    """Measure and print a Markdown table."""
     options = parse_arguments(__doc__, repeats=7, more=_add)
     publish(
         'serving',

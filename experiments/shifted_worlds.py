@@ -105,7 +105,7 @@ Said = dict[str, Any]
 
 
 def more(parser: argparse.ArgumentParser) -> None:
-    """Adds options."""
+    """Add options."""
     parser.add_argument('--physics', default=','.join(catalogue()))
     parser.add_argument('--pictures', default='', metavar='PHYSICS', help='of these, or all')
     parser.add_argument('--real', default='', metavar='PHYSICS', help='of these, or all')
@@ -122,7 +122,7 @@ def more(parser: argparse.ArgumentParser) -> None:
 
 
 def policies_of(faults: str, size: float, count: int) -> list[str]:
-    """Returns the expert and a policy of each kind of fault; known ones in their usual size."""
+    """Return the expert and a policy of each kind of fault; known ones in their usual size."""
     kinds = kinds_of(faults)
     sizes = {kind: size if is_drawn(kind) else FAULTS[kind].size.typical for kind in kinds}
     return [EXPERT, *(PolicyVariant.of({k: v}).name for k, v in sizes.items())][:count]
@@ -145,7 +145,7 @@ class Ahead:
     times: FloatArray
 
     def said(self, sim: SimEpisode, take: Take) -> Said:
-        """Returns the share, and how far each chunk's end truly was from all futures [m]."""
+        """Return the share, and how far each chunk's end truly was from all futures [m]."""
         items = {item.name: number for number, item in enumerate(sim.scene.objects)}
         known = [number for number, name in enumerate(self.names) if name in items]
         frames = np.rint(self.times / _RECORD.frame_period_s).astype(int)
@@ -161,7 +161,7 @@ class Ahead:
 def foreseen_by(
     pipeline: Pipeline, episode: Rollout, observation: Observation, commands: FloatArray
 ) -> Ahead:
-    """Returns what is foreseen of commands (C, J)."""
+    """Return what is foreseen of commands (C, J)."""
     model, names = pipeline.object_motion, episode.names
     assert model is not None  # `Scenes._ask` asks only pipelines that foresee
     masks = pipeline.segmenter.segment(observation.frames[:, None], names).masks[:, :, 0]
@@ -193,7 +193,7 @@ def features_of(estimate: SuccessEstimate) -> dict[str, float] | None:
 
 
 def imagined(pipeline: Pipeline, episode: Rollout, commands: FloatArray) -> Said:
-    """Returns what the estimate rests on after commands (C, J) are imagined."""
+    """Return what the estimate rests on after commands (C, J) are imagined."""
     times = PERIOD_S * np.arange(1, len(commands), dtype=np.float64)
     plan = JointTrajectory(
         joint_names=pipeline.robot.joint_names, times=times, positions=commands[1:]
@@ -203,18 +203,18 @@ def imagined(pipeline: Pipeline, episode: Rollout, commands: FloatArray) -> Said
 
 
 def packed(frames: ByteArray) -> str:
-    """Returns frames (V, H, W, 3) uint8 RGB, views in a row, as text."""
+    """Return frames (V, H, W, 3) uint8 RGB, views in a row, as text."""
     return base64.b64encode(encode_png(np.concatenate(list(frames), axis=1))).decode()
 
 
 def unpacked(text: str) -> ByteArray:
-    """Returns what `packed` was given, (H, V * W, 3)."""
+    """Return what `packed` was given, (H, V * W, 3)."""
     data = np.frombuffer(base64.b64decode(text), np.uint8)
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
 
 
 def ends_of(pipeline: Pipeline, sim: SimEpisode, names: tuple[str, ...]) -> dict[str, str]:
-    """Returns the picture that a rollout ends with, and where objects are in it, as text."""
+    """Return the picture that a rollout ends with, and where objects are in it, as text."""
     last = observed(sim, sim.observe())
     size = pipeline.spec.width, pipeline.spec.height
     frames = np.stack([resize_frames(frame[None], *size)[0] for frame in last.frames])
@@ -224,14 +224,14 @@ def ends_of(pipeline: Pipeline, sim: SimEpisode, names: tuple[str, ...]) -> dict
 
 
 def observed(sim: SimEpisode, seen: Any) -> Observation:
-    """Returns what a policy sees, with the cameras as they are told."""
+    """Return what a policy sees, with the cameras as they are told."""
     cameras = sim.calibrated_cameras
     frames = np.stack([seen.images[camera.view] for camera in cameras])
     return Observation(cameras=cameras, frames=frames, positions=seen.positions, stamp_ns=1)
 
 
 def frames_judged(pipeline: Pipeline, episode: Rollout, take: Take) -> Said:
-    """Returns what the estimate rests on at the end of the simulator's own frames."""
+    """Return what the estimate rests on at the end of the simulator's own frames."""
     each = round(1 / (pipeline.spec.fps * _RECORD.frame_period_s))
     kept = take.observations[::each]
     positions = np.stack([seen.positions for seen in kept])
@@ -264,13 +264,13 @@ class Scenes:
         self._group: tuple | None = None
 
     def wanted(self, physics: str) -> list[str]:
-        """Returns the judges of a physics."""
+        """Return the judges of a physics."""
         more = [FITTED] if physics in self._fitted else []
         more += IMAGINED if physics in self._of['pictures'] else ()
         return [FORESEEN, *more, *([REAL] if physics in self._of['real'] else ())]
 
     def rollout(self, job: Job) -> dict[str, Any]:
-        """Returns what really happens, and what each checkpoint and the rule say."""
+        """Return what really happens, and what each checkpoint and the rule say."""
         physics, task, _, seed, policy = job
         if self._group != job[1:]:
             self._group, self._known = job[1:], {}
@@ -392,7 +392,7 @@ class Scenes:
 
 
 def jobs(options: argparse.Namespace) -> Iterator[Job]:
-    """Yields physics, task, number of the scene, its seed, policy: all physics take turns."""
+    """Yield physics, task, number of the scene, its seed, policy: all physics take turns."""
     policies = policies_of(options.faults, options.size, options.policies)
     for index in range(options.scenes):
         for policy in policies:
@@ -403,7 +403,7 @@ def jobs(options: argparse.Namespace) -> Iterator[Job]:
 
 
 def run(options: argparse.Namespace, pipelines: dict[str, Pipeline]) -> list[dict[str, Any]]:
-    """Runs what is missing in the log; returns all of it that the options ask for."""
+    """Run what is missing in the log; return all of it that the options ask for."""
     begun, scenes = time.monotonic(), Scenes(pipelines, options)
     done: dict[Job, dict[str, Any]] = {}
     if options.log.is_file():
@@ -430,14 +430,14 @@ def run(options: argparse.Namespace, pipelines: dict[str, Pipeline]) -> list[dic
 
 
 def is_whole(known: dict[str, Any], judges: Sequence[str], names: Iterable[str]) -> bool:
-    """Tells whether a line of the log has all that is asked for."""
+    """Tell whether a line of the log has all that is asked for."""
     if 'skipped' in known:
         return True
     return all(set(judges) <= set(known['said'].get(name, ())) for name in names)
 
 
 def estimated(pipeline: Pipeline, judge: str, said: Said) -> float:
-    """Returns the probability of success that a judge gives; NaN = it abstains.
+    """Return the probability of success that a judge gives; NaN = it abstains.
 
     Estimates are those of the checkpoint as it is calibrated now; of one that is not calibrated
     for rollouts of this kind, those of the stated weights.
@@ -469,7 +469,7 @@ class Row:
 
 
 def row(physics: str, judge: str, rows: Sequence[dict[str, Any]], said: FloatArray) -> Row:
-    """Returns a row of the table, of estimates (N,)."""
+    """Return a row of the table, of estimates (N,)."""
     real = np.array([r['final'] for r in rows], np.bool_)
     scenes = [(r['job'][1], r['job'][2]) for r in rows]
     known = np.isfinite(said)
@@ -491,7 +491,7 @@ def row(physics: str, judge: str, rows: Sequence[dict[str, Any]], said: FloatArr
 
 
 def across(rows: Sequence[Row]) -> list[list[str]]:
-    """Returns a line a judge: the means over all shifted truths, and the worst."""
+    """Return a line a judge: the means over all shifted truths, and the worst."""
     lines = []
     for judge in dict.fromkeys(r.judge for r in rows):
         of = [r for r in rows if r.judge == judge and r.physics != NOMINAL]
@@ -529,7 +529,7 @@ def _share(hits: np.ndarray, among: np.ndarray, scenes: Sequence[tuple[str, int]
 def rows_of(
     options: argparse.Namespace, pipelines: dict[str, Pipeline], found: Sequence[dict[str, Any]]
 ) -> list[Row]:
-    """Returns a row for each physics and judge."""
+    """Return a row for each physics and judge."""
     rows, scenes = [], Scenes(pipelines, options)
     for physics in options.physics.split(','):
         chosen = [r for r in found if r['job'][0] == physics]
@@ -548,7 +548,7 @@ def rows_of(
 def flip_rows(
     options: argparse.Namespace, found: Sequence[dict[str, Any]], names: Iterable[str]
 ) -> list[list[str]]:
-    """Returns how many flips of contact each way of imagining shows, in each physics."""
+    """Return how many flips of contact each way of imagining shows, in each physics."""
     rows, names = [], list(names)
     for physics in options.physics.split(','):
         chosen = [r for r in found if r['job'][0] == physics and 'ends' in r]
@@ -568,7 +568,7 @@ def flip_rows(
 
 
 def is_flip(faulty: dict[str, Any], expert: dict[str, Any], imagined_ends: str) -> bool:
-    """Returns whether an imagined end is nearer to the faulty rollout's than to the expert's."""
+    """Return whether an imagined end is nearer to the faulty rollout's than to the expert's."""
     own, other, imagined_end = map(unpacked, (faulty['ends'], expert['ends'], imagined_ends))
     objects = (unpacked(faulty['objects']) > 127) | (unpacked(expert['objects']) > 127)
     return is_nearer(imagined_end, own, other, np.asarray(objects.any(-1)))
@@ -577,7 +577,7 @@ def is_flip(faulty: dict[str, Any], expert: dict[str, Any], imagined_ends: str) 
 def watch_rows(
     options: argparse.Namespace, found: Sequence[dict[str, Any]], names: Iterable[str]
 ) -> list[list[str]]:
-    """Returns what the watch makes of executed chunks, in each physics."""
+    """Return what the watch makes of executed chunks, in each physics."""
     rows = []
     for physics in options.physics.split(','):
         for name in names:
@@ -591,7 +591,7 @@ def watch_rows(
 
 
 def watch_cells(apart: Sequence[Sequence[float]]) -> list[str]:
-    """Returns the rest of a row, of how far the chunks of each rollout ended from all futures."""
+    """Return the rest of a row, of how far the chunks of each rollout ended from all futures."""
     told = np.concatenate([np.array(one) for one in apart])
     told = told[np.isfinite(told)]
     rng = np.random.default_rng(0)
@@ -606,7 +606,7 @@ def watch_cells(apart: Sequence[Sequence[float]]) -> list[str]:
 
 
 def needed(apart: Sequence[Sequence[float]], order: Iterable[int]) -> int:
-    """Returns after how many rollouts the watch says that the physics is another; 0 = never."""
+    """Return after how many rollouts the watch says that the physics is another; 0 = never."""
     watch = PhysicsWatch()
     for count, number in enumerate(order, 1):
         for away in apart[number]:
@@ -617,7 +617,7 @@ def needed(apart: Sequence[Sequence[float]], order: Iterable[int]) -> int:
 
 
 def main() -> None:
-    """Prints a row for each physics and judge, and writes them as a page."""
+    """Print a row for each physics and judge, and write them as a page."""
     options = parse_arguments(__doc__, 1, more)
     names = options.checkpoints.split(',')
     pipelines = {

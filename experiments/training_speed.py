@@ -45,7 +45,7 @@ _WARM_UP = 2
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Adds what other benchmarks do not have."""
+    """Add what other benchmarks do not have."""
     parser.add_argument('train', type=Path, help='folder of episodes')
     parser.add_argument('--work', type=Path, required=True, help='what was read of them')
     parser.add_argument('--preset', default='small')
@@ -115,7 +115,7 @@ def plain_loop(trainer: Trainer, dtype: torch.dtype) -> Callable[[ClipBatch], No
 
 
 def main() -> None:
-    """Measures, and prints the page."""
+    """Measure, and print the page."""
     options = parse_arguments(__doc__, repeats=10, more=add_options)
     torch.set_num_threads(options.threads)
     trainer, source = make(options)

@@ -117,7 +117,7 @@ def plain_loop(
 
 
 def main() -> None:
-    """Measures both and prints the table."""
+    """Measure both and print the table."""
     options = parse_arguments(__doc__, repeats=15)
     cv2.setNumThreads(1)
     robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))

@@ -34,13 +34,13 @@ _LEAST_AREA_PX = 15
 
 
 def more(parser: argparse.ArgumentParser) -> None:
-    """Adds options."""
+    """Add options."""
     parser.add_argument('dataset', type=Path)
     parser.add_argument('--checkpoint', default='bundled')
 
 
 def areas_left(pipeline: Pipeline, recording: Recording, seed: int) -> dict[str, list[float]]:
-    """Returns the shares of the objects that stay, by which objects were named."""
+    """Return the shares of the objects that stay, by which objects were named."""
     stretch = stretches(recording, pipeline.spec, 'observe')[0]
     real = masks_of(pipeline, recording, stretch.frames[:, [0, -1]])
     still = np.flatnonzero(stays(real))
@@ -73,7 +73,7 @@ def areas_left(pipeline: Pipeline, recording: Recording, seed: int) -> dict[str,
 
 
 def masks_of(pipeline: Pipeline, recording: Recording, frames: np.ndarray) -> BoolArray:
-    """Returns (V, O, T, H, W) masks of frames (V, T, H, W, 3), each found by itself."""
+    """Return (V, O, T, H, W) masks of frames (V, T, H, W, 3), each found by itself."""
     found = [
         pipeline.segmenter.segment(frames[:, [k]], recording.objects).masks[:, :, 0]
         for k in range(frames.shape[1])
@@ -82,7 +82,7 @@ def masks_of(pipeline: Pipeline, recording: Recording, frames: np.ndarray) -> Bo
 
 
 def stays(real: BoolArray) -> BoolArray:
-    """Returns (O,) which objects are seen in all views and do not move, (V, O, 2, H, W)."""
+    """Return (O,) which objects are seen in all views and do not move, (V, O, 2, H, W)."""
     areas = real.sum((-2, -1))
     first, last = centroids(real[:, :, 0]), centroids(real[:, :, 1])
     way = np.nan_to_num(np.linalg.norm(last - first, axis=-1), nan=np.inf)
@@ -90,7 +90,7 @@ def stays(real: BoolArray) -> BoolArray:
 
 
 def main() -> None:
-    """Prints a row for each choice of names, and writes them as a result page."""
+    """Print a row for each choice of names, and write them as a result page."""
     options = parse_arguments(__doc__, 40, more)
     pipeline = Pipeline.load(options.checkpoint)
     paths = list_episodes(options.dataset)

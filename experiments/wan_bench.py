@@ -63,7 +63,7 @@ class Bench:
         self._forget_peak()
 
     def close(self) -> None:
-        """Frees the device."""
+        """Free the device."""
         del self.transformer, self.autoencoder, self.decoder
         gc.collect()
         if self.device.type == 'cuda':

@@ -73,7 +73,7 @@ def row(options: argparse.Namespace, dtype: torch.dtype, levels: str) -> list[st
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Adds what other benchmarks do not have."""
+    """Add what other benchmarks do not have."""
     parser.add_argument('--preset', default='wan-1.3b')
     parser.add_argument('--frames', type=int, default=5, help='token frames of a view')
     parser.add_argument('--threads', type=int, default=1)
@@ -81,7 +81,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main() -> None:
-    """Measures, and prints the page."""
+    """Measure, and print the page."""
     options = parse_arguments(__doc__, repeats=7, more=add_options)
     torch.set_num_threads(options.threads)
     with torch.inference_mode():

@@ -204,7 +204,7 @@ def chunks(found: dict[str, Count], view_frames: int, options: argparse.Namespac
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Adds what other benchmarks do not have."""
+    """Add what other benchmarks do not have."""
     parser.add_argument('--preset', nargs='+', default=['wan-1.3b', 'wan-14b'])
     parser.add_argument('--set', nargs='*', default=[], metavar='SECTION.KEY=VALUE')
     parser.add_argument('--steps', type=int, nargs='+', default=[4, 16])

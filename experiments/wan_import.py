@@ -48,7 +48,7 @@ _WATCH_S = 0.02
 
 
 def write_sparse(file: Path, shapes: Shapes, dtype: str) -> None:
-    """Writes a safetensors file of zeros whose content takes no space on the disk."""
+    """Write a safetensors file of zeros whose content takes no space on the disk."""
     header, end = {}, 0
     for name, shape in shapes.items():
         begin, end = end, end + prod(shape) * _BYTES[dtype]
@@ -61,7 +61,7 @@ def write_sparse(file: Path, shapes: Shapes, dtype: str) -> None:
 
 
 def write_transformer(folder: Path, shapes: Shapes, num_shards: int) -> None:
-    """Writes one file, or shards and their index."""
+    """Write one file, or shards and their index."""
     stem, names = 'diffusion_pytorch_model', list(shapes)
     if num_shards == 1:
         write_sparse(folder / f'{stem}.safetensors', shapes, 'BF16')
@@ -77,7 +77,7 @@ def write_transformer(folder: Path, shapes: Shapes, num_shards: int) -> None:
 
 
 def write_public(folder: Path, preset: str, options: argparse.Namespace) -> int:
-    """Writes a folder like the published one; returns the numbers in it."""
+    """Write a folder like the published one; return the numbers in it."""
     model = load_training_config(preset).transformer
     dim = model['num_attention_heads'] * model['attention_head_dim']
     transformer = video_tensors(
@@ -106,7 +106,7 @@ def write_public(folder: Path, preset: str, options: argparse.Namespace) -> int:
 
 
 def watched(command: list[str]) -> tuple[float, float, float]:
-    """Runs a command; returns its seconds, and the most GiB that it held, and held unmapped."""
+    """Run a command; return its seconds, and the most GiB that it held, and held unmapped."""
     begun, whole, own = time.perf_counter(), 0, 0
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     status = Path(f'/proc/{process.pid}/status')
@@ -157,7 +157,7 @@ def measure(options: argparse.Namespace) -> str:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Adds what other benchmarks do not have."""
+    """Add what other benchmarks do not have."""
     parser.add_argument('--preset', default='wan-1.3b')
     parser.add_argument('--layers', type=int, default=0, help='0 = all of the preset')
     parser.add_argument('--shards', type=int, default=1, help="the transformer's files")
@@ -165,7 +165,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main() -> None:
-    """Measures, and prints the page."""
+    """Measure, and print the page."""
     options = parse_arguments(__doc__, repeats=1, more=add_options)
     kind = 'wan_import_' + options.preset.removeprefix('wan-').replace('.', '_')
     command = shlex.join(['python', *sys.argv])

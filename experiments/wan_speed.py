@@ -44,7 +44,7 @@ _COMPARED = (
 
 
 def main() -> None:
-    """Measures, and prints the page."""
+    """Measure, and print the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -221,7 +221,7 @@ class Products:
         )
 
     def __call__(self) -> None:
-        """Computes them."""
+        """Compute them."""
         for _ in range(20):
             torch.mm(*self._factors)
 

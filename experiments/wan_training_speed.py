@@ -39,7 +39,7 @@ from mtv_world_ros.training.training_config import load_training_config, Trainin
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Adds what other benchmarks do not have."""
+    """Add what other benchmarks do not have."""
     parser.add_argument('--preset', default='wan-1.3b')
     parser.add_argument('--set', action='append', default=[], metavar='SECTION.KEY=VALUE')
     parser.add_argument('--device', default='cpu')
@@ -103,7 +103,7 @@ def make(bench: Bench, config: TrainingConfig, encoders: Encoders, work: Path) -
 
 
 def main() -> None:
-    """Measures, and prints the page."""
+    """Measure, and print the page."""
     options = parse_arguments(__doc__, repeats=5, more=add_options)
     torch.set_num_threads(options.threads)
     config = load_training_config(options.preset, set_overrides(options.set)).with_steps(10**6)

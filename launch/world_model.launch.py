@@ -27,7 +27,7 @@ PARAMETERS = {
 
 
 def end_launch(event, context):
-    """Ends the launch with a process; where that failed, with an exit status."""
+    """End the launch with a process; where that failed, with an exit status."""
     if event.returncode and not context.is_shutdown:
         raise RuntimeError(f'{event.process_name} ended with status {event.returncode}')
     return Shutdown(reason='world_model ended')

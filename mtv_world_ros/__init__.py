@@ -181,7 +181,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 
 def __getattr__(name: str) -> Any:
-    """Imports one of the public names."""
+    """Import one of the public names."""
     new = _RENAMED.get(name, name)
     if new != name:
         warnings.warn(

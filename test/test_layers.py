@@ -80,7 +80,7 @@ def test_an_old_name_says_the_new_one_and_works(old, words, capsys):
 
 
 def registering(monkeypatch, **entries):
-    """Replaces what is registered: group -> name = module."""
+    """Replace what is registered: group -> name = module."""
     listed = {
         group: [metadata.EntryPoint(name=n, value=v, group=group) for n, v in pairs.items()]
         for group, pairs in ((getattr(entry_points, key), pairs) for key, pairs in entries.items())

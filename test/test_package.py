@@ -96,7 +96,7 @@ def prefix(tmp_path_factory) -> Path:
 
 
 def _run_installed(prefix: Path, *command: str) -> str:
-    """Runs python on the installed copy, away from the source folder; returns what it printed."""
+    """Run python on the installed copy, away from the source folder; return what it printed."""
     packages = next(prefix.glob('lib/python3*/site-packages'))
     finished = subprocess.run(
         [sys.executable, *command],

@@ -82,7 +82,7 @@ class _View(Schema):
     quaternion_xyzw: ListOf[Quaternion] = ()
 
     def camera(self, view: str) -> CameraModel:
-        """Returns the camera.
+        """Return the camera.
 
         Raises:
             ValueError: its pose is not given once.
@@ -104,7 +104,7 @@ class _View(Schema):
 
 
 def load_calibration(path: Path | str) -> dict[str, CameraModel]:
-    """Reads `views: {<view>: {...}}`.
+    """Read `views: {<view>: {...}}`.
 
     Each view has `width`, `height`, `K` (3 x 3 or fx, fy, cx, cy), optional
     `distortion_model` and `distortion`, `mount_link`, and the pose of the optical frame in it:
@@ -125,7 +125,7 @@ def load_calibration(path: Path | str) -> dict[str, CameraModel]:
 
 
 def save_calibration(path: Path | str, cameras: Mapping[str, CameraModel]) -> None:
-    """Writes cameras; `load_calibration` reads back exactly the same values."""
+    """Write cameras; `load_calibration` reads back exactly the same values."""
     views = {
         view: {
             'width': camera.width,

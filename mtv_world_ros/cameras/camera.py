@@ -49,7 +49,7 @@ def check_mount(camera: CameraModel, robot: RobotModel) -> None:
 
 
 def camera_poses(camera: CameraModel, robot: RobotModel, positions: FloatArray) -> FloatArray:
-    """Returns T_base_camera (T, 4, 4) for positions (T, J); constant for a fixed camera.
+    """Return T_base_camera (T, 4, 4) for positions (T, J); constant for a fixed camera.
 
     Raises:
         CalibrationError: a joint carries it that is not among the robot's joints.
@@ -63,7 +63,7 @@ def camera_poses(camera: CameraModel, robot: RobotModel, positions: FloatArray) 
 def project(
     camera: CameraModel, T_base_camera: FloatArray, points: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Projects points of the base frame into the image.
+    """Project points of the base frame into the image.
 
     Args:
         camera: intrinsics and distortion.
@@ -88,7 +88,7 @@ def project(
 
 
 def unproject(camera: CameraModel, pixels: FloatArray) -> FloatArray:
-    """Returns unit rays (..., 3) in the optical frame of pixels (..., 2).
+    """Return unit rays (..., 3) in the optical frame of pixels (..., 2).
 
     Rays are NaN where no point in front of the camera projects to the pixel.
     """
@@ -112,7 +112,7 @@ def unknown_camera(view: str, width: int, height: int, mount_link: str) -> Camer
 
 
 def scaled(camera: CameraModel, width: int, height: int) -> CameraModel:
-    """Returns the camera for its image resized to another size.
+    """Return the camera for its image resized to another size.
 
     fx, fy, cx, cy scale with the size as in ROS' image_proc resize, shifted by the half pixel
     that keeps pixel centres at integers. Scaling to the same size changes nothing.
@@ -133,7 +133,7 @@ def with_camera_info(
     distortion_model: str,
     distortion: Sequence[float],
 ) -> CameraModel:
-    """Returns the camera with the intrinsics of a CameraInfo; its pose stays.
+    """Return the camera with the intrinsics of a CameraInfo; its pose stays.
 
     Args:
         camera: the calibrated view.
@@ -181,7 +181,7 @@ def _check_consistent(informed: CameraModel) -> None:
 
 
 def check_plausible(camera: CameraModel) -> None:
-    """Checks that intrinsics and pose can be those of a real camera.
+    """Check that intrinsics and pose can be those of a real camera.
 
     Raises:
         CalibrationError: focal lengths, a distortion or a mount that no camera has.
@@ -210,7 +210,7 @@ def check_plausible(camera: CameraModel) -> None:
 
 
 def _check_lens(camera: CameraModel) -> None:
-    """Refuses a distortion that does not even show what lies around the middle of the image."""
+    """Refuse a distortion that does not even show what lies around the middle of the image."""
     size = np.array([camera.width, camera.height])
     corners = (size - 1) * np.array([[x, y] for x in (0.25, 0.75) for y in (0.25, 0.75)])
     with np.errstate(all='ignore'):
@@ -225,7 +225,7 @@ def _check_lens(camera: CameraModel) -> None:
 def triangulate(
     cameras: Sequence[CameraModel], T_base_camera: Sequence[FloatArray], pixels: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Returns the point (3,) [m] nearest to all views' rays, and the mean residual [px].
+    """Return the point (3,) [m] nearest to all views' rays, and the mean residual [px].
 
     Both are NaN where the rays are parallel or meet behind a camera.
 
@@ -268,7 +268,7 @@ _SOLVED = 1e-9
 
 
 def distort(coefficients: FloatArray, xy: FloatArray) -> FloatArray:
-    """Returns where ideal points (..., 2) appear; NaN beyond the model's reach.
+    """Return where ideal points (..., 2) appear; NaN beyond the model's reach.
 
     A polynomial turns back at some radius, and points farther out would fold into the image.
     """
@@ -278,7 +278,7 @@ def distort(coefficients: FloatArray, xy: FloatArray) -> FloatArray:
 
 
 def fisheye(coefficients: FloatArray, xy: FloatArray) -> FloatArray:
-    """Returns where ideal points (..., 2) appear by the equidistant model; NaN beyond its reach.
+    """Return where ideal points (..., 2) appear by the equidistant model; NaN beyond its reach.
 
     The distance from the axis is theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8).
     """
@@ -290,7 +290,7 @@ def fisheye(coefficients: FloatArray, xy: FloatArray) -> FloatArray:
 
 
 def unfisheye(coefficients: FloatArray, distorted: FloatArray) -> FloatArray:
-    """Returns the ideal points (..., 2) that appear at the distorted ones; NaN where none does."""
+    """Return the ideal points (..., 2) that appear at the distorted ones; NaN where none does."""
     radius = np.linalg.norm(distorted, axis=-1)
     angles = np.linspace(0.0, _largest_angle(tuple(coefficients)), 4001)
     theta = np.interp(radius, _bent(coefficients, angles), angles, right=np.nan)
@@ -320,7 +320,7 @@ def _largest_angle(coefficients: tuple[float, ...]) -> float:
 
 
 def undistort(coefficients: FloatArray, distorted: FloatArray) -> FloatArray:
-    """Returns the ideal points (..., 2) that appear at the distorted ones; NaN where none does.
+    """Return the ideal points (..., 2) that appear at the distorted ones; NaN where none does.
 
     Newton's method; the derivatives come from complex steps, which lose no digits.
     """

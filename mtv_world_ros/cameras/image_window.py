@@ -41,7 +41,7 @@ class ImageWindow:
         return max(self.binning_x, 1), max(self.binning_y, 1)
 
     def of(self, width: int, height: int) -> tuple[int, int]:
-        """Returns width and height of the images that this window of a size gives [px]."""
+        """Return width and height of the images that this window of a size gives [px]."""
         whole = (self.width or width, self.height or height)
         return whole[0] // self.binning[0], whole[1] // self.binning[1]
 
@@ -54,7 +54,7 @@ WHOLE = ImageWindow()
 
 
 def window_of(info: Any) -> ImageWindow:
-    """Returns the window of a sensor_msgs/CameraInfo, whichever library made the object."""
+    """Return the window of a sensor_msgs/CameraInfo, whichever library made the object."""
     roi = info.roi
     return ImageWindow(
         x=int(roi.x_offset),
@@ -69,7 +69,7 @@ def window_of(info: Any) -> ImageWindow:
 def windowed_camera(
     camera: CameraModel, width: int, height: int, window: ImageWindow = WHOLE
 ) -> tuple[CameraModel, str]:
-    """Returns the calibrated camera for images of a size [px], and the assumptions made.
+    """Return the calibrated camera for images of a size [px], and the assumptions made.
 
     See `windowed_pixels`.
 
@@ -85,7 +85,7 @@ def windowed_camera(
 def windowed_pixels(
     camera: CameraModel, width: int, height: int, window: ImageWindow = WHOLE
 ) -> tuple[FloatArray, str]:
-    """Returns the map (3, 3) from calibrated pixels to those of images of a size, and a note.
+    """Return the map (3, 3) from calibrated pixels to those of images of a size, and a note.
 
     The note says what the camera's description leaves open and how it is taken; empty = nothing.
 
@@ -132,7 +132,7 @@ def windowed_pixels(
 
 
 def _shift(window: ImageWindow) -> FloatArray:
-    """Cuts the region out and bins it; pixel centres are at integers."""
+    """Cut the region out and bins it; pixel centres are at integers."""
     moved = np.eye(3)
     for axis, (start, binning) in enumerate(
         zip((window.x, window.y), window.binning, strict=True)
@@ -163,7 +163,7 @@ def _check_window(camera: CameraModel, window: ImageWindow) -> None:
 
 
 def _check_K(camera: CameraModel, window: ImageWindow, size: tuple[int, int]) -> None:
-    """Refuses a K that is of the window already, by where its principal point is."""
+    """Refuse a K that is of the window already, by where its principal point is."""
     centre = camera.K[:2, 2]
     sent, full = np.array(size), np.array([camera.width, camera.height])
     near = np.abs(centre - (sent - 1) / 2) <= MAX_CENTRE_OFFSET * sent

@@ -33,7 +33,7 @@ class Location:
 
 
 def centroids(masks: BoolArray) -> FloatArray:
-    """Returns the (..., 2) mean x, y of masks (..., H, W) [px], NaN where empty."""
+    """Return the (..., 2) mean x, y of masks (..., H, W) [px], NaN where empty."""
     centres = np.full((*masks.shape[:-2], 2), np.nan)
     for index in np.ndindex(masks.shape[:-2]):
         left, top, width, height = cv2.boundingRect(masks[index].view(np.uint8))
@@ -49,7 +49,7 @@ def centroids(masks: BoolArray) -> FloatArray:
 def locate(
     cameras: Sequence[CameraModel], T_base_camera: Sequence[FloatArray], pixels: FloatArray
 ) -> Location | None:
-    """Triangulates one point from (V, 2) pixels; views with NaN are ignored.
+    """Triangulate one point from (V, 2) pixels; views with NaN are ignored.
 
     Returns None if fewer than two views see the point; NaN if all see it along one ray.
     """
@@ -70,7 +70,7 @@ def locate(
 def locate_all(
     cameras: Sequence[CameraModel], T_base_camera: Sequence[FloatArray], pixels: FloatArray
 ) -> FloatArray:
-    """Returns the (O, 3) points of (V, O, 2) pixels [m]; NaN if fewer than two views see one."""
+    """Return the (O, 3) points of (V, O, 2) pixels [m]; NaN if fewer than two views see one."""
     found = [locate(cameras, T_base_camera, pixels[:, item]) for item in range(pixels.shape[1])]
     points = [np.full(3, np.nan) if one is None else one.point for one in found]
     return np.array(points).reshape(-1, 3)
@@ -82,7 +82,7 @@ def block_size(
     areas: FloatArray,
     point: FloatArray,
 ) -> float:
-    """Returns the edge of an upright cube from its (V,) mask areas [px]; the median of the views.
+    """Return the edge of an upright cube from its (V,) mask areas [px]; the median of the views.
 
     A cube seen at elevation e shows edge^2 * (sin e + 4/pi * cos e), averaged over its yaw.
     """
@@ -101,7 +101,7 @@ def block_size(
 def lean(
     cameras: Sequence[CameraModel], T_base_camera: Sequence[FloatArray], masks: Sequence[BoolArray]
 ) -> FloatArray:
-    """Returns the horizontal part (2,) of the unit vector along an object's long axis, upwards.
+    """Return the horizontal part (2,) of the unit vector along an object's long axis, upwards.
 
     A mask's long axis and the camera span a plane that the axis lies in. Its lean is the least one
     that fits the planes of all views; a round mask determines none.
@@ -137,7 +137,7 @@ def moved_mask(
     start: FloatArray,
     goal: FloatArray,
 ) -> BoolArray:
-    """Returns the (H, W) mask of an object after it moved from `start` to `goal` [m].
+    """Return the (H, W) mask of an object after it moved from `start` to `goal` [m].
 
     The mask is shifted by the projected displacement and scaled by the ratio of depths.
     """
@@ -159,12 +159,12 @@ def _depth(T_base_camera: FloatArray, point: FloatArray) -> float:
 
 
 def widest_swing(leans: FloatArray) -> FloatArray:
-    """Returns (T,) the leans (T, 2) along the direction in which they differ most."""
+    """Return (T,) the leans (T, 2) along the direction in which they differ most."""
     return np.asarray(leans @ np.linalg.svd(leans - leans.mean(0))[2][0])
 
 
 def count_reversals(angles: FloatArray, swing: float) -> FloatArray:
-    """Returns (T,) the number of reversals of the angle so far, each by more than `swing`.
+    """Return (T,) the number of reversals of the angle so far, each by more than `swing`.
 
     Args:
         angles: (T,) without jumps of whole turns [rad].

@@ -62,7 +62,7 @@ class Motion:
         positions: FloatArray,
         links: Iterable[str] = (),
     ) -> Motion:
-        """Returns the motion of a robot and its cameras along positions (N, J) [rad or m].
+        """Return the motion of a robot and its cameras along positions (N, J) [rad or m].
 
         Args:
             robot: gives the kinematics.
@@ -102,7 +102,7 @@ class Motion:
         return self.tools[..., :3, 3]
 
     def first(self, num_states: int) -> Motion:
-        """Returns the motion through the first states."""
+        """Return the motion through the first states."""
         kept = slice(0, num_states)
         return replace(
             self,
@@ -115,7 +115,7 @@ class Motion:
         )
 
     def tools_in_view(self) -> FloatArray:
-        """Returns (V,) the fraction of the states in which each view shows a tool of any arm.
+        """Return (V,) the fraction of the states in which each view shows a tool of any arm.
 
         Raises:
             CalibrationError: a tool is not in the image, but would be in its inner half without

@@ -176,7 +176,7 @@ def _path(text: str) -> Path:
 
 
 def _check_texts(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    """Refuses an empty text that is not the option's default."""
+    """Refuse an empty text that is not the option's default."""
     for action in parser._actions:
         given = getattr(arguments, action.dest, None)
         is_empty = '' in given if isinstance(given, list) else given == ''
@@ -264,7 +264,7 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs a command; returns the exit status.
+    """Run a command; return the exit status.
 
     That is 1 for an error of the user's or of the disk, and 128 + n where signal n ended it.
     """
@@ -313,6 +313,6 @@ def _advice(error: Exception) -> str:
 
 
 def _said(text: str, status: int) -> int:
-    """Prints the line on stderr and returns the status."""
+    """Print the line on stderr and return the status."""
     print(f'mtv-world: {text}', file=sys.stderr)
     return status

@@ -11,7 +11,7 @@ from mtv_world_ros.cli.shared_options import names
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the command."""
+    """Add the command."""
     parser = commands.add_parser(
         'collect',
         help='make episodes of the simulated benchmark',

@@ -106,7 +106,7 @@ class Entry(NamedTuple):
 
 
 def parse_entries(texts: list[str]) -> list[Entry]:
-    """Returns checkpoints by name; `NAME=FOLDER` gives the name, else the folder does.
+    """Return checkpoints by name; `NAME=FOLDER` gives the name, else the folder does.
 
     Raises:
         ConfigError: two are called alike, or one has no folder.
@@ -172,7 +172,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 
 def say_failed(failed: Sequence[Mapping[str, str]]) -> bool:
-    """Writes which episodes have no result and why, once each, to standard error."""
+    """Write which episodes have no result and why, once each, to standard error."""
     lines = dict.fromkeys(
         f'mtv-world: {episode} was not scored: {reason}\n'
         for run in failed
@@ -190,7 +190,7 @@ _J = (
 
 
 def in_short(summary: EvaluationSummary) -> str:
-    """Returns the one line of an evaluation that is printed; all else is in its report."""
+    """Return the one line of an evaluation that is printed; all else is in its report."""
     from mtv_world_ros.core.documents import number
     from mtv_world_ros.evaluation.metrics.statistics import MIN_EPISODES
     from mtv_world_ros.evaluation.tables import cell
@@ -219,7 +219,7 @@ def _slug(label: str) -> str:
 def load_pipelines(
     arguments: argparse.Namespace, checkpoint: Checkpoint, **options: Any
 ) -> tuple[Pipeline, Parallel]:
-    """Returns the pipeline of this process, and what makes those of worker processes."""
+    """Return the pipeline of this process, and what makes those of worker processes."""
     from mtv_world_ros.evaluation.evaluate_episodes import Parallel
     from mtv_world_ros.rollout.pipeline import Pipeline
 

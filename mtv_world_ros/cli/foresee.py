@@ -19,7 +19,7 @@ _FILES = ('.yaml', '.yml')
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the command."""
+    """Add the command."""
     parser = commands.add_parser(
         'foresee',
         help='say where objects go under the commands of an episode or a file, without a picture',

@@ -235,7 +235,7 @@ def _from_cameras(
 
 
 def episode_table(results: Sequence[Mapping[str, object]]) -> list[str]:
-    """Returns a table of the episodes: estimate, reasons, success rate."""
+    """Return a table of the episodes: estimate, reasons, success rate."""
     lines = ['episode  end            chunks  estimate         verdict   seconds  bag']
     for result in results:
         low, value, high = (result[f'success{end}'] for end in ('_low', '', '_high'))

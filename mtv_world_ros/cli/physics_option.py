@@ -8,7 +8,7 @@ from mtv_world_ros.simulation.physics import physics_named
 
 
 def add_physics(parser: argparse.ArgumentParser) -> None:
-    """Adds `--physics`."""
+    """Add `--physics`."""
     parser.add_argument(
         '--physics',
         default='nominal',
@@ -19,7 +19,7 @@ def add_physics(parser: argparse.ArgumentParser) -> None:
 
 
 def physics_text(name: str) -> str:
-    """Returns a physics' name and text, for pages.
+    """Return a physics' name and text, for pages.
 
     Raises:
         SimulatorError: unknown name.

@@ -47,7 +47,7 @@ default one denoising step. Logs of the policy servers that a file starts go to 
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the command."""
+    """Add the command."""
     parser = commands.add_parser(
         'rank',
         help='rank policies in imagination, and compare with the simulator',

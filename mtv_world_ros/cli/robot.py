@@ -81,7 +81,7 @@ def _write_guess(urdf: Path, out: Path) -> Path:
 
 
 def describe(robot: RobotModel) -> str:
-    """Returns joints with limits, and tools, as text lines."""
+    """Return joints with limits, and tools, as text lines."""
     import numpy as np
 
     lines = [f"robot '{robot.name}', base link '{robot.base_link}'"]

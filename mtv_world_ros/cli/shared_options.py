@@ -33,12 +33,12 @@ _CHOICES = (
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Returns the names of a comma-separated list, as an option's type."""
+    """Return the names of a comma-separated list, as an option's type."""
     return tuple(name.strip() for name in text.split(',') if name.strip())
 
 
 def number_or_0(text: str) -> int:
-    """Returns a whole number, 0 for the default, as an option's type."""
+    """Return a whole number, 0 for the default, as an option's type."""
     number = int(text)
     if number < 0:
         raise argparse.ArgumentTypeError(f'{number}; it must be 1 or more, or 0')
@@ -146,14 +146,14 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 def add_options(parser: argparse.ArgumentParser, words: str) -> None:
-    """Adds options that several commands share, e.g. those of `overwrite model task`."""
+    """Add options that several commands share, e.g. those of `overwrite model task`."""
     for word in words.split():
         for flag, how in _OPTIONS[word].items():
             parser.add_argument(flag, **how)
 
 
 def add_watch(parser: argparse.ArgumentParser, what: str) -> None:
-    """Adds `--watch`.
+    """Add `--watch`.
 
     Args:
         parser: of the command.
@@ -172,7 +172,7 @@ def add_watch(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def watch_arguments(arguments: argparse.Namespace) -> tuple[str, ...] | None:
-    """Returns the viewer's arguments for `--watch`; None = nobody watches.
+    """Return the viewer's arguments for `--watch`; None = nobody watches.
 
     Raises:
         ConfigError: the viewer is not installed, its port is taken, or its file exists.
@@ -206,7 +206,7 @@ class Watch:
 
     @classmethod
     def parse(cls, text: str) -> Watch:
-        """Returns the value of `--watch`."""
+        """Return the value of `--watch`."""
         if text.endswith('.rrd'):
             return cls(file=Path(text))
         try:
@@ -216,14 +216,14 @@ class Watch:
 
 
 def threads_of_workers(arguments: argparse.Namespace) -> int:
-    """Returns the CPU threads of each of `--workers` processes: as asked, else its share."""
+    """Return the CPU threads of each of `--workers` processes: as asked, else its share."""
     from mtv_world_ros.core.processes import threads_each
 
     return arguments.threads or threads_each(arguments.workers)
 
 
 def pipeline_of(arguments: argparse.Namespace) -> Pipeline:
-    """Returns the pipeline of a command's checkpoint, which was opened, and model options."""
+    """Return the pipeline of a command's checkpoint, which was opened, and model options."""
     from mtv_world_ros.rollout.pipeline import Pipeline
 
     return Pipeline.load(
@@ -249,13 +249,13 @@ def open_checkpoints(device: str, *names: str) -> list[Checkpoint]:
 
 
 def pipeline_choices(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Returns the options of a pipeline except checkpoint and threads."""
+    """Return the options of a pipeline except checkpoint and threads."""
     given = vars(arguments)
     return {name: given[name] for name in _CHOICES if name in given}
 
 
 def provenance(arguments: argparse.Namespace) -> dict[str, str]:
-    """Returns the provenance of a result (command, date, machine, versions), by heading."""
+    """Return the provenance of a result (command, date, machine, versions), by heading."""
     return {
         'command': shlex.join(['mtv-world', *arguments.command_line]),
         'date': datetime.now().astimezone().isoformat(timespec='seconds'),
@@ -267,7 +267,7 @@ def provenance(arguments: argparse.Namespace) -> dict[str, str]:
 
 
 def machine() -> str:
-    """Returns processor, number of cores, operating system."""
+    """Return processor, number of cores, operating system."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path('/proc/cpuinfo')
     if cpuinfo.is_file():

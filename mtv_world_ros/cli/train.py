@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the command."""
+    """Add the command."""
     parser = commands.add_parser(
         'train',
         help='train a world model on a folder of episodes',
@@ -194,7 +194,7 @@ def _train(arguments: argparse.Namespace) -> int:
 
 
 def found_broken(report: Path, paths: Sequence[Path], views: Sequence[str]) -> dict[str, str]:
-    """Returns why episodes are broken, by path.
+    """Return why episodes are broken, by path.
 
     Args:
         report: folder that `mtv-world check` wrote.
@@ -232,7 +232,7 @@ def found_broken(report: Path, paths: Sequence[Path], views: Sequence[str]) -> d
 
 
 def _use_threads(arguments: argparse.Namespace) -> None:
-    """Lets torch use the threads of `--threads`: 0 = the process's share of the cores."""
+    """Let torch use the threads of `--threads`: 0 = the process's share of the cores."""
     import os
 
     import torch
@@ -257,7 +257,7 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def set_overrides(items: list[str]) -> dict[str, Any]:
-    """Returns the overrides of `--set SECTION.KEY=VALUE` options.
+    """Return the overrides of `--set SECTION.KEY=VALUE` options.
 
     Raises:
         ConfigError: one has no value, or one that is not YAML.
@@ -307,7 +307,7 @@ def _held_out(
     dtype: torch.dtype,
     source: EpisodeSource,
 ) -> HeldOut | None:
-    """Returns the scorer of held-out episodes; None if it is off.
+    """Return the scorer of held-out episodes; None if it is off.
 
     Raises:
         ConfigError: there are no held-out episodes, or they are trained on.
@@ -345,7 +345,7 @@ def _paths(arguments: argparse.Namespace) -> Sequence[Path]:
 def _judge(
     arguments: argparse.Namespace, paths: Sequence[Path], dtype: torch.dtype, source: EpisodeSource
 ) -> Judge:
-    """Returns a function that scores checkpoints by J of moving objects, as `mtv-world evaluate`.
+    """Return a function that scores checkpoints by J of moving objects, as `mtv-world evaluate`.
 
     `OUT/held_out` gets a folder per step, with `metrics.json` and an MP4 per episode.
     """
@@ -398,7 +398,7 @@ def _judge(
 
 
 def _show(rollout: StoredRollout, path: Path) -> None:
-    """Writes an MP4: recorded, trajectory video and imagined side by side, views below."""
+    """Write an MP4: recorded, trajectory video and imagined side by side, views below."""
     import numpy as np
 
     from mtv_world_ros.core.files import write_whole

@@ -26,7 +26,7 @@ now. Needs the extra `view`.
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the command."""
+    """Add the command."""
     parser = commands.add_parser(
         'view',
         help='show episodes, predictions, evaluations, rankings or a running node in Rerun',

@@ -32,7 +32,7 @@ _SHIFT = 4
 def arm_pictures(
     parts: Sequence[LinkShape], motion: Motion, start_frame: ByteArray
 ) -> ByteArray | None:
-    """Returns the robot alone, (V, T, H, W, 4) uint8 RGB and cover; None without parts.
+    """Return the robot alone, (V, T, H, W, 4) uint8 RGB and cover; None without parts.
 
     The silhouette of each link has the start frame's pixels of that link, moved by the affine map
     that fits its projected points best; where these were hidden or outside the image it has their
@@ -110,7 +110,7 @@ def _draw_link(
     start_frame: ByteArray,
     hidden: NDArray[np.int_],
 ) -> None:
-    """Draws a link into pictures (T, H, W, 4) where it is seen (T, H, W).
+    """Draw a link into pictures (T, H, W, 4) where it is seen (T, H, W).
 
     Args:
         pictures: drawn upon.

@@ -32,7 +32,7 @@ def is_empty(box: Box) -> bool:
 
 
 def union(a: Box, b: Box) -> Box:
-    """Returns the smallest box that contains both; an empty box is ignored."""
+    """Return the smallest box that contains both; an empty box is ignored."""
     if is_empty(a):
         return b
     if is_empty(b):
@@ -41,12 +41,12 @@ def union(a: Box, b: Box) -> Box:
 
 
 def intersection(a: Box, b: Box) -> Box:
-    """Returns the box that both contain; without overlap an empty one."""
+    """Return the box that both contain; without overlap an empty one."""
     return max(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), min(a[3], b[3])
 
 
 def region(image: np.ndarray, box: Box) -> np.ndarray:
-    """Returns the view of an (H, W, ...) array inside a box."""
+    """Return the view of an (H, W, ...) array inside a box."""
     return image[box[0] : box[1], box[2] : box[3]]
 
 
@@ -69,7 +69,7 @@ class Stamps:
     def glows(
         self, numbers: NDArray[np.intp], brightness: FloatArray
     ) -> Iterator[tuple[Box, GlowArray]]:
-        """Yields box and (h, w) glow inside it of stamps, each with its brightness."""
+        """Yield box and (h, w) glow inside it of stamps, each with its brightness."""
         dimmed = self.down[numbers] * brightness.astype(np.float32)[:, None]
         for n, down in zip(numbers.tolist(), dimmed, strict=True):
             box = top, bottom, left, right = self.boxes[n]
@@ -79,7 +79,7 @@ class Stamps:
 
 
 def make_stamps(pixels: FloatArray, sigmas: FloatArray, width: int, height: int) -> Stamps:
-    """Returns the stamps of (N, 2) pixels with (N,) standard deviations [px].
+    """Return the stamps of (N, 2) pixels with (N,) standard deviations [px].
 
     Points with NaN pixels (behind the camera) get an empty box. A stamp whose centre is outside
     the image keeps the part that is inside.
@@ -117,21 +117,21 @@ class Trail:
         self._half_life_s = half_life_s
 
     def fade(self, seconds: float) -> None:
-        """Lets time pass."""
+        """Let time pass."""
         region(self.image, self.box)[...] *= np.float32(0.5 ** (seconds / self._half_life_s))
 
     def clear(self) -> None:
-        """Forgets all points."""
+        """Forget all points."""
         region(self.image, self.box)[...] = 0
         self.box = NO_BOX
 
     def brightness(self, ages_s: FloatArray) -> FloatArray:
-        """Returns how bright points of (N,) ages are; 0 where that is below one grey level."""
+        """Return how bright points of (N,) ages are; 0 where that is below one grey level."""
         brightness = 0.5 ** (ages_s / self._half_life_s)
         return np.where(brightness >= FAINTEST, brightness, 0.0)
 
     def add(self, glows: Iterable[tuple[Box, GlowArray]]) -> None:
-        """Adds points, each as a box inside the image and the (h, w) glow in it."""
+        """Add points, each as a box inside the image and the (h, w) glow in it."""
         for box, glow in glows:
             if not is_empty(box):
                 part = region(self.image, box)

@@ -152,7 +152,7 @@ def render_trajectory_video(
     objects: ByteArray | None = None,
     arms: ByteArray | None = None,
 ) -> MultiViewVideo:
-    """Draws the trajectory into each view, at the cameras' size.
+    """Draw the trajectory into each view, at the cameras' size.
 
     Args:
         motion: T states of the robot, and V cameras of one size; frame k shows state k, state 0
@@ -191,12 +191,12 @@ def render_trajectory_video(
 
 
 def arm_colour(arm: int, num_arms: int) -> FloatArray:
-    """Returns the (3,) RGB in 0 .. 1 of an arm: hues spread evenly from orange on."""
+    """Return the (3,) RGB in 0 .. 1 of an arm: hues spread evenly from orange on."""
     return np.array(colorsys.hsv_to_rgb((0.08 + arm / max(num_arms, 1)) % 1.0, 0.85, 1.0))
 
 
 def object_colour(index: int, fill: float) -> FloatArray:
-    """Returns the (3,) RGB in 0 .. 1 of an object's fill, by the golden angle from green on."""
+    """Return the (3,) RGB in 0 .. 1 of an object's fill, by the golden angle from green on."""
     return np.array(colorsys.hsv_to_rgb((0.36 + index * 0.381966) % 1.0, 0.7, fill))
 
 
@@ -223,7 +223,7 @@ def _check(motion: Motion, times: FloatArray, masks: BoolArray | None) -> None:
 def _fills(
     camera: CameraModel, masks: Sequence[BoolArray] | BoolArray, fill: float, grey: int
 ) -> tuple[Box, ByteArray]:
-    """Returns the box of all objects in a view and its (h, w, 3) fills on a grey level."""
+    """Return the box of all objects in a view and its (h, w, 3) fills on a grey level."""
     canvas = np.full((camera.height, camera.width, 3), grey, np.uint8)
     box = NO_BOX
     for index, mask in enumerate(masks):
@@ -244,7 +244,7 @@ def _draw_view(
     arms: ByteArray | None,
     objects: ByteArray | None,
 ) -> None:
-    """Draws one view onto (T, H, W, 3) frames of one grey level."""
+    """Draw one view onto (T, H, W, 3) frames of one grey level."""
     num_arms = len(motion.points)
     heads, depths = project(camera, poses, motion.points[:, motion.shown_at])
     core_sigmas = np.maximum(_CORE_SHARE * _sigmas(camera, depths, config), _LEAST_CORE_PX)
@@ -358,7 +358,7 @@ class _Paint:
         self._colour = np.rint(levels * colour).astype(np.uint8)[:, None]
 
     def lay(self, image: ByteArray, box: Box, glow: GlowArray, drawn: list[Box]) -> None:
-        """Blends the colour into an (H, W, 3) image.
+        """Blend the colour into an (H, W, 3) image.
 
         Args:
             image: drawn upon.
@@ -408,7 +408,7 @@ class ToolMotion:
 def tool_motion(
     motion: Motion, times: FloatArray, points_per_frame: int, max_gap_m: float | None
 ) -> ToolMotion:
-    """Interpolates the joints between the frames, so that trails follow the arms' arcs.
+    """Interpolate the joints between the frames, so that trails follow the arms' arcs.
 
     Args:
         motion: at the T frames.
@@ -478,7 +478,7 @@ class ArmLinks:
             self._widths.append((width_m or 0.0) * focal / np.maximum(depths, _NEAREST_SIZE_M))
 
     def draw(self, image: ByteArray, arm: int, frame: int, colour: FloatArray) -> None:
-        """Draws one arm onto an (H, W, 3) image; pieces behind the camera are not drawn."""
+        """Draw one arm onto an (H, W, 3) image; pieces behind the camera are not drawn."""
         if not self._pixels:
             return
         pixels, widths = self._pixels[arm][:, frame], self._widths[arm][:, frame]

@@ -125,7 +125,7 @@ class Limits:
 
 
 def limits() -> Limits:
-    """Returns the limits as the environment sets them.
+    """Return the limits as the environment sets them.
 
     Raises:
         ConfigError: a variable is not a positive whole number.
@@ -149,7 +149,7 @@ class LimitError(ValueError):
 
 
 def check_limit(name: str, value: int, what: str) -> None:
-    """Checks the size of `what`, e.g. `the image`, against the field `name` of `Limits`.
+    """Check the size of `what`, e.g. `the image`, against the field `name` of `Limits`.
 
     Raises:
         LimitError: the value is larger; names the environment variable that allows more.
@@ -164,7 +164,7 @@ def check_limit(name: str, value: int, what: str) -> None:
 
 
 def read_bytes(path: Path | str, limit: str) -> bytes:
-    """Returns the content of a regular file within a field of `Limits`; never blocks on a pipe.
+    """Return the content of a regular file within a field of `Limits`; never blocks on a pipe.
 
     Raises:
         OSError: the file cannot be read, or is no regular file.
@@ -225,7 +225,7 @@ def read_text(path: Path | str, limit: str) -> str:
 
 
 def read_json(path: Path | str) -> Any:
-    """Returns the values of a JSON file.
+    """Return the values of a JSON file.
 
     Raises:
         OSError: the file cannot be read, or is no regular file.
@@ -235,7 +235,7 @@ def read_json(path: Path | str) -> Any:
 
 
 def parse_json(text: str | bytes, what: str) -> Any:
-    """Returns the values of a JSON text whose size was checked.
+    """Return the values of a JSON text whose size was checked.
 
     Raises:
         ValueError: the text is not JSON, or too deeply nested.
@@ -254,7 +254,7 @@ def _whole_number(digits: str) -> int:
 
 
 def fill_template(template: object, values: Mapping[str, int | str]) -> str:
-    """Returns a template's text with its fields filled in, e.g. `episode_{episode_index:06d}.mp4`.
+    """Return a template's text with its fields filled in, e.g. `episode_{episode_index:06d}.mp4`.
 
     Fields are `{name}`, or `{name:6d}` and `{name:06d}` for whole numbers; `{{` and `}}` stand for
     braces. Python's own format strings reach attributes of objects and make texts of any length.
@@ -290,7 +290,7 @@ def fill_template(template: object, values: Mapping[str, int | str]) -> str:
 
 
 def read_arrays(path: Path | str, limit: str = 'array_bytes') -> dict[str, np.ndarray]:
-    """Returns the arrays of an .npz file by name; inflated they are within a field of `Limits`.
+    """Return the arrays of an .npz file by name; inflated they are within a field of `Limits`.
 
     Raises:
         OSError: the file cannot be read, or is no regular file.
@@ -327,7 +327,7 @@ def _array(data: bytes) -> np.ndarray:
 
 
 def check_finite(tensor: Any, name: str, file: Path) -> None:
-    """Checks that a tensor of torch holds finite numbers: a model with others gives wrong results.
+    """Check that a tensor of torch holds finite numbers: a model with others gives wrong results.
 
     Raises:
         CheckpointError: a number is not finite.
@@ -348,13 +348,13 @@ def check_finite(tensor: Any, name: str, file: Path) -> None:
 
 
 def check_weights(model: Any, folder: Path) -> None:
-    """Checks the tensors of a module of torch; see `check_finite`."""
+    """Check the tensors of a module of torch; see `check_finite`."""
     for name, tensor in model.state_dict().items():
         check_finite(tensor, name, folder)
 
 
 def parse_yaml(text: str | bytes) -> Any:
-    """Returns the plain values of a YAML text.
+    """Return the plain values of a YAML text.
 
     Raises:
         yaml.YAMLError: it is not YAML, or too large once aliases are written out.
@@ -379,7 +379,7 @@ class _YamlCount:
         self._count = 0
 
     def check(self, events: Iterator[yaml.Event]) -> None:
-        """Goes through the events of a parser; raises LimitError."""
+        """Go through the events of a parser; raise LimitError."""
         most, deepest = limits().yaml_nodes, limits().nesting
         for event in events:
             self._take(event)

@@ -32,7 +32,7 @@ Model = TypeVar('Model', bound='Schema')
 
 
 def wrong(what: str, says: str = ', must be', parts: int = 1) -> PydanticCustomError:
-    """Returns the error of a value: `what` is valid, e.g. `in [0, 1]`.
+    """Return the error of a value: `what` is valid, e.g. `in [0, 1]`.
 
     Args:
         what: the valid values in words.
@@ -43,7 +43,7 @@ def wrong(what: str, says: str = ', must be', parts: int = 1) -> PydanticCustomE
 
 
 def expected(what: str, says: str = ', must be', parts: int = 1) -> WrapValidator:
-    """Returns an annotation: whatever is wrong with a value of its field, the error is `wrong`."""
+    """Return an annotation: whatever is wrong with a value of its field, the error is `wrong`."""
 
     def checked(value: Any, validate: Any) -> Any:
         try:
@@ -83,7 +83,7 @@ _VAST = 1e10
 
 
 def _vast(value: Any) -> Iterator[float]:
-    """Yields the numbers with a fraction that are beyond `_VAST`, in lists and maps as well."""
+    """Yield the numbers with a fraction that are beyond `_VAST`, in lists and maps as well."""
     if isinstance(value, float) and abs(value) > _VAST:
         yield value
     elif isinstance(value, Mapping):
@@ -140,7 +140,7 @@ class Schema(BaseModel):
         return self
 
     def replace(self, **changes: Any) -> Self:
-        """Returns a copy with changed values.
+        """Return a copy with changed values.
 
         Raises:
             ConfigError: a changed value is wrong.
@@ -158,7 +158,7 @@ def validated(
     context: Mapping[str, Any] | None = None,
     error: type[MtvWorldError] = ConfigError,
 ) -> Model:
-    """Returns the model that plain values describe.
+    """Return the model that plain values describe.
 
     Args:
         kind: class of the model.
@@ -255,7 +255,7 @@ def _valid(error: ErrorDetails) -> str:
 def read_yaml(
     path: Path | str, what: str, setting: str, *, error: type[MtvWorldError] = ConfigError
 ) -> Any:
-    """Returns the plain values of a file.
+    """Return the plain values of a file.
 
     Args:
         path: the file.

@@ -169,7 +169,7 @@ class JointTrajectory:
             )
 
     def points(self, rows: np.ndarray, times: FloatArray) -> JointTrajectory:
-        """Returns some of the points (`rows` numbers or marks them), at other times (T,) [s]."""
+        """Return some of the points (`rows` numbers or marks them), at other times (T,) [s]."""
         return replace(
             self,
             times=times[rows],
@@ -237,11 +237,11 @@ class History:
 
     @staticmethod
     def begin(start_frame: ByteArray) -> History:
-        """Returns the empty history of a rollout that begins at a frame (V, H, W, 3)."""
+        """Return the empty history of a rollout that begins at a frame (V, H, W, 3)."""
         return History(anchor=start_frame, frames=start_frame[:, None][:, :0])
 
     def after(self, start_frame: ByteArray, predicted: ByteArray, num_kept: int) -> History:
-        """Returns the history of the next chunk, which starts from the last predicted frame.
+        """Return the history of the next chunk, which starts from the last predicted frame.
 
         Args:
             start_frame: (V, H, W, 3) where the chunk started.
@@ -253,7 +253,7 @@ class History:
         return History(anchor=self.anchor, frames=frames[:, max(frames.shape[1] - num_kept, 0) :])
 
     def filled(self, num_frames: int) -> ByteArray:
-        """Returns (V, num_frames, H, W, 3) frames; where there are fewer, the oldest is repeated.
+        """Return (V, num_frames, H, W, 3) frames; where there are fewer, the oldest is repeated.
 
         Between its first chunk and the N-th predicted frame a rollout has less than N of them, and
         a causal autoencoder takes no less. Zeros where there is none at all.

@@ -40,7 +40,7 @@ class Table:
     num_labels: int = 1
 
     def narrow(self, width: int = MAX_WIDTH) -> list[Table]:
-        """Returns the table in parts that fit a width of text, without columns of dashes alone.
+        """Return the table in parts that fit a width of text, without columns of dashes alone.
 
         Every part has the columns of labels, and as many of the others as fit, at least one.
         """
@@ -69,11 +69,11 @@ class Table:
         ]
 
     def text(self, width: int = MAX_WIDTH) -> str:
-        """Returns it as Markdown that fits a console, see `narrow`."""
+        """Return it as Markdown that fits a console, see `narrow`."""
         return '\n\n'.join(part.markdown() for part in self.narrow(width))
 
     def markdown(self, *, aligned: bool = True) -> str:
-        """Returns the table without its caption, its columns `aligned` for reading as text."""
+        """Return the table without its caption, its columns `aligned` for reading as text."""
         lines = [[str(cell) for cell in row] for row in (self.head, *self.rows)]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         if not aligned:
@@ -86,14 +86,14 @@ class Table:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Returns a number as text; a dash where there is none."""
+    """Return a number as text; a dash where there is none."""
     return DASH if value is None or not isfinite(value) else f'{value:.{digits}f}'
 
 
 def with_interval(
     value: float | None, interval: Sequence[float | None] | None, digits: int = 3
 ) -> str:
-    """Returns a number and its interval in brackets, as far as they are known."""
+    """Return a number and its interval in brackets, as far as they are known."""
     text = number(value, digits)
     low, high = interval or (None, None)
     if text == DASH or low is None or high is None or not isfinite(low):
@@ -102,12 +102,12 @@ def with_interval(
 
 
 def render(template: str, **values: Any) -> str:
-    """Returns a template of `resource/report/` with its values; those of HTML are escaped."""
+    """Return a template of `resource/report/` with its values; those of HTML are escaped."""
     return _environment().get_template(template).render(**values)
 
 
 def clicked_frame(recording: str, seconds: float, frame: ByteArray) -> dict[str, object]:
-    """Returns what `clicks.html.j2` shows of a frame (H, W, 3) uint8 RGB at a time [s]."""
+    """Return what `clicks.html.j2` shows of a frame (H, W, 3) uint8 RGB at a time [s]."""
     done, data = cv2.imencode('.jpg', frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
     assert done
     return {

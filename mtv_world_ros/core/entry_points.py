@@ -16,12 +16,12 @@ CONTROLS = 'mtv_world.controls'
 
 
 def registered(group: str) -> dict[str, metadata.EntryPoint]:
-    """Returns the entry points of a group by name; nothing is imported."""
+    """Return the entry points of a group by name; nothing is imported."""
     return {entry.name: entry for entry in metadata.entry_points(group=group)}
 
 
 def load(entry: metadata.EntryPoint) -> Any:
-    """Returns what an entry point names.
+    """Return what an entry point names.
 
     Raises:
         ConfigError: the module cannot be imported.
@@ -33,7 +33,7 @@ def load(entry: metadata.EntryPoint) -> Any:
 
 
 def broken(entry: metadata.EntryPoint, error: Exception) -> ConfigError:
-    """Returns the error of an entry point that cannot be used."""
+    """Return the error of an entry point that cannot be used."""
     return ConfigError(
         f"entry point '{entry.name} = {entry.value}' of the group '{entry.group}' cannot be "
         f'loaded ({error or type(error).__name__}); install the package that registers it again, '
@@ -42,7 +42,7 @@ def broken(entry: metadata.EntryPoint, error: Exception) -> ConfigError:
 
 
 def policy_kind(name: str) -> Any:
-    """Returns the module of a registered kind of policies.
+    """Return the module of a registered kind of policies.
 
     Raises:
         ConfigError: no installed package registers it.

@@ -119,11 +119,11 @@ class CannotTell(Exception):
 
 
 def masked(text: str, key: str) -> str:
-    """Returns the text with an API key masked, which servers may quote and no log may hold."""
+    """Return the text with an API key masked, which servers may quote and no log may hold."""
     return text.replace(key, '***') if key else text
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Returns ` (did you mean 'x'?)` for the known name nearest to `name`, else an empty text."""
+    """Return ` (did you mean 'x'?)` for the known name nearest to `name`, else an empty text."""
     close = get_close_matches(name, list(known), n=1)
     return f" (did you mean '{close[0]}'?)" if close else ''

@@ -40,7 +40,7 @@ def _candidates() -> list[Path]:
 
 
 def share_path(*parts: str) -> Path:
-    """Returns the path of a bundled file or folder.
+    """Return the path of a bundled file or folder.
 
     Looks in the source tree, then in the ament share folder, then in the pip prefix.
 
@@ -83,7 +83,7 @@ def bundled(kind: str, name: str | Path, setting: str) -> Path:
 
 
 def content_digest(folder: Path, without: Collection[str] = ()) -> str:
-    """Returns the SHA-256 of a folder's files, or of one: other names or contents, another digest.
+    """Return the SHA-256 of a folder's files, or of one: other names or contents, another digest.
 
     Args:
         folder: searched recursively; or a file.
@@ -101,7 +101,7 @@ def content_digest(folder: Path, without: Collection[str] = ()) -> str:
 
 
 def check_free(path: Path, overwrite: bool, instead: str = '--out') -> None:
-    """Refuses to replace an existing file or folder unless the user asked for it.
+    """Refuse to replace an existing file or folder unless the user asked for it.
 
     Args:
         path: file or folder that would be written; an empty folder counts as free.
@@ -177,7 +177,7 @@ def _check_link(link: Path) -> None:
 
 
 def check_room(folder: Path, num_bytes: int) -> None:
-    """Checks the free space of a folder's disk before processes write to it; makes the folder.
+    """Check the free space of a folder's disk before processes write to it; make the folder.
 
     Raises:
         OSError: the disk has less.
@@ -208,12 +208,12 @@ def _copy_regular(source: str, target: str) -> None:
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
-    """Writes a JSON file; NaN becomes null."""
+    """Write a JSON file; NaN becomes null."""
     write_whole(path, json.dumps(plain(values), indent=1, allow_nan=False) + '\n')
 
 
 def plain(value: Any) -> Any:
-    """Returns what JSON can hold: NaN as None, tuples as lists, floats to 6 digits."""
+    """Return what JSON can hold: NaN as None, tuples as lists, floats to 6 digits."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -224,7 +224,7 @@ def plain(value: Any) -> Any:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Writes a file beside its name and renames it, in a folder that is made where it is missing.
+    """Write a file beside its name and renames it, in a folder that is made where it is missing.
 
     Args:
         path: the file; what was there before stays until the new content is complete.
@@ -248,7 +248,7 @@ def write_whole(path: Path, content: bytes | str) -> None:
 
 @contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """Yields an empty folder that gets the name `folder` when the block ends without an error.
+    """Yield an empty folder that gets the name `folder` when the block ends without an error.
 
     A folder of that name stays until then. What is written has a hidden name of its own beside it,
     `.<folder>.mtv-new-<process>`, and what is replaced, `.<folder>.mtv-old-<process>`; nothing
@@ -285,7 +285,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
 
 def recover_folder(folder: Path) -> None:
-    """Tidies up what a process left that was killed while it wrote a folder by `whole_folder`.
+    """Tidy up what a process left that was killed while it wrote a folder by `whole_folder`.
 
     A folder that was replaced, while the new one did not get its name, is renamed back. What
     living processes write is left alone. Earlier versions left `<folder>.old` and, complete,
@@ -332,7 +332,7 @@ def _names_in(folder: Path) -> set[str]:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Holds a folder's lock, which ends with the process; a file system may have no locks."""
+    """Hold a folder's lock, which ends with the process; a file system may have no locks."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         with suppress(OSError):

@@ -13,7 +13,7 @@ from mtv_world_ros.core.files import write_whole
 
 
 def resize_frames(frames: ByteArray, width: int, height: int) -> ByteArray:
-    """Returns (N, height, width, 3) frames; shrinking averages over areas."""
+    """Return (N, height, width, 3) frames; shrinking averages over areas."""
     if frames.shape[1:3] == (height, width):
         return frames
     shrinks = height <= frames.shape[1] and width <= frames.shape[2]
@@ -22,7 +22,7 @@ def resize_frames(frames: ByteArray, width: int, height: int) -> ByteArray:
 
 
 def resize_labels(labels: ByteArray, width: int, height: int) -> ByteArray:
-    """Returns (N, height, width) label images, nearest pixel."""
+    """Return (N, height, width) label images, nearest pixel."""
     if labels.shape[1:] == (height, width):
         return labels
     return np.stack(
@@ -31,7 +31,7 @@ def resize_labels(labels: ByteArray, width: int, height: int) -> ByteArray:
 
 
 def encode_jpeg(rgb: ByteArray, quality: int) -> bytes:
-    """Returns the JPEG file of an (H, W, 3) RGB image.
+    """Return the JPEG file of an (H, W, 3) RGB image.
 
     Raises:
         EpisodeError: the image is too large.
@@ -40,7 +40,7 @@ def encode_jpeg(rgb: ByteArray, quality: int) -> bytes:
 
 
 def encode_png(image: ByteArray) -> bytes:
-    """Returns the PNG file of an (H, W, 3) RGB or (H, W) image.
+    """Return the PNG file of an (H, W, 3) RGB or (H, W) image.
 
     Raises:
         EpisodeError: the image has no pixels.
@@ -49,7 +49,7 @@ def encode_png(image: ByteArray) -> bytes:
 
 
 def write_png(path: Path, image: ByteArray) -> None:
-    """Writes an (H, W, 3) RGB picture beside its name and renames it."""
+    """Write an (H, W, 3) RGB picture beside its name and renames it."""
     write_whole(path, encode_png(image))
 
 

@@ -60,7 +60,7 @@ class Starting:
 
 
 def end_on_signals(name: str) -> Starting:
-    """Lets SIGINT and SIGTERM end this process while it starts; ignored ones stay ignored."""
+    """Let SIGINT and SIGTERM end this process while it starts; ignored ones stay ignored."""
     starting = Starting(name)
     for number in _SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -158,7 +158,7 @@ def ros_arguments(
 def start_process(
     name: str, command: Sequence[str], logs: Path, environment: Mapping[str, str] | None = None
 ) -> subprocess.Popen[bytes]:
-    """Starts a node in a session of its own; it writes to `logs/<name>.log`.
+    """Start a node in a session of its own; it writes to `logs/<name>.log`.
 
     To be called from the main thread: the node ends with the thread that started it.
     """
@@ -175,7 +175,7 @@ def start_process(
 
 
 def ending_with_this_process(command: Sequence[str]) -> list[str]:
-    """Returns a command that is killed with this process, where the system can do that.
+    """Return a command that is killed with this process, where the system can do that.
 
     To be started from the main thread: the kernel looks at the thread.
     """
@@ -184,14 +184,14 @@ def ending_with_this_process(command: Sequence[str]) -> list[str]:
 
 
 def last_line(log: Path, otherwise: str) -> str:
-    """Returns the last line of a log; `otherwise` where it is empty."""
+    """Return the last line of a log; `otherwise` where it is empty."""
     tail = log.read_bytes()[-_TAIL_BYTES:].decode(errors='replace')
     lines = [line.strip() for line in tail.splitlines() if line.strip()]
     return lines[-1] if lines else otherwise
 
 
 def how_it_ended(name: str, process: subprocess.Popen[bytes], logs: Path) -> str:
-    """Returns the exit status of a process of `start_process` and its last line, in words."""
+    """Return the exit status of a process of `start_process` and its last line, in words."""
     text = last_line(logs / f'{name}.log', 'its log is empty')
     return f"'{name}' ended with status {process.returncode}: {text} (logs are in '{logs}')"
 
@@ -204,7 +204,7 @@ class StoppedProcesses:
         self._looked_s = 0.0
 
     def find(self, pids: Iterable[int]) -> int | None:
-        """Returns the number of a process that has been stopped for `STOPPED_S`, or None."""
+        """Return the number of a process that has been stopped for `STOPPED_S`, or None."""
         now_s = time.monotonic()
         if now_s - self._looked_s > _LONGEST_GAP_S:  # a terminal stopped this process as well
             self._since.clear()
@@ -214,7 +214,7 @@ class StoppedProcesses:
         return next(found, None)
 
     def report(self, processes: Mapping[str, subprocess.Popen[bytes]]) -> str:
-        """Returns which named process has been stopped for `STOPPED_S`, in words; or empty."""
+        """Return which named process has been stopped for `STOPPED_S`, in words; or empty."""
         found = self.find(process.pid for process in processes.values())
         names = [name for name, process in processes.items() if process.pid == found]
         return f"'{names[0]}' was stopped and stood still for {STOPPED_S:g} s" if names else ''
@@ -229,7 +229,7 @@ def _is_stopped(pid: int) -> bool:
 
 
 def stop_process(process: subprocess.Popen[bytes] | None) -> None:
-    """Ends a node with SIGINT and waits for it; kills it where that does not help."""
+    """End a node with SIGINT and wait for it; kill it where that does not help."""
     if process is None or process.poll() is not None:
         return
     process.send_signal(signal.SIGINT)
@@ -243,5 +243,5 @@ def stop_process(process: subprocess.Popen[bytes] | None) -> None:
 
 
 def threads_each(workers: int) -> int:
-    """Returns the usable cores' share of each of some processes, at least 1."""
+    """Return the usable cores' share of each of some processes, at least 1."""
     return max(len(os.sched_getaffinity(0)) // max(workers, 1), 1)

@@ -11,7 +11,7 @@ from mtv_world_ros.core.data_types import FloatArray
 
 
 def rotation(quaternion_xyzw: Sequence[float] | FloatArray) -> FloatArray:
-    """Returns the (3, 3) rotation of a quaternion (x, y, z, w) of any length but zero.
+    """Return the (3, 3) rotation of a quaternion (x, y, z, w) of any length but zero.
 
     Raises:
         ValueError: not four finite numbers, or all zero.
@@ -24,19 +24,19 @@ def rotation(quaternion_xyzw: Sequence[float] | FloatArray) -> FloatArray:
 
 
 def quaternion(R: FloatArray) -> FloatArray:
-    """Returns the unit quaternion (x, y, z, w) of a rotation (3, 3)."""
+    """Return the unit quaternion (x, y, z, w) of a rotation (3, 3)."""
     return np.asarray(pin.Quaternion(np.asarray(R, dtype=float)).coeffs())
 
 
 def about_z(angle: float) -> FloatArray:
-    """Returns the (3, 3) rotation by an angle [rad] about z."""
+    """Return the (3, 3) rotation by an angle [rad] about z."""
     return np.asarray(pin.utils.rotate('z', angle))
 
 
 def pose(
     position: Sequence[float] | FloatArray, quaternion_xyzw: Sequence[float] | FloatArray
 ) -> FloatArray:
-    """Returns the (4, 4) pose of a position [m] and a quaternion (x, y, z, w).
+    """Return the (4, 4) pose of a position [m] and a quaternion (x, y, z, w).
 
     Raises:
         ValueError: not three finite numbers, or no quaternion.
@@ -50,7 +50,7 @@ def pose(
 
 
 def looking_along(ahead: FloatArray) -> FloatArray:
-    """Returns the (3, 3) rotation of an upright camera: x right, y down, z along `ahead`."""
+    """Return the (3, 3) rotation of an upright camera: x right, y down, z along `ahead`."""
     ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -58,7 +58,7 @@ def looking_along(ahead: FloatArray) -> FloatArray:
 
 
 def denavit_hartenberg(a: float, alpha: float, d: float, theta: float) -> FloatArray:
-    """Returns Rz(theta) Tz(d) Tx(a) Rx(alpha), the standard convention's (4, 4) [m, rad].
+    """Return Rz(theta) Tz(d) Tx(a) Rx(alpha), the standard convention's (4, 4) [m, rad].
 
     Source: B. Siciliano et al., Robotics, 2.8.2.
     """
@@ -74,7 +74,7 @@ def denavit_hartenberg(a: float, alpha: float, d: float, theta: float) -> FloatA
 
 
 def inverse(T: FloatArray) -> FloatArray:
-    """Returns the inverses (..., 4, 4) of rigid poses (..., 4, 4)."""
+    """Return the inverses (..., 4, 4) of rigid poses (..., 4, 4)."""
     transposed = np.swapaxes(T[..., :3, :3], -1, -2)
     result = np.zeros_like(T)
     result[..., :3, :3] = transposed

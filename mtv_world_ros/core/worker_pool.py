@@ -48,7 +48,7 @@ class Scores(Protocol):
     """Result of a job, or the reason why it failed."""
 
     def as_json(self) -> dict[str, Any]:
-        """Returns plain values."""
+        """Return plain values."""
         ...
 
 
@@ -56,14 +56,14 @@ class Scorer(Protocol):
     """Scores one job after the other."""
 
     def score(self, job: Any) -> Scores:
-        """Returns a job's scores; raises MtvWorldError where there are none."""
+        """Return a job's scores; raise MtvWorldError where there are none."""
         ...
 
 
 def run_all(
     jobs: Sequence[Job], make_run: Callable[[], Run], workers: int, threads: int = 1
 ) -> Iterator[tuple[Job, Any]]:
-    """Yields jobs with their result, in the order in which they are done.
+    """Yield jobs with their result, in the order in which they are done.
 
     Workers are spawned, not forked, since the threads of torch and OpenCV do not survive a fork.
     They end with this process, however that ends.
@@ -133,7 +133,7 @@ class WorkerPool(ProcessPoolExecutor):
         threading.Thread(target=self._kill_stopped, daemon=True).start()
 
     def submit(self, *job: Any, **options: Any) -> Future[Any]:
-        """Starts processes; none of them gets a Ctrl-C that it does not ignore yet."""
+        """Start processes; none of them gets a Ctrl-C that it does not ignore yet."""
         resource_tracker.ensure_running()  # which lets SIGINT through
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
@@ -142,12 +142,12 @@ class WorkerPool(ProcessPoolExecutor):
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def kill(self) -> None:
-        """Ends the processes in the middle of a job."""
+        """End the processes in the middle of a job."""
         for worker in list((self._processes or {}).values()):
             worker.kill()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Ends the processes."""
+        """End the processes."""
         super().shutdown(wait, cancel_futures=cancel_futures)
         self._closed.set()
 
@@ -179,7 +179,7 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
 
 
 def _start_worker(make_run: Callable[[], Run], threads: int, parent: int) -> None:
-    """Prepares a worker; an error is raised by every job."""
+    """Prepare a worker; an error is raised by every job."""
     global _run
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops the pool
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -209,7 +209,7 @@ def _raising(error: MtvWorldError) -> Run:
 
 
 def run_job(*job: Any) -> Any:
-    """Runs a job in a worker of a `WorkerPool`."""
+    """Run a job in a worker of a `WorkerPool`."""
     assert _run is not None
     return _run(*job)
 
@@ -246,7 +246,7 @@ class _Scoring:
 def score_all(
     jobs: Sequence[Job], make_scorer: Callable[[], Scorer], workers: int, threads: int
 ) -> Iterator[tuple[Job, Outcome]]:
-    """Yields jobs with their scores, or why there are none; see `run_all`.
+    """Yield jobs with their scores, or why there are none; see `run_all`.
 
     Args:
         jobs: to score, in any order.
@@ -262,7 +262,7 @@ def score_all(
 def score_with_ray(
     jobs: Sequence[Job], make_scorer: Callable[[], Scorer], workers: int, address: str = ''
 ) -> Iterator[tuple[Job, Outcome]]:
-    """Yields jobs with their scores, or why there are none, from actors of a Ray cluster.
+    """Yield jobs with their scores, or why there are none, from actors of a Ray cluster.
 
     Every machine of the cluster needs this package, and checkpoints under the same path.
 

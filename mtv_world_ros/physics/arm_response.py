@@ -97,7 +97,7 @@ class ArmResponse:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], joint_names: Sequence[str]) -> ArmResponse:
-        """Returns what `as_json` gave, of a robot with these joints.
+        """Return what `as_json` gave, of a robot with these joints.
 
         Raises:
             KeyError: a joint or number is missing.
@@ -111,7 +111,7 @@ class ArmResponse:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Returns the numbers by joint, and the floor."""
+        """Return the numbers by joint, and the floor."""
         joints: dict[str, Any] = {
             joint: {name: float(getattr(self, name)[column]) for name in NUMBERS}
             for column, joint in enumerate(self.joint_names)
@@ -124,7 +124,7 @@ class ArmResponse:
         commands: FloatArray,
         state: ArmState | None = None,
     ) -> tuple[FloatArray, ArmState]:
-        """Returns the positions (T, J) under commands (T, J), and the state after them.
+        """Return the positions (T, J) under commands (T, J), and the state after them.
 
         Args:
             robot: gives the inertia.
@@ -203,7 +203,7 @@ class _Tips:
     def forces(
         self, positions: FloatArray, velocities: FloatArray, step_s: float
     ) -> tuple[FloatArray, FloatArray] | None:
-        """Returns what the table does to joints: (J,) now, and (J, J) of an acceleration then.
+        """Return what the table does to joints: (J,) now, and (J, J) of an acceleration then.
 
         None where nothing touches it.
         """

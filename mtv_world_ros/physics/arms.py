@@ -69,11 +69,11 @@ class Drives:
     lead: FloatArray
 
     def spread(self, positions: FloatArray) -> FloatArray:
-        """Returns degrees of freedom (..., D) of joints (..., J)."""
+        """Return degrees of freedom (..., D) of joints (..., J)."""
         return positions[..., self.columns] * self.multipliers + self.offsets
 
     def joints(self, values: FloatArray, count: int) -> FloatArray:
-        """Returns joints (..., J), each the mean of the degrees of freedom (..., D) of it."""
+        """Return joints (..., J), each the mean of the degrees of freedom (..., D) of it."""
         single = (values - self.offsets) / self.multipliers
         sums = np.zeros((*values.shape[:-1], count))
         np.add.at(np.moveaxis(sums, -1, 0), self.columns, np.moveaxis(single, -1, 0))
@@ -125,7 +125,7 @@ class Arms:
         return {j: firsts.index(c[1]) for j, c in supports.items() if c[1] in firsts}
 
     def add_to(self, spec: Any) -> None:
-        """Adds bodies, shapes and drives to an `MjSpec` whose world is the robot's base link."""
+        """Add bodies, shapes and drives to an `MjSpec` whose world is the robot's base link."""
         arm_of = self.arm_of
         bits = [2 << arm for arm in range(len(set(arm_of.values())))]
         bodies = {0: spec.worldbody}
@@ -155,7 +155,7 @@ class Arms:
         self._add_gears(spec)
 
     def finger_dofs(self) -> list[list[int]]:
-        """Returns the degrees of freedom of each arm's tool that move fingers."""
+        """Return the degrees of freedom of each arm's tool that move fingers."""
         names, found = self.robot.joint_names, []
         for tool in self.robot.tools:
             column = -1 if tool.gripper_joint is None else names.index(tool.gripper_joint)
@@ -223,7 +223,7 @@ class Arms:
         return False
 
     def _add_gears(self, spec: Any) -> None:
-        """Holds the fingers that follow one joint together; left out where they swing."""
+        """Hold the fingers that follow one joint together; left out where they swing."""
         drives = self.drives
         for column in np.unique(drives.columns[drives.fingers]):
             first, *others = np.flatnonzero(drives.columns == column)
@@ -321,7 +321,7 @@ class Arms:
 
 
 def set_drives(model: Any, drives: Drives, settings: ContactSettings) -> None:
-    """Writes the drives of a scene's arms into a model, those of fingers as they were fitted."""
+    """Write the drives of a scene's arms into a model, those of fingers as they were fitted."""
     way = drives.travels**2
     count = np.bincount(drives.columns)[drives.columns]
     # of a finger of several joints each has its share

@@ -23,7 +23,7 @@ RESPONSE_FILE = 'arm_response.json'
 
 
 def load_foresight(folder: Path, robot: RobotModel, threads: int = 1) -> SolidForesight | None:
-    """Reads the files of `fit contact`; None = no foresight, verdicts rest on frames alone.
+    """Read the files of `fit contact`; None = no foresight, verdicts rest on frames alone.
 
     Args:
         folder: that it wrote.
@@ -41,7 +41,7 @@ def load_foresight(folder: Path, robot: RobotModel, threads: int = 1) -> SolidFo
 
 
 def load_response(folder: Path, robot: RobotModel) -> ArmResponse | None:
-    """Reads the arms' response to commands; None = it was not fitted.
+    """Read the arms' response to commands; None = it was not fitted.
 
     Raises:
         CheckpointError: the file is not whole, or of another robot.
@@ -61,7 +61,7 @@ def load_response(folder: Path, robot: RobotModel) -> ArmResponse | None:
 
 
 def load_contact(folder: Path) -> ContactSettings | None:
-    """Reads the contact settings; None = there are none.
+    """Read the contact settings; None = there are none.
 
     Raises:
         CheckpointError: the file cannot be used.
@@ -77,10 +77,10 @@ def load_contact(folder: Path) -> ContactSettings | None:
 
 
 def save_contact(contact: ContactSettings, folder: Path) -> None:
-    """Writes the contact settings into the folder of a checkpoint's foresight."""
+    """Write the contact settings into the folder of a checkpoint's foresight."""
     write_json(folder / CONTACT_FILE, contact.model_dump(mode='json'))
 
 
 def save_response(response: ArmResponse, folder: Path) -> None:
-    """Writes the arms' response to commands."""
+    """Write the arms' response to commands."""
     write_json(folder / RESPONSE_FILE, response.as_json())

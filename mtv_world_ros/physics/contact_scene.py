@@ -112,7 +112,7 @@ class CompiledScene:
 
     @classmethod
     def compiled(cls, arms: Arms, kinds: Sequence[str]) -> CompiledScene:
-        """Returns the scene of a robot and solids of some kinds.
+        """Return the scene of a robot and solids of some kinds.
 
         Raises:
             RobotError: MuJoCo refuses the robot.
@@ -147,7 +147,7 @@ class CompiledScene:
     def model_of(
         self, settings: ContactSettings, solids: Sequence[Solid], data: Any = None
     ) -> Any:
-        """Returns a model with the numbers of settings and of solids of these kinds.
+        """Return a model with the numbers of settings and of solids of these kinds.
 
         Args:
             settings: of contact.
@@ -170,7 +170,7 @@ class CompiledScene:
         return model
 
     def positions(self, arms: FloatArray, solids: Sequence[Solid]) -> FloatArray:
-        """Returns qpos with the arms (D,) and the solids where they stand."""
+        """Return qpos with the arms (D,) and the solids where they stand."""
         qpos = self.model.qpos0.copy()
         qpos[self.arm_qpos] = arms
         for first, solid in zip(self.solid_qpos, solids, strict=True):
@@ -180,7 +180,7 @@ class CompiledScene:
 
 
 def kind_of(solid: Solid) -> str:
-    """Returns of what pieces a solid is made."""
+    """Return of what pieces a solid is made."""
     wide, long, high = map(float, solid.size)
     across = min(wide, long)
     if across > MIN_DISH_WIDTH_M and across > MIN_DISH_RATIO * high:
@@ -217,7 +217,7 @@ def _empty_spec() -> Any:
 
 
 def _add_pieces(body: Any, pieces: Sequence[_Piece]) -> None:
-    """Adds the pieces of a solid to its body in an `MjSpec`."""
+    """Add the pieces of a solid to its body in an `MjSpec`."""
     mass, middle, moments, turn = _inertia_of(pieces)
     body.explicitinertial, body.simple = True, False  # numbers change after compilation
     body.mass, body.ipos, body.inertia, body.iquat = mass, middle, moments, turn
@@ -234,7 +234,7 @@ def _add_pieces(body: Any, pieces: Sequence[_Piece]) -> None:
 
 
 def _set_pieces(model: Any, body: int, geoms: np.ndarray, pieces: Sequence[_Piece]) -> None:
-    """Writes sizes, places and inertia of a solid into a model."""
+    """Write sizes, place and inertia of a solid into a model."""
     for geom, piece in zip(geoms, pieces, strict=True):
         model.geom_size[geom], model.geom_pos[geom] = piece.size, piece.at
         model.geom_aabb[geom] = *np.zeros(3), *piece.half

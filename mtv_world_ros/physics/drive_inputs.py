@@ -101,7 +101,7 @@ class CoursePlanner:
         self._finger_mass = self._masses()
 
     def begin(self, positions: FloatArray) -> ArmsState:
-        """Returns the state of arms that rest at joints (J,)."""
+        """Return the state of arms that rest at joints (J,)."""
         drives = self._scene.arms.drives
         data, model = self._data, self._model
         mujoco.mj_resetData(model, data)
@@ -114,7 +114,7 @@ class CoursePlanner:
         )
 
     def plan(self, commands: FloatArray, state: ArmsState) -> tuple[FreeMotion, ArmsState]:
-        """Returns the course of commands (1 + N, J), `PERIOD_S` apart, and the state after it."""
+        """Return the course of commands (1 + N, J), `PERIOD_S` apart, and the state after it."""
         scene, drives = self._scene, self._scene.arms.drives
         targets = np.concatenate([state.commands[None], commands[1:]])
         rows = drives.spread(self._squeezed(targets))

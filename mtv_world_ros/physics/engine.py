@@ -115,7 +115,7 @@ class BatchMotion:
 
 
 def _log_once(message: str) -> None:
-    """Logs each warning of the engine once; by default they fill a file and the terminal."""
+    """Log each warning of the engine once; by default they fill a file and the terminal."""
     kind = message.split(' Time =')[0]
     if kind not in _told:
         _told.add(kind)
@@ -141,7 +141,7 @@ class Engine:
         self._rollout = Rollout(nthread=0 if threads < 2 else threads)
 
     def scene_of(self, kinds: Sequence[str]) -> tuple[CompiledScene, list[Any]]:
-        """Returns the compiled scene of solids of some kinds, and data of each thread."""
+        """Return the compiled scene of solids of some kinds, and data of each thread."""
         key = tuple(kinds)
         if key not in self._scenes:
             if len(self._scenes) >= 8:
@@ -151,13 +151,13 @@ class Engine:
         return self._scenes[key]
 
     def begin(self, futures: Sequence[Future]) -> Batch:
-        """Returns what computes futures of solids of the same kinds."""
+        """Return what computes futures of solids of the same kinds."""
         return Batch(self, futures)
 
     def run(
         self, models: Sequence[Any], data: Sequence[Any], states: FloatArray, controls: FloatArray
     ) -> FloatArray:
-        """Returns the states (K, S, N) of K models at S steps from some states (K, N) on."""
+        """Return the states (K, S, N) of K models at S steps from some states (K, N) on."""
         return self._rollout.rollout(
             models, data, states, controls, chunk_size=1 if self.threads > 1 else None
         )[0]
@@ -195,14 +195,14 @@ class Batch:
         return self._models[0]
 
     def touches_arms(self, positions: FloatArray) -> bool:
-        """Returns whether arms at joints (J,) are near a solid, as one that they hold."""
+        """Return whether arms at joints (J,) are near a solid, as one that they hold."""
         at = self._scene.arms.drives.spread(positions)
         return not self._nearby.is_clear(
             self._scene.positions(at, self.futures[0].solids), at[None]
         )
 
     def start(self, positions: FloatArray) -> BatchState:
-        """Returns the start of the futures, with the robot at rest at joints (J,)."""
+        """Return the start of the futures, with the robot at rest at joints (J,)."""
         scene, model = self._scene, self._models[0]
         at = scene.arms.drives.spread(positions)
         physics = np.zeros((len(self.futures), mujoco.mj_stateSize(model, FULL)))
@@ -221,7 +221,7 @@ class Batch:
         state: BatchState | None = None,
         should_stop: Callable[[], bool] = lambda: False,
     ) -> tuple[BatchMotion, BatchState]:
-        """Returns the motion at each `every`-th of commands, and the state after them.
+        """Return the motion at each `every`-th of commands, and the state after them.
 
         Args:
             commands: (1 + T * every, J), `PERIOD_S` apart [rad or m].
@@ -265,7 +265,7 @@ class Batch:
     def _compute_row(
         self, run: _Run, row: int, moving: np.ndarray, check: Callable[[], None]
     ) -> None:
-        """Computes a row of some futures; those that are crowded in pieces, few at a time."""
+        """Compute a row of some futures; those that are crowded in pieces, few at a time."""
         controls = np.stack([self._controls(run, int(number), row) for number in moving])
         crowded = np.zeros(len(moving), np.bool_)
         for place, number in enumerate(moving):
@@ -282,7 +282,7 @@ class Batch:
     def _compute_crowded(
         self, run: _Run, moving: np.ndarray, controls: FloatArray, check: Callable[[], None]
     ) -> None:
-        """Computes a row in pieces of the same length on every machine, which the result shows.
+        """Compute a row in pieces of the same length on every machine, which the result shows.
 
         What counts as too much is a number of constraints, not a time: so the same is lost
         whatever else a machine does.
@@ -362,7 +362,7 @@ class _Run:
         )
 
     def take(self, moving: np.ndarray, states: FloatArray) -> None:
-        """Takes what was computed; futures that no object can have are lost."""
+        """Take what was computed; futures that no object can have are lost."""
         self.computed += states.shape[0] * states.shape[1]
         for number, last in zip(map(int, moving), states[:, -1], strict=True):
             why = self._implausible(last)
@@ -372,7 +372,7 @@ class _Run:
                 self.physics[number] = last
 
     def charge(self, number: int, constraints: int, steps: int) -> None:
-        """Counts what steps of a crowded future cost; it is lost where that is too much."""
+        """Count what steps of a crowded future cost; it is lost where that is too much."""
         self._spent[number] += constraints * steps
         if constraints > _LIMITS.overlapping_constraints:
             self.lost[number] = 'objects overlap: more touches than things on a table can have'
@@ -380,11 +380,11 @@ class _Run:
             self.lost[number] = 'more touches, for longer, than can be foreseen in time'
 
     def lose_all(self, why: str) -> None:
-        """Gives up the futures that still count."""
+        """Give up the futures that still count."""
         self.lost = dict.fromkeys(range(len(self.physics)), why) | self.lost
 
     def finish_row(self, row: int, moving: np.ndarray) -> None:
-        """Moves the arms of futures that were not computed, and keeps where all is."""
+        """Move the arms of futures that were not computed, and keep where all is."""
         scene, step = self._scene, self.first_step(row + 1)
         nq, moved = scene.model.nq, set(map(int, moving))
         for number, physics in enumerate(self.physics):
@@ -401,7 +401,7 @@ class _Run:
         self._rows.append(self._read())
 
     def motion(self) -> BatchMotion:
-        """Returns what the rows were."""
+        """Return what the rows were."""
         points, rotations, joints = (np.stack(rows, 1) for rows in zip(*self._rows, strict=True))
         return BatchMotion(points=points, rotations=rotations, joints=joints, steps=self.computed)
 

@@ -45,7 +45,7 @@ class ObjectForesight:
     _whole: dict[tuple[str, ...], FoundObjects] = field(default_factory=dict)
 
     def branch(self, source: Observation) -> ObjectForesight:
-        """Returns objects that are looked for in a later real observation.
+        """Return objects that are looked for in a later real observation.
 
         What they look like where nothing hides them is kept.
         """
@@ -61,7 +61,7 @@ class ObjectForesight:
         is_begun: bool,
         should_stop: Callable[[], bool],
     ) -> ObjectForesight:
-        """Returns the objects at the end of a chunk.
+        """Return the objects at the end of a chunk.
 
         Pictures go on to show the future that they showed, unless it ends otherwise than most.
 
@@ -97,7 +97,7 @@ class ObjectForesight:
         )
 
     def pictures(self, plan: ChunkPlan, motion: Motion) -> ByteArray | None:
-        """Returns the objects on their way through a chunk (V, 1 + T, H, W, 4); None = unknown.
+        """Return the objects on their way through a chunk (V, 1 + T, H, W, 4); None = unknown.
 
         Args:
             plan: the chunk.
@@ -109,7 +109,7 @@ class ObjectForesight:
         return self.found.pictures(times, motion.cameras, motion.camera_poses)
 
     def motions(self, plan: ChunkPlan, is_begun: bool) -> ForeseenMotions | None:
-        """Returns the futures until the end of what is kept of a chunk; None = they do not count.
+        """Return the futures until the end of what is kept of a chunk; None = they do not count.
 
         Args:
             plan: the chunk.

@@ -40,7 +40,7 @@ class ForeseenMotions:
     is_begun: bool = True
 
     def at_frames(self, plan: ChunkPlan) -> FloatArray:
-        """Returns centres (K, 1 + T, O, 3) at the start and the frames kept of a chunk [m].
+        """Return centres (K, 1 + T, O, 3) at the start and the frames kept of a chunk [m].
 
         Args:
             plan: the chunk, at whose end these motions end.
@@ -53,7 +53,7 @@ class ForeseenMotions:
 def foreseen_of(
     robot: RobotModel, objects: FoundObjects, num_steps: int, *, is_begun: bool = True
 ) -> ForeseenMotions:
-    """Returns the foreseen motions of objects, without the steps after `num_steps`.
+    """Return the foreseen motions of objects, without the steps after `num_steps`.
 
     Grippers of a motion without openings are as wide as commanded.
     """

@@ -33,7 +33,7 @@ class RobotMechanics:
     def inertia(
         self, positions: FloatArray, velocities: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Returns the mass matrix (J, J), and the forces (J,) of joints (J,) without gravity.
+        """Return the mass matrix (J, J), and the forces (J,) of joints (J,) without gravity.
 
         Both are zero where the description has no inertias.
         """
@@ -45,7 +45,7 @@ class RobotMechanics:
         return mass, follows.T @ (moving - still)
 
     def fingertips(self, positions: FloatArray) -> FloatArray:
-        """Returns the tips of all fingers (P, 3) in the base frame [m].
+        """Return the tips of all fingers (P, 3) in the base frame [m].
 
         Two of each tool, as far apart as the gripper is open.
         """
@@ -62,7 +62,7 @@ class RobotMechanics:
         return np.array(points)
 
     def fingertip_jacobians(self, positions: FloatArray, points: FloatArray) -> FloatArray:
-        """Returns how `fingertips` at positions (J,) move with the joints (P, 3, J).
+        """Return how `fingertips` at positions (J,) move with the joints (P, 3, J).
 
         That the gripper opens is not in them.
         """

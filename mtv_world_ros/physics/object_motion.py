@@ -53,7 +53,7 @@ class ObjectMotion:
     weight: float = 1.0
 
     def moves(self) -> BoolArray:
-        """Returns (T, O) whether an object is elsewhere than at first, by more than an error."""
+        """Return (T, O) whether an object is elsewhere than at first, by more than an error."""
         turned = np.einsum('toii->to', self.rotations) < 1 + 2 * np.cos(_STILL_RAD)
         return (np.linalg.norm(self.displacements, axis=-1) > _STILL_M) | turned
 
@@ -63,16 +63,16 @@ class ObjectMotion:
         return self.points - self.reference
 
     def then(self, motion: ObjectMotion) -> ObjectMotion:
-        """Returns both, one after the other; row 0 of the second is the last of the first."""
+        """Return both, one after the other; row 0 of the second is the last of the first."""
         rows = zip(self._rows, motion._rows, strict=True)
         return self._of([np.concatenate([before, after[1:]]) for before, after in rows])
 
     def __getitem__(self, frames: slice | np.ndarray) -> ObjectMotion:
-        """Returns some of the frames, with the same reference."""
+        """Return some of the frames, with the same reference."""
         return self._of([rows[frames] for rows in self._rows])
 
     def blended_from(self, last: ObjectMotion, steps: int) -> ObjectMotion:
-        """Returns the motion blended from the last row of another into itself within `steps`."""
+        """Return the motion blended from the last row of another into itself within `steps`."""
         left = np.clip(1 - np.arange(len(self.points)) / steps, 0.0, 1.0)
         way = np.nan_to_num(last.displacements[-1] - self.displacements[0])
         turns = Rotation.from_matrix(self.rotations[0].swapaxes(-1, -2) @ last.rotations[-1])
@@ -133,7 +133,7 @@ class TrackedObjects(Protocol):
     def advance(
         self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
     ) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
-        """Returns where they are at each of 1 + T steps, and then.
+        """Return where they are at each of 1 + T steps, and then.
 
         The first motion is the expected one; the others, if any, start from poses and sizes within
         the error of the masks. Row 0 is the present.
@@ -158,7 +158,7 @@ class ObjectMotionModel(Protocol):
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
     ) -> TrackedObjects:
-        """Returns the objects of O names and masks (V, O, H, W), seen at T_base_camera (4, 4)."""
+        """Return the objects of O names and masks (V, O, H, W), seen at T_base_camera (4, 4)."""
         ...
 
     def find_again(
@@ -169,7 +169,7 @@ class ObjectMotionModel(Protocol):
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
     ) -> tuple[TrackedObjects, BoolArray, BoolArray]:
-        """Returns the objects where they may be partly hidden by now.
+        """Return the objects where they may be partly hidden by now.
 
         Args:
             whole: what `find` returned on a frame in which nothing hid the objects.
@@ -185,7 +185,7 @@ class ObjectMotionModel(Protocol):
         ...
 
     def with_robot(self, robot: RobotModel) -> ObjectMotionModel:
-        """Returns the same for a robot of the same joints and tools."""
+        """Return the same for a robot of the same joints and tools."""
         ...
 
 
@@ -227,18 +227,18 @@ class FoundObjects:
         poses: FloatArray,
         tracked: TrackedObjects,
     ) -> FoundObjects:
-        """Returns objects of masks (V, O, H, W) in frames (V, H, W, 3), seen at (V, 4, 4)."""
+        """Return objects of masks (V, O, H, W) in frames (V, H, W, 3), seen at (V, 4, 4)."""
         of_each = np.repeat(poses[:, None], len(names), axis=1)
         return cls(names=names, cuts=cut_outs(frames, masks), poses=of_each, tracked=tracked)
 
     def shown_as(self, whole: FoundObjects, hidden: BoolArray) -> FoundObjects:
-        """Returns these, those of `hidden` (O,) with the pictures of when they were whole."""
+        """Return these, those of `hidden` (O,) with the pictures of when they were whole."""
         cuts = np.where(hidden[:, None, None, None], whole.cuts, self.cuts)
         poses = np.where(hidden[:, None, None], whole.poses, self.poses)
         return replace(self, cuts=cuts, poses=poses)
 
     def foresee(self, parts: Iterable[FloatArray]) -> tuple[FoundObjects, ...]:
-        """Returns the objects after each part of a plan, which show the same motion as before.
+        """Return the objects after each part of a plan, which show the same motion as before.
 
         Args:
             parts: (1 + T * `tracked.commands_a_step`, J) each [rad or m], evenly spaced; row 0
@@ -250,7 +250,7 @@ class FoundObjects:
         return tuple(found)
 
     def medoid(self, among: BoolArray | None = None) -> int:
-        """Returns the index of the medoid motion: its end is closest to those of all.
+        """Return the index of the medoid motion: its end is closest to those of all.
 
         Args:
             among: (K,) which motions it may be, one or more; None = all.
@@ -262,7 +262,7 @@ class FoundObjects:
     def pictures(
         self, times: FloatArray, cameras: Sequence[CameraModel], poses: FloatArray
     ) -> ByteArray:
-        """Returns pictures (V, T, H, W, 4) of the objects in the last part of the plan.
+        """Return pictures (V, T, H, W, 4) of the objects in the last part of the plan.
 
         Where the part shows another motion than the one before, objects pass to it gradually.
 
@@ -282,7 +282,7 @@ class FoundObjects:
     def after(
         self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
     ) -> FoundObjects:
-        """Returns the objects after a part of a plan, which show the same motion as before.
+        """Return the objects after a part of a plan, which show the same motion as before.
 
         Args:
             positions: (1 + T * `tracked.commands_a_step`, J) [rad or m], evenly spaced.
@@ -315,7 +315,7 @@ def _apart(motions: Sequence[ObjectMotion]) -> FloatArray:
 
 
 def cut_outs(frames: ByteArray, masks: BoolArray) -> ByteArray:
-    """Returns (V, O, H, W, 4) colours of objects, black elsewhere, and masks as 0 or 255.
+    """Return (V, O, H, W, 4) colours of objects, black elsewhere, and masks as 0 or 255.
 
     Args:
         frames: (V, H, W, 3) uint8 RGB.
@@ -333,7 +333,7 @@ def moved_pictures(
     reference_poses: FloatArray,
     poses: FloatArray,
 ) -> ByteArray:
-    """Returns the objects alone, (V, T, H, W, 4) uint8 RGB and cover, as they move rigidly.
+    """Return the objects alone, (V, T, H, W, 4) uint8 RGB and cover, as they move rigidly.
 
     Each object is warped like a plane through its centre that faces the camera: shifted by the
     projected displacement, scaled by the ratio of depths, turned about the line of sight. Near

@@ -73,7 +73,7 @@ class RobotParts:
 
 
 def load_parts(robot: RobotModel) -> RobotParts:
-    """Returns the parts that can touch something.
+    """Return the parts that can touch something.
 
     The URDF's collision elements; for links that have none, what is drawn of them. A mesh counts
     as its convex hull, that of a gripper as convex pieces, between which there is room for what
@@ -105,7 +105,7 @@ def load_parts(robot: RobotModel) -> RobotParts:
 
 
 def with_inertias(robot: RobotModel, parts: Sequence[Part]) -> tuple[RobotModel, tuple[str, ...]]:
-    """Returns a robot whose moving bodies all have inertias, and what was assumed.
+    """Return a robot whose moving bodies all have inertias, and what was assumed.
 
     Links that state none are taken to be filled with water.
     """

@@ -74,7 +74,7 @@ class SolidForesight:
         return self.engine.arms.notes
 
     def with_robot(self, robot: RobotModel) -> SolidForesight:
-        """Returns the same for a robot of the same joints and tools."""
+        """Return the same for a robot of the same joints and tools."""
         return SolidForesight(robot, self.response, self.settings, self._threads)
 
     def find(
@@ -84,7 +84,7 @@ class SolidForesight:
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
     ) -> TrackedSolids:
-        """Returns the objects of masks (V, O, H, W), best of the camera's own size.
+        """Return the objects of masks (V, O, H, W), best of the camera's own size.
 
         Args:
             names: O of them; those of vessels say that they are hollow.
@@ -126,7 +126,7 @@ class SolidForesight:
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
     ) -> tuple[TrackedSolids, BoolArray, BoolArray]:
-        """Returns objects that something may hide in part by now; see `ObjectMotionModel`."""
+        """Return objects that something may hide in part by now; see `ObjectMotionModel`."""
         points = locate_all(cameras, poses, centroids(masks))
         floor = whole.foresight.settings.table_m
         solids = [
@@ -251,7 +251,7 @@ class TrackedSolids:
     def advance(
         self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
     ) -> tuple[tuple[ObjectMotion, ...], TrackedSolids]:
-        """Returns where they are at each of 1 + T steps in K futures, and then.
+        """Return where they are at each of 1 + T steps in K futures, and then.
 
         In the first future all is as it was found. Row 0 is where they are now. What cannot be
         foreseen is NaN.
@@ -315,7 +315,7 @@ class TrackedSolids:
         }
 
     def futures(self) -> tuple[Future, ...]:
-        """Returns the K futures."""
+        """Return the K futures."""
         if self.batch is not None:
             return self.batch.futures
         solids = [solid for solid in self.solids if solid is not None]
@@ -329,7 +329,7 @@ def table_in(
     cameras: Sequence[CameraModel],
     poses: Sequence[FloatArray],
 ) -> float:
-    """Returns the height of a table that nothing is known of [m]; NaN = no object tells.
+    """Return the height of a table that nothing is known of [m]; NaN = no object tells.
 
     It is the middle one of where objects end below; see `SolidForesight.find`.
     """

@@ -94,12 +94,12 @@ class Solid:
         return float(self.centre[2] - self.size[2] / 2)
 
     def turn_to(self, now: Solid) -> FloatArray:
-        """Returns (3, 3) how it has turned."""
+        """Return (3, 3) how it has turned."""
         return about_z(now.yaw - self.yaw)
 
 
 def is_vessel(name: str) -> bool:
-    """Returns whether a name is that of a vessel: hollow and open at the top."""
+    """Return whether a name is that of a vessel: hollow and open at the top."""
     return _VESSEL.search(name.lower()) is not None
 
 
@@ -117,7 +117,7 @@ def bottom_of(
     floor: float = 0.0,
     fits: int = 2,
 ) -> float:
-    """Returns where an object ends below [m]; NaN = two views do not see it.
+    """Return where an object ends below [m]; NaN = two views do not see it.
 
     Args:
         masks: see `fit_solid`; so are the others.
@@ -145,7 +145,7 @@ def fit_solid(
     is_open: bool = False,
     is_box: bool = False,
 ) -> Solid | None:
-    """Returns the solid whose outlines are nearest to those of an object.
+    """Return the solid whose outlines are nearest to those of an object.
 
     Of a block whose masks are whole at 384 x 288, place and size are found to half a millimetre.
     What a mask does not show (hidden parts, hollows) the solid does not have, but `is_open`.
@@ -206,7 +206,7 @@ def find_solid(
     poses: Sequence[FloatArray],
     floor: float = 0.0,
 ) -> Solid | None:
-    """Returns the pose of a solid of known size that may be partly hidden.
+    """Return the pose of a solid of known size that may be partly hidden.
 
     Most of its outline is that of the masks; a robust loss leaves the hidden part out.
 

@@ -66,7 +66,7 @@ class LeRobotConfig(ServerMapping):
         return self
 
     def make(self) -> LeRobotPolicy:
-        """Returns the client; it connects at its first reset.
+        """Return the client; it connects at its first reset.
 
         Raises:
             ConfigError: a package is missing.
@@ -100,7 +100,7 @@ class LeRobotPolicy:
         return f'lerobot {self._config.policy.type} {self._config.policy.path}'
 
     def reset(self, *, seed: int) -> None:
-        """Lets the server forget what it has, and load the policy if that is not done."""
+        """Let the server forget what it has, and load the policy if that is not done."""
         del seed
         self._timestep = 0
         config = self._config
@@ -118,7 +118,7 @@ class LeRobotPolicy:
             self._is_set_up = True
 
     def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
-        """Returns the server's chunk of actions as commands; it never ends an episode.
+        """Return the server's chunk of actions as commands; it never ends an episode.
 
         Raises:
             PolicyError: no connection, no answer in time, or one that cannot be used.
@@ -139,7 +139,7 @@ class LeRobotPolicy:
         return config.actions.trajectory(read_actions(answer), observation)
 
     def close(self) -> None:
-        """Closes the connection; the next reset sets the policy up again."""
+        """Close the connection; the next reset sets the policy up again."""
         channel, self._channel, self._is_set_up = self._channel, None, False
         if channel is not None:
             channel.close()
@@ -223,7 +223,7 @@ def observation_parts(values: Mapping[str, Any]) -> Iterator[bytes]:
 
 
 def read_actions(message: bytes) -> FloatArray:
-    """Returns the (T, C) actions of a message `Actions`.
+    """Return the (T, C) actions of a message `Actions`.
 
     Raises:
         PolicyError: there are none in it, or it holds something else.

@@ -48,7 +48,7 @@ class OpenPiConfig(ServerMapping):
     )
 
     def make(self) -> OpenPiPolicy:
-        """Returns the client; it connects at its first reset.
+        """Return the client; it connects at its first reset.
 
         Raises:
             ConfigError: a package is missing.
@@ -108,13 +108,13 @@ class OpenPiPolicy:
         return f'openpi {self._config.server}'
 
     def reset(self, *, seed: int) -> None:
-        """Connects, if that is not done; the protocol knows neither episodes nor seeds."""
+        """Connect, if that is not done; the protocol knows neither episodes nor seeds."""
         del seed
         if self._connection is None:
             self._connect()
 
     def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
-        """Returns the server's chunk of actions as commands; it never ends an episode.
+        """Return the server's chunk of actions as commands; it never ends an episode.
 
         Raises:
             PolicyError: no connection, no answer in time, the server failed, or its answer
@@ -127,7 +127,7 @@ class OpenPiPolicy:
         return actions.trajectory(find(answer, actions.key), observation)
 
     def close(self) -> None:
-        """Closes the connection; the next question opens another."""
+        """Close the connection; the next question opens another."""
         self._connection = None
         self._opened.close()
 
@@ -177,7 +177,7 @@ class OpenPiPolicy:
         return unpack(message)
 
     def _guarded(self, call: Callable[[], Any]) -> Any:
-        """Closes the connection at an error: a late answer would be taken for the next one."""
+        """Close the connection at an error: a late answer would be taken for the next one."""
         from websockets.exceptions import WebSocketException
 
         server, timeout_s = self._config.server, self._config.timeout_s
@@ -194,7 +194,7 @@ class OpenPiPolicy:
 
 
 def limit_sending(connected: socket.socket, seconds: float) -> None:
-    """Sets a timeout for sending: a stopped server would block it for ever."""
+    """Set a timeout for sending: a stopped server would block it for ever."""
     whole = int(seconds)
     value = struct.pack('ll', whole, int((seconds - whole) * 1e6))
     connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, value)
@@ -206,7 +206,7 @@ _LONGEST_DTYPE = 16
 
 
 def pack(value: Any) -> bytes:
-    """Returns the bytes of nested mappings and lists of arrays, numbers and text."""
+    """Return the bytes of nested mappings and lists of arrays, numbers and text."""
     import msgpack
 
     packed = msgpack.packb(value, default=_encode)
@@ -215,7 +215,7 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(data: bytes) -> Any:
-    """Returns what the bytes hold.
+    """Return what the bytes hold.
 
     Raises:
         PolicyError: the bytes are not msgpack, or hold a malformed array.

@@ -46,7 +46,7 @@ class Policy(Protocol):
         ...
 
     def reset(self, *, seed: int) -> None:
-        """Begins an episode; the next observation is its first.
+        """Begin an episode; the next observation is its first.
 
         Args:
             seed: of the policy's own randomness.
@@ -102,11 +102,11 @@ class RecordedPolicy:
         self._first_ns: int | None = None
 
     def reset(self, *, seed: int) -> None:
-        """Begins an episode."""
+        """Begin an episode."""
         self._first_ns = None
 
     def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
-        """Returns all commands after the observation's stamp; None = the episode is over."""
+        """Return all commands after the observation's stamp; None = the episode is over."""
         if self._first_ns is None:
             self._first_ns = observation.stamp_ns
         times = self._commands.times - (observation.stamp_ns - self._first_ns) / 1e9
@@ -147,7 +147,7 @@ class PythonPolicyConfig(Schema):
     )
 
     def make(self) -> Policy:
-        """Calls the factory.
+        """Call the factory.
 
         Raises:
             ConfigError: there is no such function, or it does not take the arguments.
@@ -175,7 +175,7 @@ _KINDS: dict[str, type[PolicyConfig]] = {
 
 
 def load_policy_config(path: Path, robot: RobotModel) -> PolicyConfig:
-    """Reads a file like those in `config/policies`.
+    """Read a file like those in `config/policies`.
 
     Raises:
         ConfigError: it cannot be read, a key is unknown or missing, a value is wrong.
@@ -184,7 +184,7 @@ def load_policy_config(path: Path, robot: RobotModel) -> PolicyConfig:
 
 
 def policy_config(values: Any, robot: RobotModel, where: str) -> PolicyConfig:
-    """Returns the policy that a file's values describe; errors begin with `where`.
+    """Return the policy that a file's values describe; errors begin with `where`.
 
     Raises:
         ConfigError: a key is unknown or missing, a value is wrong.

@@ -241,7 +241,7 @@ class ServerMapping(Schema):
 
 
 def fitted(frame: ByteArray, width: int, height: int, fit: str = 'pad') -> ByteArray:
-    """Returns the (H, W, 3) frame at another size, with black borders where it would be skewed."""
+    """Return the (H, W, 3) frame at another size, with black borders where it would be skewed."""
     scale_x, scale_y = width / frame.shape[1], height / frame.shape[0]
     if fit == 'pad':
         scale_x = scale_y = min(scale_x, scale_y)

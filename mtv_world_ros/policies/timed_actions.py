@@ -34,7 +34,7 @@ _FORMATS = {
 
 
 def read_timed_actions(data: bytes) -> FloatArray:
-    """Returns (T, C) actions.
+    """Return (T, C) actions.
 
     Raises:
         PolicyError: it is no list of timed actions, or a larger one than is allowed.
@@ -85,7 +85,7 @@ class _Tensors:
         self._left = limits().array_bytes
 
     def names(self, module: str, name: str) -> _Name:
-        """Returns what a name stands for; PolicyError for all other names."""
+        """Return what a name stands for; PolicyError for all other names."""
         if name == 'TimedAction' and module.startswith('lerobot.'):
             return _Name(name, _TimedAction)
         if (module, name) == ('torch._utils', '_rebuild_tensor_v2'):
@@ -176,7 +176,7 @@ class _Machine:
         self._memo: dict[int, Any] = {}
 
     def run(self, stream: io.BytesIO) -> Any:
-        """Returns the pickle's value; the stream then stands behind it."""
+        """Return the pickle's value; the stream then stands behind it."""
         for count, (code, argument, _) in enumerate(pickletools.genops(stream)):
             if count > _MOST_STEPS:
                 raise PolicyError(f'the answer has more than {_MOST_STEPS} instructions')

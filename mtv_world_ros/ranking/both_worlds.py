@@ -55,7 +55,7 @@ class BothWorlds:
     imagined: Sequence[Prediction]
 
     def course(self) -> WorldComparison:
-        """Returns how the rollout went."""
+        """Return how the rollout went."""
         commands = [chunk.commands for chunk in self.real]
         gaps = command_gaps(commands, [chunk.positions for chunk in self.imagined])
         overlaps = np.full((0, len(gaps)), nan)
@@ -90,7 +90,7 @@ class BothWorlds:
         )
 
     def frames(self) -> StoredRollout | None:
-        """Returns both worlds frame by frame; grey where one has ended; None = one is empty."""
+        """Return both worlds frame by frame; grey where one has ended; None = one is empty."""
         if not (self.observed and self.imagined):
             return None
         first = self.imagined[0]
@@ -122,7 +122,7 @@ class BothWorlds:
         )
 
     def files(self) -> dict[str, str]:
-        """Returns a rollout's video, contact sheet and frames in base64, by suffix."""
+        """Return a rollout's video, contact sheet and frames in base64, by suffix."""
         rollout = self.frames()
         if rollout is None:
             return {}
@@ -132,7 +132,7 @@ class BothWorlds:
 
 
 def command_gaps(real: Sequence[FloatArray], imagined: Sequence[FloatArray]) -> FloatArray:
-    """Returns (T,) largest differences between commands, chunks of (T', J); NaN where one ends."""
+    """Return (T,) largest differences between commands, chunks of (T', J); NaN where one ends."""
     num = max(sum(map(len, real)), sum(map(len, imagined)))
     gaps = np.full(num, nan)
     if real and imagined:
@@ -143,7 +143,7 @@ def command_gaps(real: Sequence[FloatArray], imagined: Sequence[FloatArray]) -> 
 
 
 def object_overlaps(true: BoolArray, found: BoolArray) -> FloatArray:
-    """Returns (O, T) J of masks (V, O, T', H, W) of two worlds, in the view of the largest J.
+    """Return (O, T) J of masks (V, O, T', H, W) of two worlds, in the view of the largest J.
 
     NaN where no view shows the object in either world: little of it is seen in both, as where it
     lies below another one, and J of what is left says nothing.
@@ -158,7 +158,7 @@ def object_overlaps(true: BoolArray, found: BoolArray) -> FloatArray:
 
 
 def first_apart(overlaps: FloatArray) -> list[int]:
-    """Returns the frame from which each object of (O, T) overlaps has parted; -1 = never.
+    """Return the frame from which each object of (O, T) overlaps has parted; -1 = never.
 
     It has where J stays below `OBJECTS_PART` for some frames, or from there to the end.
     """
@@ -195,7 +195,7 @@ def _first(holds: BoolArray, times: FloatArray) -> float:
 
 
 def _padded(values: Any, num: int, axis: int, blank: float) -> Any:
-    """Pads an axis of an array to a length."""
+    """Pad an axis of an array to a length."""
     missing = [(0, num - values.shape[axis] if k == axis else 0) for k in range(values.ndim)]
     return np.pad(values, missing, constant_values=blank)
 

@@ -22,7 +22,7 @@ _GAP_PX = 6
 
 
 def find_flips(results: Sequence[Result], folder: Path) -> dict[str, bool]:
-    """Returns which flips are imagined; see `Optimism.flips`.
+    """Return which flips are imagined; see `Optimism.flips`.
 
     Args:
         results: the rollouts of all policies.
@@ -44,7 +44,7 @@ def find_flips(results: Sequence[Result], folder: Path) -> dict[str, bool]:
 
 
 def is_nearer(imagined: ByteArray, real: ByteArray, other: ByteArray, objects: BoolArray) -> bool:
-    """Returns whether imagined frames are nearer to the real ones than to others, (..., 3) each.
+    """Return whether imagined frames are nearer to the real ones than to others, (..., 3) each.
 
     By squared distance over the pixels of objects (...) in which the real ones and the others
     differ.
@@ -56,13 +56,13 @@ def is_nearer(imagined: ByteArray, real: ByteArray, other: ByteArray, objects: B
 
 
 def last_frames_png(real: ByteArray, imagined: ByteArray) -> bytes:
-    """Returns a PNG of a rollout's last frames (V, H, W, 3): views in a row, real ones on top."""
+    """Return a PNG of a rollout's last frames (V, H, W, 3): views in a row, real ones on top."""
     rows = [np.concatenate(list(frames), axis=1) for frames in (real, imagined)]
     return encode_png(np.concatenate(rows))
 
 
 def objects_png(masks: BoolArray) -> bytes:
-    """Returns a PNG of where objects (V, N, H, W) are: white, views in a row."""
+    """Return a PNG of where objects (V, N, H, W) are: white, views in a row."""
     shown = np.concatenate([view.any(axis=0) for view in masks], axis=1)
     return encode_png(np.repeat(255 * shown[..., None].astype(np.uint8), 3, axis=-1))
 
@@ -74,7 +74,7 @@ def _read_objects(path: Path) -> BoolArray | None:
 
 
 def read_last_frames(path: Path) -> tuple[ByteArray, ByteArray] | None:
-    """Returns both rows of `last_frames_png` (H, V * W, 3) RGB; None = there is no such file."""
+    """Return both rows of `last_frames_png` (H, V * W, 3) RGB; None = there is no such file."""
     picture = cv2.imread(str(path)) if path.is_file() else None
     if picture is None:
         return None
@@ -86,7 +86,7 @@ def read_last_frames(path: Path) -> tuple[ByteArray, ByteArray] | None:
 def flip_sheet(
     results: Sequence[Result], flips: Mapping[str, bool], folder: Path, count: int = 6
 ) -> ByteArray | None:
-    """Returns a picture (H, W, 3) uint8 RGB of flips of contact; None = there are none.
+    """Return a picture (H, W, 3) uint8 RGB of flips of contact; None = there are none.
 
     A row is a flip: the last frames under the expert's commands and under the faulty ones, real
     above imagined. The flips are spread evenly over all, whether they were imagined or not.

@@ -92,7 +92,7 @@ class Score:
 
     @classmethod
     def rate(cls, hits: float, count: int, num_unknown: int = 0) -> Score:
-        """Returns a rate with Wilson's interval, a wide one where hits are a sum of estimates."""
+        """Return a rate with Wilson's interval, a wide one where hits are a sum of estimates."""
         return cls(
             value=hits / count if count else nan,
             interval=wilson(hits, count),
@@ -103,7 +103,7 @@ class Score:
 
     @classmethod
     def share(cls, results: Sequence[Result], is_hit: Callable[[Result], bool]) -> Score:
-        """Returns the share of rollouts that are hits; those of a scene are a cluster."""
+        """Return the share of rollouts that are hits; those of a scene are a cluster."""
         counts: dict[Scene, list[bool]] = {}
         for result in results:
             counts.setdefault((result.task, result.index), []).append(is_hit(result))
@@ -116,11 +116,11 @@ class Score:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Returns plain values."""
+        """Return plain values."""
         return {'value': self.value, 'interval': self.interval, 'count': self.count}
 
     def rate_json(self) -> dict[str, Any]:
-        """Returns plain values of a rate."""
+        """Return plain values of a rate."""
         return {
             'rate': self.value,
             'interval': self.interval,
@@ -131,32 +131,32 @@ class Score:
 
 
 def judged_by(result: Result, judge: str) -> StoredEstimate:
-    """Returns the verdict of a judge, a key of `JUDGES`."""
+    """Return the verdict of a judge, a key of `JUDGES`."""
     return getattr(result, judge)
 
 
 def has_verdict(result: Result, judge: str) -> bool:
-    """Returns whether a judge says success or failure."""
+    """Return whether a judge says success or failure."""
     return isfinite(judged_by(result, judge).success)
 
 
 def kinds_of(result: Result) -> tuple[str, ...]:
-    """Returns the fault kinds of the policy."""
+    """Return the fault kinds of the policy."""
     return parse_variant(result.policy).kinds
 
 
 def is_contact(result: Result) -> bool:
-    """Returns whether all faults of the policy are of contact: the arm's path does not tell."""
+    """Return whether all faults of the policy are of contact: the arm's path does not tell."""
     return all(FAULTS[kind].contact for kind in kinds_of(result))
 
 
 def true_rate(results: Sequence[Result]) -> Score:
-    """Returns how often rollouts succeed in the simulator."""
+    """Return how often rollouts succeed in the simulator."""
     return Score.share(results, lambda r: r.final)
 
 
 def false_success(results: Sequence[Result], judge: str) -> Score:
-    """Returns the share of true failures with a verdict that a judge calls a success."""
+    """Return the share of true failures with a verdict that a judge calls a success."""
     failed = [r for r in results if not r.final and has_verdict(r, judge)]
     return Score.share(failed, lambda r: judged_by(r, judge).success == 1)
 
@@ -164,7 +164,7 @@ def false_success(results: Sequence[Result], judge: str) -> Score:
 def agreements(
     results: Sequence[Result], judge: str, policies: Sequence[str] = ()
 ) -> dict[str, Score]:
-    """Returns Pearson's r and MMRV of a judge's rates over policies: observed, and noise-free.
+    """Return Pearson's r and MMRV of a judge's rates over policies: observed, and noise-free.
 
     Args:
         results: the rollouts of the policies; those without a verdict do not count.
@@ -185,7 +185,7 @@ def agreements(
 def outcomes(
     results: Sequence[Result], outcome: Callable[[Result], float], policies: Sequence[str] = ()
 ) -> FloatArray:
-    """Returns (P, K, E) outcomes by policy, task and episode; NaN where there is none."""
+    """Return (P, K, E) outcomes by policy, task and episode; NaN where there is none."""
     names = list(policies or dict.fromkeys(r.policy for r in results))
     tasks = list(dict.fromkeys(r.task for r in results))
     num_episodes = 1 + max((r.index for r in results), default=-1)
@@ -201,7 +201,7 @@ def scores(
     judge: str,
     flips: Mapping[str, bool] | None = None,
 ) -> dict[str, Score]:
-    """Returns the `MEASURES` of a judge.
+    """Return the `MEASURES` of a judge.
 
     Args:
         results: rollouts that shares are of.
@@ -237,7 +237,7 @@ def _area(results: Sequence[Result], *judges: str) -> Score:
 def area_interval(
     said: Sequence[FloatArray], real: BoolArray, scenes: Sequence[Scene]
 ) -> tuple[float, Interval]:
-    """Returns the area under the ROC and its 95 % t interval, from a jackknife over scenes.
+    """Return the area under the ROC and its 95 % t interval, from a jackknife over scenes.
 
     Args:
         said: (N,) estimates; of two, the first area less the second one is taken.
@@ -268,7 +268,7 @@ def area_interval(
 
 
 def areas_under_roc(said: FloatArray, real: BoolArray, weights: FloatArray) -> FloatArray:
-    """Returns (R,) areas under the ROC of (N,) estimates for weights (R, N), ties half."""
+    """Return (R,) areas under the ROC of (N,) estimates for weights (R, N), ties half."""
     gained, lost = said[real][:, None], said[~real][None]
     above = (gained > lost) + 0.5 * (gained == lost)
     up, down = weights[:, real], weights[:, ~real]

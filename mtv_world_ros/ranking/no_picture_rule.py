@@ -58,13 +58,13 @@ class Thing:
         return shape is not None and shape.hollow
 
     def is_within_reach(self, tool: FloatArray) -> bool:
-        """Returns whether a gripper that closes at `tool` (3,) takes it."""
+        """Return whether a gripper that closes at `tool` (3,) takes it."""
         away = np.abs(tool - self.centre)
         reach = REACH_M + (self.size[0] / 2 if self.is_rim_held else 0.0)
         return bool(np.hypot(*away[:2]) < reach and away[2] < REACH_HEIGHT_M)
 
     def resting(self, others: Sequence[Thing]) -> Thing:
-        """Returns it at rest on whatever is below it: another object, or the table."""
+        """Return it at rest on whatever is below it: another object, or the table."""
         height = self.size[2] / 2
         for other in others:
             if np.hypot(*(self.centre - other.centre)[:2]) < max(other.size[:2]) / 2:
@@ -75,7 +75,7 @@ class Thing:
 
 
 def judge_without_pictures(pipeline: Pipeline, episode: Rollout, commands: FloatArray) -> bool:
-    """Returns whether the task is done at the end, by the rule.
+    """Return whether the task is done at the end, by the rule.
 
     Args:
         pipeline: knows the tasks and finds the objects.
@@ -106,7 +106,7 @@ def is_done(
     robot: RobotModel,
     commands: FloatArray,
 ) -> bool:
-    """Returns whether the task is done at the end, by the rule.
+    """Return whether the task is done at the end, by the rule.
 
     Args:
         task: the task whose relations decide.
@@ -131,7 +131,7 @@ def is_done(
 
 
 def find_things(pipeline: Pipeline, episode: Rollout) -> dict[str, Thing]:
-    """Returns the objects of the episode's present frame by name, those that two views see."""
+    """Return the objects of the episode's present frame by name, those that two views see."""
     start, names = episode.observation, episode.names
     masks = pipeline.segmenter.segment(start.frames[:, None], names).masks[:, :, 0]
     cameras = start.cameras
@@ -169,7 +169,7 @@ def things_in(
 
 
 def carried(robot: RobotModel, commands: FloatArray, roles: Mapping[str, Thing]) -> TruePoses:
-    """Returns where the objects are while commands (C, J) are executed, by the rule.
+    """Return where the objects are while commands (C, J) are executed, by the rule.
 
     Args:
         robot: commanded.
@@ -211,7 +211,7 @@ class _Gripper:
         now: dict[str, Thing],
         turns: dict[str, FloatArray],
     ) -> None:
-        """Moves the held objects with the tool's pose (4, 4); takes and drops."""
+        """Move the held objects with the tool's pose (4, 4); take and drop."""
         for role, T_tool_object in self._held.items():
             pose = tool @ T_tool_object
             now[role], turns[role] = replace(now[role], centre=pose[:3, 3]), pose[:3, :3]

@@ -99,7 +99,7 @@ class ListedPolicy:
 
 
 def load_policy_list(path: Path, robot: RobotModel) -> tuple[ListedPolicy, ...]:
-    """Reads a file of policies; `config/rankings/example.yaml` describes its keys.
+    """Read a file of policies; `config/rankings/example.yaml` describes its keys.
 
     Raises:
         ConfigError: it cannot be read, a key is unknown or missing, a value is wrong, two
@@ -173,7 +173,7 @@ def _merged(values: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, A
 
 
 def tasks_of(policies: Sequence[ListedPolicy], others: Sequence[str]) -> tuple[str, ...]:
-    """Returns the tasks that policies are ranked on where the user names none.
+    """Return the tasks that policies are ranked on where the user names none.
 
     Args:
         policies: the file's policies.
@@ -184,7 +184,7 @@ def tasks_of(policies: Sequence[ListedPolicy], others: Sequence[str]) -> tuple[s
 
 
 def check_tasks(policies: Sequence[ListedPolicy], tasks: Sequence[str]) -> None:
-    """Refuses policies that would be ranked on nothing.
+    """Refuse policies that would be ranked on nothing.
 
     Raises:
         ConfigError: a policy is for other tasks than those that are asked for.
@@ -198,7 +198,7 @@ def check_tasks(policies: Sequence[ListedPolicy], tasks: Sequence[str]) -> None:
 
 
 def check_single_clients(policies: Sequence[ListedPolicy], workers: int) -> None:
-    """Refuses servers that several workers would talk to and that know one client only.
+    """Refuse servers that several workers would talk to and that know one client only.
 
     Raises:
         ConfigError: a LeRobot server is given by its address, and there are several workers.
@@ -226,7 +226,7 @@ class ListedPolicies:
     _made: dict[str, Policy] = field(default_factory=dict)
 
     def __call__(self, name: str, task: str, seed: int, expert: Expert) -> Policy:
-        """Returns the policy of a name; those that know their scene are made for it."""
+        """Return the policy of a name; those that know their scene are made for it."""
         listed = next(policy for policy in self.policies if policy.name == name)
         config = listed.config
         if isinstance(config, ScriptedPolicySettings):
@@ -258,11 +258,11 @@ class GuardedPolicy:
         )
 
     def reset(self, *, seed: int) -> None:
-        """Begins an episode; starts the server, and makes the policy, where that is not done."""
+        """Begin an episode; start the server, and make the policy, where that is not done."""
         self._guarded(lambda: self._begin(seed))
 
     def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
-        """Returns the policy's answer.
+        """Return the policy's answer.
 
         Raises:
             PolicyError: it raised something, or its answer is no trajectory.

@@ -51,7 +51,7 @@ class Optimism:
 
     @classmethod
     def of(cls, results: Sequence[Result], folder: Path) -> Optimism:
-        """Returns the numbers of results whose last frames lie in a folder."""
+        """Return the numbers of results whose last frames lie in a folder."""
         return cls(results=results, flips=find_flips(results, folder))
 
     @cached_property
@@ -60,11 +60,11 @@ class Optimism:
         return tuple(in_order({kind for result in self.results for kind in kinds_of(result)}))
 
     def rollouts(self, kind: str | None) -> list[Result]:
-        """Returns the rollouts of policies with a fault kind; None = all rollouts."""
+        """Return the rollouts of policies with a fault kind; None = all rollouts."""
         return [r for r in self.results if kind is None or kind in kinds_of(r)]
 
     def scores(self, judge: str, kind: str | None = None) -> dict[str, Score]:
-        """Returns the `MEASURES` of a judge.
+        """Return the `MEASURES` of a judge.
 
         Args:
             judge: key of `JUDGES`.
@@ -78,7 +78,7 @@ class Optimism:
         return scores(chosen, compared, judge, self.flips)
 
     def as_json(self) -> dict[str, Any]:
-        """Returns everything as plain values."""
+        """Return everything as plain values."""
         groups = {'all': None, **{kind: kind for kind in self.kinds}}
         return {
             group: {
@@ -120,22 +120,22 @@ class Summary:
         return tuple(dict.fromkeys(result.task for result in self.results))
 
     def chosen(self, policy: str, task: str | None) -> list[Result]:
-        """Returns a policy's results on a task; None = all."""
+        """Return a policy's results on a task; None = all."""
         return [r for r in self.results if r.policy == policy and task in (None, r.task)]
 
     def true_rate(self, policy: str, task: str | None) -> Score:
-        """Returns how often it succeeded in the simulator: the task was done at the end."""
+        """Return how often it succeeded in the simulator: the task was done at the end."""
         found = self.chosen(policy, task)
         return Score.rate(sum(result.final for result in found), len(found))
 
     def judged_rate(self, policy: str, task: str | None, judge: str) -> Score:
-        """Returns how often it succeeds by the estimates, their mean; NaN is counted apart."""
+        """Return how often it succeeds by the estimates, their mean; NaN is counted apart."""
         found = [judged_by(result, judge).probability for result in self.chosen(policy, task)]
         known = [value for value in found if isfinite(value)]
         return Score.rate(sum(known), len(known), len(found) - len(known))
 
     def agreement(self, judge: str, task: str | None) -> dict[str, Score]:
-        """Returns r and MMRV of a judge's rates with the simulator's, over the policies."""
+        """Return r and MMRV of a judge's rates with the simulator's, over the policies."""
         if (judge, task) not in self._agreements:
             results = [r for r in self.results if task in (None, r.task)]
             self._agreements[judge, task] = agreements(results, judge, self.policies)
@@ -170,7 +170,7 @@ class Summary:
         return float(shares[0]), float(shares[1]), gain
 
     def powered(self, policy: str) -> PoweredMean:
-        """Returns the success rate from few true outcomes and all imagined ones, all tasks.
+        """Return the success rate from few true outcomes and all imagined ones, all tasks.
 
         An abstention counts as probability one half: leaving it out would bias the estimate.
         """
@@ -182,12 +182,12 @@ class Summary:
         )
 
     def abstained(self, judge: str) -> Score:
-        """Returns how often a judge gave no verdict."""
+        """Return how often a judge gave no verdict."""
         missing = sum(not has_verdict(result, judge) for result in self.results)
         return Score.rate(missing, len(self.results))
 
     def confusion(self, judge: str) -> dict[str, int]:
-        """Returns how estimates and true outcomes go together, by `said_true`."""
+        """Return how estimates and true outcomes go together, by `said_true`."""
         counts = {'success_success': 0, 'success_failure': 0}
         counts |= {'failure_success': 0, 'failure_failure': 0}
         words = {True: 'success', False: 'failure'}
@@ -198,11 +198,11 @@ class Summary:
         return counts
 
     def false_success(self, judge: str) -> Score:
-        """Returns the share of true failures that were called a success."""
+        """Return the share of true failures that were called a success."""
         return false_success(self.results, judge)
 
     def speed(self) -> dict[str, float]:
-        """Returns episodes an hour of one process, and seconds an episode by stage."""
+        """Return episodes an hour of one process, and seconds an episode by stage."""
         stages = sorted({stage for result in self.results for stage in result.seconds})
         mean = {
             f'seconds, {stage}': float(np.mean([r.seconds.get(stage, 0.0) for r in self.results]))
@@ -219,7 +219,7 @@ class Summary:
         }
 
     def as_json(self) -> dict[str, Any]:
-        """Returns everything as plain values, NaN where not known."""
+        """Return everything as plain values, NaN where not known."""
         groups = {ALL_TASKS: None, **{task: task for task in self.tasks}}
         return {
             'policies': {name: self._policy_json(name, groups) for name in self.policies},

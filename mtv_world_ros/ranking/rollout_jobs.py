@@ -96,7 +96,7 @@ class StoredEstimate:
 
     @classmethod
     def of(cls, estimate: SuccessEstimate | None) -> StoredEstimate:
-        """Returns an estimate in plain values; None = the policy gave no answer to judge."""
+        """Return an estimate in plain values; None = the policy gave no answer to judge."""
         if estimate is None:
             return cls.stated(nan, 'abstains: the policy gave no answer')
         return cls(
@@ -108,7 +108,7 @@ class StoredEstimate:
 
     @classmethod
     def of_motions(cls, estimate: SuccessEstimate | None) -> StoredEstimate:
-        """Returns the share of an estimate's foreseen motions that succeed."""
+        """Return the share of an estimate's foreseen motions that succeed."""
         feature = nan if estimate is None else estimate.features.get('foreseen', nan)
         if not isfinite(feature):
             return cls.stated(nan, 'abstains: no motion was foreseen')
@@ -116,7 +116,7 @@ class StoredEstimate:
 
     @classmethod
     def stated(cls, probability: float, reason: str) -> StoredEstimate:
-        """Returns a verdict without J; NaN = abstains."""
+        """Return a verdict without J; NaN = abstains."""
         interval = (probability, probability)
         return cls(probability=probability, interval=interval, jaccard=(), reasons=(reason,))
 
@@ -224,12 +224,12 @@ class Result:
         return f'{self.task}_{self.index:05d}_{self.policy}'
 
     def as_json(self) -> dict[str, Any]:
-        """Returns plain values."""
+        """Return plain values."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Result:
-        """Reads what `as_json` returned, NaN as null.
+        """Read what `as_json` returned, NaN as null.
 
         Raises:
             ValueError: a key is unknown or missing, or a value is wrong.
@@ -241,7 +241,7 @@ _RESULT = TypeAdapter(Result)
 
 
 def policies_named(text: str) -> tuple[str, ...]:
-    """Returns the policies of a comma-separated list, as they are called.
+    """Return the policies of a comma-separated list, as they are called.
 
     Raises:
         ConfigError: none, or one twice.
@@ -258,7 +258,7 @@ def policies_named(text: str) -> tuple[str, ...]:
 def make_jobs(
     policies: Sequence[str], tasks: Sequence[str], num_episodes: int, seed: int, expert: Expert
 ) -> list[Job]:
-    """Returns the jobs; all policies meet the same episodes.
+    """Return the jobs; all policies meet the same episodes.
 
     Episodes alternate between policies and tasks, so that partial results are always balanced.
 

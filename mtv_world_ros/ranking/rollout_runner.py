@@ -78,7 +78,7 @@ class RolloutRunner:
         self._sim = SimEpisode(pipeline.robot, self._expert.home, physics=config.physics)
 
     def score(self, job: Job) -> Result:
-        """Returns what a policy reached.
+        """Return what a policy reached.
 
         Raises:
             PolicyError: the policy cannot answer.
@@ -87,7 +87,7 @@ class RolloutRunner:
         return self.imagine(job, self.simulate(job))
 
     def simulate(self, job: Job) -> SimulatedRollout:
-        """Returns what a policy reached in the simulator."""
+        """Return what a policy reached in the simulator."""
         policy = self.config.make_policy(job.policy, job.task, job.seed, self._expert)
         spec = self.pipeline.spec
         world = SimulatedWorld(self._sim, job.task, fps=spec.fps, chunk_s=spec.chunk_seconds)
@@ -103,7 +103,7 @@ class RolloutRunner:
         )
 
     def imagine(self, job: Job, real: SimulatedRollout) -> Result:
-        """Returns what a policy reached, of a rollout that was simulated already."""
+        """Return what a policy reached, of a rollout that was simulated already."""
         world = real.world
         begun = time.perf_counter()
         observed = self._begin(real, job)
@@ -233,7 +233,7 @@ class Results:
     by_checkpoint: tuple[Result | None, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Returns plain values by number of the checkpoint."""
+        """Return plain values by number of the checkpoint."""
         return {str(k): r.as_json() for k, r in enumerate(self.by_checkpoint) if r is not None}
 
 
@@ -254,7 +254,7 @@ class ComparisonRunner:
             )
 
     def score(self, wanted: WantedJob) -> Results:
-        """Returns what a policy reached, as the checkpoints imagine it that are asked for."""
+        """Return what a policy reached, as the checkpoints imagine it that are asked for."""
         job, real = wanted.job, self._runners[0].simulate(wanted.job)
         return Results(
             tuple(
@@ -280,5 +280,5 @@ def _objects_shown(masks: ObjectMasks) -> str:
 def make_runner(
     make_pipelines: Sequence[Callable[[], Pipeline]], config: RolloutConfig
 ) -> ComparisonRunner:
-    """Returns a runner; picklable with `functools.partial`."""
+    """Return a runner; picklable with `functools.partial`."""
     return ComparisonRunner([RolloutRunner(make(), config) for make in make_pipelines])

@@ -142,7 +142,7 @@ class _Store:
         return result if same and definition == job.definition else None
 
     def add(self, job: Job, values: dict[str, Any]) -> None:
-        """Writes a result."""
+        """Write a result."""
         path = _path(self._out, job)
         for suffix, data in values.pop('files', {}).items():
             write_whole(path.with_name(f'{job.name}{suffix}'), base64.b64decode(data))
@@ -166,7 +166,7 @@ def _path(out: Path, job: Job) -> Path:
 
 
 def read_results(out: Path) -> list[Result]:
-    """Reads the results of a ranking's folder, whatever their settings.
+    """Read the results of a ranking's folder, whatever their settings.
 
     Raises:
         ConfigError: one is of another version.

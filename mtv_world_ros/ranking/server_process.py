@@ -51,7 +51,7 @@ class ServerProcess:
         self.port = 0
 
     def ensure(self) -> bool:
-        """Starts the server unless it runs; returns whether it did.
+        """Start the server unless it runs; return whether it did.
 
         Raises:
             PolicyServerError: the server does not start, or was given up.
@@ -67,11 +67,11 @@ class ServerProcess:
         return True
 
     def answered(self) -> None:
-        """Notes a good answer, which resets the count of starts."""
+        """Note a good answer, which resets the count of starts."""
         self._num_fruitless = 0
 
     def stop(self) -> None:
-        """Ends the server and what it started."""
+        """End the server and what it started."""
         if self._process is not None:
             _end(self._process)
             self._process = None
@@ -94,7 +94,7 @@ class ServerProcess:
         self._wait(self._process)
 
     def _wait(self, process: subprocess.Popen[bytes]) -> None:
-        """Waits until the server listens."""
+        """Wait until the server listens."""
         deadline, stopped = time.monotonic() + self._start_timeout_s, StoppedProcesses()
         while time.monotonic() < deadline:
             status = process.poll()
@@ -132,7 +132,7 @@ def _listens(port: int) -> bool:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Ends a process that leads a session, and the others of it."""
+    """End a process that leads a session, and the others of it."""
     if process.poll() is not None:
         return
     for number in (signal.SIGTERM, signal.SIGKILL):

@@ -51,7 +51,7 @@ _GROUP_COLUMNS = (
 
 
 def write_calibration_report(out: Path, found: Calibrated, horizon: HorizonCurve | None) -> str:
-    """Writes `calibration.md`, `reliability.html` and `calibration.json`; returns the first."""
+    """Write `calibration.md`, `reliability.html` and `calibration.json`; return the first."""
     text = markdown(found, horizon)
     write_whole(out / 'calibration.md', text)
     write_whole(out / 'reliability.html', reliability_page(found))
@@ -60,7 +60,7 @@ def write_calibration_report(out: Path, found: Calibrated, horizon: HorizonCurve
 
 
 def markdown(found: Calibrated, horizon: HorizonCurve | None) -> str:
-    """Returns scores before and after, by task, the weights, and the trusted horizon."""
+    """Return scores before and after, by task, the weights, and the trusted horizon."""
     calibration = found.calibration
     scores = [
         [words, *(_text(calibration.scores[name].get(key)) for key in _COLUMNS)]
@@ -147,7 +147,7 @@ def _horizon_text(horizon: HorizonCurve) -> str:
 
 
 def reliability_page(found: Calibrated) -> str:
-    """Returns a page with two charts that needs no other file."""
+    """Return a page with two charts that needs no other file."""
     charts = []
     for name in (BEFORE, AFTER, AFTER_KINDS):
         if name not in found.judgements:

@@ -103,7 +103,7 @@ class Point:
 
 
 def dot_chart(title: str, dots: Sequence[Dot]) -> Markup:
-    """Returns values in [0, 1] with their intervals, one below the other."""
+    """Return values in [0, 1] with their intervals, one below the other."""
     height = 26 * len(dots) + 30
     with _axes(_WIDTH, height, left=92, right=142, top=4, bottom=26) as axes:
         axes.set(xlim=(0, 1), ylim=(len(dots) - 0.5, -0.5), xticks=_TICKS)
@@ -138,7 +138,7 @@ def _draw_dot(axes: Axes, row: int, dot: Dot) -> None:
 def line_chart(
     title: str, lines: Sequence[ChartLine], seconds: Sequence[float], y_label: str
 ) -> Markup:
-    """Returns values in [0, 1] over time, the last line on top.
+    """Return values in [0, 1] over time, the last line on top.
 
     Args:
         title: for those who cannot see it.
@@ -166,7 +166,7 @@ def line_chart(
 
 
 def reliability_chart(title: str, bins: Sequence[Bin], colour: str) -> Markup:
-    """Returns how often estimates came true; calibrated ones lie on the diagonal."""
+    """Return how often estimates came true; calibrated ones lie on the diagonal."""
     width, height, drawn = 290, 300, _COLOURS[colour]
     with _axes(width, height, left=40, right=10, top=22, bottom=60) as axes:
         _square(axes, 'estimated probability of success', 'share that really succeeded')
@@ -188,7 +188,7 @@ def reliability_chart(title: str, bins: Sequence[Bin], colour: str) -> Markup:
 
 
 def scatter_chart(title: str, points: Sequence[Point], x_label: str, y_label: str) -> Markup:
-    """Returns values against values, both in [0, 1], with intervals; equal ones on the diagonal.
+    """Return values against values, both in [0, 1], with intervals; equal ones on the diagonal.
 
     Points at the same place are one mark with all their labels.
     """

@@ -33,7 +33,7 @@ class Line(NamedTuple):
     held: bool = False
 
     def numbers(self, view: str, task: str | None = None) -> Mapping[str, Estimate]:
-        """Returns the numbers of a view and task; none for a view that the model lacks."""
+        """Return the numbers of a view and task; none for a view that the model lacks."""
         group = Group(task=task, zero_shot=self.zero_shot)
         if view not in self.summary.spec.views or not self.summary.chosen(group):
             return {}
@@ -44,12 +44,12 @@ class Line(NamedTuple):
 
 
 def labels(summaries: Sequence[EvaluationSummary]) -> list[str]:
-    """Returns what the rows of checkpoints are called."""
+    """Return what the rows of checkpoints are called."""
     return [summary.label or summary.name for summary in summaries]
 
 
 def lines(summaries: Sequence[EvaluationSummary], names: Sequence[str]) -> list[Line]:
-    """Returns a row per checkpoint, or per zero-shot set of each; the held first frame below.
+    """Return a row per checkpoint, or per zero-shot set of each; the held first frame below.
 
     Where a data set has zero-shot episodes, the row with the plain name is that of the others.
     """
@@ -63,12 +63,12 @@ def lines(summaries: Sequence[EvaluationSummary], names: Sequence[str]) -> list[
 
 
 def all_views(summaries: Sequence[EvaluationSummary]) -> list[str]:
-    """Returns the names of all views, in the order in which they come first."""
+    """Return the names of all views, in the order in which they come first."""
     return list(dict.fromkeys(view for summary in summaries for view in summary.spec.views))
 
 
 def method_table(rows: Sequence[Line], views: Sequence[str]) -> Table:
-    """Returns method by view: FID, FVD and J (the paper's table 1), and J of what moves."""
+    """Return method by view: FID, FVD and J (the paper's table 1), and J of what moves."""
     columns = ('FID ↓', 'FVD ↓', 'J ↑', 'J moving ↑')
     head = ['Method', *(f'{view} {what}' for view in views for what in columns)]
     body = []
@@ -83,7 +83,7 @@ def method_table(rows: Sequence[Line], views: Sequence[str]) -> Table:
 
 
 def task_tables(rows: Sequence[Line], views: Sequence[str]) -> list[Table]:
-    """Returns method by task and view: J (the paper's table 3), a few tasks at a time."""
+    """Return method by task and view: J (the paper's table 3), a few tasks at a time."""
     tasks = sorted({task for row in rows for task in row.summary.tasks})
     parts = []
     for first in range(0, len(tasks), TASKS_PER_TABLE):
@@ -100,7 +100,7 @@ def task_tables(rows: Sequence[Line], views: Sequence[str]) -> list[Table]:
 
 
 def markdown(summaries: Sequence[EvaluationSummary]) -> str:
-    """Returns both tables with what they mean."""
+    """Return both tables with what they mean."""
     names, views = labels(summaries), all_views(summaries)
     rows = lines(summaries, names)
     numbers = ', '.join(
@@ -117,7 +117,7 @@ def markdown(summaries: Sequence[EvaluationSummary]) -> str:
 
 
 def as_csv(summaries: Sequence[EvaluationSummary]) -> str:
-    """Returns every number with its interval: a line per method, set, task, view and number."""
+    """Return every number with its interval: a line per method, set, task, view and number."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator='\n')
     writer.writerow(
@@ -141,7 +141,7 @@ def _text(value: float) -> str:
 
 
 def write_comparison(summaries: Sequence[EvaluationSummary], out: Path) -> None:
-    """Writes `paper_tables.md` and `numbers.csv`; for several checkpoints `metrics.json` too."""
+    """Write `paper_tables.md` and `numbers.csv`; for several checkpoints `metrics.json` too."""
     write_whole(out / 'paper_tables.md', markdown(summaries))
     write_whole(out / 'numbers.csv', as_csv(summaries))
     if len(summaries) > 1:

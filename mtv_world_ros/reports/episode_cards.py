@@ -39,7 +39,7 @@ _Scored = tuple[Marked, EpisodeResult]
 
 
 def episode_cards(evaluations: Sequence[Marked]) -> dict[str, Any]:
-    """Returns the filters and the cards of all episodes, the worst first.
+    """Return the filters and the cards of all episodes, the worst first.
 
     Ranked by J of the objects that move, where any episode has it, else by J of all objects.
     """

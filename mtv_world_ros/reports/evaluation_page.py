@@ -29,7 +29,7 @@ _SHOWN |= {'views', 'overall', 'tasks', 'zero_shot'}
 
 
 def write_report(folders: Sequence[Path], path: Path) -> Path:
-    """Writes the report of one or more evaluations; the first one sets the clock of the plots.
+    """Write the report of one or more evaluations; the first one sets the clock of the plots.
 
     Raises:
         ConfigError: none is given, or one holds no evaluation.
@@ -42,7 +42,7 @@ def write_report(folders: Sequence[Path], path: Path) -> Path:
 
 
 def page(evaluations: Sequence[EvaluationSummary]) -> str:
-    """Returns the whole page."""
+    """Return the whole page."""
     ones = marked(evaluations)
     return render(
         'evaluation.html.j2',

@@ -25,7 +25,7 @@ class Filter:
     within: Filter | None = None
 
     def classes(self, *values: str, of: str = '') -> str:
-        """Returns the classes of a card to which options apply; other values are left out.
+        """Return the classes of a card to which options apply; other values are left out.
 
         `of` is the option of `within` for which they do; empty = for `all` of it.
         """
@@ -36,7 +36,7 @@ class Filter:
         return f'{self.key}-{where}{self.options.index(value)}'
 
     def rules(self) -> Markup:
-        """Returns the style rules."""
+        """Return the style rules."""
         outer = ('', *self.within.options) if self.within else ('',)
         lines = [
             f'main:has({self._chosen(value)}){self._outer(of)} '
@@ -55,5 +55,5 @@ class Filter:
 
 
 def filters(*found: Filter) -> Sequence[Filter]:
-    """Returns those that have a choice."""
+    """Return those that have a choice."""
     return [one for one in found if len(one.options) > 1]

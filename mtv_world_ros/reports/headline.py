@@ -62,7 +62,7 @@ class Marked(NamedTuple):
     colour: str
 
     def name(self, words: str = '') -> str:
-        """Returns words, after the letter where there is one."""
+        """Return words, after the letter where there is one."""
         return f'{self.letter} {words}'.strip()
 
     @property
@@ -72,7 +72,7 @@ class Marked(NamedTuple):
 
 
 def marked(evaluations: Sequence[EvaluationSummary]) -> list[Marked]:
-    """Returns evaluations with their letters and colours."""
+    """Return evaluations with their letters and colours."""
     return [
         Marked(found, letter(index) if len(evaluations) > 1 else '', f'c{index % _NUM_HUES}')
         for index, found in enumerate(evaluations)
@@ -80,17 +80,17 @@ def marked(evaluations: Sequence[EvaluationSummary]) -> list[Marked]:
 
 
 def letter(index: int) -> str:
-    """Returns the letter of an evaluation."""
+    """Return the letter of an evaluation."""
     return chr(ord('A') + index % 26) + (str(index // 26 + 1) if index >= 26 else '')
 
 
 def views_of(evaluations: Sequence[Marked]) -> list[str]:
-    """Returns the names of all views, in the order in which they come first."""
+    """Return the names of all views, in the order in which they come first."""
     return all_views([one.found for one in evaluations])
 
 
 def headline(evaluations: Sequence[Marked]) -> dict[str, Any]:
-    """Returns J per view with intervals, and whether it beats what knows nothing."""
+    """Return J per view with intervals, and whether it beats what knows nothing."""
     keys, words = _keys(evaluations)
     overall = [one.found.estimates(None) for one in evaluations]
     return {
@@ -107,7 +107,7 @@ def headline(evaluations: Sequence[Marked]) -> dict[str, Any]:
 
 
 def compared(evaluations: Sequence[Marked]) -> list[tuple[Marked, str, bool]]:
-    """Returns how each further evaluation does against the first on the episodes of both.
+    """Return how each further evaluation does against the first on the episodes of both.
 
     The evaluation, a sentence, and whether the interval of the difference leaves out 0.
     Differences are paired within the episodes.
@@ -189,7 +189,7 @@ def _dots(evaluations: Sequence[Marked], view: str, keys: tuple[str, str, str]) 
 
 
 def horizon(evaluations: Sequence[Marked]) -> dict[str, Any] | None:
-    """Returns J against how far ahead was imagined; None if no object moves anywhere."""
+    """Return J against how far ahead was imagined; None if no object moves anywhere."""
     fps = evaluations[0].found.spec.fps  # all evaluations are on the first one's clock
     panels = []
     for view in views_of(evaluations):

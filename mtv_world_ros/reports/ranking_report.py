@@ -35,7 +35,7 @@ _NAME_LENGTH = 17
 
 
 def tables(summary: Summary) -> list[Table]:
-    """Returns the ranking's tables."""
+    """Return the ranking's tables."""
     return [
         _worth(summary),
         *optimism_tables(summary.optimism),
@@ -50,7 +50,7 @@ def tables(summary: Summary) -> list[Table]:
 
 
 def remarks(summary: Summary) -> list[str]:
-    """Returns the remarks that explain the numbers."""
+    """Return the remarks that explain the numbers."""
     text = render(
         'ranking_remarks.txt.j2',
         success_from=SUCCESS_FROM,
@@ -188,7 +188,7 @@ def _value(score: Score) -> str:
 
 
 def optimism_tables(by_model: Mapping[str, Optimism]) -> list[Table]:
-    """Returns the tables: overall, then by fault kind.
+    """Return the tables: overall, then by fault kind.
 
     Args:
         by_model: label of the checkpoint -> its numbers; the first one's stand for the judges
@@ -391,19 +391,19 @@ def _failures(summary: Summary) -> list[Table]:
 
 
 def console(summary: Summary) -> str:
-    """Returns the text for the console: what decides, success rates, failures, remarks."""
+    """Return the text for the console: what decides, success rates, failures, remarks."""
     tables = [_worth(summary), _rates(summary, None), *_failures(summary)]
     parts = [f'{found.caption}\n\n{found.text()}' for found in tables]
     return '\n\n'.join([*parts, *_notes(summary)])
 
 
 def markdown(summary: Summary) -> str:
-    """Returns the ranking as a page of Markdown."""
+    """Return the ranking as a page of Markdown."""
     return render('ranking.md.j2', **_content(summary))
 
 
 def write_ranking(summary: Summary, out: Path) -> Path:
-    """Writes `ranking.json`, `ranking.md` and `ranking.html`; returns the last one's path."""
+    """Write `ranking.json`, `ranking.md` and `ranking.html`; return the last one's path."""
     write_json(out / 'ranking.json', summary.as_json())
     write_whole(out / 'ranking.md', markdown(summary))
     path = out / 'ranking.html'
@@ -429,7 +429,7 @@ def write_ranking(summary: Summary, out: Path) -> Path:
 
 
 def _answer(summary: Summary) -> tuple[str, str]:
-    """Returns whether looking at the imagined pictures pays, and its class in the style sheet."""
+    """Return whether looking at the imagined pictures pays, and its class in the style sheet."""
     imagined, rule, gain = summary.gain_over_rule
     shares = (
         f'imagination is right in {imagined:.2f} of {gain.count} rollouts, a rule that sees the '

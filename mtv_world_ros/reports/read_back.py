@@ -24,7 +24,7 @@ _NEEDED = {'name', 'provenance', 'model', 'views', 'overall', 'tasks', 'failed',
 
 
 def read_evaluations(folder: Path) -> list[EvaluationSummary]:
-    """Reads what `mtv-world evaluate --out FOLDER` wrote: one evaluation, or one per checkpoint.
+    """Read what `mtv-world evaluate --out FOLDER` wrote: one evaluation, or one per checkpoint.
 
     Raises:
         ConfigError: the folder holds no evaluation, or one of another version.
@@ -47,7 +47,7 @@ def read_evaluations(folder: Path) -> list[EvaluationSummary]:
 
 
 def check_evaluation(folder: Path) -> str:
-    """Returns the command that makes an evaluation in a folder, for other errors.
+    """Return the command that makes an evaluation in a folder, for other errors.
 
     Raises:
         ConfigError: the folder holds none.
@@ -109,13 +109,13 @@ def _result(folder: Path, episode: str) -> EpisodeResult:
 
 
 def scores(evaluated: EvaluationSummary, key: str) -> dict[str, float]:
-    """Returns a number of `scores.MEANS` by episode, over all views; unknown ones left out."""
+    """Return a number of `scores.MEANS` by episode, over all views; unknown ones left out."""
     means = {r.episode: episode_means(r.rows, None)[key] for r in evaluated.results}
     return {name: value for name, value in means.items() if np.isfinite(value)}
 
 
 def ranked_by(evaluations: Sequence[EvaluationSummary]) -> tuple[str, str, dict[str, float]]:
-    """Returns what episodes are ranked by: words, the number's name, its mean by episode.
+    """Return what episodes are ranked by: words, the number's name, its mean by episode.
 
     J of the objects that move, where any episode has it, else J of all objects; the mean over the
     evaluations that scored the episode.
@@ -134,7 +134,7 @@ def ranked_by(evaluations: Sequence[EvaluationSummary]) -> tuple[str, str, dict[
 
 
 def picks(evaluations: Sequence[EvaluationSummary]) -> dict[str, str]:
-    """Returns titles of the best, the median and the worst episode by name; see `ranked_by`."""
+    """Return titles of the best, the median and the worst episode by name; see `ranked_by`."""
     means = ranked_by(evaluations)[2]
     ranked = sorted(means, key=lambda name: (-means[name], name))
     chosen = {0: 'Best', len(ranked) // 2: 'Median', len(ranked) - 1: 'Worst'}

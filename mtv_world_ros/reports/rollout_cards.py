@@ -25,7 +25,7 @@ _PLOT_HEIGHT_PX = 64
 
 
 def rollout_cards(results: Sequence[Result], out: Path) -> dict[str, Any]:
-    """Returns the filters and the cards of all rollouts; see `worst_first`.
+    """Return the filters and the cards of all rollouts; see `worst_first`.
 
     Args:
         results: the rollouts of a ranking.
@@ -85,7 +85,7 @@ def rollout_cards(results: Sequence[Result], out: Path) -> dict[str, Any]:
 
 
 def worst_first(results: Sequence[Result]) -> list[Result]:
-    """Returns the rollouts, those first whose imagined estimate is farthest from what happened.
+    """Return the rollouts, those first whose imagined estimate is farthest from what happened.
 
     Of equal ones, those whose worlds part first.
     """
@@ -108,7 +108,7 @@ def _word(final: bool) -> str:
 
 
 def verdict(result: Result) -> str:
-    """Returns what the imagined verdict is: right, a false success or failure, or none."""
+    """Return what the imagined verdict is: right, a false success or failure, or none."""
     said = result.imagined.success
     if not isfinite(said):
         return 'no verdict'
@@ -116,7 +116,7 @@ def verdict(result: Result) -> str:
 
 
 def estimate_text(judged: StoredEstimate) -> str:
-    """Returns an estimate in words."""
+    """Return an estimate in words."""
     return number(judged.probability, 2) if isfinite(judged.probability) else 'abstains'
 
 
@@ -130,7 +130,7 @@ def _first_to_part(course: WorldComparison | None) -> str:
 
 
 def when_they_part(course: WorldComparison) -> list[tuple[float, str]]:
-    """Returns when [s] what parts in the two worlds, the first one first."""
+    """Return when [s] what parts in the two worlds, the first one first."""
     whats = {
         'commands': course.commands_part_s,
         f'objects ({course.parted_object})': course.objects_part_s,
@@ -140,7 +140,7 @@ def when_they_part(course: WorldComparison) -> list[tuple[float, str]]:
 
 
 def rollout_file(out: Path, result: Result, suffix: str) -> Path:
-    """Returns where a file of a rollout lies in a ranking's folder."""
+    """Return where a file of a rollout lies in a ranking's folder."""
     return out / FOLDER / f'{result.name}{suffix}'
 
 
@@ -151,7 +151,7 @@ def _address(out: Path, result: Result, suffix: str) -> str:
 
 
 def curves(course: WorldComparison) -> Markup:
-    """Returns estimates in both worlds and the overlap of the objects over time, as SVG."""
+    """Return estimates in both worlds and the overlap of the objects over time, as SVG."""
     last = max([*course.times, *course.ends], default=0.0) or 1.0
     lines = {
         'held': ("estimate on the simulator's frames", course.ends, course.seen, True),

@@ -30,7 +30,7 @@ _MAX_TABS = 8
 
 
 def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
-    """Yields the worst rollouts of a ranking whose frames were kept, up to `count`.
+    """Yield the worst rollouts of a ranking whose frames were kept, up to `count`.
 
     Raises:
         ConfigError: the folder is no ranking's.
@@ -41,7 +41,7 @@ def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
 
 
 def last_rollouts(folder: Path, results: Sequence[Result], count: int) -> Iterator[ScoredRollout]:
-    """Yields the last `count` of the results whose frames were kept, in their order.
+    """Yield the last `count` of the results whose frames were kept, in their order.
 
     Raises:
         EpisodeError: frames cannot be read.
@@ -87,7 +87,7 @@ class LiveRanking:
         self._tabs: dict[str, ScoredRollout] = {}
 
     def add(self, results: Sequence[Result]) -> None:
-        """Shows rollouts that have ended; of many the last ones and the rates of all."""
+        """Show rollouts that have ended; of many the last ones and the rates of all."""
         import rerun
 
         self._results += results
@@ -104,7 +104,7 @@ class LiveRanking:
 
 
 def rates_table(results: Sequence[Result]) -> str:
-    """Returns Markdown: a row a policy, how often it succeeds in the simulator and imagined."""
+    """Return Markdown: a row a policy, how often it succeeds in the simulator and imagined."""
     lines = ['| policy | rollouts | simulator | imagined | no estimate |', '|---|---|---|---|---|']
     for policy in dict.fromkeys(result.policy for result in results):
         own = [result for result in results if result.policy == policy]

@@ -15,7 +15,7 @@ FILE = 'metrics.json'
 
 
 def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
-    """Yields the rollouts of an evaluation's first `count` episodes whose frames were kept.
+    """Yield the rollouts of an evaluation's first `count` episodes whose frames were kept.
 
     Raises:
         ConfigError: the folder is no evaluation's.

@@ -55,7 +55,7 @@ class ArmSolver:
         self._base = pin.updateFramePlacement(self._model, self._data, base)
 
     def solve(self, pose: FloatArray, start: FloatArray) -> FloatArray:
-        """Returns the arm's joints (n,) [rad] that bring the tool to `pose` (4, 4).
+        """Return the arm's joints (n,) [rad] that bring the tool to `pose` (4, 4).
 
         Args:
             pose: of the tool in the robot's base link.

@@ -41,7 +41,7 @@ _NUM_CONFIGURATIONS = 64
 
 
 def robot_path(name: str | Path) -> Path:
-    """Returns the YAML of a robot given by path or by the name of a bundled one.
+    """Return the YAML of a robot given by path or by the name of a bundled one.
 
     Raises:
         ConfigError: no such file, and no bundled robot of this name.
@@ -54,7 +54,7 @@ def robot_path(name: str | Path) -> Path:
 
 
 def described_robot(expected: RobotModel, urdf: str) -> tuple[RobotModel, float]:
-    """Returns an expected robot with the lengths, offsets and limits of its description (URDF).
+    """Return an expected robot with the lengths, offsets and limits of its description (URDF).
 
     With it comes how far its tool points are off the expected ones, at most over the joints'
     range [m].
@@ -115,7 +115,7 @@ _ERROR = re.compile(rb'^Error: *(.+)$', re.MULTILINE)
 
 @contextmanager
 def parser_errors() -> Iterator[list[str]]:
-    """Takes the parser's errors off stderr; all else that is written there meanwhile goes on.
+    """Take the parser's errors off stderr; all else that is written there meanwhile goes on.
 
     Yields:
         The errors, filled at the end.
@@ -166,7 +166,7 @@ class PoseEntry(Schema):
         return self
 
     def matrix(self) -> FloatArray:
-        """Returns the (4, 4) pose."""
+        """Return the (4, 4) pose."""
         return pose(self.position, self.quaternion_xyzw)
 
 
@@ -252,7 +252,7 @@ class RobotFile(Schema):
 
 
 def load_robot(path: Path | str) -> RobotModel:
-    """Reads a robot YAML, see `RobotFile`.
+    """Read a robot YAML, see `RobotFile`.
 
     Raises:
         ConfigError: the file is missing, not YAML, or has unknown, missing or wrong values.
@@ -316,7 +316,7 @@ class SavedRobot:
 
 
 def save_robot(file: Path, folder: Path) -> SavedRobot:
-    """Copies a robot file, its URDF and the shapes in it; the copy can be moved anywhere.
+    """Copy a robot file, its URDF and the shapes in it; the copy can be moved anywhere.
 
     Meshes are stored as their convex hulls, which is all that drawing a robot uses; what touches
     things in a gripper as convex pieces, made here once. The name of a mesh that is missing or
@@ -401,7 +401,7 @@ def _present_mesh(name: str, urdf: Path) -> Path:
 
 
 def _split_collisions(link: Any, urdf: Path, folder: Path, first: int) -> list[str]:
-    """Replaces a link's collision meshes by convex pieces, numbered from `first`; their files."""
+    """Replace a link's collision meshes by convex pieces, numbered from `first`; their files."""
     made: list[str] = []
     if not link.findall('collision'):  # then what is drawn is what touches
         for drawn in map(deepcopy, link.findall('visual')):
@@ -445,7 +445,7 @@ def _scaled_pieces(mesh: ElementTree.Element, file: Path, what: str) -> list[Flo
 
 
 def read_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:
-    """Returns a URDF's model, its mimic joints (kept as joints of their own), and the root link.
+    """Return a URDF's model, its mimic joints (kept as joints of their own), and the root link.
 
     Raises:
         ConfigError: there is no such file.
@@ -463,7 +463,7 @@ def read_urdf(path: Path) -> tuple[pin.Model, list[Mimic], str]:
 
 
 def parse_urdf(text: str, what: str) -> tuple[pin.Model, list[Mimic], str]:
-    """Returns what `read_urdf` does of a URDF's text; errors begin with `what`.
+    """Return what `read_urdf` does of a URDF's text; errors begin with `what`.
 
     Raises:
         RobotError: the file is not a usable URDF.
@@ -486,7 +486,7 @@ def parse_urdf(text: str, what: str) -> tuple[pin.Model, list[Mimic], str]:
 
 
 def _build(urdf: str) -> pin.Model:
-    """Builds the model; why urdfdom refuses one, which it only prints, is in the error.
+    """Build the model; why urdfdom refuses one, which it only prints, is in the error.
 
     Raises:
         ValueError: it is not a usable URDF.

@@ -71,7 +71,7 @@ class ColumnEntry(Schema):
         return self
 
     def of(self, joint: str, unit: Unit, robot: RobotModel) -> JointColumn:
-        """Returns what it says of a joint of a robot, whose unit is `unit` by default."""
+        """Return what it says of a joint of a robot, whose unit is `unit` by default."""
         if self.column is None:
             return JointColumn(joint=joint, column=None, offset=self.constant or 0.0)
         if self.from_ and self.to:
@@ -149,7 +149,7 @@ class JointTable(Schema):
 def to_positions(
     values: FloatArray, names: Sequence[str], joints: Sequence[JointColumn], feature: str
 ) -> FloatArray:
-    """Returns (T, J) positions [rad or m] of a feature's values (T, C).
+    """Return (T, J) positions [rad or m] of a feature's values (T, C).
 
     Args:
         values: joint values in the dataset's units.
@@ -175,7 +175,7 @@ def to_positions(
 def to_columns(
     positions: Mapping[str, float], names: Sequence[str], joints: Sequence[JointColumn]
 ) -> FloatArray:
-    """Returns (C,) values of positions by joint [rad or m]; the inverse of `to_positions`.
+    """Return (C,) values of positions by joint [rad or m]; the inverse of `to_positions`.
 
     Args:
         positions: by joint name.
@@ -203,7 +203,7 @@ def to_columns(
 def column_number(
     column: str | int, names: Sequence[str], count: int, feature: str, what: str
 ) -> int:
-    """Returns which of a feature's `count` columns a name or number is.
+    """Return which of a feature's `count` columns a name or number is.
 
     Raises:
         ConfigError: the column is missing; names what needs it.

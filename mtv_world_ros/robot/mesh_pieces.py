@@ -50,7 +50,7 @@ _NUM_FOLDERS = 4
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:
-    """Returns where a mesh lies, or None.
+    """Return where a mesh lies, or None.
 
     `package://<name>/...` is looked for above the URDF, then in the ROS packages that are
     installed (`AMENT_PREFIX_PATH`). A mesh that is not there is looked for by the end of its path
@@ -245,12 +245,12 @@ def _collada_unit_m(path: Path) -> float:
 
 
 def outermost(points: FloatArray, directions: int = NUM_HULL_DIRECTIONS) -> FloatArray:
-    """Returns the points (M, 3) of (N, 3) that are outermost in one of some directions."""
+    """Return the points (M, 3) of (N, 3) that are outermost in one of some directions."""
     return points[np.unique((points @ even_directions(directions).T).argmax(axis=0))]
 
 
 def slices(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
-    """Returns the hull's points, or those of slices across the longest axis that hold far less."""
+    """Return the hull's points, or those of slices across the longest axis that hold far less."""
     whole = outermost(vertices)
     middle = vertices - vertices.mean(axis=0)
     axis = np.linalg.svd(middle[:: max(1, len(middle) // 2000)], full_matrices=False)[2][0]
@@ -266,7 +266,7 @@ def slices(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
 
 
 def convex_pieces(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
-    """Returns convex parts (N, 3) of a mesh, with the room that a hand has between its jaws.
+    """Return convex parts (N, 3) of a mesh, with the room that a hand has between its jaws.
 
     The piece that holds most empty space is cut where its halves' hulls hold least, along one of
     its principal axes, until no cut gains much.
@@ -292,7 +292,7 @@ def convex_pieces(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatA
 
 
 def write_convex_hull(points: FloatArray, out: Path) -> None:
-    """Writes the convex hull of the outermost of points (N, 3) as a binary STL.
+    """Write the convex hull of the outermost of points (N, 3) as a binary STL.
 
     Raises:
         RobotError: they have no volume.

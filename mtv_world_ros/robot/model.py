@@ -171,7 +171,7 @@ class RobotModel:
         return tuple(link for link in self._frames if not self.unknown_joints(link))
 
     def unknown_joints(self, link: str) -> tuple[str, ...]:
-        """Returns the joints between a link and the base link that no commanded joint moves."""
+        """Return the joints between a link and the base link that no commanded joint moves."""
         model = self.pinocchio_model
         ends = [model.frames[self._frame(name)].parentJoint for name in (link, self.base_link)]
         between = set(model.supports[ends[0]]) ^ set(model.supports[ends[1]])
@@ -179,15 +179,15 @@ class RobotModel:
         return tuple(model.names[joint] for joint in sorted(between - known))
 
     def forward_kinematics(self, positions: FloatArray) -> dict[str, FloatArray]:
-        """Returns base_T_link (T, 4, 4) of every link for positions (T, J)."""
+        """Return base_T_link (T, 4, 4) of every link for positions (T, J)."""
         return self._placements(positions, self.link_names)[0]
 
     def link_poses(self, link: str, positions: FloatArray) -> FloatArray:
-        """Returns base_T_link (T, 4, 4) of one link for positions (T, J)."""
+        """Return base_T_link (T, 4, 4) of one link for positions (T, J)."""
         return self._placements(positions, (link,))[0][link]
 
     def tool_poses(self, positions: FloatArray) -> FloatArray:
-        """Returns base_T_tool (A, T, 4, 4) of the tool centre points for positions (T, J)."""
+        """Return base_T_tool (A, T, 4, 4) of the tool centre points for positions (T, J)."""
         links = [tool.link for tool in self.tools]
         return self._tool_poses(self._placements(positions, links)[0])
 
@@ -217,7 +217,7 @@ class RobotModel:
         )
 
     def gripper_openings(self, positions: FloatArray) -> FloatArray:
-        """Returns (A, T) openings in [0, 1] for positions (T, J); 1 where there is no gripper."""
+        """Return (A, T) openings in [0, 1] for positions (T, J); 1 where there is no gripper."""
         openings = np.ones((len(self.tools), len(positions)))
         for arm, tool in enumerate(self.tools):
             if tool.gripper_joint is not None:
@@ -227,7 +227,7 @@ class RobotModel:
         return openings.clip(0.0, 1.0)
 
     def finger_gaps(self, positions: FloatArray) -> FloatArray:
-        """Returns (T, A) how far each finger is from its tool at positions (T, J) [m]."""
+        """Return (T, A) how far each finger is from its tool at positions (T, J) [m]."""
         travels = [
             _TRAVEL_M if tool.finger_travel_m is None else tool.finger_travel_m
             for tool in self.tools
@@ -402,7 +402,7 @@ class _Setter:
 
 
 def _check_places(name: str, model: pin.Model) -> None:
-    """Refuses a description in which something is nowhere, or out of all reach."""
+    """Refuse a description in which something is nowhere, or out of all reach."""
     joints = zip(list(model.names)[1:], list(model.jointPlacements)[1:], strict=True)
     frames = ((frame.name, frame.placement) for frame in model.frames)
     for part, place in [*joints, *frames]:
@@ -414,7 +414,7 @@ def _check_places(name: str, model: pin.Model) -> None:
 
 
 def check_can_move(joint: str, lower: float, upper: float, where: str) -> None:
-    """Refuses a joint whose limits are equal; a URDF without stops has 0 and 0.
+    """Refuse a joint whose limits are equal; a URDF without stops has 0 and 0.
 
     Raises:
         RobotError: names the entry and what to write instead.

@@ -77,7 +77,7 @@ class Plan:
         *,
         stamp_ns: int | None = None,
     ) -> Plan:
-        """Returns the plan to execute a trajectory after an observation.
+        """Return the plan to execute a trajectory after an observation.
 
         Args:
             trajectory: joints in any order; those that the robot lacks are dropped.
@@ -116,7 +116,7 @@ class Plan:
         )
 
     def after(self, observation: Observation) -> Plan:
-        """Returns the plan after an observation: this one, or the trajectory checked again.
+        """Return the plan after an observation: this one, or the trajectory checked again.
 
         Raises:
             PlanError: as in `of`.
@@ -127,11 +127,11 @@ class Plan:
         return Plan.of(self.given, self.robot, observation, self.limits, stamp_ns=self.given_ns)
 
     def positions_at(self, times: FloatArray) -> FloatArray:
-        """Returns (N, J) joint positions at times (N,) from the observation [s]."""
+        """Return (N, J) joint positions at times (N,) from the observation [s]."""
         return resample(self.trajectory, self.start_positions, times)
 
     def chunks(self, spec: WorldModelSpec) -> tuple[ChunkPlan, ...]:
-        """Returns the plan on a model's clock, cut into chunks."""
+        """Return the plan on a model's clock, cut into chunks."""
         num_frames, fps = spec.num_frames, spec.fps
         total = max(1, ceil(float(self.trajectory.times[-1]) * fps - 1e-6))
         num_chunks = ceil(total / num_frames)
@@ -217,6 +217,6 @@ class ChunkPlan:
         return len(self.times) - 1 - self.num_frames
 
     def fine_positions(self, step_s: float, each: int = 1) -> FloatArray:
-        """Returns the joint positions of the whole chunk, `each` in a step; row 0 its start."""
+        """Return the joint positions of the whole chunk, `each` in a step; row 0 its start."""
         count = round((self.times[-1] - self.times[0]) / step_s) * each
         return self.plan.positions_at(self.times[0] + step_s / each * np.arange(count + 1))

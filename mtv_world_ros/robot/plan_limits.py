@@ -22,7 +22,7 @@ _SWING = 0.05
 
 
 def speed_limits(robot: RobotModel) -> FloatArray:
-    """Returns (J,) the largest speeds that a plan may ask for [rad/s or m/s].
+    """Return (J,) the largest speeds that a plan may ask for [rad/s or m/s].
 
     They are `SPEED_RATIO` times those of the robot's description, or of `DEFAULT_TURN` and
     `DEFAULT_SLIDE`. Policies command a gripper to open or close from one row to the next, so its
@@ -95,7 +95,7 @@ def _ratio(over: FloatArray, under: FloatArray) -> FloatArray:
 def _check_way_there(
     robot: RobotModel, plan: JointTrajectory, start_positions: FloatArray, limits: FloatArray
 ) -> None:
-    """Checks the way from where the joints are to where the plan has them next."""
+    """Check the way from where the joints are to where the plan has them next."""
     first_s = max(float(plan.times[0]), 0.0)
     first = resample(plan, start_positions, np.array([first_s]))
     speeds = np.abs(first - start_positions) / max(first_s, CATCH_UP_S)

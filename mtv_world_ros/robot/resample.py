@@ -20,7 +20,7 @@ _NOW = 1e-9
 def match_joints(
     trajectory: JointTrajectory, robot: RobotModel, current: FloatArray | None = None
 ) -> JointTrajectory:
-    """Returns the trajectory with the robot's joints in the robot's order; extra ones dropped.
+    """Return the trajectory with the robot's joints in the robot's order; extra ones dropped.
 
     Args:
         trajectory: joints in any order.
@@ -84,7 +84,7 @@ def _pick(
 def resample(
     trajectory: JointTrajectory, start_positions: FloatArray, times: FloatArray
 ) -> FloatArray:
-    """Returns (N, J) positions at the wanted times.
+    """Return (N, J) positions at the wanted times.
 
     Cubic Hermite between points where velocities are given, else linear. Before the first point
     it starts from the start positions at time 0; after the last point it holds. A point at time
@@ -124,7 +124,7 @@ def interpolated(
     rows: FloatArray,
     is_endless: BoolArray | None = None,
 ) -> FloatArray:
-    """Returns rows (T, J) of increasing times (T,) at wanted ones (N,); held before and after.
+    """Return rows (T, J) of increasing times (T,) at wanted ones (N,); held before and after.
 
     Args:
         wanted: (N,) [s].
@@ -147,7 +147,7 @@ def interpolated(
 def cut_off(
     trajectory: JointTrajectory, start_positions: FloatArray, seconds: float
 ) -> JointTrajectory:
-    """Returns the points before a time, and one at that time; past its end it holds still.
+    """Return the points before a time, and one at that time; past its end it holds still.
 
     Args:
         trajectory: joints in the order of `start_positions`.
@@ -170,7 +170,7 @@ def cut_off(
 
 
 def nearest_rows(have: np.ndarray, want: np.ndarray) -> np.ndarray:
-    """Returns the index of the nearest of `have` (increasing) for each of `want`."""
+    """Return the index of the nearest of `have` (increasing) for each of `want`."""
     right = np.clip(np.searchsorted(have, want), 1, max(len(have) - 1, 1))
     right = np.minimum(right, len(have) - 1)
     left = np.maximum(right - 1, 0)

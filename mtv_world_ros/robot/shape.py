@@ -92,7 +92,7 @@ class RobotShape:
 
 
 def urdf_path(robot: RobotModel) -> Path | None:
-    """Returns where a robot's URDF lies; None = it is given by a table, or made in code."""
+    """Return where a robot's URDF lies; None = it is given by a table, or made in code."""
     if robot.file is None:
         return None
     urdf = parse_yaml(read_text(robot.file, 'yaml_bytes')).get('urdf')
@@ -100,7 +100,7 @@ def urdf_path(robot: RobotModel) -> Path | None:
 
 
 def urdf_links(robot: RobotModel) -> tuple[Path, dict[str, ElementTree.Element]] | None:
-    """Returns the URDF's path and its links by name; None where the robot has none."""
+    """Return the URDF's path and its links by name; None where the robot has none."""
     path = urdf_path(robot)
     if path is None:
         return None
@@ -109,7 +109,7 @@ def urdf_links(robot: RobotModel) -> tuple[Path, dict[str, ElementTree.Element]]
 
 
 def load_shape(robot: RobotModel) -> RobotShape:
-    """Returns the robot's shape.
+    """Return the robot's shape.
 
     The URDF's visual elements; for links where it has none, or where their meshes are not there
     or cannot be read, its collision elements. Rods from joint to joint where the robot is given
@@ -188,13 +188,13 @@ def _arm_length(robot: RobotModel) -> float:
 
 
 def moving_links(robot: RobotModel) -> set[str]:
-    """Returns the links that move against the base link, by the robot's kinematics."""
+    """Return the links that move against the base link, by the robot's kinematics."""
     joints = _joint_frames(robot)
     return {name for name, joint in joints.items() if joint != joints[robot.base_link]}
 
 
 def grip_links(robot: RobotModel) -> set[str]:
-    """Returns the links that hold things: those of tools, and what gripper joints move."""
+    """Return the links that hold things: those of tools, and what gripper joints move."""
     frames = _joint_frames(robot)
     hands = {frames[tool.link] for tool in robot.tools if tool.gripper_joint} - {0}
     moved = {link for tool in robot.tools for link in gripper_links(robot, tool)}
@@ -202,7 +202,7 @@ def grip_links(robot: RobotModel) -> set[str]:
 
 
 def gripper_links(robot: RobotModel, tool: Tool) -> set[str]:
-    """Returns the links that a tool's gripper joint moves, itself or by mimics; none without."""
+    """Return the links that a tool's gripper joint moves, itself or by mimics; none without."""
     model, gripper = robot.pinocchio_model, tool.gripper_joint
     moved = {m.joint for m in robot.mimics if m.source == gripper} | {gripper}
     return {
@@ -220,7 +220,7 @@ def _joint_frames(robot: RobotModel) -> dict[str, int]:
 
 
 def rods(robot: RobotModel, why: str, missing: Sequence[str] = ()) -> RobotShape:
-    """Returns rods between neighbouring joints, and from the last ones to the tools."""
+    """Return rods between neighbouring joints, and from the last ones to the tools."""
     model, neutral = robot.pinocchio_model, pin.neutral(robot.pinocchio_model)
     data = model.createData()
     pin.framesForwardKinematics(model, data, neutral)
@@ -260,7 +260,7 @@ def _rod(link: str, start: FloatArray, end: FloatArray) -> LinkShape | None:
 def link_shapes(
     link: ElementTree.Element, urdf: Path, *, sliced: bool = False
 ) -> tuple[list[LinkShape], list[str]]:
-    """Returns a link's shapes, and meshes that are missing; collisions stand in for visuals.
+    """Return a link's shapes, and meshes that are missing; collisions stand in for visuals.
 
     With `sliced`, a mesh that is far from convex is given in slices.
 
@@ -287,7 +287,7 @@ def element_shapes(
     urdf: Path,
     cut: Callable[[FloatArray, NDArray[np.int64]], list[FloatArray]] | None = None,
 ) -> Iterator[LinkShape]:
-    """Yields the convex parts of a `visual` or `collision`: none where it describes nothing.
+    """Yield the convex parts of a `visual` or `collision`: none where it describes nothing.
 
     Args:
         element: of the URDF.

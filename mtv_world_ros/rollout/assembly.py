@@ -32,7 +32,7 @@ PolicyMaker = Callable[[EpisodeOrigin], Policy]
 
 
 def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
-    """Returns what makes the policy of a name.
+    """Return what makes the policy of a name.
 
     Args:
         name: YAML file, name of one in `config/policies`, or a scripted policy such as
@@ -52,7 +52,7 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
 
 
 def policy_settings(name: str | Path, robot: RobotModel) -> PolicyConfig:
-    """Returns the settings of the policy of a name, checked; no server is asked.
+    """Return the settings of the policy of a name, checked; no server is asked.
 
     Raises:
         ConfigError, PolicyError: as in `assemble_policy`.
@@ -83,7 +83,7 @@ def _recorded(
 
 
 def asked_describer(file: str | Path | None) -> Describer | None:
-    """Returns the describer of `--describer` or the parameter `describer`; None = none is asked.
+    """Return the describer of `--describer` or the parameter `describer`; None = none is asked.
 
     Raises:
         ConfigError, CheckpointError: see `assemble_describer`.
@@ -92,7 +92,7 @@ def asked_describer(file: str | Path | None) -> Describer | None:
 
 
 def assemble_describer(config: DescriberConfig | str | Path | None = None) -> Describer:
-    """Returns what names the objects of a scene; by default the instruction's words alone.
+    """Return what names the objects of a scene; by default the instruction's words alone.
 
     Args:
         config: a configuration, or a YAML file like `config/describer.yaml`.

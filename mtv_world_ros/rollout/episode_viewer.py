@@ -31,7 +31,7 @@ class EpisodeViewer:
         self._root, self._begin_ns = '', 0
 
     def begin(self, start: EpisodeStart) -> None:
-        """Opens a tab with the frames that an episode starts from."""
+        """Open a tab with the frames that an episode starts from."""
         seen = start.observation
         self._root = f'/episode_{len(self._tabs)}'
         self._begin_ns = seen.stamp_ns
@@ -43,7 +43,7 @@ class EpisodeViewer:
         self._log(shown)
 
     def add(self, prediction: Prediction) -> None:
-        """Logs a chunk."""
+        """Log a chunk."""
         shown = streams_of(prediction)
         tab = self._tabs[self._root]
         if not {*shown.images} <= {*tab.images}:
@@ -54,7 +54,7 @@ class EpisodeViewer:
         self._log(shown)
 
     def close(self) -> None:
-        """Waits until the viewer or the file has everything.
+        """Wait until the viewer or the file has everything.
 
         Raises:
             MtvWorldError: the file cannot be written.

@@ -78,7 +78,7 @@ class WorldEnv(gymnasium.Env[State, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[State, dict[str, Any]]:
-        """Begins an episode.
+        """Begin an episode.
 
         Args:
             seed: seed of the world; None = one that is drawn.
@@ -90,7 +90,7 @@ class WorldEnv(gymnasium.Env[State, NDArray[np.float32]]):
         return _state(self._seen), {'instruction': self._world.instruction}
 
     def step(self, action: NDArray[np.float32]) -> tuple[State, float, bool, bool, dict[str, Any]]:
-        """Sends the joints to positions (J,); returns state, reward, whether it ended, and why."""
+        """Send the joints to positions (J,); return state, reward, whether it ended, and why."""
         # float32 bounds of the action space are rounded
         target = np.clip(np.asarray(action, np.float64), self._robot.lower, self._robot.upper)
         answer = JointTrajectory(
@@ -109,7 +109,7 @@ class WorldEnv(gymnasium.Env[State, NDArray[np.float32]]):
         return _state(self._seen), reward, bool(is_done), is_late, {'is_done': is_done}
 
     def render(self) -> ByteArray | None:  # type: ignore[override]
-        """Returns the views side by side, (H, V * W, 3) uint8 RGB."""
+        """Return the views side by side, (H, V * W, 3) uint8 RGB."""
         if self.render_mode is None:
             return None
         return np.concatenate(list(self._seen.frames), axis=1)

@@ -231,7 +231,7 @@ class _EpisodeRun:
         self._how, self._text = 'interrupted', 'it was stopped before its end'
 
     def imagine(self, make: PolicyMaker, on_chunk: Callable[[Prediction], object]) -> None:
-        """Runs the policy until the episode ends; an error of the episode is its end."""
+        """Run the policy until the episode ends; an error of the episode is its end."""
         robot, seen = self._pipeline.robot, self._start.observation
         instruction = self._options.instruction or self._start.instruction
         with PredictionWriter(self._bag, robot.joint_names, keep=True) as writer:
@@ -259,7 +259,7 @@ class _EpisodeRun:
                 writer.write_report(world.observation.stamp_ns, ERROR, self._how, values)
 
     def result(self) -> dict[str, Any]:
-        """Returns the entry of `episodes.json`; numbers are null where the estimate abstains."""
+        """Return the entry of `episodes.json`; numbers are null where the estimate abstains."""
         success = None if self._last is None else self._last.success
         low, high = (nan, nan) if success is None else success.interval
         probability = nan if success is None else success.probability
@@ -283,7 +283,7 @@ class _EpisodeRun:
         }
 
     def _end(self, make: PolicyMaker, world: _RecordedWorld) -> None:
-        """Runs the episode; sets how it ended."""
+        """Run the episode; set how it ended."""
         try:
             policy = make(self._start.origin)
             self._policy = policy.name
@@ -329,7 +329,7 @@ class _RecordedWorld(ImaginedWorld):
         self.num_answers, self.is_recording_broken = 0, False
 
     def step(self, answer: JointTrajectory) -> Observation:
-        """Records and imagines an answer; returns the last predicted frames."""
+        """Record and imagine an answer; return the last predicted frames."""
         self.is_recording_broken = True
         self._writer.write_plan(self.observation.stamp_ns, answer)
         self.is_recording_broken = False
@@ -350,19 +350,19 @@ class _NamedErrors:
         self._policy, self.name = policy, policy.name
 
     def reset(self, *, seed: int) -> None:
-        """Begins an episode."""
+        """Begin an episode."""
         with _policy_errors():
             self._policy.reset(seed=seed)
 
     def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
-        """Returns the policy's answer."""
+        """Return the policy's answer."""
         with _policy_errors():
             return self._policy.act(observation, instruction)
 
 
 @contextmanager
 def _policy_errors() -> Iterator[None]:
-    """Turns what a policy raises into a `PolicyError`."""
+    """Turn what a policy raises into a `PolicyError`."""
     try:
         yield
     except PolicyError:

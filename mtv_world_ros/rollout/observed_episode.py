@@ -61,7 +61,7 @@ class ObservedEpisode:
                 del self._waiting[::2]
 
     def forget(self) -> None:
-        """Drops the episode so far: the next plan begins a new one."""
+        """Drop the episode so far: the next plan begins a new one."""
         with self._lock:
             self._seen, self._waiting = None, []
 
@@ -77,7 +77,7 @@ class ObservedEpisode:
     def begin(
         self, observation: Observation, options: RolloutOptions = DEFAULT_OPTIONS
     ) -> Rollout:
-        """Returns an episode that begins at an observation and remembers what was seen before.
+        """Return an episode that begins at an observation and remembers what was seen before.
 
         Another instruction, or other objects, begin a new episode.
 
@@ -111,7 +111,7 @@ def _task(options: RolloutOptions) -> tuple[str, tuple[str, ...]]:
 
 
 def _look_at(episode: Rollout, observations: Sequence[Observation]) -> None:
-    """Lets the episode observe these, at the model's size."""
+    """Let the episode observe these, at the model's size."""
     if observations:
         frames = np.stack([observation.frames for observation in observations], axis=1)
         positions = [episode.observation, *observations]

@@ -82,7 +82,7 @@ def replay_offline(
     overwrite: bool = False,
     show_progress: bool = True,
 ) -> ReplaySummary:
-    """Imagines every joint trajectory of an episode from the newest frames before it.
+    """Imagine every joint trajectory of an episode from the newest frames before it.
 
     The estimates remember the episode's recorded frames since its first trajectory, as the node's
     do in mode observe.
@@ -203,7 +203,7 @@ def _seen_between(
 
 
 def judge(pipeline: Pipeline, recording: Recording) -> SuccessEstimate:
-    """Returns the success estimate at the end of a recorded episode.
+    """Return the success estimate at the end of a recorded episode.
 
     Args:
         pipeline: finds the objects and judges; see `Pipeline.load`.

@@ -10,7 +10,7 @@ from mtv_world_ros.robot.plan import PlanLimits
 
 
 def never() -> bool:
-    """Returns False: nothing stops the rollout."""
+    """Return False: nothing stops the rollout."""
     return False
 
 

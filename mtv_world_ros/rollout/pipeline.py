@@ -73,7 +73,7 @@ class WorldModel(Protocol):
         should_stop: Callable[[], bool],
         history: History | None = None,
     ) -> ByteArray:
-        """Returns (V, T, H, W, 3) uint8 RGB predicted frames.
+        """Return (V, T, H, W, 3) uint8 RGB predicted frames.
 
         Args:
             start_frame: (V, H, W, 3) uint8 RGB, the frame the chunk starts from.
@@ -147,7 +147,7 @@ class Pipeline:
         foresight: bool = True,
         camera_check: bool = True,
     ) -> Pipeline:
-        """Returns the pipeline around the world model of a checkpoint.
+        """Return the pipeline around the world model of a checkpoint.
 
         Args:
             checkpoint: folder, or `bundled`.
@@ -238,7 +238,7 @@ class Pipeline:
         camera_checker: CameraChecker | None = None,
         setting: Setting | None = None,
     ) -> Pipeline:
-        """Returns the pipeline around a world model trained as the card says.
+        """Return the pipeline around a world model trained as the card says.
 
         The control is that of the card; one that is fitted to a training set has to be given.
         """
@@ -269,7 +269,7 @@ class Pipeline:
         return self.world_model.spec
 
     def with_robot(self, robot: RobotModel) -> Pipeline:
-        """Returns the pipeline for a robot of the same joints and tools, e.g. a calibrated one."""
+        """Return the pipeline for a robot of the same joints and tools, e.g. a calibrated one."""
         motion, checker = self.object_motion, self.camera_checker
         return replace(
             self,
@@ -301,7 +301,7 @@ class Pipeline:
     def begin(
         self, observation: Observation, options: RolloutOptions = DEFAULT_OPTIONS
     ) -> Rollout:
-        """Returns an episode that begins at an observation (V views, any image size).
+        """Return an episode that begins at an observation (V views, any image size).
 
         Raises:
             ObservationError: the views are not the model's.
@@ -316,7 +316,7 @@ class Pipeline:
     def name_objects(
         self, options: RolloutOptions, first_frame: Callable[[], ByteArray]
     ) -> tuple[str, ...]:
-        """Returns the names of the objects of a rollout.
+        """Return the names of the objects of a rollout.
 
         Args:
             options: may name them; else the pipeline does, its describer, or the instruction.
@@ -335,7 +335,7 @@ class Pipeline:
     def imagine(
         self, state: RolloutState, plan: ChunkPlan, options: RolloutOptions
     ) -> tuple[Prediction, RolloutState]:
-        """Returns one chunk of one rollout, stage by stage, and the rollout's state after it."""
+        """Return one chunk of one rollout, stage by stage, and the rollout's state after it."""
         start, clock = state.observation, StageClock()
         num_steps = options.num_inference_steps or self.spec.num_inference_steps
         motion = Motion.of(self.robot, start.cameras, plan.positions, self.control.links)
@@ -419,7 +419,7 @@ class Pipeline:
         positions: FloatArray,
         options: RolloutOptions,
     ) -> tuple[ObservedChunk, RolloutState]:
-        """Returns masks and estimate of real frames, and the rollout's state after them.
+        """Return masks and estimate of real frames, and the rollout's state after them.
 
         Args:
             state: before them.
@@ -438,7 +438,7 @@ class Pipeline:
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success), after
 
     def find(self, state: RolloutState, options: RolloutOptions) -> ObjectMasks:
-        """Returns masks of the frame that a chunk starts from (T = 1)."""
+        """Return masks of the frame that a chunk starts from (T = 1)."""
         return self.segmenter.segment(state.observation.frames[:, None], options.objects)
 
     def follow(
@@ -448,7 +448,7 @@ class Pipeline:
         frames: ByteArray,
         options: RolloutOptions,
     ) -> ObjectMasks:
-        """Returns masks of the frames (V, T, H, W, 3) after the start frame."""
+        """Return masks of the frames (V, T, H, W, 3) after the start frame."""
         return self.segmenter.segment(
             frames,
             options.objects,
@@ -467,7 +467,7 @@ class Pipeline:
         *,
         is_real: bool = False,
     ) -> JudgedChunk:
-        """Returns the estimate after a chunk of 1 + T states, and what it remembers."""
+        """Return the estimate after a chunk of 1 + T states, and what it remembers."""
         check, footage = state.camera_check, footage_of(motion, start_masks, masks)
         judged = self.estimator.estimate(
             footage, options.instruction, state.memory, foreseen, is_real=is_real
@@ -499,7 +499,7 @@ class Pipeline:
 
 
 def _check_inputs(name: str, control: Control, transformer: Mapping[str, Any]) -> None:
-    """Raises if the transformer was not built for the inputs that a control feeds."""
+    """Raise if the transformer was not built for the inputs that a control feeds."""
     wanted = control.layout.transformer_arguments()
     for kind in ('context', 'frame'):
         key = f'{kind}_input'

@@ -32,7 +32,7 @@ class StageClock:
         self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:
-        """Ends a stage, which began at the end of the one before."""
+        """End a stage, which began at the end of the one before."""
         now = time.perf_counter()
         self.seconds[stage] = now - self._last
         self._last = now
@@ -85,7 +85,7 @@ class Prediction:
     seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
     def trusted_seconds(self, level: float) -> float:
-        """Returns up to which time after the last real frame J is expected to be `level` [s].
+        """Return up to which time after the last real frame J is expected to be `level` [s].
 
         NaN = not measured for this checkpoint and segmenter.
         """
@@ -95,7 +95,7 @@ class Prediction:
 
 
 def mean_of_seeds(predictions: Sequence[Prediction]) -> Prediction:
-    """Returns the first of a chunk's predictions with the mean estimate and the time of all."""
+    """Return the first of a chunk's predictions with the mean estimate and the time of all."""
     if len(predictions) == 1:
         return predictions[0]
     seconds: Counter[str] = Counter()
@@ -109,7 +109,7 @@ def mean_of_seeds(predictions: Sequence[Prediction]) -> Prediction:
 
 
 def mean_estimate(estimates: Sequence[SuccessEstimate]) -> SuccessEstimate:
-    """Returns the mean over rollouts that differ in their seeds alone.
+    """Return the mean over rollouts that differ in their seeds alone.
 
     `spread` is their standard deviation; the interval is Student's of the mean: where more
     rollouts of this world model would put it, not where reality lies. Abstains where most of them

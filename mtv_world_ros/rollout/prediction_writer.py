@@ -53,7 +53,7 @@ class PredictionWriter(BagWriter):
         self.frame_stamps: list[int] = []
 
     def write_chunk(self, prediction: Prediction, until_ns: int | None = None) -> int:
-        """Records a chunk's frames, those up to `until_ns` alone; returns how many.
+        """Record a chunk's frames, those up to `until_ns` alone; return how many.
 
         The estimate is recorded at the chunk's last frame, if that is among them.
         """
@@ -70,23 +70,23 @@ class PredictionWriter(BagWriter):
         return len(kept)
 
     def write_observed(self, camera: CameraModel, stamp_ns: int, rgb: ByteArray) -> None:
-        """Records what a camera really showed, (H, W, 3) uint8 RGB, under its own topic."""
+        """Record what a camera really showed, (H, W, 3) uint8 RGB, under its own topic."""
         self._write_jpeg(f'/{camera.view}', camera, stamp_ns, rgb)
 
     def write_plan(self, stamp_ns: int, trajectory: JointTrajectory) -> None:
-        """Records a policy's answer; its times count from the stamp."""
+        """Record a policy's answer; its times count from the stamp."""
         message = messages.make_joint_trajectory(stamp_ns, trajectory)
         self.write_message('/joint_trajectory', messages.JOINT_TRAJECTORY, stamp_ns, message)
 
     def write_instruction(self, stamp_ns: int, text: str) -> None:
-        """Records the instruction of an episode."""
+        """Record the instruction of an episode."""
         message = messages.make(messages.STRING, data=text)
         self.write_message('/instruction', messages.STRING, stamp_ns, message)
 
     def write_report(
         self, stamp_ns: int, level: int, text: str, values: Mapping[str, Any]
     ) -> None:
-        """Records a line of `~/report`."""
+        """Record a line of `~/report`."""
         pairs = [
             messages.make('diagnostic_msgs/msg/KeyValue', key=key, value=_text(value))
             for key, value in values.items()

@@ -55,13 +55,13 @@ class ChunkMaker(Protocol):
     def name_objects(
         self, options: RolloutOptions, first_frame: Callable[[], ByteArray]
     ) -> tuple[str, ...]:
-        """Returns the names of the objects, which (H, W, 3) the first real frame may show."""
+        """Return the names of the objects, which (H, W, 3) the first real frame may show."""
         ...
 
     def imagine(
         self, state: RolloutState, plan: ChunkPlan, options: RolloutOptions
     ) -> tuple[Prediction, RolloutState]:
-        """Returns one imagined chunk and the state after it."""
+        """Return one imagined chunk and the state after it."""
         ...
 
     def observe(
@@ -71,7 +71,7 @@ class ChunkMaker(Protocol):
         positions: FloatArray,
         options: RolloutOptions,
     ) -> tuple[ObservedChunk, RolloutState]:
-        """Returns masks and estimate of real frames, and the state after them."""
+        """Return masks and estimate of real frames, and the state after them."""
         ...
 
 
@@ -121,7 +121,7 @@ class Rollout:
         return self._described[instruction]
 
     def extend(self, trajectory: JointTrajectory | Plan) -> Iterator[Prediction]:
-        """Imagines a trajectory from where the episode stands; yields each chunk once it is ready.
+        """Imagine a trajectory from where the episode stands; yield each chunk once it is ready.
 
         An error leaves the episode at the end of the last chunk that was completed.
 
@@ -158,7 +158,7 @@ class Rollout:
         positions: FloatArray,
         cameras: tuple[CameraModel, ...] | None = None,
     ) -> ObservedChunk:
-        """Takes real frames instead of imagining some; the episode then stands at the last one.
+        """Take real frames instead of imagining some; the episode then stands at the last one.
 
         Args:
             frames: (V, T, H', W', 3) uint8 RGB after `observation`, at the model's frame rate and
@@ -174,13 +174,13 @@ class Rollout:
         return chunk
 
     def seen_points(self, num_frames: int) -> FloatArray:
-        """Returns (1 + T, O, 3) where masks showed the objects in the last frames [m]."""
+        """Return (1 + T, O, 3) where masks showed the objects in the last frames [m]."""
         memory = self._states[0].memory
         assert memory is not None
         return memory.points[:, -1 - num_frames :].swapaxes(0, 1)
 
     def branch(self, observation: Observation) -> Rollout:
-        """Returns an episode that begins at a later real observation and remembers this one.
+        """Return an episode that begins at a later real observation and remembers this one.
 
         What the estimate remembers (grasps, first masks, where objects have been) goes on, and
         what objects look like where nothing hides them; the model's history begins again. This

@@ -49,7 +49,7 @@ class RolloutState:
         objects: ObjectForesight,
         camera_check: CameraCheck,
     ) -> RolloutState:
-        """Returns the state of an episode that begins at a real observation.
+        """Return the state of an episode that begins at a real observation.
 
         Raises:
             ObservationError: the views are not the model's.
@@ -76,7 +76,7 @@ class RolloutState:
         memory: RolloutMemory,
         objects: ObjectForesight,
     ) -> RolloutState:
-        """Returns the state at the last of the frames (V, T, H, W, 3).
+        """Return the state at the last of the frames (V, T, H, W, 3).
 
         Args:
             frames: (V, T, H, W, 3) uint8 RGB after `observation`.
@@ -99,7 +99,7 @@ class RolloutState:
         )
 
     def seen_by(self, cameras: tuple[CameraModel, ...] | None) -> RolloutState:
-        """Returns the state at a real frame, from which objects are looked for anew.
+        """Return the state at a real frame, from which objects are looked for anew.
 
         Args:
             cameras: as they are at that frame, at the model's size; None = as before.
@@ -113,7 +113,7 @@ class RolloutState:
 
 
 def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observation:
-    """Returns the observation with frames and cameras at the model's size.
+    """Return the observation with frames and cameras at the model's size.
 
     Raises:
         ObservationError: the views are not the model's.

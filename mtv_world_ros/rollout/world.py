@@ -37,11 +37,11 @@ class World(Protocol):
         ...
 
     def reset(self, *, seed: int) -> Observation:
-        """Begins an episode; returns its first observation."""
+        """Begin an episode; return its first observation."""
         ...
 
     def step(self, answer: JointTrajectory) -> Observation:
-        """Executes an answer to the newest observation; returns the observation after it.
+        """Execute an answer to the newest observation; return the observation after it.
 
         Args:
             answer: joints in any order; times count from the newest observation.
@@ -52,7 +52,7 @@ class World(Protocol):
         ...
 
     def is_done(self) -> bool | None:
-        """Returns whether the task is done now; None = that cannot be told."""
+        """Return whether the task is done now; None = that cannot be told."""
         ...
 
 
@@ -189,13 +189,13 @@ class ImaginedWorld:
         return self.chunks[-1].success if self.chunks else None
 
     def reset(self, *, seed: int) -> Observation:
-        """Begins an episode at the real observation; returns that."""
+        """Begin an episode at the real observation; return that."""
         self._rollout = self._pipeline.begin(self._start, replace(self._options, seed=seed))
         self.chunks, self.observation = [], self._start
         return self.observation
 
     def step(self, answer: JointTrajectory) -> Observation:
-        """Imagines an answer; returns the last predicted frames.
+        """Imagine an answer; return the last predicted frames.
 
         Raises:
             PlanError: the robot cannot execute it.
@@ -213,7 +213,7 @@ class ImaginedWorld:
         return self.observation
 
     def is_done(self) -> bool | None:
-        """Returns whether the estimate is a success at the end of the newest chunk.
+        """Return whether the estimate is a success at the end of the newest chunk.
 
         None = it abstains, or nothing was imagined yet.
         """

@@ -72,7 +72,7 @@ def imagine_episodes(
     overwrite: bool = False,
     tell: Callable[[str], object] = lambda _: None,
 ) -> list[dict[str, object]]:
-    """Runs the episodes; `out` gets a bag for each, `episodes.json` and `logs/`.
+    """Run the episodes; `out` gets a bag for each, `episodes.json` and `logs/`.
 
     Args:
         options: policy, episodes and settings of the nodes.
@@ -140,7 +140,7 @@ def _viewer_said(viewer: subprocess.Popen[bytes], logs: Path) -> str:
 
 
 def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path, bar: Any) -> None:
-    """Waits for the runner; before its first episode it does not notice dead nodes itself."""
+    """Wait for the runner; before its first episode it does not notice dead nodes itself."""
     runner, stopped = processes['runner'], StoppedProcesses()
     while runner.poll() is None:
         time.sleep(0.2)
@@ -158,7 +158,7 @@ def _wait(processes: dict[str, subprocess.Popen[bytes]], logs: Path, bar: Any) -
 
 
 def episodes_done(out: Path) -> int:
-    """Returns how many episodes have ended, by the runner's `episodes.json`."""
+    """Return how many episodes have ended, by the runner's `episodes.json`."""
     try:
         return len(read_json(out / 'episodes.json'))
     except (OSError, ValueError, TypeError):  # before the first has ended

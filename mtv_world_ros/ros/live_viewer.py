@@ -51,7 +51,7 @@ class LiveViewer(Node):
         self.create_timer(_LOOK_PERIOD_S, self._look)
 
     def _look(self) -> None:
-        """Subscribes to new topics; of raw and compressed images of one view to the latter."""
+        """Subscribe to new topics; of raw and compressed images of one view to the latter."""
         self._watch.refresh()
         found = dict(self.get_topic_names_and_types())
         for topic in sorted(found, key=lambda topic: (not topic.endswith('compressed'), topic)):
@@ -115,7 +115,7 @@ class LiveViewer(Node):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Shows topics until Ctrl-C; returns the exit status."""
+    """Show topics until Ctrl-C; return the exit status."""
     arguments = list(sys.argv if args is None else ('live_viewer', *args))
     parser = argparse.ArgumentParser(prog='live_viewer', description=__doc__)
     parser.add_argument('--port', type=PageAddress.parse, default=PageAddress())

@@ -23,55 +23,55 @@ class NodeEvents(Protocol):
     """Events of a configured node; see `Rollouts`. All but `on_results` come from the executor."""
 
     def settings(self) -> Settings:
-        """Returns the present parameters."""
+        """Return the present parameters."""
         ...
 
     def guarded(self, handle: Callable[..., None]) -> Callable[..., None]:
-        """Returns the handler as a callback that no message makes raise."""
+        """Return the handler as a callback that no message makes raise."""
         ...
 
     def on_image(self, view: str, message: Image | CompressedImage) -> None:
-        """Takes a real image that was stored."""
+        """Take a real image that was stored."""
         ...
 
     def on_instruction(self, message: String) -> None:
-        """Takes the instruction."""
+        """Take the instruction."""
         ...
 
     def on_plan(self, plan: JointTrajectoryMsg | Goal, transport_s: float = 0.0) -> None:
-        """Takes a plan of the topic or of the action, and how long it was under way [s]."""
+        """Take a plan of the topic or of the action, and how long it was under way [s]."""
         ...
 
     def on_robot(self, robot: RobotModel) -> None:
-        """Takes the robot as it describes itself."""
+        """Take the robot as it describes itself."""
         ...
 
     def on_results(self) -> None:
-        """Notes that the worker has results; called from any thread."""
+        """Note that the worker has results; called from any thread."""
         ...
 
     def on_judged(self, chunk: Chunk) -> None:
-        """Takes a chunk whose estimate is out."""
+        """Take a chunk whose estimate is out."""
         ...
 
     def on_sent(self, chunk: Chunk, sent: Sent) -> None:
-        """Takes a chunk whose last frame is out, or whose rest was dropped."""
+        """Take a chunk whose last frame is out, or whose rest was dropped."""
         ...
 
     def on_ended(self, ended: Ended) -> None:
-        """Takes the end of a plan, after the estimates of its chunks."""
+        """Take the end of a plan, after the estimates of its chunks."""
         ...
 
     def on_scored(self, scored: ScoredChunk) -> None:
-        """Takes a chunk that was compared with the real frames."""
+        """Take a chunk that was compared with the real frames."""
         ...
 
     def on_error(self, error: Exception) -> None:
-        """Takes an error that nobody raised on purpose."""
+        """Take an error that nobody raised on purpose."""
         ...
 
     def start_waiting(self) -> None:
-        """Starts the plans that wait."""
+        """Start the plans that wait."""
         ...
 
     def give_up(self, rollout: int, text: str) -> None:
@@ -80,4 +80,4 @@ class NodeEvents(Protocol):
 
 
 def ignore_sent(chunk: Any, sent: Any) -> None:
-    """Takes frames of which nobody is told."""
+    """Take frames of which nobody is told."""

@@ -31,7 +31,7 @@ Names = Annotated[ListOf[str], AfterValidator(lambda names: tuple(filter(None, n
 
 
 def parameter(default: Any, text: str, within: Span | None = None) -> Any:
-    """Returns the field of a parameter that can be set at any time.
+    """Return the field of a parameter that can be set at any time.
 
     Args:
         default: its default.
@@ -43,7 +43,7 @@ def parameter(default: Any, text: str, within: Span | None = None) -> Any:
 
 
 def at_start(default: Any, text: str, within: Span | None = None) -> Any:
-    """Returns the field of a parameter that is read-only while the node runs."""
+    """Return the field of a parameter that is read-only while the node runs."""
     low, high = within or (None, None)
     return Field(default, description=text, ge=low, le=high, json_schema_extra={'read_only': True})
 
@@ -216,7 +216,7 @@ class Settings(NodeSettings):
 
 
 def help_text(name: str, kind: type[Schema]) -> str:
-    """Returns what a node prints on `--help`."""
+    """Return what a node prints on `--help`."""
     lines = [f'usage: {name} [--ros-args [-p PARAMETER:=VALUE] [--params-file FILE]]', '']
     for parameter_name, field in kind.model_fields.items():
         lines += [f'  {parameter_name}  {shown_default(field)}  {valid_values(field)}'.rstrip()]
@@ -251,7 +251,7 @@ def guard_parameter_services(node: Node) -> None:
 def refusing(
     check: Callable[[list[Parameter]], None],
 ) -> Callable[[list[Parameter]], SetParametersResult]:
-    """Returns a set-parameters callback that refuses with the text of what `check` raises."""
+    """Return a set-parameters callback that refuses with the text of what `check` raises."""
 
     def called(changed: list[Parameter]) -> SetParametersResult:
         try:
@@ -328,7 +328,7 @@ def declare_one(
 
 
 def refuse_unknown(node: Node) -> None:
-    """Refuses parameters that were given at start-up and that the node does not have.
+    """Refuse parameters that were given at start-up and that the node does not have.
 
     To be called when all of them are declared.
 
@@ -357,31 +357,31 @@ def declare_camera_topics(node: Node, views: Sequence[str]) -> dict[str, str]:
 
 
 def read(node: Node, kind: type[Model]) -> Model:
-    """Returns the present values."""
+    """Return the present values."""
     return kind(**{name: node.get_parameter(name).value for name in kind.model_fields})
 
 
 def shown_default(field: FieldInfo) -> str:
-    """Returns the default as YAML, or `empty`."""
+    """Return the default as YAML, or `empty`."""
     if field.default in ('', ()):
         return 'empty'
     return yaml.safe_dump(field.default).split('\n')[0]
 
 
 def valid_values(field: FieldInfo) -> str:
-    """Returns range or choices as text, empty if any value of the type is valid."""
+    """Return range or choices as text, empty if any value of the type is valid."""
     limits = span(field)
     return '{:.10g} … {:.10g}'.format(*limits) if limits else ', '.join(choices(field))
 
 
 def choices(field: FieldInfo) -> tuple[str, ...]:
-    """Returns the only valid values; empty = any of the type."""
+    """Return the only valid values; empty = any of the type."""
     kind = field.annotation
     return get_args(kind) if get_origin(kind) is Literal else ()
 
 
 def span(field: FieldInfo) -> Span | None:
-    """Returns least and greatest value."""
+    """Return least and greatest value."""
     limits = {
         key: getattr(item, key)
         for item in field.metadata
@@ -397,7 +397,7 @@ def is_read_only(field: FieldInfo) -> bool:
 
 
 def descriptor(field: FieldInfo) -> ParameterDescriptor:
-    """Returns what `ros2 param describe` shows."""
+    """Return what `ros2 param describe` shows."""
     described = ParameterDescriptor(description=field.description, read_only=is_read_only(field))
     if choices(field):
         described.additional_constraints = f'one of: {", ".join(choices(field))}'
@@ -428,7 +428,7 @@ def _declare(node: Node, name: str, field: FieldInfo) -> object:
 
 
 def _refusal(name: str, field: FieldInfo, value: object) -> str:
-    """Returns why a choice is refused, or an empty text; ROS checks types and ranges."""
+    """Return why a choice is refused, or an empty text; ROS checks types and ranges."""
     valid = choices(field)
     if not valid or value in valid:
         return ''
@@ -437,7 +437,7 @@ def _refusal(name: str, field: FieldInfo, value: object) -> str:
 
 
 def _check(node: Node, kind: type[Schema], parameters: list[Parameter]) -> None:
-    """Refuses values outside the schema: choices, ranges, numbers that are not finite.
+    """Refuse values outside the schema: choices, ranges, numbers that are not finite.
 
     Raises:
         ConfigError: names the parameter and what would be valid.

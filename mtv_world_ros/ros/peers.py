@@ -51,7 +51,7 @@ class Peers:
         return self._newest[name][1] if name in self._newest else {}
 
     def unconnected(self, topics: Iterable[str], least: int = 1) -> list[str]:
-        """Returns the topics whose publisher, by its node's diagnostics, has too few subscribers.
+        """Return the topics whose publisher, by its node's diagnostics, has too few subscribers.
 
         Two that know of each other from the graph may still not be connected, and what is
         published until then is lost.
@@ -65,11 +65,11 @@ class Peers:
         return [topic for topic in topics if has_too_few(topic)]
 
     def forget(self, name: str) -> None:
-        """Drops a node's diagnostics, so that the next ones are new."""
+        """Drop a node's diagnostics, so that the next ones are new."""
         self._newest.pop(self._status_name(name), None)
 
     def wait(self, condition: Callable[[], bool], what: str, timeout_s: float) -> None:
-        """Spins until the condition holds.
+        """Spin until the condition holds.
 
         Raises:
             ConfigError: the condition does not hold in time.
@@ -81,7 +81,7 @@ class Peers:
             self._spin_once()
 
     def call(self, kind: Any, name: str, request: Any, wait_s: float = _ANSWER_S) -> Any:
-        """Calls an idempotent service and returns its answer.
+        """Call an idempotent service and return its answer.
 
         Raises:
             ConfigError: the node is missing or does not answer in time.
@@ -108,7 +108,7 @@ class Peers:
         return next(future.result() for _, future in asked if future.done())
 
     def set_parameters(self, node: str, values: Mapping[str, object]) -> None:
-        """Sets parameters of a node.
+        """Set parameters of a node.
 
         Raises:
             ConfigError: the node refuses a parameter, or is missing.

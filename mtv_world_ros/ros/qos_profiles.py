@@ -33,7 +33,7 @@ def is_latched(profile: QoSProfile) -> bool:
 
 
 def best_offer(publishers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfile:
-    """Returns the best profile that all publishers of a topic can serve.
+    """Return the best profile that all publishers of a topic can serve.
 
     Args:
         publishers: of the topic, as the graph knows them.

@@ -59,13 +59,13 @@ class ReceivePaths:
     _locks: list[socket.socket] = field(default_factory=list)
 
     def reserve(self, topics: Sequence[str]) -> None:
-        """Gives topics a free port that they share."""
+        """Give topics a free port that they share."""
         port, lock = _free_port()
         self._locks.append(lock)
         self.ports.update(dict.fromkeys(topics, port))
 
     def of(self, topic: str) -> str:
-        """Returns the receive path of a subscribed topic in words, for `/diagnostics`.
+        """Return the receive path of a subscribed topic in words, for `/diagnostics`.
 
         Raises:
             ConfigError: another process has taken the port: nothing would be received.
@@ -89,7 +89,7 @@ PATHS = ReceivePaths()
 
 @contextmanager
 def receive_paths(groups: Sequence[Sequence[str]]) -> Iterator[ReceivePaths]:
-    """Has nodes that are made inside receive topics through UDP ports of their own.
+    """Have nodes that are made inside receive topics through UDP ports of their own.
 
     Other middlewares than Fast DDS, and profiles of the user's own, are left alone. What this
     package publishes is sent again after .1 s where it was lost.
@@ -122,7 +122,7 @@ def receive_paths(groups: Sequence[Sequence[str]]) -> Iterator[ReceivePaths]:
 
 
 def resolved_topics(arguments: Sequence[str], node: str, topics: Sequence[str]) -> list[str]:
-    """Returns the fully qualified names that a node's topics will have.
+    """Return the fully qualified names that a node's topics will have.
 
     rclpy resolves names for nodes that exist; Fast DDS needs them before.
 
@@ -196,7 +196,7 @@ def _can_receive_udp() -> bool:
 
 
 def _write(base: Path, groups: Sequence[Sequence[str]], folder: Path) -> str:
-    """Writes the profile with the ports of this process; returns its path."""
+    """Write the profile with the ports of this process; return its path."""
     ElementTree.register_namespace('', _SPACE)
     tree = ElementTree.parse(base)
     root = tree.getroot()
@@ -218,7 +218,7 @@ def _reader(topic: str, port: int) -> ElementTree.Element:
 
 
 def _add_buffer(root: ElementTree.Element, size: int) -> None:
-    """Sets the receive buffer of the default participant's sockets."""
+    """Set the receive buffer of the default participant's sockets."""
     participant = root.find(_tag('participant'))
     if participant is None:
         participant = ElementTree.SubElement(
@@ -256,7 +256,7 @@ def _buffer_bytes() -> int:
 
 
 def _free_port() -> tuple[int, socket.socket]:
-    """Returns a free UDP port, and a TCP socket of the same number that reserves it.
+    """Return a free UDP port, and a TCP socket of the same number that reserves it.
 
     Fast DDS opens the UDP port itself, later. The TCP port, on which nobody listens, keeps other
     nodes of this package from choosing the same number meanwhile.

@@ -32,7 +32,7 @@ AnyNode = TypeVar('AnyNode', bound=Node)
 
 
 def end_with_parent() -> None:
-    """Lets this process get SIGINT when the one that started it is gone, even if it was killed.
+    """Let this process get SIGINT when the one that started it is gone, even if it was killed.
 
     Only where that one asks for it (`child_processes`), and only on Linux.
     """
@@ -67,7 +67,7 @@ def run(
     name: str = '',
     own_paths: Sequence[Sequence[str]] = (),
 ) -> int:
-    """Makes a node and spins it until it is done, or until SIGINT or SIGTERM.
+    """Make a node and spin it until it is done, or until SIGINT or SIGTERM.
 
     Fast DDS is set to send soon again what a reliable subscriber missed, unless it has a profile.
 
@@ -135,7 +135,7 @@ def _why_refused(error: Exception) -> str:
 
 
 def _find_log_folder() -> None:
-    """Lets ROS log into a temporary folder where it cannot write its own (a read-only home)."""
+    """Let ROS log into a temporary folder where it cannot write its own (a read-only home)."""
     home = os.environ.get('ROS_HOME') or Path.home() / '.ros'
     folder = Path(os.environ.get('ROS_LOG_DIR') or Path(home) / 'log')
     try:
@@ -149,7 +149,7 @@ def _find_log_folder() -> None:
 
 
 def _shut_down(node: Node | None) -> None:
-    """Ends the node; a second Ctrl-C (a launcher sends one too) does not disturb it."""
+    """End the node; a second Ctrl-C (a launcher sends one too) does not disturb it."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     if node is not None:

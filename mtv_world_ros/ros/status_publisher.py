@@ -42,7 +42,7 @@ class StatusPublisher:
         self._diagnostics = create_publisher(node, DiagnosticArray, '/diagnostics', 10)
 
     def fault(self, kind: str, text: str) -> None:
-        """Counts a fault; `/diagnostics` warns of it for a while."""
+        """Count a fault; `/diagnostics` warns of it for a while."""
         self.counts[f'faults.{kind}'] += 1
         self._last = (time.monotonic(), f'{kind}: {text}')
         self._node.get_logger().warning(f'{kind}: {text}')
@@ -50,12 +50,12 @@ class StatusPublisher:
     def report(
         self, state: str, values: Mapping[str, object], level: bytes = DiagnosticStatus.OK
     ) -> None:
-        """Publishes a report at once."""
+        """Publish a report at once."""
         name = f': {self._subject}'
         self._publish(self._report, name, level, state, {'state': state, **values})
 
     def publish_diagnostics(self, state: Mapping[str, object], warning: str = '') -> None:
-        """Publishes `/diagnostics`: the state, the counts and the last fault.
+        """Publish `/diagnostics`: the state, the counts and the last fault.
 
         Args:
             state: keys and values.
@@ -71,7 +71,7 @@ class StatusPublisher:
         self.diagnose(level, warning or 'ready', values)
 
     def diagnose(self, level: bytes, message: str, values: Mapping[str, object]) -> None:
-        """Publishes `/diagnostics` as they are given."""
+        """Publish `/diagnostics` as they are given."""
         self._publish(self._diagnostics, '', level, message, values)
 
     def _publish(
@@ -91,7 +91,7 @@ class StatusPublisher:
 
 
 def create_publisher(node: Node, kind: Any, topic: str, depth: int) -> Publisher:
-    """Returns a reliable publisher whose QoS can be overridden by parameters.
+    """Return a reliable publisher whose QoS can be overridden by parameters.
 
     Raises:
         ConfigError: an override is not one of the middleware's words.

@@ -44,7 +44,7 @@ _DRIVE = DriveSettings()
 
 
 def bodies_xml(robot: RobotModel, cameras: Sequence[CameraModel]) -> str:
-    """Returns the MJCF body trees of all arms, bases and cameras on links included.
+    """Return the MJCF body trees of all arms, bases and cameras on links included.
 
     A site `<arm>_tool` stands at each tool centre point.
 
@@ -58,7 +58,7 @@ def bodies_xml(robot: RobotModel, cameras: Sequence[CameraModel]) -> str:
 
 @lru_cache(maxsize=8)
 def actuators_of(robot: RobotModel) -> tuple[Actuator, ...]:
-    """Returns the position actuators of all joints, in the order of the robot's joints.
+    """Return the position actuators of all joints, in the order of the robot's joints.
 
     Gains follow from the torque and force limits of the URDF; damping is critical or above.
     """
@@ -113,7 +113,7 @@ class _UrdfBodies:
             self._add(joint, f'<site name="{tool.arm}_tool" {_at(pose)} size="0.002" group="5"/>')
 
     def xml(self) -> str:
-        """Returns what is fixed to the base, and the bodies of its joints."""
+        """Return what is fixed to the base, and the bodies of its joints."""
         return self._inside.get(0, '') + self._children(0)
 
     def _children(self, parent: int) -> str:

@@ -102,7 +102,7 @@ TRAINING_MOVES = (
 def moved(
     spec: AnyCameraSpec, moves: CameraMoves, generator: np.random.Generator
 ) -> AnyCameraSpec:
-    """Returns a camera that stands elsewhere and looks at the same point; one on a link stays."""
+    """Return a camera that stands elsewhere and looks at the same point; one on a link stays."""
     if isinstance(spec, WristCameraSpec):
         return spec
     side = float(generator.choice((-1.0, 1.0)))
@@ -120,7 +120,7 @@ def moved(
 def jittered(
     spec: AnyCameraSpec, jitter: CameraJitter, generator: np.random.Generator
 ) -> AnyCameraSpec:
-    """Returns the spec with target, distance and angles moved within the jitter.
+    """Return the spec with target, distance and angles moved within the jitter.
 
     A camera on a link is moved and turned by a quarter of it: its mount is a fixed part.
     """
@@ -146,7 +146,7 @@ def jittered(
 
 
 def optical_pose(spec: AnyCameraSpec) -> FloatArray:
-    """Returns T_mount_camera (4, 4) of the optical frame: x right, y down, z ahead."""
+    """Return T_mount_camera (4, 4) of the optical frame: x right, y down, z ahead."""
     if isinstance(spec, WristCameraSpec):
         ahead = np.subtract(spec.target, spec.position) / spec.distance
         across = np.asarray(spec.right) - ahead * (ahead @ np.asarray(spec.right))
@@ -175,7 +175,7 @@ def _pose(right: FloatArray, ahead: FloatArray, position: FloatArray) -> FloatAr
 def camera_model(
     spec: AnyCameraSpec, width: int, height: int, base_link: str = 'base'
 ) -> CameraModel:
-    """Returns the calibrated camera for images of `width` x `height` px; no distortion.
+    """Return the calibrated camera for images of `width` x `height` px; no distortion.
 
     Args:
         spec: pose and field of view of the camera.
@@ -196,7 +196,7 @@ def camera_model(
 
 
 def camera_xml(camera: CameraModel, pose: FloatArray) -> str:
-    """Returns the MJCF camera of a centred, undistorted camera.
+    """Return the MJCF camera of a centred, undistorted camera.
 
     MuJoCo's camera looks along its own -z with y up; the optical frame has y down, z ahead.
 

@@ -11,7 +11,7 @@ from mtv_world_ros.core.files import share_path
 
 
 def template(name: str) -> Template:
-    """Returns the template `config/mjcf/<name>.xml.j2`."""
+    """Return the template `config/mjcf/<name>.xml.j2`."""
     return _environment().get_template(f'{name}.xml.j2')
 
 

@@ -25,7 +25,7 @@ def _loads(name: str) -> bool:
 
 
 def missing_opengl() -> str | None:
-    """Returns why nothing can be rendered on this machine, or None if an OpenGL library is there.
+    """Return why nothing can be rendered on this machine, or None if an OpenGL library is there.
 
     Reads `MUJOCO_GL`; where it is not set, EGL is taken before OSMesa.
     """
@@ -41,7 +41,7 @@ def missing_opengl() -> str | None:
 
 
 def load_mujoco(*, rendering: bool = True) -> ModuleType:
-    """Returns the `mujoco` module, with `MUJOCO_GL` set to a backend whose library exists.
+    """Return the `mujoco` module, with `MUJOCO_GL` set to a backend whose library exists.
 
     Args:
         rendering: also make sure that images can be rendered; physics alone needs no OpenGL.

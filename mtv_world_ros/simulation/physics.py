@@ -74,11 +74,11 @@ class Physics(Schema):
     )
 
     def workcell(self, workcell: Workcell) -> Workcell:
-        """Returns a workcell with this table and objects of this size."""
+        """Return a workcell with this table and objects of this size."""
         return replace(workcell, table_m=self.table_m, object_size=self.object_size)
 
     def joint_zeros(self, robot: RobotModel) -> FloatArray:
-        """Returns (J,) reported less true positions [rad]; 0 of grippers and what slides."""
+        """Return (J,) reported less true positions [rad]; 0 of grippers and what slides."""
         signs = np.random.default_rng(_ZERO_SEED).choice((-1.0, 1.0), len(robot.joint_names))
         grippers = {tool.gripper_joint for tool in robot.tools}
         model = robot.pinocchio_model
@@ -90,7 +90,7 @@ class Physics(Schema):
         return np.where(turns, np.deg2rad(self.joint_zero_deg) * signs, 0.0)
 
     def change(self, model: Any, mujoco: Any, change: ModelParts) -> None:
-        """Changes a compiled scene in place.
+        """Change a compiled scene in place.
 
         Args:
             model: the nominal `MjModel`.
@@ -111,7 +111,7 @@ class Physics(Schema):
     def calibrated_cameras(
         self, cameras: Sequence[CameraModel], seed: int
     ) -> tuple[CameraModel, ...]:
-        """Returns the cameras as they are calibrated, off in directions that a seed draws."""
+        """Return the cameras as they are calibrated, off in directions that a seed draws."""
         if not (self.camera_m or self.camera_deg):
             return tuple(cameras)
         rng = _generator(seed)
@@ -125,7 +125,7 @@ class Physics(Schema):
         return replace(camera, T_mount_camera=pose)
 
     def pictured(self, image: ByteArray, rng: np.random.Generator) -> ByteArray:
-        """Returns a picture (H, W, 3) as the camera gives it."""
+        """Return a picture (H, W, 3) as the camera gives it."""
         if self.blur_px:
             image = np.asarray(cv2.GaussianBlur(image, (0, 0), self.blur_px), np.uint8)
         if self.noise:
@@ -156,7 +156,7 @@ class ModelParts:
     def of(
         cls, model: Any, roles: Sequence[str], robot: RobotModel, actuators: Sequence[Actuator]
     ) -> ModelParts:
-        """Returns the indices for a scene with objects of these roles."""
+        """Return the indices for a scene with objects of these roles."""
         columns = {
             robot.joint_names.index(tool.gripper_joint)
             for tool in robot.tools
@@ -181,13 +181,13 @@ class DelayLine:
         self._last = deque([first] * (int(periods) + 2), maxlen=int(periods) + 2)
 
     def pass_on(self, command: FloatArray) -> FloatArray:
-        """Sends a command (J,); returns the one (J,) that arrives meanwhile."""
+        """Send a command (J,); return the one (J,) that arrives meanwhile."""
         self._last.append(command)
         return self._last[1] * (1 - self._share) + self._last[0] * self._share
 
 
 def picture_generator(seed: int) -> np.random.Generator:
-    """Returns the generator of the noise of an episode's pictures."""
+    """Return the generator of the noise of an episode's pictures."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_SPAWN_KEY, 1)))
 
 
@@ -197,7 +197,7 @@ def _generator(seed: int) -> np.random.Generator:
 
 @cache
 def catalogue() -> dict[str, Physics]:
-    """Returns all physics by name, the nominal one first."""
+    """Return all physics by name, the nominal one first."""
     path = share_path('config', 'physics.yaml')
     entries = read_yaml(path, 'physics catalogue', 'physics')
     return {
@@ -206,7 +206,7 @@ def catalogue() -> dict[str, Physics]:
 
 
 def physics_named(name: str) -> Physics:
-    """Returns a physics by name.
+    """Return a physics by name.
 
     Raises:
         SimulatorError: unknown name; the text names the nearest known one.

@@ -15,7 +15,7 @@ from mtv_world_ros.success.relations import FLOOR_M
 
 
 def side_of(subject: SceneObject) -> float:
-    """Returns on which side of the table's middle line an object lies: -1 left, 1 right."""
+    """Return on which side of the table's middle line an object lies: -1 left, 1 right."""
     return -1.0 if subject.position[0] < 0 else 1.0
 
 
@@ -33,7 +33,7 @@ def _fits(subject: SceneObject, under: SceneObject) -> bool:
 
 
 def goal_of(move: Move, items: dict[str, SceneObject], shift: tuple[float, float]) -> Place:
-    """Returns where a move's subject comes to rest, centre [m].
+    """Return where a move's subject comes to rest, centre [m].
 
     Args:
         move: the expert's move.
@@ -60,7 +60,7 @@ def goal_of(move: Move, items: dict[str, SceneObject], shift: tuple[float, float
 def goals_of(
     task: Task, items: dict[str, SceneObject], shifts: list[tuple[float, float]]
 ) -> tuple[Place, ...]:
-    """Returns the goal of each of a task's moves, one after the other."""
+    """Return the goal of each of a task's moves, one after the other."""
     now, goals = dict(items), []
     for move, shift in zip(task.moves, shifts, strict=True):
         goal = goal_of(move, now, shift)
@@ -76,7 +76,7 @@ def is_feasible(
     config: PlacementConfig,
     workcell: Workcell,
 ) -> bool:
-    """Returns whether objects lie apart, and goals are free and in the arm's reach."""
+    """Return whether objects lie apart, and goals are free and in the arm's reach."""
     listed = list(items.values())
     if any(_gap(a, b) < config.clearance for i, a in enumerate(listed) for b in listed[:i]):
         return False

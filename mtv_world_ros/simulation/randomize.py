@@ -49,7 +49,7 @@ class RandomizationConfig:
     placement: PlacementConfig | None = None
 
     def of(self, workcell: Workcell) -> RandomizationConfig:
-        """Returns it with the cameras and limits of a workcell where it has none."""
+        """Return it with the cameras and limits of a workcell where it has none."""
         return replace(
             self,
             cameras=self.cameras or workcell.cameras,
@@ -60,7 +60,7 @@ class RandomizationConfig:
 def _draw_object(
     role: ObjectRole, side: float, taken: set[str], rng: Rng, scale: float
 ) -> SceneObject:
-    """Draws an object of a role in a free colour; `side` -1 exchanges left and right."""
+    """Draw an object of a role in a free colour; `side` -1 exchanges left and right."""
     name = str(rng.choice([shape for shape in role.shapes if SHAPES[shape].free(taken)]))
     shape = SHAPES[name]
     word = str(rng.choice([word for word in shape.colours if word not in taken]))
@@ -108,7 +108,7 @@ def _draw_look(rng: np.random.Generator) -> SceneLook:
 def start_situation(
     task: Task, items: dict[str, SceneObject], goals: Sequence[Place]
 ) -> TruePoses:
-    """Returns the start poses (T = 1), grippers open."""
+    """Return the start poses (T = 1), grippers open."""
     return TruePoses(
         positions={role: np.array([item.position]) for role, item in items.items()},
         rotations={role: rotation_of(item)[None] for role, item in items.items()},
@@ -124,7 +124,7 @@ def draw_scene(
     workcell: Workcell,
     config: RandomizationConfig | None = None,
 ) -> Scene:
-    """Returns a random scene of a task; the same generator state gives the same scene.
+    """Return a random scene of a task; the same generator state gives the same scene.
 
     Raises:
         SimulatorError: no feasible placement found, or a fixed camera does not see an object.
@@ -171,5 +171,5 @@ def _raised(place: Place, height: float) -> Place:
 
 
 def instruction_of(task: Task, scene: Scene) -> str:
-    """Returns the task's instruction with the scene's object names filled in."""
+    """Return the task's instruction with the scene's object names filled in."""
     return fill_template(task.instruction, {item.role: item.name for item in scene.objects})

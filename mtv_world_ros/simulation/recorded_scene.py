@@ -32,13 +32,13 @@ _GOALS = TypeAdapter(tuple[Place, ...])
 
 
 def dump_scene(scene: Scene) -> str:
-    """Returns objects, look and goals as JSON; the cameras are in the episode's calibration."""
+    """Return objects, look and goals as JSON; the cameras are in the episode's calibration."""
     objects = [asdict(item) for item in scene.objects]
     return json.dumps({'objects': objects, 'look': asdict(scene.look), 'goals': scene.goals})
 
 
 def recorded_scene(path: Path, workcell: Workcell) -> tuple[Task, Scene]:
-    """Returns task and scene of a simulated episode.
+    """Return task and scene of a simulated episode.
 
     Args:
         path: its folder.
@@ -53,7 +53,7 @@ def recorded_scene(path: Path, workcell: Workcell) -> tuple[Task, Scene]:
 
 
 def scene_of(episode: Episode, workcell: Workcell) -> Scene:
-    """Returns the scene that a simulated episode holds, else the one that its seed draws.
+    """Return the scene that a simulated episode holds, else the one that its seed draws.
 
     Args:
         episode: simulated.

@@ -79,7 +79,7 @@ class Scene:
 
 
 def scene_xml(scene: Scene, robot: RobotModel) -> str:
-    """Returns the MJCF document of a scene with the arms at the origin pose of all joints."""
+    """Return the MJCF document of a scene with the arms at the origin pose of all joints."""
     fixed = [camera for camera in scene.cameras if camera.mount_link == robot.base_link]
     moving = [camera for camera in scene.cameras if camera.mount_link != robot.base_link]
     return template('scene').render(
@@ -94,19 +94,19 @@ def scene_xml(scene: Scene, robot: RobotModel) -> str:
 
 
 def rotation_of(item: SceneObject) -> FloatArray:
-    """Returns the (3, 3) rotation of an object as it is placed."""
+    """Return the (3, 3) rotation of an object as it is placed."""
     return rotation((0.0, 0.0, np.sin(item.yaw / 2), np.cos(item.yaw / 2)))
 
 
 def corners(item: SceneObject) -> FloatArray:
-    """Returns the (8, 3) corners of the object's bounding box in the base frame [m]."""
+    """Return the (8, 3) corners of the object's bounding box in the base frame [m]."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     local = signs * np.asarray(item.size) / 2
     return local @ rotation_of(item).T + np.asarray(item.position)
 
 
 def check_cameras(scene: Scene, base_link: str) -> None:
-    """Refuses a scene in which a fixed camera does not see every object as a whole.
+    """Refuse a scene in which a fixed camera does not see every object as a whole.
 
     Args:
         scene: the scene, with its cameras.

@@ -35,7 +35,7 @@ def second_engine(
     actuators: Sequence[Actuator],
     home: FloatArray,
 ) -> SteppedWorld:
-    """Returns a scene as rigid bodies of DART.
+    """Return a scene as rigid bodies of DART.
 
     Args:
         model: the compiled `MjModel` of the scene, whose gains, masses and friction these are.

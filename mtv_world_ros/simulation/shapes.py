@@ -39,7 +39,7 @@ class Grasp:
     opening: float = 1.0
 
     def offset(self, size: Size, side: float) -> float:
-        """Returns how far the tool is from the object's centre along its x [m].
+        """Return how far the tool is from the object's centre along its x [m].
 
         Args:
             size: of the object [m].
@@ -50,7 +50,7 @@ class Grasp:
         return (size[0] - self.rim_m) / 2 * side
 
     def width(self, size: Size) -> float:
-        """Returns what is between the closed fingers [m]."""
+        """Return what is between the closed fingers [m]."""
         return size[0] if self.rim_m is None else self.rim_m
 
 
@@ -77,7 +77,7 @@ class Shape:
     hollow: bool = False
 
     def xml(self, size: Size, rgb: Rgb) -> str:
-        """Returns its MJCF geoms in the frame of the bounding box's centre.
+        """Return its MJCF geoms in the frame of the bounding box's centre.
 
         Args:
             size: full extents (x, y, z) [m].
@@ -89,11 +89,11 @@ class Shape:
         return str(getattr(macros, self.geoms)(x, y, z, rgb))
 
     def free(self, taken: set[str]) -> bool:
-        """Returns whether one of its colours is not taken yet."""
+        """Return whether one of its colours is not taken yet."""
         return not set(self.colours) <= taken
 
     def size(self, share: float) -> Size:
-        """Returns the extents [m] at `share` 0..1 between the smallest and the largest."""
+        """Return the extents [m] at `share` 0..1 between the smallest and the largest."""
         low, high = np.asarray(self.smallest), np.asarray(self.largest)
         x, y, z = (low + share * (high - low)).tolist()
         return (x, y, z)
@@ -142,7 +142,7 @@ SHAPES = {
 
 
 def shape_named(name: str) -> Shape:
-    """Returns a shape by name.
+    """Return a shape by name.
 
     Raises:
         SimulatorError: unknown name; the text names the nearest known one.

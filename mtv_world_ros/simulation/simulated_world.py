@@ -61,7 +61,7 @@ class SimulatedWorld:
         self._target = np.array(sim.home)
 
     def reset(self, *, seed: int) -> Observation:
-        """Builds the scene of a seed; returns the first observation."""
+        """Build the scene of a seed; return the first observation."""
         begun = time.perf_counter()
         self.start = self.observation = self._observation(self._sim.reset(seed, self._task))
         self.rendering_s, self.physics_s = time.perf_counter() - begun, 0.0
@@ -75,7 +75,7 @@ class SimulatedWorld:
         return self._sim.instruction
 
     def step(self, answer: JointTrajectory) -> Observation:
-        """Executes an answer; the arms hold up to a whole frame.
+        """Execute an answer; the arms hold up to a whole frame.
 
         Raises:
             PlanError: the robot cannot execute it.
@@ -104,11 +104,11 @@ class SimulatedWorld:
         return self.observation
 
     def is_done(self) -> bool:
-        """Returns whether the task's predicate holds now."""
+        """Return whether the task's predicate holds now."""
         return self.outcome()[1]
 
     def outcome(self) -> tuple[bool, bool]:
-        """Returns whether the task was ever done, and is done at the end."""
+        """Return whether the task was ever done, and is done at the end."""
         return ever_and_final(self._sim.task.succeeds(self._sim.situation()))
 
     def _advance(self, targets: FloatArray, number: int, is_frame: bool) -> SimObservation | None:

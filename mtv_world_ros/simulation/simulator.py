@@ -53,12 +53,12 @@ class SimObservation:
 
 
 def scene_generator(seed: int) -> np.random.Generator:
-    """Returns the generator that draws the scene of an episode seed."""
+    """Return the generator that draws the scene of an episode seed."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
 
 
 def situation_of(scene: Scene, task: Task, poses: FloatArray, openings: FloatArray) -> TruePoses:
-    """Returns the objects' poses over time, with heights above the table.
+    """Return the objects' poses over time, with heights above the table.
 
     Args:
         scene: of O objects.
@@ -121,14 +121,14 @@ class SimEpisode:
         self._seed = 0
 
     def reset(self, seed: int, task: str | Task) -> SimObservation:
-        """Builds the scene of a seed and returns its first observation."""
+        """Build the scene of a seed and return its first observation."""
         self.task = task_named(task) if isinstance(task, str) else task
         self._seed = seed
         scene = draw_scene(self.task, scene_generator(seed), self._workcell, self._config)
         return self.load(scene, self.task)
 
     def load(self, scene: Scene, task: Task) -> SimObservation:
-        """Builds a given scene and returns its first observation.
+        """Build a given scene and return its first observation.
 
         Raises:
             SimulatorError: MuJoCo refuses the scene.
@@ -167,7 +167,7 @@ class SimEpisode:
         return self.observe()
 
     def close(self) -> None:
-        """Frees the OpenGL context of the current scene."""
+        """Free the OpenGL context of the current scene."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -183,7 +183,7 @@ class SimEpisode:
         return float(self._data.time)
 
     def step(self, targets: FloatArray, seconds: float = 0.1) -> SimObservation:
-        """Drives the joints to `targets` (J,) over one camera period and observes."""
+        """Drive the joints to `targets` (J,) over one camera period and observe."""
         targets = self._checked(targets)
         start, num = self._target, max(1, round(seconds / CONTROL_PERIOD_S))
         for k in range(1, num + 1):
@@ -191,7 +191,7 @@ class SimEpisode:
         return self.observe()
 
     def advance(self, targets: FloatArray) -> None:
-        """Runs one control period towards joint `targets` (J,), without rendering.
+        """Run one control period towards joint `targets` (J,), without rendering.
 
         Raises:
             TrajectoryError: wrong number of joints, or not finite.
@@ -210,7 +210,7 @@ class SimEpisode:
         self._target, self._arrived = targets, arrived
 
     def _show(self, second: SteppedWorld) -> None:
-        """Puts arms and objects where the second engine has them, for pictures and poses."""
+        """Put arms and objects where the second engine has them, for pictures and poses."""
         mujoco, data = self._mujoco, self._data
         data.qpos[self._arm_qpos] = self._spread(second.joints)
         for item, pose in zip(self.scene.objects, second.poses, strict=True):
@@ -232,13 +232,13 @@ class SimEpisode:
         return targets
 
     def positions(self) -> FloatArray:
-        """Returns the measured joint positions (J,) in the robot's order [rad or m]."""
+        """Return the measured joint positions (J,) in the robot's order [rad or m]."""
         driven = (self._data.qpos[self._arm_qpos] - self._offsets) / self._multipliers
         sums = np.bincount(self._columns, driven, minlength=len(self.home))
         return sums / np.bincount(self._columns, minlength=len(self.home)) + self._zeros
 
     def object_poses(self) -> FloatArray:
-        """Returns T_base_object (O, 4, 4) of the objects' centres [m]."""
+        """Return T_base_object (O, 4, 4) of the objects' centres [m]."""
         poses = np.tile(np.eye(4), (len(self.scene.objects), 1, 1))
         for pose, item in zip(poses, self.scene.objects, strict=True):
             body = self._data.body(item.role)
@@ -246,16 +246,16 @@ class SimEpisode:
         return poses
 
     def seen_poses(self) -> FloatArray:
-        """Returns T_base_object (T, O, 4, 4) [m] at every observation since reset."""
+        """Return T_base_object (T, O, 4, 4) [m] at every observation since reset."""
         return np.array([poses for poses, _ in self._seen])
 
     def situation(self) -> TruePoses:
-        """Returns the true poses since reset, on which the task's relations are evaluated."""
+        """Return the true poses since reset, on which the task's relations are evaluated."""
         openings = self.robot.gripper_openings(np.array([seen for _, seen in self._seen]))
         return situation_of(self.scene, self.task, self.seen_poses(), openings)
 
     def observe(self, *, rendering: bool = True) -> SimObservation:
-        """Renders all views (unless disabled) and evaluates whether the task is done."""
+        """Render all views (unless disabled) and evaluate whether the task is done."""
         positions = self.positions()
         self._seen.append((self.object_poses(), positions))
         images, masks = self._render() if self._rendering and rendering else ({}, {})
@@ -276,7 +276,7 @@ class SimEpisode:
         return images, masks
 
     def _render_instances(self) -> ByteArray:
-        """Draws the same scene with every geom in the colour of its number.
+        """Draw the same scene with every geom in the colour of its number.
 
         The renderer's own segmentation looks all geoms up again in every frame, which takes
         as long as drawing them.
@@ -303,7 +303,7 @@ class SimEpisode:
         return instances
 
     def _index_model(self) -> None:
-        """Looks up the joints' indices in qpos."""
+        """Look up the joints' indices in qpos."""
         joints = [actuator.joint for actuator in actuators_of(self.robot)]
         self._arm_qpos = np.array([self._model.joint(name).qposadr[0] for name in joints])
         self._instance_of = np.zeros(0, dtype=np.uint8)

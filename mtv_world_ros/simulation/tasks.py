@@ -132,11 +132,11 @@ class Task:
         return self.definition.instruction
 
     def succeeds(self, poses: TruePoses) -> BoolArray:
-        """Returns (T,) whether the task is done at each sample."""
+        """Return (T,) whether the task is done at each sample."""
         return self.definition.holds(poses, poses.openings)
 
     def goals(self, places: Sequence[tuple[float, float, float]]) -> dict[str, FloatArray]:
-        """Returns role -> goal (3,) of the goals of the moves [m]."""
+        """Return role -> goal (3,) of the goals of the moves [m]."""
         pairs = zip(self.moves, places, strict=True)
         return {move.subject: np.asarray(place) for move, place in pairs}
 
@@ -157,7 +157,7 @@ TASKS = _read_tasks()
 
 
 def task_named(name: str) -> Task:
-    """Returns a task by name.
+    """Return a task by name.
 
     Raises:
         SimulatorError: unknown name; the text names the nearest known one.
@@ -170,7 +170,7 @@ def task_named(name: str) -> Task:
 
 
 def tasks_named(text: str) -> tuple[Task, ...]:
-    """Returns the tasks of a comma-separated list of names; `all` = all but the zero-shot ones."""
+    """Return the tasks of a comma-separated list of names; `all` = all but the zero-shot ones."""
     if text.strip() == 'all':
         return tuple(task for task in TASKS.values() if not task.zero_shot)
     return tuple(task_named(name.strip()) for name in text.split(',') if name.strip())

@@ -89,14 +89,14 @@ class Workcell:
     object_size: float = 1.0
 
     def arm_at(self, x: float) -> str:
-        """Returns the arm that handles an object at `x`: the one whose base is nearest."""
+        """Return the arm that handles an object at `x`: the one whose base is nearest."""
         # of two that are equally near the last one: the right arm handles what is in the middle
         return min(reversed(self.bases), key=lambda arm: abs(x - self.bases[arm][0]))
 
 
 @lru_cache(maxsize=8)
 def workcell_of(robot: RobotModel) -> Workcell:
-    """Returns the workcell of a robot, `config/robots/<its name>/workcell.yaml`.
+    """Return the workcell of a robot, `config/robots/<its name>/workcell.yaml`.
 
     Raises:
         SimulatorError: there is none for this robot, or it is for other arms.

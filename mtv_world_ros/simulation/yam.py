@@ -65,7 +65,7 @@ def _finger_xml(arm: str, side: str, closed: float) -> str:
 
 
 def arm_xml(arm: str, robot: RobotModel) -> str:
-    """Returns the MJCF body tree of one arm (`left` or `right`), base included.
+    """Return the MJCF body tree of one arm (`left` or `right`), base included.
 
     The finger pads are placed so that they meet at the robot's closed gripper value.
     """
@@ -77,7 +77,7 @@ def arm_xml(arm: str, robot: RobotModel) -> str:
 
 
 def actuators() -> tuple[Actuator, ...]:
-    """Returns the actuators of both arms: joints 1-6, left finger, right finger."""
+    """Return the actuators of both arms: joints 1-6, left finger, right finger."""
     return tuple(
         actuator for number, arm in enumerate(ARMS) for actuator in _actuators(arm, 7 * number)
     )

@@ -21,7 +21,7 @@ UNSEEN_SHAPES = ('can', 'house')
 
 
 def kinds_named(text: str | Sequence[str]) -> tuple[str, ...]:
-    """Returns the kinds of a comma-separated list, or of a sequence; each one once.
+    """Return the kinds of a comma-separated list, or of a sequence; each one once.
 
     Raises:
         SimulatorError: unknown kind; the text names the nearest known one.
@@ -38,7 +38,7 @@ def kinds_named(text: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def tasks_of(kind: str, tasks: Sequence[Task]) -> tuple[Task, ...]:
-    """Returns the tasks that a zero-shot set is made of, out of the chosen ones.
+    """Return the tasks that a zero-shot set is made of, out of the chosen ones.
 
     Raises:
         SimulatorError: none of the chosen tasks can show unseen objects.
@@ -63,7 +63,7 @@ def variant(
     randomization: RandomizationConfig,
     moves: CameraMoves,
 ) -> tuple[Task, RandomizationConfig]:
-    """Returns the task and the randomisation of one episode; as given where `kind` is None.
+    """Return the task and the randomisation of one episode; as given where `kind` is None.
 
     Args:
         kind: one of `KINDS`, or None.
@@ -83,7 +83,7 @@ def variant(
 def with_moved_cameras(
     randomization: RandomizationConfig, moves: CameraMoves, rng: np.random.Generator
 ) -> RandomizationConfig:
-    """Returns the randomisation with every fixed camera moved; its cameras must be known."""
+    """Return the randomisation with every fixed camera moved; its cameras must be known."""
     cameras = tuple(moved(spec, moves, rng) for spec in randomization.cameras or ())
     return replace(randomization, cameras=cameras)
 
@@ -118,7 +118,7 @@ def _exchangeable(task: Task) -> tuple[str, ...]:
 
 
 def _with_unseen_objects(task: Task, rng: np.random.Generator) -> Task:
-    """Gives half of the movable objects (rounded at random) shapes that training never shows."""
+    """Give half of the movable objects (rounded at random) shapes that training never shows."""
     roles, usable = _movable(task), _exchangeable(task)
     half = (len(roles) + int(rng.integers(2)) * (len(roles) % 2)) // 2
     chosen = set(rng.permutation(usable)[:half].tolist())

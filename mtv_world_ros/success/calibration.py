@@ -36,7 +36,7 @@ _Known = Annotated[float, Field(ge=-1, le=1), WrapValidator(_or_nan)]
 
 
 def weighed(features: Mapping[str, float], name: str) -> float:
-    """Returns a feature's value for the logistic; NaN = unknown.
+    """Return a feature's value for the logistic; NaN = unknown.
 
     Doubts count only if negative, and only where no motion is foreseen: what is foreseen to move
     is moved by something, which may push it with shut fingers.
@@ -74,7 +74,7 @@ class Weights(Schema):
         return self
 
     def probability(self, features: Mapping[str, float]) -> float:
-        """Returns the probability of success; features that are NaN count as the mean."""
+        """Return the probability of success; features that are NaN count as the mean."""
         logit = self.bias
         for name, mean, scale, weight in zip(
             self.features, self.means, self.scales, self.weights, strict=True
@@ -115,7 +115,7 @@ class Calibration(Weights):
     fitted_to: FittedTo | None = None
 
     def given(self, is_real: bool, is_foreseen: bool = True) -> Weights:
-        """Returns the weights for real frames, or imagined ones with or without foresight."""
+        """Return the weights for real frames, or imagined ones with or without foresight."""
         if is_real:
             return self.observed or self
         if is_foreseen or self.is_of_pictures:
@@ -128,7 +128,7 @@ class Calibration(Weights):
         return self.fitted_to is not None and not self.fitted_to.foresight
 
     def objection(self, task: str, segmenter: str) -> str:
-        """Returns why the weights do not hold for a task and segmenter; empty = they hold."""
+        """Return why the weights do not hold for a task and segmenter; empty = they hold."""
         if segmenter != self.segmenter:
             return f"uncalibrated for the segmenter '{segmenter}' (fitted with '{self.segmenter}')"
         if task not in self.tasks:
@@ -138,7 +138,7 @@ class Calibration(Weights):
     def elsewhere(
         self, setting: Setting, cameras: Sequence[CameraModel], *, is_foreseen: bool
     ) -> str:
-        """Returns how the setting differs from that of the fit; empty = it does not.
+        """Return how the setting differs from that of the fit; empty = it does not.
 
         Its weights are used all the same: stated ones know less. Arguments as in
         `FittedTo.objection`.
@@ -179,7 +179,7 @@ class HorizonCurve(Schema):
         return self
 
     def trusted_seconds(self, level: float) -> float:
-        """Returns the time until which J is expected to stay at least `level` [s].
+        """Return the time until which J is expected to stay at least `level` [s].
 
         By the lower bound, at every frame up to it; 0 = not even at the first. The curve's end
         is the most that is known.
@@ -210,7 +210,7 @@ def fit_path(folder: Path, kind: type[Schema], *, of_pictures: bool = False) -> 
 
 
 def save_fit(folder: Path, fit: Calibration | HorizonCurve, *, of_pictures: bool = False) -> Path:
-    """Writes it into a checkpoint; returns the file. Arguments as in `fit_path`.
+    """Write it into a checkpoint; return the file. Arguments as in `fit_path`.
 
     Raises:
         CheckpointError: the folder cannot be written to.
@@ -255,7 +255,7 @@ def load_fits(folder: Path, *, of_pictures: bool = False) -> Fits:
 
 
 def load_fit(folder: Path, kind: type[Model], *, of_pictures: bool = False) -> Model | None:
-    """Returns the `Calibration` or `HorizonCurve` of a checkpoint; None = it has none.
+    """Return the `Calibration` or `HorizonCurve` of a checkpoint; None = it has none.
 
     Arguments as in `fit_path`.
 

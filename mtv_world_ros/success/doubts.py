@@ -29,7 +29,7 @@ SAYS = 'the physics here is not the one that was fitted'
 
 
 def unforeseen(foreseen: FloatArray, real: FloatArray) -> float:
-    """Returns the distance of the real motion from the nearest future [m]; NaN = nothing moved.
+    """Return the distance of the real motion from the nearest future [m]; NaN = nothing moved.
 
     Args:
         foreseen: (K, 1 + T, O, 3) centres of objects from a chunk's start on [m].
@@ -52,12 +52,12 @@ class PhysicsWatch:
         self._unforeseen: deque[bool] = deque(maxlen=_NUM_CHUNKS)
 
     def take(self, away_m: float) -> None:
-        """Adds the distance of a chunk's end from the nearest future [m]; NaN = no evidence."""
+        """Add the distance of a chunk's end from the nearest future [m]; NaN = no evidence."""
         if np.isfinite(away_m):
             self._unforeseen.append(away_m > NEAR_M)
 
     def forget(self) -> None:
-        """Begins anew: another task, or another fit."""
+        """Begin anew: another task, or another fit."""
         self._unforeseen.clear()
 
     @property
@@ -83,7 +83,7 @@ class PhysicsWatch:
 def doubted(
     estimate: SuccessEstimate, notes: Sequence[str] = (), refusal: str = ''
 ) -> SuccessEstimate:
-    """Returns an estimate with remarks, or without a verdict.
+    """Return an estimate with remarks, or without a verdict.
 
     Args:
         estimate: of pictures and foreseen motions.
@@ -107,7 +107,7 @@ _MIN_HALF_WIDTH = 0.35
 
 
 def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
-    """Returns a less certain estimate, for foreseen motions under a doubtful physics.
+    """Return a less certain estimate, for foreseen motions under a doubtful physics.
 
     Args:
         estimate: under the fitted physics.
@@ -145,7 +145,7 @@ class Grounds:
 
     @classmethod
     def of(cls, contact: str, is_calibrated: bool) -> Grounds:
-        """Returns the grounds of a checkpoint.
+        """Return the grounds of a checkpoint.
 
         Args:
             contact: doubt about its numbers of contact; empty = there is none.
@@ -159,7 +159,7 @@ class Grounds:
         )
 
     def bear(self, estimate: SuccessEstimate) -> SuccessEstimate:
-        """Returns an estimate of imagined frames by what it may rest on: none if by nothing.
+        """Return an estimate of imagined frames by what it may rest on: none if by nothing.
 
         Where pictures are no ground, foreseen motions alone decide.
         """

@@ -31,14 +31,14 @@ FAILURE_BELOW = 0.5
 
 
 def verdict(probability: float) -> float:
-    """Returns 1 = a success, 0 = a failure, NaN = open, or the estimator abstained (NaN)."""
+    """Return 1 = a success, 0 = a failure, NaN = open, or the estimator abstained (NaN)."""
     if probability >= SUCCESS_FROM:
         return 1.0
     return 0.0 if probability < FAILURE_BELOW else nan
 
 
 def verdict_word(probability: float) -> str:
-    """Returns `success`, `failure`, `open`, or `abstains` where the probability is NaN."""
+    """Return `success`, `failure`, `open`, or `abstains` where the probability is NaN."""
     if isnan(probability):
         return 'abstains'
     return {1.0: 'success', 0.0: 'failure'}.get(verdict(probability), 'open')
@@ -57,13 +57,13 @@ STATED_WEIGHTS = {'margin': 1.5, 'goal': 1.0, 'grasp': 8.0, 'carry': 0.5, 'fores
 
 
 def stated_probability(features: Mapping[str, float]) -> float:
-    """Returns the logistic of the features by `STATED_WEIGHTS`; NaN features do not count."""
+    """Return the logistic of the features by `STATED_WEIGHTS`; NaN features do not count."""
     terms = [weight * weighed(features, name) for name, weight in STATED_WEIGHTS.items()]
     return 1.0 / (1.0 + exp(-sum(term for term in terms if isfinite(term))))
 
 
 def capped(probability: float, features: Mapping[str, float]) -> float:
-    """Returns the probability, small where a gripper is still closed or nothing has moved."""
+    """Return the probability, small where a gripper is still closed or nothing has moved."""
     closed = features.get('released', nan) == 0.0
     # a rollout may begin where the task is all but done: then the margin is small
     left = features.get('moved', nan) == 0.0 and features.get('margin', nan) <= -MAX_MARGIN
@@ -88,7 +88,7 @@ class SuccessEstimator:
         segmenter: Segmenter | None = None,
         setting: Setting | None = None,
     ) -> None:
-        """Sets the tasks that may be judged.
+        """Set the tasks that may be judged.
 
         Args:
             tasks: known tasks.
@@ -128,7 +128,7 @@ class SuccessEstimator:
         *,
         is_real: bool = False,
     ) -> JudgedChunk:
-        """Returns the probability that the task is done at the end of a rollout's chunk.
+        """Return the probability that the task is done at the end of a rollout's chunk.
 
         `jaccard` holds J of every subject with its goal mask (its first mask of the rollout,
         moved to where the relation wants it), and J of every other object with its first mask.
@@ -276,7 +276,7 @@ def _released(task: TaskSpec, openings: FloatArray | None) -> float:
 
 
 def _check_views(task: TaskSpec, footage: Footage) -> None:
-    """Refuses a task that needs views which do not exist."""
+    """Refuse a task that needs views which do not exist."""
     known = [camera.view for camera in footage.cameras]
     missing = [view for view in task.views if view not in known]
     if missing:

@@ -48,7 +48,7 @@ class ImaginedScene:
     _ends: dict[str, Location] = field(default_factory=dict)
 
     def item(self, role: str) -> int:
-        """Returns the index of a placeholder's object."""
+        """Return the index of a placeholder's object."""
         return self.views.index(self.bound[role])
 
     def centres(self, role: str) -> FloatArray:
@@ -151,14 +151,14 @@ class Evidence:
 
     @classmethod
     def none(cls, reason: CannotTell) -> Evidence:
-        """Returns the evidence of pictures that do not show the outcome."""
+        """Return the evidence of pictures that do not show the outcome."""
         features = dict.fromkeys((*FEATURES, 'moved'), nan)
         notes = (f'pictures do not tell: {reason}',)
         return cls(worst=None, features=features, sigma=nan, goal_jaccard={}, notes=notes)
 
 
 def gather(views: Views, task: TaskSpec, bound: Mapping[str, str]) -> Evidence:
-    """Measures how far a task's relations hold at the end of a rollout.
+    """Measure how far a task's relations hold at the end of a rollout.
 
     Args:
         views: the rollout.
@@ -196,7 +196,7 @@ def gather(views: Views, task: TaskSpec, bound: Mapping[str, str]) -> Evidence:
 
 
 def clipped(score: float) -> float:
-    """Returns the score within plus and minus `MAX_MARGIN`."""
+    """Return the score within plus and minus `MAX_MARGIN`."""
     return min(max(score, -MAX_MARGIN), MAX_MARGIN)
 
 
@@ -314,5 +314,5 @@ def _is_away(away: FloatArray) -> bool:
 
 
 def view_mean(values: FloatArray) -> float:
-    """Returns the mean of the values that are not NaN, NaN if there is none."""
+    """Return the mean of the values that are not NaN, NaN if there is none."""
     return float(mean_of_known(values))

@@ -46,7 +46,7 @@ class CameraRange(Schema):
 
     @classmethod
     def of(cls, cameras: Sequence[CameraModel]) -> CameraRange:
-        """Returns the range of cameras of one view on one link."""
+        """Return the range of cameras of one view on one link."""
         rows = np.stack([_placement(camera) for camera in cameras])
         return cls(
             mount_link=cameras[0].mount_link,
@@ -77,7 +77,7 @@ class Setting(Schema):
 
     @classmethod
     def of(cls, robot: RobotModel, foresight: str = '') -> Setting:
-        """Returns the setting of a robot."""
+        """Return the setting of a robot."""
         tools = robot.tool_poses(np.zeros((1, len(robot.joint_names))))[:, 0, :3, 3]
         return cls(foresight=foresight, robot=robot.name, tools=tuple(map(tuple, tools.tolist())))
 
@@ -102,7 +102,7 @@ class FittedTo(Setting):
 
     @classmethod
     def episodes(cls, setting: Setting, sets: Iterable[Sequence[CameraModel]]) -> FittedTo:
-        """Returns what episodes were made with.
+        """Return what episodes were made with.
 
         Args:
             setting: of all episodes.
@@ -118,7 +118,7 @@ class FittedTo(Setting):
     def objection(
         self, setting: Setting, cameras: Sequence[CameraModel], *, is_foreseen: bool
     ) -> str:
-        """Returns how a setting differs; empty = it does not.
+        """Return how a setting differs; empty = it does not.
 
         Args:
             setting: where the estimate is made.

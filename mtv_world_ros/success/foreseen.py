@@ -47,7 +47,7 @@ class ForeseenEnds:
 def foreseen_ends(
     motions: ForeseenMotions, task: TaskSpec, bound: Mapping[str, str], starts: FloatArray
 ) -> ForeseenEnds | None:
-    """Returns whether the task is done at the end of each; None = they do not tell.
+    """Return whether the task is done at the end of each; None = they do not tell.
 
     Args:
         motions: of the objects, in several futures.
@@ -103,5 +103,5 @@ def _size(measured: FloatArray, usual: Sequence[float] | None) -> tuple[float, f
 
 
 def foreseen_feature(ends: ForeseenEnds | None) -> float:
-    """Returns the share of the motions that succeed, -1 (none) to 1 (all); NaN = not known."""
+    """Return the share of the motions that succeed, -1 (none) to 1 (all); NaN = not known."""
     return nan if ends is None else 2 * ends.share - 1

@@ -54,7 +54,7 @@ class Margin(NamedTuple):
 
 
 def plane_distance(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Returns the (T,) distance of centres (T, 3) or (3,) in x and y [m]."""
+    """Return the (T,) distance of centres (T, 3) or (3,) in x and y [m]."""
     return np.linalg.norm((np.asarray(a) - np.asarray(b))[..., :2], axis=-1)
 
 
@@ -102,13 +102,13 @@ class Relation(Schema):
         return tuple(getattr(self, key) for key in ('subject', 'target') if hasattr(self, key))
 
     def goal(self, at: Situation) -> Goal | None:
-        """Returns where the subject's centre should be (3,) [m]; None if that is not one place."""
+        """Return where the subject's centre should be (3,) [m]; None if that is not one place."""
         del at
         return None
 
     @abstractmethod
     def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much each condition holds."""
+        """Return by how much each condition holds."""
 
 
 class Beside(Relation):
@@ -130,12 +130,12 @@ class Beside(Relation):
     goal_distance_m: Length = 0.13
 
     def goal(self, at: Situation) -> Goal | None:
-        """Returns where the subject's centre should be (3,) [m]."""
+        """Return where the subject's centre should be (3,) [m]."""
         way = np.array([self._side() * self.goal_distance_m, 0.0, 0.0])
         return self.subject, at.centres(self.target)[-1] + way
 
     def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much each condition holds."""
+        """Return by how much each condition holds."""
         a, b = at.centres(self.subject), at.centres(self.target)
         distance, (dx, dy, dz) = plane_distance(a, b), (a - b).T
         return [
@@ -162,11 +162,11 @@ class OnTop(Relation):
     max_offset_m: Lengths3 = (0.025, 0.025, 0.012)
 
     def goal(self, at: Situation) -> Goal | None:
-        """Returns where the subject's centre should be (3,) [m]."""
+        """Return where the subject's centre should be (3,) [m]."""
         return self.subject, at.centres(self.target)[-1] + self._rise(at)
 
     def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much each condition holds."""
+        """Return by how much each condition holds."""
         offset = at.centres(self.subject) - at.centres(self.target) - self._rise(at)
         room = np.asarray(self.max_offset_m) - np.abs(offset)
         names = ('over it in x', 'over it in y', 'at its top')
@@ -191,12 +191,12 @@ class ServedOn(Relation):
     max_rise_m: Length = 0.015
 
     def goal(self, at: Situation) -> Goal | None:
-        """Returns where the subject's centre should be (3,) [m]."""
+        """Return where the subject's centre should be (3,) [m]."""
         rise = np.array([0.0, 0.0, self._rise(at)])
         return self.subject, at.centres(self.target)[-1] + rise
 
     def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much each condition holds."""
+        """Return by how much each condition holds."""
         a, b = at.centres(self.subject), at.centres(self.target)
         rise = (a - b)[:, 2] - self._rise(at)
         return [
@@ -243,14 +243,14 @@ class Within(Relation):
     goal_rise_m: Length | None = None
 
     def goal(self, at: Situation) -> Goal | None:
-        """Returns where the subject's centre should be (3,) [m], if that is one place."""
+        """Return where the subject's centre should be (3,) [m], if that is one place."""
         if self.goal_rise_m is None:
             return None
         rise = np.array([0.0, 0.0, self.goal_rise_m])
         return self.subject, at.centres(self.target)[-1] + rise
 
     def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much each condition holds."""
+        """Return by how much each condition holds."""
         distance = plane_distance(at.centres(self.subject), at.centres(self.target))
         return [
             Margin('near its middle', self.max_distance_m - distance),
@@ -275,7 +275,7 @@ class Inside(Relation):
     rise_m: _Heights | None = None
 
     def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much each condition holds."""
+        """Return by how much each condition holds."""
         room = (self._room(at) - np.abs(at.offsets(self.subject, self.target)[:, :2])).T
         return [
             Margin('inside in x', room[0]),
@@ -316,7 +316,7 @@ class Apart(Relation):
     min_distance_m: Length = 0.06
 
     def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much the condition holds."""
+        """Return by how much the condition holds."""
         distance = plane_distance(at.centres(self.subject), at.centres(self.target))
         return [Margin('apart', distance - self.min_distance_m)]
 
@@ -331,7 +331,7 @@ class Moved(Relation):
     min_distance_m: Length = 0.1
 
     def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much the condition holds."""
+        """Return by how much the condition holds."""
         way = plane_distance(at.centres(self.subject), at.start(self.subject))
         return [Margin('moved away', way - self.min_distance_m)]
 
@@ -348,11 +348,11 @@ class AtGoal(Relation):
     max_rise_m: Length = 0.03
 
     def goal(self, at: Situation) -> Goal | None:
-        """Returns where the subject's centre should be (3,) [m]."""
+        """Return where the subject's centre should be (3,) [m]."""
         return self.subject, self._goal(at)
 
     def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much each condition holds."""
+        """Return by how much each condition holds."""
         centres, goal = at.centres(self.subject), self._goal(at)
         return [
             Margin('at its goal', self.max_distance_m - plane_distance(centres, goal)),
@@ -391,7 +391,7 @@ class Shaken(Relation):
     min_swing_rad: _Angle = 0.15
 
     def margins(self, at: Situation) -> list[Margin]:
-        """Returns by how much each condition holds; how wide the swings were, to `_SWINGS`."""
+        """Return by how much each condition holds; how wide the swings were, to `_SWINGS`."""
         room = at.clearances(self.subject) - self.min_lift_m
         swings = self.min_swing_rad * np.array(_SWINGS)
         enough = np.array([self._reversed(at, swing, room > 0) for swing in swings])

@@ -53,11 +53,11 @@ class Footage:
         return self.masks.masks.shape[2]
 
     def frame_masks(self, frame: int) -> BoolArray:
-        """Returns (V, O, H, W) masks of a frame, 0 = the start frame."""
+        """Return (V, O, H, W) masks of a frame, 0 = the start frame."""
         return self.start_masks.masks[:, :, 0] if frame == 0 else self.masks.masks[:, :, frame - 1]
 
     def known(self, frame: int) -> BoolArray:
-        """Returns (V, O) whether an object's mask is not empty and its status `ok`."""
+        """Return (V, O) whether an object's mask is not empty and its status `ok`."""
         status = self.start_masks.status if frame == 0 else self.masks.status
         ok = np.array([[word == 'ok' for word in row] for row in status], np.bool_)
         masks = self.frame_masks(frame)
@@ -65,7 +65,7 @@ class Footage:
 
 
 def footage_of(motion: Motion, start_masks: ObjectMasks, masks: ObjectMasks) -> Footage:
-    """Returns the footage of a chunk of 1 + T states, the first at the start masks."""
+    """Return the footage of a chunk of 1 + T states, the first at the start masks."""
     return Footage(
         masks=masks,
         start_masks=start_masks,
@@ -133,12 +133,12 @@ class RolloutMemory:
         return self.points.shape[1]
 
     def start_point(self, item: int) -> FloatArray:
-        """Returns where an object was in the rollout's first frame (3,) [m], NaN = not known."""
+        """Return where an object was in the rollout's first frame (3,) [m], NaN = not known."""
         return self.points[item, 0]
 
 
 def remember(memory: RolloutMemory | None, footage: Footage) -> RolloutMemory:
-    """Returns the memory after a chunk.
+    """Return the memory after a chunk.
 
     Args:
         memory: before it; None = the chunk is the first, as it is where the objects have changed.
@@ -228,7 +228,7 @@ def _grasped(memory: RolloutMemory, footage: Footage, frame: int, arm: int) -> R
 
 
 def _released(memory: RolloutMemory, arm: int, tool: FloatArray) -> RolloutMemory:
-    """Ends all open grasps of the arm; a gripper that closes in steps has several."""
+    """End all open grasps of the arm; a gripper that closes in steps has several."""
     ended = tuple(
         grasp._replace(released_at=tool)
         if grasp.arm == arm and grasp.released_at is None

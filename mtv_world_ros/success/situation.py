@@ -25,31 +25,31 @@ class Situation(Protocol):
     """
 
     def centres(self, role: str) -> FloatArray:
-        """Returns the object's centre (T, 3) [m]."""
+        """Return the object's centre (T, 3) [m]."""
         ...
 
     def offsets(self, role: str, target: str) -> FloatArray:
-        """Returns the object's centre (T, 3) from the target's, in the target's own frame [m]."""
+        """Return the object's centre (T, 3) from the target's, in the target's own frame [m]."""
         ...
 
     def start(self, role: str) -> FloatArray:
-        """Returns the object's centre (3,) at the start of the episode [m]."""
+        """Return the object's centre (3,) at the start of the episode [m]."""
         ...
 
     def goal(self, role: str) -> FloatArray:
-        """Returns where the object's centre (3,) is to be, if the scene came with a goal [m]."""
+        """Return where the object's centre (3,) is to be, if the scene came with a goal [m]."""
         ...
 
     def size(self, role: str) -> FloatArray:
-        """Returns the full extents (3,) of the object in its own frame [m]."""
+        """Return the full extents (3,) of the object in its own frame [m]."""
         ...
 
     def clearances(self, role: str) -> FloatArray:
-        """Returns the height (T,) of the object's lowest point over the table [m]."""
+        """Return the height (T,) of the object's lowest point over the table [m]."""
         ...
 
     def reversals(self, role: str, swing: float) -> FloatArray:
-        """Returns (T,) how often the object's lean has turned back by more than `swing` [rad]."""
+        """Return (T,) how often the object's lean has turned back by more than `swing` [rad]."""
         ...
 
 
@@ -109,5 +109,5 @@ class TruePoses:
 
 
 def grippers_open(openings: FloatArray) -> BoolArray:
-    """Returns (T,) where every gripper of (A, T) `openings` is open."""
+    """Return (T,) where every gripper of (A, T) `openings` is open."""
     return np.all(np.asarray(openings) > OPEN_SHARE, axis=0)

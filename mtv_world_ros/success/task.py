@@ -109,7 +109,7 @@ class TaskSpec(Schema):
         return tuple(dict.fromkeys(relation.subject for relation in self.relations))
 
     def holds(self, at: Situation, openings: FloatArray) -> BoolArray:
-        """Returns (T,) whether the task is done at each sample.
+        """Return (T,) whether the task is done at each sample.
 
         Args:
             at: object poses and gripper openings over time.
@@ -129,7 +129,7 @@ class TaskSpec(Schema):
         return np.all(held, axis=0)
 
     def bind(self, instruction: str) -> dict[str, str] | None:
-        """Returns the placeholders' objects if the instruction fits the template, else None."""
+        """Return the placeholders' objects if the instruction fits the template, else None."""
         name = rf'(?P<\1>[\\w -]{{1,{_LONGEST_NAME}}}?)'
         pattern = re.sub(r'\\\{(\w+)\\\}', name, re.escape(self.instruction.lower()))
         found = re.fullmatch(pattern, ' '.join(instruction.lower().split()).rstrip('.! '))
@@ -145,7 +145,7 @@ class TaskSpec(Schema):
 def match_task(
     tasks: Iterable[TaskSpec], instruction: str
 ) -> tuple[TaskSpec, dict[str, str]] | None:
-    """Returns the task whose template the instruction fits, and its objects.
+    """Return the task whose template the instruction fits, and its objects.
 
     Where several fit, the one that says most about its objects' nouns, then the first.
     """
@@ -155,12 +155,12 @@ def match_task(
 
 
 def ever_and_final(success: BoolArray, held: int = HELD_SAMPLES) -> tuple[bool, bool]:
-    """Returns whether (T,) `success` held at any sample, and in each of the last `held`."""
+    """Return whether (T,) `success` held at any sample, and in each of the last `held`."""
     return bool(success.any()), bool(len(success) >= held and success[-held:].all())
 
 
 def load_task(path: Path) -> TaskSpec:
-    """Reads one task.
+    """Read one task.
 
     Raises:
         ConfigError: the file is no YAML mapping, a key is unknown or missing, a value is wrong.
@@ -170,7 +170,7 @@ def load_task(path: Path) -> TaskSpec:
 
 
 def load_tasks(folder: Path) -> tuple[TaskSpec, ...]:
-    """Reads every `*.yaml` of a folder, in the order of names.
+    """Read every `*.yaml` of a folder, in the order of names.
 
     Raises:
         ConfigError: a file is wrong, or two tasks share a name.

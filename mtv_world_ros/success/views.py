@@ -45,7 +45,7 @@ class Views:
         return self.footage.masks.names
 
     def index(self, name: str) -> int:
-        """Returns the object's index.
+        """Return the object's index.
 
         Raises:
             CannotTell: the object has no mask in any view.
@@ -60,24 +60,24 @@ class Views:
         return np.array([not self.used or view in self.used for view in views])
 
     def start_mask(self, item: int) -> BoolArray:
-        """Returns the (V, H, W) masks of one object in the rollout's first frame."""
+        """Return the (V, H, W) masks of one object in the rollout's first frame."""
         return self.memory.start_masks.masks[:, item, 0]
 
     def start_ok(self, item: int) -> BoolArray:
-        """Returns (V,) whether that mask is to be trusted."""
+        """Return (V,) whether that mask is to be trusted."""
         ok = np.array([row[item] == 'ok' for row in self.memory.start_masks.status])
         return ok & self._is_used()
 
     def end_ok(self, item: int) -> BoolArray:
-        """Returns (V,) whether the object is known, and seen in the last frame."""
+        """Return (V,) whether the object is known, and seen in the last frame."""
         return self.footage.known(self.footage.num_frames)[:, item] & self._is_used()
 
     def start_jaccard(self, item: int) -> FloatArray:
-        """Returns (V,) J of the last masks with the start mask, NaN where either is not known."""
+        """Return (V,) J of the last masks with the start mask, NaN where either is not known."""
         return self._jaccard(item, self.start_mask(item))
 
     def goal_masks(self, item: int, goal: FloatArray) -> BoolArray | None:
-        """Returns (V, H, W) start masks moved to `goal` (3,); None = its start is not known."""
+        """Return (V, H, W) start masks moved to `goal` (3,); None = its start is not known."""
         start = self.memory.start_point(item)
         if not np.isfinite(start).all():
             return None
@@ -90,7 +90,7 @@ class Views:
         return np.stack(moved)
 
     def goal_jaccard(self, item: int, goals: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Returns (V,) J of the last masks, and of the start masks, with (V, H, W) goal masks.
+        """Return (V,) J of the last masks, and of the start masks, with (V, H, W) goal masks.
 
         NaN in a view whose goal mask is empty.
 
@@ -113,14 +113,14 @@ class Views:
         return np.where(self.start_ok(item) & self.end_ok(item), scores, np.nan)
 
     def share_inside(self, item: int, regions: BoolArray) -> FloatArray:
-        """Returns (V,) shares of an object's mask in (V, H, W) regions; NaN = not known."""
+        """Return (V,) shares of an object's mask in (V, H, W) regions; NaN = not known."""
         masks = self.footage.masks.masks[:, item, -_LAST_FRAMES:]
         area = np.maximum(masks.sum((-2, -1)), 1)
         shares = np.median((masks & regions[:, None]).sum((-2, -1)) / area, axis=1)
         return np.where(self.end_ok(item), shares, np.nan)
 
     def containment(self, item: int, within: int) -> float:
-        """Returns the share of an object's mask in another's last unhidden one; the least."""
+        """Return the share of an object's mask in another's last unhidden one; the least."""
         shares = self.share_inside(item, self.memory.seen_masks[:, within])
         known = np.isfinite(shares) & self.start_ok(within)
         return float(shares[known].min()) if known.any() else float('nan')
@@ -139,7 +139,7 @@ class Views:
             raise CannotTell(f"'{self.names[item]}' has vanished: {share:.0%} of its area is left")
 
     def end(self, item: int) -> tuple[Location, bool]:
-        """Returns where the object is at the end, and whether it is hidden where it stood.
+        """Return where the object is at the end, and whether it is hidden where it stood.
 
         Raises:
             CannotTell: the object was lost, or the views' rays do not meet.

@@ -26,13 +26,13 @@ _OPEN_TO_OTHERS = 'Whoever reaches this address can see and copy what is shown, 
 
 
 def check_installed() -> None:
-    """Raises a `ConfigError` where the Rerun SDK is not installed."""
+    """Raise a `ConfigError` where the Rerun SDK is not installed."""
     if find_spec('rerun') is None:
         raise ConfigError("the viewer is not installed: pip install 'mtv_world_ros[view]'")
 
 
 def recording(name: str) -> Any:
-    """Returns a new Rerun recording.
+    """Return a new Rerun recording.
 
     Raises:
         ConfigError: the Rerun SDK is not installed.
@@ -44,7 +44,7 @@ def recording(name: str) -> Any:
 
 
 def log_any(stream: Any, shown: Streams | ScoredRollout, root: str) -> None:
-    """Logs a bag or a scored rollout."""
+    """Log a bag or a scored rollout."""
     root = escaped(root)
     if isinstance(shown, Streams):
         log_streams(stream, shown, root)
@@ -53,7 +53,7 @@ def log_any(stream: Any, shown: Streams | ScoredRollout, root: str) -> None:
 
 
 def log_streams(stream: Any, streams: Streams, root: str, begin: int | None = None) -> None:
-    """Logs streams under an entity path, on a timeline in seconds.
+    """Log streams under an entity path, on a timeline in seconds.
 
     Second 0 is the stamp `begin` [ns], by default that of the first frame.
     """
@@ -83,7 +83,7 @@ def log_streams(stream: Any, streams: Streams, root: str, begin: int | None = No
 
 
 def log_rollout(stream: Any, scored: ScoredRollout, root: str) -> None:
-    """Logs a scored rollout: frames of all kinds, masks outlined, J per object, estimates."""
+    """Log a scored rollout: frames of all kinds, masks outlined, J per object, estimates."""
     import rerun
 
     rollout = scored.rollout
@@ -106,7 +106,7 @@ def log_rollout(stream: Any, scored: ScoredRollout, root: str) -> None:
 
 
 def escaped(path: str) -> str:
-    """Returns an entity's path in Rerun's notation: spaces and signs have a backslash."""
+    """Return an entity's path in Rerun's notation: spaces and signs have a backslash."""
     import rerun
 
     parts = (rerun.escape_entity_path_part(part) if part else '' for part in path.split('/'))
@@ -125,7 +125,7 @@ def _style_curves(stream: Any, rollout: StoredRollout, root: str) -> None:
 
 
 def _mark_points(stream: Any, path: str) -> None:
-    """Marks the values of a curve: a single one draws no line."""
+    """Mark the values of a curve: a single one draws no line."""
     import rerun
 
     lines, points = rerun.SeriesLines(widths=[1.5]), rerun.SeriesPoints(marker_sizes=[4.0])
@@ -163,7 +163,7 @@ def _outlines(labels: ByteArray) -> Any:
 
 
 def layout(roots: Mapping[str, Streams | ScoredRollout], table: str = '', active: int = 0) -> Any:
-    """Returns the blueprint: a tab per root; a row per view, its kinds side by side; curves.
+    """Return the blueprint: a tab per root; a row per view, its kinds side by side; curves.
 
     Args:
         roots: logged streams and rollouts, by path of their entities.
@@ -204,7 +204,7 @@ def _tab(root: str, shown: Streams | ScoredRollout, rrb: Any) -> Any:
 def open_viewer(
     stream: Any, blueprint: Any, address: PageAddress, save: Path | None, is_native: bool
 ) -> str:
-    """Opens the viewer for what is logged from here on; returns a line for the user.
+    """Open the viewer for what is logged from here on; return a line for the user.
 
     Args:
         stream: of `recording`.
@@ -230,7 +230,7 @@ def open_viewer(
 
 
 def flush(stream: Any, save: Path | None) -> None:
-    """Waits until the viewer or the file has what was logged.
+    """Wait until the viewer or the file has what was logged.
 
     Raises:
         MtvWorldError: the file cannot be written; there is none then.
@@ -241,7 +241,7 @@ def flush(stream: Any, save: Path | None) -> None:
 
 @contextmanager
 def _disk_errors(save: Path | None) -> Iterator[None]:
-    """Names the file that the viewer's library cannot write, and removes what there is of it."""
+    """Name the file that the viewer's library cannot write, and remove what there is of it."""
     try:
         yield
     except RuntimeError as error:

@@ -59,7 +59,7 @@ def make_clip(
     tile_width: int = _VIDEO_TILE_PX,
     with_sheet: bool = True,
 ) -> RolloutClip:
-    """Returns a rollout's video and contact sheet, masks outlined.
+    """Return a rollout's video and contact sheet, masks outlined.
 
     Args:
         rollout: frames and masks to show.
@@ -91,7 +91,7 @@ def _sheet(rollout: StoredRollout) -> bytes:
 
 
 def outlined(rollout: StoredRollout, tile_width: int) -> Comparison:
-    """Returns the frames, enlarged, with the masks' outlines drawn over and J as captions.
+    """Return the frames, enlarged, with the masks' outlines drawn over and J as captions.
 
     Recorded frames carry the recorded masks in the objects' colours; imagined frames the masks
     found in them in the same colours, and the recorded ones in white. Frames are enlarged by whole
@@ -133,7 +133,7 @@ def _outline(
     *,
     shadow: bool = False,
 ) -> None:
-    """Draws the outline of an (H, W) mask over the enlarged image, in place."""
+    """Draw the outline of an (H, W) mask over the enlarged image, in place."""
     if not mask.any():
         return
     large = mask.astype(np.uint8).repeat(factor, axis=0).repeat(factor, axis=1)

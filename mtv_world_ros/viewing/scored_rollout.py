@@ -81,12 +81,12 @@ class ScoredRollout:
 
 
 def is_scored(folder: Path) -> bool:
-    """Returns whether a folder holds rollouts that an installed package knows how to show."""
+    """Return whether a folder holds rollouts that an installed package knows how to show."""
     return _reader(folder) is not None
 
 
 def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
-    """Yields rollouts of an evaluation or a ranking, up to `count`; the ranking's worst first.
+    """Yield rollouts of an evaluation or a ranking, up to `count`; the ranking's worst first.
 
     Raises:
         ConfigError: the folder holds neither, or its reader cannot be imported.

@@ -30,7 +30,7 @@ _MAX_TIME_OFFSET = 0.6
 
 
 def write_pictures(bags: Sequence[Path], out: Path, *, has_video: bool = True) -> list[Path]:
-    """Writes `contact_sheet.png` and `comparison.mp4` of predictions; returns their paths.
+    """Write `contact_sheet.png` and `comparison.mp4` of predictions; return their paths.
 
     A long video shows every second, third, ... frame, `MAX_VIDEO_FRAMES` at most, in its own
     time; its quality is lowered until it takes `MAX_VIDEO_BYTES`, down to a limit.
@@ -62,7 +62,7 @@ def write_pictures(bags: Sequence[Path], out: Path, *, has_video: bool = True) -
 
 
 def every(comparison: Comparison, stride: int) -> Comparison:
-    """Returns every `stride`-th frame, the first among them."""
+    """Return every `stride`-th frame, the first among them."""
     return replace(
         comparison,
         times=comparison.times[::stride],

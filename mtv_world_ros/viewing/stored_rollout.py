@@ -31,7 +31,7 @@ _CRF = 10
 
 
 def join(stretches: Sequence[StoredRollout]) -> StoredRollout:
-    """Returns the stretches of an episode in a row.
+    """Return the stretches of an episode in a row.
 
     Raises:
         EpisodeError: there is none, or they differ in views, objects or size.
@@ -58,7 +58,7 @@ def save_rollout(path: Path, rollout: StoredRollout) -> None:
 
 
 def rollout_bytes(rollout: StoredRollout) -> bytes:
-    """Returns the file of a rollout that `load_rollout` reads."""
+    """Return the file of a rollout that `load_rollout` reads."""
     kept = _bounded(rollout)
     shape = kept.real.shape[:4]
     held: dict[str, Any] = {
@@ -82,7 +82,7 @@ def rollout_bytes(rollout: StoredRollout) -> bytes:
 
 
 def load_rollout(path: Path) -> StoredRollout:
-    """Reads a rollout back.
+    """Read a rollout back.
 
     Raises:
         EpisodeError: the file is missing or cannot be read.

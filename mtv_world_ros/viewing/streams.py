@@ -69,7 +69,7 @@ class Streams:
 
 
 def read_streams(bags: Sequence[Path]) -> Streams:
-    """Reads episodes and predictions; those of one time belong together.
+    """Read episodes and predictions; those of one time belong together.
 
     Raises:
         EpisodeError: one cannot be read, none holds an image, or they are more than a day apart.
@@ -101,7 +101,7 @@ def read_streams(bags: Sequence[Path]) -> Streams:
 
 
 def shown_as(topic: str, msgtype: str) -> tuple[str, ...] | None:
-    """Returns what a topic shows: image or mask of a kind and view, ...; None = nothing."""
+    """Return what a topic shows: image or mask of a kind and view, ...; None = nothing."""
     match = _IMAGES.match(topic)
     if match and msgtype in (IMAGE, COMPRESSED_IMAGE):
         is_mask = match['stream'] == 'mask' or '/mask/' in topic
@@ -115,7 +115,7 @@ def shown_as(topic: str, msgtype: str) -> tuple[str, ...] | None:
 
 
 def take(streams: Streams, message: BagMessage) -> None:
-    """Adds what a message shows.
+    """Add what a message shows.
 
     Raises:
         MtvWorldError: the message cannot be read.

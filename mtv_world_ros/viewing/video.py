@@ -70,7 +70,7 @@ class Comparison:
                 )
 
     def frames(self, kind: str) -> ByteArray:
-        """Returns the (V, T, H, W, 3) frames of one of `KINDS`."""
+        """Return the (V, T, H, W, 3) frames of one of `KINDS`."""
         return {'real': self.real, 'trajectory': self.trajectory, 'imagined': self.imagined}[kind]
 
 
@@ -82,7 +82,7 @@ def contact_sheet(
     num_columns: int = 8,
     tile_width: int = 240,
 ) -> ByteArray:
-    """Returns an (H, W, 3) uint8 RGB picture: a row per view and kind, time from left to right.
+    """Return an (H, W, 3) uint8 RGB picture: a row per view and kind, time from left to right.
 
     Args:
         comparison: real, drawn and imagined frames of a rollout.
@@ -139,7 +139,7 @@ def _view_band(
 
 
 def side_by_side(comparison: Comparison, *, tile_width: int = 384) -> ByteArray:
-    """Returns (T, H, W, 3) uint8 RGB frames: a row per view; real, trajectory, imagined.
+    """Return (T, H, W, 3) uint8 RGB frames: a row per view; real, trajectory, imagined.
 
     Above each row stand the view and the captions of the imagined frames.
     """
@@ -227,7 +227,7 @@ def _text(
     scale: float = _FONT_SCALE,
     colour: tuple[int, int, int] = _TEXT_COLOUR,
 ) -> None:
-    """Draws plain ASCII text in place, its baseline at (x, y)."""
+    """Draw plain ASCII text in place, its baseline at (x, y)."""
     plain = text.encode('ascii', 'replace').decode()
     cv2.putText(image, plain, place, _FONT, scale, colour, 1, cv2.LINE_AA)
 
@@ -239,7 +239,7 @@ def encode_video(
     crf: int = 20,
     full_colour: bool = False,
 ) -> bytes:
-    """Returns an MP4 file of (T, H, W, 3) uint8 RGB frames.
+    """Return an MP4 file of (T, H, W, 3) uint8 RGB frames.
 
     Args:
         frames: (T, H, W, 3) uint8 RGB; H and W even unless `full_colour`.
@@ -269,7 +269,7 @@ def encode_video(
 
 
 def decode_video(data: bytes) -> ByteArray:
-    """Returns the (T, H, W, 3) uint8 RGB frames of a video file's bytes.
+    """Return the (T, H, W, 3) uint8 RGB frames of a video file's bytes.
 
     Raises:
         EpisodeError: the bytes are no video.

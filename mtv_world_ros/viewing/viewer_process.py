@@ -52,7 +52,7 @@ class PageAddress:
 
     @classmethod
     def parse(cls, text: str) -> PageAddress:
-        """Returns the value of an option: `PORT` or `ADDRESS:PORT`, e.g. `0.0.0.0:9090`.
+        """Return the value of an option: `PORT` or `ADDRESS:PORT`, e.g. `0.0.0.0:9090`.
 
         Raises:
             argparse.ArgumentTypeError: it is neither.
@@ -91,7 +91,7 @@ class PageAddress:
 
 
 def check_ports(address: PageAddress, option: str = '--port') -> None:
-    """Checks that the ports of the page and of its data are free on the address to listen on.
+    """Check that the ports of the page and of its data are free on the address to listen on.
 
     Args:
         address: of the page.
@@ -148,7 +148,7 @@ def serve(stream: Any, blueprint: Any, address: PageAddress) -> str:
 
 
 def open_window(stream: Any, blueprint: Any) -> None:
-    """Shows a recording in Rerun's window, which stays when this process ends.
+    """Show a recording in Rerun's window, which stays when this process ends.
 
     A window that is already there on the usual port is used.
 
@@ -165,7 +165,7 @@ def open_window(stream: Any, blueprint: Any) -> None:
 
 
 def command_line(arguments: Sequence[str]) -> list[str]:
-    """Returns a command of Rerun's program, which comes with its Python package.
+    """Return a command of Rerun's program, which comes with its Python package.
 
     Raises:
         ConfigError: there is none.
@@ -181,7 +181,7 @@ def command_line(arguments: Sequence[str]) -> list[str]:
 
 
 def _start(command: Sequence[str], folder: Path) -> subprocess.Popen[bytes]:
-    """Starts the program in a session of its own: Ctrl-C ends the command, then the command it."""
+    """Start the program in a session of its own: Ctrl-C ends the command, then the command it."""
     with (folder / 'log').open('wb') as log:
         return subprocess.Popen(
             command,
@@ -194,7 +194,7 @@ def _start(command: Sequence[str], folder: Path) -> subprocess.Popen[bytes]:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Ends the program; it holds nothing that must be written."""
+    """End the program; it holds nothing that must be written."""
     process.terminate()
     try:
         process.wait(_STOP_S)
@@ -204,7 +204,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _wait(process: subprocess.Popen[bytes], host: str, port: int, folder: Path) -> None:
-    """Waits until the program listens.
+    """Wait until the program listens.
 
     Raises:
         MtvWorldError: it ended, or does not listen in time.

@@ -144,7 +144,7 @@ class CameraCheck:
         return tuple(fit.text for fit in self.fits if fit.status != 'fits')
 
     def corrected(self, cameras: Sequence[CameraModel]) -> tuple[CameraModel, ...]:
-        """Returns cameras of the same views, at any size, as they were found to be."""
+        """Return cameras of the same views, at any size, as they were found to be."""
         found = {fit.view: fit for fit in self.fits if fit.status == 'corrected'}
         return tuple(
             replace(c, T_mount_camera=c.T_mount_camera @ found[c.view].T_given_found)
@@ -154,7 +154,7 @@ class CameraCheck:
         )
 
     def corrected_observation(self, observation: Observation) -> Observation:
-        """Returns an observation with its cameras as they were found to be."""
+        """Return an observation with its cameras as they were found to be."""
         if all(fit.status != 'corrected' for fit in self.fits):
             return observation
         return replace(observation, cameras=self.corrected(observation.cameras))
@@ -172,11 +172,11 @@ class CameraChecker:
         self._robot, self._shape = robot, shape
 
     def with_robot(self, robot: RobotModel) -> CameraChecker:
-        """Returns the same for a robot of the same links, e.g. a calibrated one."""
+        """Return the same for a robot of the same links, e.g. a calibrated one."""
         return CameraChecker(robot, self._shape)
 
     def check(self, observation: Observation) -> CameraCheck:
-        """Checks each camera of an observation."""
+        """Check each camera of an observation."""
         views = zip(observation.cameras, observation.frames, strict=True)
         return CameraCheck(
             fits=tuple(self._fit(camera, frame, observation.positions) for camera, frame in views)

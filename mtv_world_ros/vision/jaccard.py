@@ -18,7 +18,7 @@ UNSCORABLE = frozenset({'ambiguous', 'out_of_palette'})
 
 
 def jaccard(pred: BoolArray, true: BoolArray) -> FloatArray:
-    """Returns |pred and true| / |pred or true| over the last two axes.
+    """Return |pred and true| / |pred or true| over the last two axes.
 
     Both empty gives 1, one empty 0 (DAVIS 2017, `db_eval_iou`).
 
@@ -40,7 +40,7 @@ def jaccard(pred: BoolArray, true: BoolArray) -> FloatArray:
 
 
 def object_jaccard(pred: ObjectMasks, true: ObjectMasks) -> FloatArray:
-    """Returns (V, O, T) J of predicted against true masks; NaN = not scored.
+    """Return (V, O, T) J of predicted against true masks; NaN = not scored.
 
     An object is not scored where its true masks are not to be trusted or where the predicted
     video leaves the segmenter in doubt which pixels are the object. An object that the
@@ -63,7 +63,7 @@ def object_jaccard(pred: ObjectMasks, true: ObjectMasks) -> FloatArray:
 
 
 def score_statuses(pred: ObjectMasks, true: ObjectMasks) -> tuple[tuple[str, ...], ...]:
-    """Returns the status of each view's and object's score: the truth's doubt goes first."""
+    """Return the status of each view's and object's score: the truth's doubt goes first."""
     return tuple(
         tuple(map(_score_status, *rows)) for rows in zip(pred.status, true.status, strict=True)
     )
@@ -76,7 +76,7 @@ def _score_status(pred: str, true: str) -> str:
 
 
 def scored_objects(status: tuple[tuple[str, ...], ...]) -> BoolArray:
-    """Returns (V, O) whether objects are scored, by the statuses of their scores."""
+    """Return (V, O) whether objects are scored, by the statuses of their scores."""
     scored = [[_is_scored(word) for word in row] for row in status]
     return np.array(scored, np.bool_).reshape(len(status), -1 if status else 0)
 
@@ -87,7 +87,7 @@ def _is_scored(status: str) -> bool:
 
 
 def held_masks(first: BoolArray, true: ObjectMasks) -> ObjectMasks:
-    """Returns the masks of the baseline that holds the first frame.
+    """Return the masks of the baseline that holds the first frame.
 
     Args:
         first: (V, O, H, W) masks in the recorded frame 0.
@@ -99,7 +99,7 @@ def held_masks(first: BoolArray, true: ObjectMasks) -> ObjectMasks:
 
 
 def mean_of_known(values: FloatArray, axis: int | tuple[int, ...] | None = None) -> FloatArray:
-    """Returns the mean over what is not NaN, NaN where nothing is known."""
+    """Return the mean over what is not NaN, NaN where nothing is known."""
     with warnings.catch_warnings():
         warnings.simplefilter('ignore', RuntimeWarning)
         return np.asarray(np.nanmean(values, axis=axis))

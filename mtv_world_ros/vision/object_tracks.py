@@ -23,7 +23,7 @@ _STILL_M = 0.01
 def track_points(
     cameras: Sequence[CameraModel], poses: FloatArray, pixels: FloatArray
 ) -> FloatArray:
-    """Returns (N, O, 3) where objects are [m], NaN = never seen by two views before or now.
+    """Return (N, O, 3) where objects are [m], NaN = never seen by two views before or now.
 
     What two views do not see is on a straight way to where they see it again, or stays. What the
     views see at places that do not belong together is taken to be hidden. A visible part's middle

@@ -82,7 +82,7 @@ def write_episode(
 
 @pytest.fixture
 def make_episode(tmp_path) -> Callable[..., Path]:
-    """Records an episode of 8 frames, 48 x 64, and returns its folder."""
+    """Record an episode of 8 frames, 48 x 64, and return its folder."""
 
     def make(name: str = 'episode', **options: object) -> Path:
         return write_episode(tmp_path / name, **options)  # type: ignore[arg-type]

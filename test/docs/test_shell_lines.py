@@ -191,7 +191,7 @@ def parsers() -> dict[str, argparse.ArgumentParser]:
 
 
 def check(block: Block) -> None:
-    """Fails where a line cannot be right."""
+    """Fail where a line cannot be right."""
     for need in block.needs:
         assert need.split(' ')[0] in NEEDS, f"'{need}' is none of {list(NEEDS)}"
     for command in block.commands():
@@ -236,7 +236,7 @@ def check_mtv_world(words: Sequence[str]) -> bool:
 
 
 def check_values(given: dict[str, Any]) -> None:
-    """Raises a user error where a preset, policy, task ... does not exist."""
+    """Raise a user error where a preset, policy, task ... does not exist."""
     from mtv_world_ros.cli.train import set_overrides
     from mtv_world_ros.model.serving import ServingOptions
     from mtv_world_ros.robot.file import robot_path
@@ -502,7 +502,7 @@ def printed_by(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> str:
-    """Runs the lines of a block; those that another page has, too, are not run again.
+    """Run the lines of a block; those that another page has, too, are not run again.
 
     Args:
         block: of a page.
@@ -523,7 +523,7 @@ def printed_by(
 
 
 def check_outcome(block: Block, printed: str) -> None:
-    """Fails where the page says something else."""
+    """Fail where the page says something else."""
     for text in block.shows:
         assert is_like(printed, f'...{text}...'), f'{text}\n\nis not in\n\n{printed}'
     if block.printed:

@@ -13,7 +13,7 @@ QUIET = {'show_progress': False}
 
 @pytest.fixture
 def make(make_pipeline):
-    """Makes a pipeline in any process."""
+    """Make a pipeline in any process."""
     return partial(persistence, make_pipeline().spec)
 
 

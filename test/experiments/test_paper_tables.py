@@ -45,7 +45,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def write_card(folder: Path, tasks: dict[str, str]) -> None:
-    """Writes the card of a data set, as far as it is read here."""
+    """Write the card of a data set, as far as it is read here."""
     names = list(tasks)
     card = {
         'splits': {'train': names[::2], 'test': names[1::2]},

@@ -55,13 +55,13 @@ _RUN_TEXT = re.compile(r'\S*/golden_\S*')
 
 
 def digest(data: bytes | str) -> str:
-    """Returns the SHA-256 of bytes or text."""
+    """Return the SHA-256 of bytes or text."""
     return sha256(data.encode() if isinstance(data, str) else data).hexdigest()
 
 
 @cache
 def modules() -> dict[str, str]:
-    """Returns the full names of the package's modules by their last part."""
+    """Return the full names of the package's modules by their last part."""
     package = import_module(PACKAGE)
     found = pkgutil.walk_packages(package.__path__, f'{PACKAGE}.', onerror=lambda _: None)
     names = [name for _, name, is_package in found if not is_package]
@@ -69,12 +69,12 @@ def modules() -> dict[str, str]:
 
 
 def module(*names: str) -> ModuleType:
-    """Returns the module whose last name is one of these."""
+    """Return the module whose last name is one of these."""
     return import_module(next(modules()[name] for name in names if name in modules()))
 
 
 def command(*words: object) -> str:
-    """Runs `mtv-world`; returns what it printed, and fails as it does."""
+    """Run `mtv-world`; return what it printed, and fail as it does."""
     code = f'import sys; from {PACKAGE}.cli import main; sys.exit(main())'
     line = [sys.executable, '-c', code, *map(str, words)]
     done = subprocess.run(line, capture_output=True, text=True, cwd=ROOT)
@@ -85,7 +85,7 @@ def command(*words: object) -> str:
 
 @cache
 def folder() -> Path:
-    """Returns a folder for what the commands write; gone at the end."""
+    """Return a folder for what the commands write; gone at the end."""
     kept = tempfile.TemporaryDirectory(prefix='golden_')
     folder.kept = kept  # type: ignore[attr-defined]
     return Path(kept.name)
@@ -93,7 +93,7 @@ def folder() -> Path:
 
 @cache
 def episodes() -> Path:
-    """Returns a folder of eight episodes, successes and failures, of two tasks."""
+    """Return a folder of eight episodes, successes and failures, of two tasks."""
     out, policies = folder() / 'episodes', 'expert,expert-high-0.06'
     command('collect', '--task', TASKS, '--episodes', 4, '--policies', policies, '--seed', 3,
             '--workers', 1, '--out', out)  # fmt: skip
@@ -101,7 +101,7 @@ def episodes() -> Path:
 
 
 def lasting(value: Any) -> Any:
-    """Returns a result without seconds, dates and paths; numbers to nine digits."""
+    """Return a result without seconds, dates and paths; numbers to nine digits."""
     if isinstance(value, dict):
         return {k: lasting(v) for k, v in value.items() if not _RUN_KEYS.search(k)}
     if isinstance(value, list):
@@ -112,7 +112,7 @@ def lasting(value: Any) -> Any:
 
 
 def results(out: Path) -> dict[str, str]:
-    """Returns digests of all JSON files under a folder, without what differs from run to run."""
+    """Return digests of all JSON files under a folder, without what differs from run to run."""
     texts = {
         str(path.relative_to(out)): json.dumps(lasting(json.loads(path.read_text())))
         for path in sorted(out.rglob('*.json'))
@@ -121,7 +121,7 @@ def results(out: Path) -> dict[str, str]:
 
 
 def weights(out: Path) -> dict[str, str]:
-    """Returns digests of all tensor files of a checkpoint."""
+    """Return digests of all tensor files of a checkpoint."""
     paths = sorted(out.rglob('*.safetensors'))
     return {
         str(p.relative_to(out)): digest(p.read_bytes()) for p in paths if 'state' not in str(p)
@@ -313,7 +313,7 @@ def _text(name: str, found: dict[str, Any]) -> str:
 
 
 def main() -> int:
-    """Records the sections, or prints how they differ from what is recorded."""
+    """Record the sections, or prints how they differ from what is recorded."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('--only', default=','.join(SECTIONS), metavar='SECTIONS')
     parser.add_argument('--check', action='store_true', help='print differences; write nothing')

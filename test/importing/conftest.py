@@ -240,7 +240,7 @@ WRITERS = {
 
 @pytest.fixture(scope='session')
 def datasets(tmp_path_factory):
-    """Returns the folder of a dataset by kind; it must not be changed."""
+    """Return the folder of a dataset by kind; it must not be changed."""
     made: dict[str, Path] = {}
 
     def dataset(kind: str) -> Path:
@@ -253,7 +253,7 @@ def datasets(tmp_path_factory):
 
 @pytest.fixture
 def make_mapping(tmp_path):
-    """Writes robot, calibration and a mapping with some texts replaced; returns its path."""
+    """Write robot, calibration and a mapping with some texts replaced; return its path."""
 
     def make(*replacements: tuple[str, str]) -> Path:
         folder = tmp_path / 'mapping'

@@ -25,7 +25,7 @@ JOINTS = 'sensor_msgs/msg/JointState'
 
 
 def payload(index: int, size: int = 20_000) -> bytes:
-    """Does not compress."""
+    """Do not compress."""
     return b'\0\1\0\0' + np.random.default_rng(index).bytes(size)
 
 
@@ -47,7 +47,7 @@ class Disk:
 
 
 def fill(writer: BagWriter, size: int) -> int:
-    """Records until the disk is full; returns how many messages `write_raw` took or refused."""
+    """Record until the disk is full; return how many messages `write_raw` took or refused."""
     disk = Disk(writer._file._file, size, writer.folder / '.reserve')
     writer._file._file = disk
     for index in range(10_000):

@@ -91,7 +91,7 @@ Edit = Callable[[str, float, int], int | None]
 
 @pytest.fixture
 def record(tmp_path):
-    """Writes a recording whose stamps [ns] are edited; messages without one are left out."""
+    """Write a recording whose stamps [ns] are edited; messages without one are left out."""
 
     def make(
         edit: Edit = lambda _topic, _seconds, stamp: stamp,
@@ -123,7 +123,7 @@ def record(tmp_path):
 
 @pytest.fixture
 def run(tmp_path, capsys):
-    """Imports a bag; returns the exit status and what was printed."""
+    """Import a bag; return the exit status and what was printed."""
 
     def imported(bag: Path, *more: str, **mapping: Any) -> tuple[int, str]:
         file = tmp_path / 'mapping.yaml'

@@ -28,7 +28,7 @@ def slider(tmp_path):
 
 
 def camera(x):
-    """Looks along +z from (x, 0, 0); half its field of view is 45 degrees."""
+    """Look along +z from (x, 0, 0); half its field of view is 45 degrees."""
     T = np.eye(4)
     T[0, 3] = x
     return CameraModel(

@@ -19,7 +19,7 @@ from test.support.wan_lora import build, RANK, run
 
 
 def trained(folder: Path, alpha: float = 8.0, seed: int = 5) -> Tensor:
-    """Saves an adapter that changes everything it may; returns the output with it."""
+    """Save an adapter that changes everything it may; return the output with it."""
     model = build()
     add_adapter(model, rank=RANK, alpha=alpha)
     torch.manual_seed(seed)

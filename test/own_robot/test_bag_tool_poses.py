@@ -24,7 +24,7 @@ def stamp_of(k):
 
 
 def poses_of(poses, frame='plinth'):
-    """Writes geometry_msgs/PoseStamped of (N, 4, 4)."""
+    """Write geometry_msgs/PoseStamped of (N, 4, 4)."""
     kind = messages.POSE_STAMPED
 
     def write(bag: Bag) -> None:

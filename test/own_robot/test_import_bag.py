@@ -29,7 +29,7 @@ def scene(robot):
 
 @pytest.fixture
 def make_bag(robot, scene, tmp_path):
-    """Records the scene, changed in some way, as a bag of a name."""
+    """Record the scene, changed in some way, as a bag of a name."""
     cameras, positions, frames = scene
 
     def make(name='wave', **how):

@@ -51,7 +51,7 @@ def bag(robot, tmp_path):
 
 @pytest.fixture
 def ask(tmp_path, monkeypatch):
-    """Writes a describer file for a server."""
+    """Write a describer file for a server."""
     monkeypatch.setenv('NO_PROXY', '127.0.0.1')
 
     def write(server):

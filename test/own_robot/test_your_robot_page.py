@@ -123,7 +123,7 @@ class Node:
             )  # fmt: skip
 
     def stop(self):
-        """Returns the exit status."""
+        """Return the exit status."""
         self._process.send_signal(signal.SIGINT)
         return self._process.wait(60)
 
@@ -134,7 +134,7 @@ def name_of(words):
 
 
 def run_in_process(words):
-    """Runs a command that talks to the node from a process of its own; returns what it said."""
+    """Run a command that talks to the node from a process of its own; return what it said."""
     command = [
         sys.executable,
         '-m',

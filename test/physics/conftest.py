@@ -43,7 +43,7 @@ tools:
 
 
 def write_lift(folder: Path) -> Path:
-    """Writes the robot; returns its file."""
+    """Write the robot; return its file."""
     mimic = '<mimic joint="left" multiplier="1"/>'
     fingers = FINGER.format(name='left', side=1, face=0.005, mimic='') + FINGER.format(
         name='right', side=-1, face=-0.005, mimic=mimic

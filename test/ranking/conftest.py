@@ -48,7 +48,7 @@ def expert(robot):
 
 @pytest.fixture(scope='session')
 def runner(robot, expert):
-    """Runs policies in the simulator and in a perfect imagination of it."""
+    """Run policies in the simulator and in a perfect imagination of it."""
     reason = missing_opengl()
     if reason:
         pytest.skip(reason)

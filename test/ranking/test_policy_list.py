@@ -67,7 +67,7 @@ def load(tmp_path, robot):
 
 @pytest.fixture
 def make(load, tmp_path, expert):
-    """Makes the one policy of a list."""
+    """Make the one policy of a list."""
 
     def make(entry):
         made = pickle.loads(pickle.dumps(ListedPolicies(load(entry), tmp_path / 'logs')))  # noqa: S301

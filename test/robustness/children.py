@@ -63,7 +63,7 @@ class Signal:
         return time.monotonic() > self.sent_s + LATE_S
 
     def close(self) -> None:
-        """Sends nothing any more."""
+        """Send nothing any more."""
         self._closed.set()
         self._thread.join()
 
@@ -275,7 +275,7 @@ def attempt(kind: str, number: int, after_s: float, folder: Path) -> tuple[str, 
 
 
 def attack(kind: str, count: int, seed: int, folder: Path) -> dict[str, Any]:
-    """Tries so often, stops and kills in turn; the row of a kind."""
+    """Try so often, stop and kill in turn; the row of a kind."""
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
     row: dict[str, Any] = {'kind': kind, 'commit': commit(), 'seed': seed, 'tried': 0}
     row |= {'done': 0, 'said': 0, 'worst_s': 0.0, 'examples': {}, 'failures': []}
@@ -299,7 +299,7 @@ def _freeze(*_: object) -> None:
 
 
 def main() -> int:
-    """Stops and kills; 1 if something froze."""
+    """Stop and kills; 1 if something froze."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     parser.add_argument('--cases', type=int, default=30, help='signals to each kind')
     parser.add_argument('--seed', type=int, default=0)

@@ -45,7 +45,7 @@ class Cycles:
         self.problems: list[str] = []
 
     def run(self, count: int, most_s: float = float('inf')) -> None:
-        """Goes through so many cycles, or as many as the time allows."""
+        """Go through so many cycles, or as many as the time allows."""
         from lifecycle_msgs.msg import Transition
 
         kinds = ('DEACTIVATE', 'CLEANUP', 'CONFIGURE', 'ACTIVATE')
@@ -117,14 +117,14 @@ class Cycles:
         }
 
     def write(self) -> None:
-        """Writes the table."""
+        """Write the table."""
         with (self.out / 'cycles.csv').open('w', newline='') as file:
             writer = csv.DictWriter(file, self.rows[0])
             writer.writeheader()
             writer.writerows(self.rows)
 
     def close(self) -> None:
-        """Ends both."""
+        """End both."""
         self.process.stop()
         self.client.close()
 

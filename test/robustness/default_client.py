@@ -121,7 +121,7 @@ class Cameras:
         return [*(publisher.topic_name for publisher, _ in self._outputs), '/joint_states']
 
     def publish_due(self) -> None:
-        """Publishes what is due; images that are late by a period are left out, as drivers do."""
+        """Publish what is due; images that are late by a period are left out, as drivers do."""
         now_s = time.monotonic()
         if now_s >= self._next_joints_s:
             self._next_joints_s = max(self._next_joints_s + 1 / JOINT_HZ, now_s)
@@ -178,13 +178,13 @@ class Policy:
         self.ages: list[float] = []
 
     def send(self) -> None:
-        """Sends a plan of its own stamp."""
+        """Send a plan of its own stamp."""
         stamp_ns = time.time_ns()
         self.sent[stamp_ns] = time.monotonic()
         self._plans.publish(to_trajectory_message(self._plan, make_header(stamp_ns)))
 
     def forget(self) -> None:
-        """Begins anew: what was sent so far does not count."""
+        """Begin anew: what was sent so far does not count."""
         for kept in (self.sent, self.verdicts, self.ends, self.ages):
             kept.clear()
 
@@ -207,7 +207,7 @@ class Policy:
 
 
 def connect(policy: Policy, cameras: Sequence[str], spin: Any) -> None:
-    """Plays until the node is connected to everything that it uses."""
+    """Play until the node is connected to everything that it uses."""
     end_s = time.monotonic() + START_S
     needed = [*cameras, '/joint_trajectory']
     while not all(policy.state.get(f'publishers.{t}', '0') != '0' for t in needed):
@@ -217,7 +217,7 @@ def connect(policy: Policy, cameras: Sequence[str], spin: Any) -> None:
 
 
 def play(options: argparse.Namespace, process: subprocess.Popen[Any]) -> dict[str, Any]:
-    """Plays to the node; returns what became of the plans."""
+    """Play to the node; return what became of the plans."""
     pipeline = load_named_pipeline(Settings())
     recording = load_recording(EPISODE, pipeline.spec, pipeline.robot)
     rclpy.init()
@@ -280,7 +280,7 @@ def row(policy: Policy, options: argparse.Namespace, cpu_share: float) -> dict[s
 
 
 def show_cameras(options: argparse.Namespace) -> None:
-    """Publishes cameras and joint states until the process is ended."""
+    """Publish cameras and joint states until the process is ended."""
     pipeline = load_named_pipeline(Settings())
     recording = load_recording(EPISODE, pipeline.spec, pipeline.robot)
     rclpy.init()
@@ -292,7 +292,7 @@ def show_cameras(options: argparse.Namespace) -> None:
 
 
 def view(options: argparse.Namespace) -> None:
-    """Reads the camera that the model does not use, as a viewer does."""
+    """Read the camera that the model does not use, as a viewer does."""
     rclpy.init()
     node = rclpy.create_node('viewer')
     kind, suffix = (CompressedImage, '/compressed') if options.compressed else (Image, '')
@@ -327,7 +327,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Plays; 1 if a plan had no verdict in time."""
+    """Play; 1 if a plan had no verdict in time."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     options = parse(words)
     if options.role != 'client':

@@ -107,7 +107,7 @@ def _yam() -> Any:
 
 
 def _reads(name: str, function: str, *more: Callable[[], Any]) -> Callable[[bytes, Path], Any]:
-    """Writes a case to a file of a name and gives it to `MODULE.FUNCTION` of the package."""
+    """Write a case to a file of a name and give it to `MODULE.FUNCTION` of the package."""
     module, _, of = function.rpartition('.')
 
     def read(data: bytes, folder: Path) -> Any:
@@ -231,7 +231,7 @@ def _read_answer(data: bytes, _: Path) -> Any:
 
 
 def timed_actions(tensors: Iterable[Any]) -> bytes:
-    """Returns a list of timed actions as LeRobot's server sends them, made without LeRobot."""
+    """Return a list of timed actions as LeRobot's server sends them, made without LeRobot."""
     out = b'\x80\x03]('
     for tensor in tensors:
         out += b'clerobot.async_inference.helpers\nTimedAction\n)\x81}X\x06\0\0\0action'

@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @cache
 def _home() -> tempfile.TemporaryDirectory[str]:
-    """Holds all folders of this process; `clean_up` removes it, or the process's end."""
+    """Hold all folders of this process; `clean_up` removes it, or the process's end."""
     return tempfile.TemporaryDirectory(prefix='mtv_world_fuzz_')
 
 
@@ -49,7 +49,7 @@ def _made(make: Callable[[Path], None]) -> Path:
 
 
 def clean_up() -> None:
-    """Removes the folders of this process."""
+    """Remove the folders of this process."""
     if _home.cache_info().currsize:
         _home().cleanup()
     _home.cache_clear()

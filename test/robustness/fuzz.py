@@ -86,14 +86,14 @@ def make_case(kind: Kind, samples: list[Any], seed: int, case: int) -> Any:
 
 
 def warm_up(kind: Kind, samples: list[Any], folder: Path) -> None:
-    """Lets the reader import what it needs, which is not its time; what is whole must be read."""
+    """Let the reader import what it needs, which is not its time; what is whole must be read."""
     kind.read(samples[0], folder)
     with suppress(Exception):
         kind.read(make_case(kind, samples, 0, 0), folder)
 
 
 def _run(name: str, seed: int, cases: Iterable[int], results: Any) -> None:
-    """Tries the cases of a kind; puts (case, outcome) into the queue, at last None."""
+    """Try the cases of a kind; put (case, outcome) into the queue, at last None."""
     kind = KINDS[name]
     silence()
     with tempfile.TemporaryDirectory() as folder:
@@ -131,7 +131,7 @@ def new_row(name: str, seed: int) -> dict[str, Any]:
 
 
 def fuzz(row: dict[str, Any], cases: range, save: Callable[[], None] = lambda: None) -> None:
-    """Tries cases of a kind and adds what became of them to its row.
+    """Try cases of a kind and add what became of them to its row.
 
     A process that dies or hangs costs its case, and another goes on after it.
 
@@ -179,7 +179,7 @@ def _fuzz(row: dict[str, Any], cases: range, save: Callable[[], None]) -> None:
 def _collect(
     row: dict[str, Any], process: Any, results: Any, save: Callable[[], None]
 ) -> int | str | None:
-    """Adds outcomes to the row; the case with which the process died or hung, or None."""
+    """Add outcomes to the row; the case with which the process died or hung, or None."""
     current: int | str = NOT_STARTED
     saved = begin = time.monotonic()
     silent_s = 0.0
@@ -227,7 +227,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> int:
-    """Fuzzes the kinds that are asked for; 1 if anything failed."""
+    """Fuzz the kinds that are asked for; 1 if anything failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--seed', type=int, default=int(time.time()))
     parser.add_argument(

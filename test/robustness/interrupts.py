@@ -102,7 +102,7 @@ BY_THE_CLOCK = ('imagine',)
 
 
 def prepare(given: Path) -> Path:
-    """Makes the inputs of all commands, once: two episodes, one of them a failure."""
+    """Make the inputs of all commands, once: two episodes, one of them a failure."""
     if not (given / 'ready').is_file():
         shutil.rmtree(given, ignore_errors=True)
         words = ['collect', '--task', TASK, '--episodes', '2', '--failures-of-ten', '5', *SIZE]
@@ -198,7 +198,7 @@ def unlisted(out: Path) -> list[str]:
 
 
 def content(path: Path) -> Any:
-    """Reads a file to its end; how many messages or frames it has, where it has some.
+    """Read a file to its end; how many messages or frames it has, where it has some.
 
     Raises:
         Exception: it cannot be read.
@@ -305,7 +305,7 @@ class Attack:
         return f'more {more[:5]}, less {less[:5]}' if more or less else ''
 
     def _again(self, out: Path) -> str:
-        """Runs the same command once more."""
+        """Run the same command once more."""
         words = COMMANDS[self.name](self._given, out)
         status = self._run(words)
         option = REPLACES.get(self.name, '')
@@ -339,7 +339,7 @@ def new_row(name: str, seed: int) -> dict[str, Any]:
 
 
 def attack(row: dict[str, Any], count: int, given: Path, folder: Path) -> Iterator[None]:
-    """Interrupts until the row has so many; yields after each."""
+    """Interrupt until the row has so many; yield after each."""
     if row['tried'] >= count:
         return
     one = Attack(row['kind'], given, folder)
@@ -357,7 +357,7 @@ def attack(row: dict[str, Any], count: int, given: Path, folder: Path) -> Iterat
 
 
 def main() -> int:
-    """Interrupts; 1 if something was wrong."""
+    """Interrupt; 1 if something was wrong."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     parser.add_argument('--cases', type=int, default=30, help='signals to each command')
     parser.add_argument('--seed', type=int, default=0)

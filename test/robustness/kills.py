@@ -69,7 +69,7 @@ def imported() -> dict[str, Callable[[], int]]:
 
 
 def run_forked(name: str, words: list[str], log: str) -> None:
-    """Runs one in this process, which was forked for it."""
+    """Run one in this process, which was forked for it."""
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
@@ -81,7 +81,7 @@ def run_forked(name: str, words: list[str], log: str) -> None:
 
 
 def note_received(path: str) -> None:
-    """Lets the recorder of this process note stamp and time [ns] of messages as they come."""
+    """Let the recorder of this process note stamp and time [ns] of messages as they come."""
     from mtv_world_ros.ros.bags.recorder import Recorder
 
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
@@ -143,7 +143,7 @@ class Kills:
             ros().make_checkpoint(out / 'checkpoint')
 
     def kill(self, name: str, number: int) -> Killed:
-        """Starts and kills one of `VICTIMS`, at the moment that belongs to the number."""
+        """Start and kill one of `VICTIMS`, at the moment that belongs to the number."""
         rng = np.random.default_rng([self._seed, number])
         after_s = float(rng.uniform(0, self._longest_s))
         is_starting = rng.random() < STARTING
@@ -189,7 +189,7 @@ class Kills:
         node.create_subscription(ros().JOINT_STATE, '/joint_states', lambda _: self._hear(), 10)
 
     def close(self) -> None:
-        """Ends the client."""
+        """End the client."""
         self._client.close()
 
     def _publish(self) -> None:
@@ -212,12 +212,12 @@ class Kills:
     # recorder
 
     def clear_bags(self) -> None:
-        """Removes the bags of the kill before."""
+        """Remove the bags of the kill before."""
         for path in [self._out / 'bag', *self._out.glob('.bag.*')]:
             shutil.rmtree(path, ignore_errors=True)
 
     def recorder_words(self) -> list[str]:
-        """Records what the client publishes."""
+        """Record what the client publishes."""
         return [str(self._out / 'bag'), '/joints']
 
     def check_recorder(self, log: Path, killed_ns: int) -> None:
@@ -255,7 +255,7 @@ class Kills:
         return self._heard > 0
 
     def player_words(self) -> list[str]:
-        """Plays to anybody, faster than it was recorded."""
+        """Play to anybody, faster than it was recorded."""
         return [str(self._episode), '--no-wait', '--loop', '--rate', '4']
 
     def check_player(self, log: Path, killed_ns: int) -> None:
@@ -329,7 +329,7 @@ VICTIMS: dict[str, tuple[Callable[..., Any], ...]] = {
 
 
 def main() -> int:
-    """Kills; 1 if something was wrong afterwards."""
+    """Kill; 1 if something was wrong afterwards."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     parser.add_argument('--kills', type=int, default=500, help='of all together')
     parser.add_argument('--seed', type=int, default=0)

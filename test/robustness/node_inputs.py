@@ -72,7 +72,7 @@ class NodeInputs:
         return self.client.diagnostic_values().get(key, default)
 
     def plan(self, **scene: Any) -> dict[str, str]:
-        """Sends a scene and a plan; returns the plan's one end.
+        """Send a scene and a plan; return the plan's one end.
 
         Raises:
             AssertionError: it has none in time, or two.
@@ -92,7 +92,7 @@ class NodeInputs:
         return [v for v in mine if v['state'] in ros.ENDS]
 
     def expect_goes_on(self) -> None:
-        """Raises unless a whole scene and a plan are judged."""
+        """Raise unless a whole scene and a plan are judged."""
         ends = []
         for _ in range(NUM_TRIES):
             ends.append(self.plan())
@@ -101,7 +101,7 @@ class NodeInputs:
         raise AssertionError(f'the node is blinded: {ends[-1].get("text")}')
 
     def expect_counted(self, reason: str, act: Callable[[], object]) -> None:
-        """Raises unless what is done is counted under a reason."""
+        """Raise unless what is done is counted under a reason."""
         before = int(self.value(f'rejected.{reason}', '0'))
         act()
         self.client.wait(
@@ -109,7 +109,7 @@ class NodeInputs:
         )
 
     def close(self) -> tuple[int, str]:
-        """Ends both; returns the node's exit status and log."""
+        """End both; return the node's exit status and log."""
         self.client.close()
         return self.node.stop(), self.node.output()
 
@@ -273,7 +273,7 @@ def fuzz(inputs: NodeInputs, rng: np.random.Generator, cases: int) -> None:
 
 
 def run(folder: Path, seed: int, cases: int, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Tries the attacks on one node; returns a row of each."""
+    """Try the attacks on one node; return a row of each."""
     inputs, rows = NodeInputs(folder), []
     attacks = {name: ATTACKS[name] for name in names}
     attacks['fuzz'] = lambda inputs, rng: fuzz(inputs, rng, cases)

@@ -204,7 +204,7 @@ def _fixed() -> Any:
 
 
 def send(key: str, message: Any) -> None:
-    """Shows a scene with this message to the node's checks, and then asks for a rollout.
+    """Show a scene with this message to the node's checks, and then ask for a rollout.
 
     Raises:
         Rejection: as the node says.
@@ -239,7 +239,7 @@ def send(key: str, message: Any) -> None:
 
 
 def check_plausible(request: Any, robot: Any) -> None:
-    """Judges what would be imagined, by numbers that are not the node's.
+    """Judge what would be imagined, by numbers that are not the node's.
 
     Raises:
         AssertionError: no robot and no camera is like that.

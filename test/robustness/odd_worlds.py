@@ -65,7 +65,7 @@ class World:
         self.spin(1.0)
 
     def tick(self, ns: int) -> None:
-        """Moves the simulated clock and says so."""
+        """Move the simulated clock and says so."""
         from rosgraph_msgs.msg import Clock
 
         self.now_ns += ns
@@ -74,7 +74,7 @@ class World:
         self.clock.publish(message)
 
     def send(self, topic: str, message: Any) -> None:
-        """Publishes in the node's namespace."""
+        """Publish in the node's namespace."""
         self.client.publishers[f'/{self.space}{topic}' if self.space else topic].publish(message)
 
     def scene(self, stamp_ns: int, *, swapped: bool = False) -> None:
@@ -86,14 +86,14 @@ class World:
         self.send('/joint_states', ros().make_joint_state(stamp_ns))
 
     def plan(self, stamp_ns: int, **fields: Any) -> None:
-        """Sends a plan, which is told apart by its stamp."""
+        """Send a plan, which is told apart by its stamp."""
         while stamp_ns in self.plans:
             stamp_ns += 1000
         self.plans[stamp_ns] = time.monotonic()
         self.send('/joint_trajectory', ros().make_trajectory(stamp_ns=stamp_ns, **fields))
 
     def follow(self) -> None:
-        """Counts plans that others send in the namespace."""
+        """Count plans that others send in the namespace."""
 
         def take(message: Any) -> None:
             stamp = message.header.stamp
@@ -103,14 +103,14 @@ class World:
         self.client.node.create_subscription(ros().PLAN, topic, take, 1000)
 
     def spin(self, seconds: float) -> None:
-        """Takes what is said for so long."""
+        """Take what is said for so long."""
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
             self.client.executor.spin_once(timeout_sec=0.02)
             self.count()
 
     def count(self) -> None:
-        """Counts the ends that came."""
+        """Count the ends that came."""
         from mtv_world_ros.ros.messages.conversions import values_of
 
         for status in self.client.statuses(self.report):
@@ -124,14 +124,14 @@ class World:
         self.client.received[self.report].clear()
 
     def settle(self) -> None:
-        """Waits for the ends that are missing."""
+        """Wait for the ends that are missing."""
         end_s = time.monotonic() + PATIENCE_S
         while len(self.ends) < len(self.plans) and time.monotonic() < end_s:
             self.spin(0.1)
         self.spin(0.5)
 
     def close(self) -> dict[str, Any]:
-        """Ends all; what became of the plans."""
+        """End all; what became of the plans."""
         self.settle()
         died = self.process.process.poll() is not None
         code = self.process.stop()
@@ -255,7 +255,7 @@ WRONG = ('without_end', 'several_ends', 'unknown_ends', 'tracebacks', 'died')
 
 
 def main() -> int:
-    """Goes through the worlds; 1 if a plan was not answered once."""
+    """Go through the worlds; 1 if a plan was not answered once."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     parser.add_argument('--cases', type=int, default=200, help='of each world')
     parser.add_argument('--seed', type=int, default=0)

@@ -72,7 +72,7 @@ def _node(name: str) -> Any:
 
 
 def close() -> None:
-    """Ends the nodes, and ROS in this process if they began it; removes the folders."""
+    """End the nodes, and ROS in this process if they began it; remove the folders."""
     if _node.cache_info().currsize:
         import rclpy
 
@@ -104,7 +104,7 @@ def _value(rng: np.random.Generator) -> Any:
 
 
 def _fitting(rng: np.random.Generator, node: Any, name: str, value: Any) -> None:
-    """Gives the value the type that the parameter has, mostly: it is looked at then."""
+    """Give the value the type that the parameter has, mostly: it is looked at then."""
     if node.has_parameter(name) and rng.random() < 0.7:
         value.type = node.get_parameter(name).type_.value
 
@@ -132,7 +132,7 @@ def damaged(_: list[Any], rng: np.random.Generator) -> Any:
 
 
 def call(case: Any, _: Any) -> None:
-    """Calls the service and asks the node how it is.
+    """Call the service and ask the node how it is.
 
     Raises:
         MtvWorldError: a value was refused with a reason.

@@ -52,7 +52,7 @@ def slow(socket: Any) -> None:
 
 
 def never(socket: Any) -> None:
-    """Does not answer and keeps the line."""
+    """Do not answer and keep the line."""
     time.sleep(4 * TIMEOUT_S)
 
 
@@ -80,7 +80,7 @@ def pieces(socket: Any) -> None:
 
 
 def gone(socket: Any) -> None:
-    """Closes in mid-answer."""
+    """Close in mid-answer."""
     socket.socket.sendall(b'\x82\x7e\xff\xff' + b'\0' * 100)
     socket.socket.close()
 
@@ -149,7 +149,7 @@ def _observation() -> Observation:
 
 
 def ask(policy: Any, observation: Observation) -> tuple[str, float]:
-    """Asks once: `answered`, `refused`, or what went wrong; and how long it took [s]."""
+    """Ask once: `answered`, `refused`, or what went wrong; and how long it took [s]."""
     begin_s = time.monotonic()
     try:
         answer = policy.act(observation, 'stack')
@@ -162,7 +162,7 @@ def ask(policy: Any, observation: Observation) -> tuple[str, float]:
 
 
 def run(count: int, margin_s: float = MARGIN_S) -> list[dict[str, Any]]:
-    """Asks each kind of server so often; a row a kind."""
+    """Ask each kind of server so often; a row a kind."""
     rows, observation = [], _observation()
     with tempfile.TemporaryDirectory() as folder:
         for name in WAYS:
@@ -190,7 +190,7 @@ def run(count: int, margin_s: float = MARGIN_S) -> list[dict[str, Any]]:
 
 
 def main() -> int:
-    """Asks; 1 if something hung, or was not refused as it should."""
+    """Ask; 1 if something hung, or was not refused as it should."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     parser.add_argument('--cases', type=int, default=20, help='questions to each kind of server')
     parser.add_argument('--margin', type=float, default=MARGIN_S, help='[s]')

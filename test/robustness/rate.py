@@ -102,14 +102,14 @@ class Rate:
         self.client.send_scene()
 
     def send(self) -> None:
-        """Sends a plan of its own stamp."""
+        """Send a plan of its own stamp."""
         starved = starved_s(self.process.process.pid)
         stamp_ns = self.client.now_ns()
         self.plans.publish(ros().make_trajectory(stamp_ns=stamp_ns))
         self.sent[stamp_ns] = (time.monotonic(), starved)
 
     def spin(self, seconds: float) -> None:
-        """Takes what the node says for so long."""
+        """Take what the node says for so long."""
         end_s = time.monotonic() + seconds
         while True:
             self.client.executor.spin_once(timeout_sec=max(min(end_s - time.monotonic(), 0.02), 0))
@@ -134,7 +134,7 @@ class Rate:
                 )
 
     def run(self, count: int, rate_hz: float) -> None:
-        """Sends so many plans."""
+        """Send so many plans."""
         begin_s, paced = time.monotonic(), 0
         while len(self.sent) < count and self.process.process.poll() is None:
             number = len(self.sent)
@@ -187,7 +187,7 @@ class Rate:
         }
 
     def write(self) -> None:
-        """Writes when each end came, and the memory over plans."""
+        """Write when each end came, and the memory over plans."""
         for name, head, rows in (
             ('ends.csv', Ended._fields, self.ended),
             ('memory.csv', ('plan', 'memory_mb'), self.memory),
@@ -196,7 +196,7 @@ class Rate:
                 csv.writer(file).writerows([head, *rows])
 
     def close(self) -> None:
-        """Ends both."""
+        """End both."""
         self.process.stop()
         self.client.close()
 
@@ -224,7 +224,7 @@ def growth(memory: Sequence[tuple[int, float]]) -> float | str:
 
 
 def main() -> int:
-    """Sends; 1 if a plan was lost, late or answered twice."""
+    """Send; 1 if a plan was lost, late or answered twice."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     parser.add_argument('--cases', type=int, default=20_000, help='plans')
     parser.add_argument('--rate', type=float, default=10.0, help='[Hz]')

@@ -55,7 +55,7 @@ class Soak:
         self.problems: list[str] = []
 
     def run(self, count: int, kill_every: int) -> None:
-        """Sends `count` plans; what was measured is written now and then."""
+        """Send `count` plans; what was measured is written now and then."""
         self._start()
         for index in range(count):
             if kill_every and index and index % kill_every == 0:
@@ -72,7 +72,7 @@ class Soak:
         self._client.close()
 
     def write(self) -> dict[str, Any]:
-        """Writes rows, plot and summary; returns the summary."""
+        """Write rows, plot and summary; return the summary."""
         with (self._out / 'soak.csv').open('w', newline='') as file:
             writer = csv.DictWriter(file, self.rows[0])
             writer.writeheader()
@@ -237,7 +237,7 @@ def growth(rows: list[dict[str, float]]) -> float:
 
 
 def main() -> int:
-    """Runs the soak; 1 if something was lost, died or grew."""
+    """Run the soak; 1 if something was lost, died or grew."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     parser.add_argument('--rollouts', type=int, default=10_000)
     parser.add_argument('--kill-every', type=int, default=1_000, help='0 = never')

@@ -148,7 +148,7 @@ PLACES: dict[str, Callable[[Path], Path]] = {
 
 @cache
 def _warm() -> None:
-    """Imports what commands need, which is not their time."""
+    """Import what commands need, which is not their time."""
     with suppress(SystemExit):  # which ends a command that only prints
         main(['rank', '--list-faults', 'grasp_height'])
 

@@ -34,7 +34,7 @@ PAIRS = [
 
 
 def run(name: str, words: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs the script in a folder."""
+    """Run the script in a folder."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr('sys.argv', [name, *words])
     runpy.run_path(str(EXAMPLES / name), run_name='__main__')

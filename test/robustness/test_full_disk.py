@@ -88,7 +88,7 @@ def _as_guessed(camera: FixedCamera, **options: object) -> CameraEstimate:
 
 @pytest.fixture(scope='module')
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[str]]:
-    """Makes the input of a command of `PREPARED`, once; returns the command."""
+    """Make the input of a command of `PREPARED`, once; return the command."""
 
     @cache
     def words(name: str) -> list[str]:
@@ -99,13 +99,13 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[s
 
 
 def _dataset(folder: Path) -> list[str]:
-    """Makes a LeRobot dataset; the command that imports it."""
+    """Make a LeRobot dataset; the command that imports it."""
     assert main(['export', 'lerobot', str(EPISODE), '--out', str(folder)]) == 0
     return ['import', 'lerobot', str(folder), '--mapping', str(folder / 'meta' / 'mapping.yaml')]
 
 
 def _weights(folder: Path) -> list[str]:
-    """Makes small weights in the public layout; the command that imports them."""
+    """Make small weights in the public layout; the command that imports them."""
     public = write_videox(folder / 'public')
     preset, video = folder / 'tiny.yaml', {'num_frames': 4, 'width': 32, 'height': 32}
     sections = {'transformer': TRANSFORMER, 'autoencoder': AUTOENCODER, 'scheduler': SCHEDULER}
@@ -114,7 +114,7 @@ def _weights(folder: Path) -> list[str]:
 
 
 def _evaluation(folder: Path) -> list[str]:
-    """Evaluates without a report; the command that writes it."""
+    """Evaluate without a report; the command that writes it."""
     words = ['--actions', 'true', '--no-ceiling', '--no-report', '--out', str(folder), *ONE_STEP]
     assert main(['evaluate', 'bundled', str(EPISODE.parent), *words]) == 0
     return ['export', 'report', str(folder)]

@@ -50,7 +50,7 @@ def test_damaged_input_is_read_or_refused_with_a_reason(name, tmp_path) -> None:
 
 @cache
 def warm_up(kind: str) -> None:
-    """Reads a whole sample: what is imported and loaded for it is not what an accident takes."""
+    """Read a whole sample: what is imported and loaded for it is not what an accident takes."""
     with tempfile.TemporaryDirectory() as folder:
         fuzz.warm_up(KINDS[kind], KINDS[kind].samples(), Path(folder))
 

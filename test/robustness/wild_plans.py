@@ -115,7 +115,7 @@ def damaged(_: list[Any], rng: np.random.Generator) -> Any:
 
 
 def imagine(plan: Any, _: Any) -> None:
-    """Imagines the first chunk of a plan.
+    """Imagine the first chunk of a plan.
 
     Raises:
         MtvWorldError: it is refused.
@@ -136,7 +136,7 @@ def imagine(plan: Any, _: Any) -> None:
 
 
 def check_plausible(episode: Any, prediction: Any) -> None:
-    """Judges what was imagined, by numbers that are not the node's."""
+    """Judge what was imagined, by numbers that are not the node's."""
     success = prediction.success.probability
     assert np.isnan(success) or 0 <= success <= 1, f'a success estimate of {success}'
     robot = episode.pipeline.robot

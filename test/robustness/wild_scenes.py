@@ -49,7 +49,7 @@ def damaged(_: list[Any], rng: np.random.Generator) -> Any:
 
 
 def foresee(solids: Any, _: Any) -> None:
-    """Foresees what happens to the solids while the arms stand still.
+    """Foresee what happens to the solids while the arms stand still.
 
     Raises:
         AssertionError: something that counts is where nothing can be.

@@ -10,14 +10,14 @@ import time
 
 
 def stop_on_three(number: int) -> int:
-    """Stands still at job three."""
+    """Stand still at job three."""
     if number == 3:
         os.kill(os.getpid(), signal.SIGSTOP)
     return number
 
 
 def make_stopping() -> object:
-    """Makes what stands still."""
+    """Make what stands still."""
     return stop_on_three
 
 
@@ -28,7 +28,7 @@ class LongJobs:
     folder: Path
 
     def __call__(self) -> object:
-        """Makes what runs a job."""
+        """Make what runs a job."""
         return self._run
 
     def _run(self, number: int) -> None:
@@ -43,5 +43,5 @@ def held_back() -> tuple[bool, bool]:
 
 
 def make_held_back() -> object:
-    """Makes what says so."""
+    """Make what says so."""
     return held_back

@@ -24,7 +24,7 @@ USE_SIM_TIME = Parameter('use_sim_time', value=True)
 
 @pytest.fixture
 def make_node():
-    """Makes nodes in a context of their own."""
+    """Make nodes in a context of their own."""
     context = rclpy.Context()
     rclpy.init(context=context)
     nodes = []

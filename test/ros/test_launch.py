@@ -29,7 +29,7 @@ def test_launch_file_shows_its_arguments(name, arguments):
 
 @pytest.fixture
 def launch(tmp_path):
-    """Starts `ros2 launch` on the package as colcon installed it."""
+    """Start `ros2 launch` on the package as colcon installed it."""
     found = subprocess.run(['ros2', 'pkg', 'prefix', 'mtv_world_ros'], capture_output=True)
     if found.returncode != 0:
         pytest.skip('mtv_world_ros is not built by colcon and sourced')
@@ -57,7 +57,7 @@ def launch(tmp_path):
 
 
 def read_until(process, text):
-    """Reads what a launch says up to a text."""
+    """Read what a launch says up to a text."""
     said = []
     for line in process.stdout:
         said.append(line)
@@ -68,7 +68,7 @@ def read_until(process, text):
 
 @pytest.fixture
 def ros2(launch):
-    """Runs the command line beside a launch; returns what it said."""
+    """Run the command line beside a launch; return what it said."""
 
     def ros2(*arguments, until=''):
         """With `until` again and again, for a minute: discovery takes its time."""

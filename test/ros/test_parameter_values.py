@@ -14,7 +14,7 @@ KINDS = {'world_model': Settings, 'policy': PolicySettings}
 
 
 def run_with(name, *words):
-    """Returns the exit status of a node that only reads its parameters, and what it said."""
+    """Return the exit status of a node that only reads its parameters, and what it said."""
 
     def make():
         node = Node(name)

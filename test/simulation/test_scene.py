@@ -27,7 +27,7 @@ def scene(workcell):
 
 
 def put(model, data, robot, row):
-    """Puts the simulated robot where its joints have these positions."""
+    """Put the simulated robot where its joints have these positions."""
     for actuator in actuators_of(robot):
         driven = actuator.multiplier * row[actuator.column] + actuator.offset
         data.joint(actuator.joint).qpos = driven

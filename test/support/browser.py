@@ -62,7 +62,7 @@ class Browser:
         self._session = attached['sessionId']
 
     def call(self, method: str, **parameters: Any) -> Any:
-        """Returns the result of a DevTools method."""
+        """Return the result of a DevTools method."""
         number = next(self._numbers)
         message = {'id': number, 'method': method, 'params': parameters}
         if self._session:
@@ -84,7 +84,7 @@ class Browser:
         return json.loads(text)
 
     def open(self, address: str) -> None:
-        """Opens a page and waits until it is there."""
+        """Open a page and wait until it is there."""
         self.call('Page.navigate', url=address)
         end = time.monotonic() + TIMEOUT_S
         while self.run('document.readyState + location.href').startswith('complete') is False:
@@ -92,7 +92,7 @@ class Browser:
             time.sleep(0.2)
 
     def run(self, script: str) -> Any:
-        """Returns the value of a script, or of the promise that it gives."""
+        """Return the value of a script, or of the promise that it gives."""
         found = self.call(
             'Runtime.evaluate', expression=script, awaitPromise=True, returnByValue=True
         )
@@ -100,21 +100,21 @@ class Browser:
         return found['result'].get('value')
 
     def choose(self, name: str, option: str) -> None:
-        """Chooses an option of a drop-down by its text."""
+        """Choose an option of a drop-down by its text."""
         self.run(
             f'{{const s = document.getElementById({json.dumps(name)}); s.value = '
             f'[...s.options].find(o => o.text === {json.dumps(option)}).value; 0}}'
         )
 
     def shown(self) -> list[str]:
-        """Returns the headings of the cards that are to be seen."""
+        """Return the headings of the cards that are to be seen."""
         return self.run(
             "[...document.querySelectorAll('.card')].filter(c => c.offsetParent !== null)"
             ".map(c => c.querySelector('summary').innerText)"
         )
 
     def play(self, number: int = 0) -> tuple[int, float]:
-        """Plays a video for a moment; returns its width [px] and where it stands [s]."""
+        """Play a video for a moment; return its width [px] and where it stands [s]."""
         width, time_s = self.run(
             'new Promise((done, fail) => {const v = '
             f"document.querySelectorAll('video')[{number}];"
@@ -126,16 +126,16 @@ class Browser:
         return width, time_s
 
     def picture(self, path: Path) -> None:
-        """Writes what is to be seen as a PNG."""
+        """Write what is to be seen as a PNG."""
         path.write_bytes(base64.b64decode(self.call('Page.captureScreenshot')['data']))
 
     def keep(self, name: str) -> None:
-        """Writes what is to be seen to `out/screenshots`, for people to look at."""
+        """Write what is to be seen to `out/screenshots`, for people to look at."""
         SCREENSHOTS.mkdir(parents=True, exist_ok=True)
         self.picture(SCREENSHOTS / f'{name}.png')
 
     def close(self) -> None:
-        """Ends it."""
+        """End it."""
         self._process.terminate()
         try:
             self._process.wait(20)

@@ -108,7 +108,7 @@ def error(status: int, message: str, *, code: str | None = None, **headers: str)
 
 
 def knows_only(*formats: str | None, reply: Reply) -> Callable[[dict], Reply]:
-    """Refuses requests whose `response_format` is of another type, as older servers do."""
+    """Refuse requests whose `response_format` is of another type, as older servers do."""
 
     def choose(request: dict) -> Reply:
         wanted = request.get('response_format', {}).get('type')
@@ -121,7 +121,7 @@ def knows_only(*formats: str | None, reply: Reply) -> Callable[[dict], Reply]:
 
 
 def after(seconds: float, reply: Reply) -> Sender:
-    """Sends nothing for a while."""
+    """Send nothing for a while."""
 
     def late(handler: BaseHTTPRequestHandler) -> None:
         time.sleep(seconds)
@@ -131,7 +131,7 @@ def after(seconds: float, reply: Reply) -> Sender:
 
 
 def dribble(seconds: float, reply: Reply) -> Sender:
-    """Sends blanks for a while, to keep the connection alive, and then the answer."""
+    """Send blanks for a while, to keep the connection alive, and then the answer."""
 
     def slowly(handler: BaseHTTPRequestHandler) -> None:
         handler.send_response(200)
@@ -150,7 +150,7 @@ def dribble(seconds: float, reply: Reply) -> Sender:
 
 
 def break_off(handler: BaseHTTPRequestHandler) -> None:
-    """Announces more than it sends."""
+    """Announce more than it sends."""
     handler.send_response(200)
     handler.send_header('Content-Type', 'application/json')
     handler.send_header('Content-Length', '1000')

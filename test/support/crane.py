@@ -72,7 +72,7 @@ URDF = '\n'.join(
 
 
 def write_robot(folder: Path) -> Path:
-    """Writes `crane.yaml`, its URDF and its one mesh; returns the YAML."""
+    """Write `crane.yaml`, its URDF and its one mesh; return the YAML."""
     (folder / 'crane' / 'meshes').mkdir(parents=True, exist_ok=True)
     write_cuboid(folder / 'crane' / 'meshes' / 'hand.stl', np.array([0.05, 0.12, 0.08]))
     (folder / 'crane' / 'crane.urdf').write_text(URDF)
@@ -173,7 +173,7 @@ def write_episode(
     *,
     recorded_as: dict[str, CameraModel] | None = None,
 ) -> Path:
-    """Records what the cameras see; `recorded_as` is the calibration that is written."""
+    """Record what the cameras see; `recorded_as` is the calibration that is written."""
     written = recorded_as or cameras
     frames = {view: render(robot, camera, positions) for view, camera in cameras.items()}
     with EpisodeWriter(
@@ -205,7 +205,7 @@ def tilted(camera: CameraModel, degrees: float, axis: int) -> CameraModel:
 
 
 def load(folder: Path) -> RobotModel:
-    """Writes the robot and loads it."""
+    """Write the robot and load it."""
     return load_robot(write_robot(folder))
 
 

@@ -47,13 +47,13 @@ def state() -> dict[str, Any]:
 
 
 def restore(before: Mapping[str, Any]) -> None:
-    """Gives torch the threads back that it had: commands that run in this process set them."""
+    """Give torch the threads back that it had: commands that run in this process set them."""
     if _TORCH in before:
         sys.modules['torch'].set_num_threads(before[_TORCH])
 
 
 def left(before: Mapping[str, Any]) -> list[str]:
-    """Says what differs from an earlier state; what is about to end is waited for."""
+    """Say what differs from an earlier state; what is about to end is waited for."""
     end_s = time.monotonic() + _PATIENCE_S
     while (found := _differences(before, state())) and time.monotonic() < end_s:
         if not any(text.startswith((_THREADS, _CHILDREN)) for text in found):

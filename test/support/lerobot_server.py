@@ -102,7 +102,7 @@ class Server:
         return self.messages['Empty']()
 
     def act(self, request, context):
-        """Moves every motor by 1 an action; the task says what goes wrong."""
+        """Move every motor by 1 an action; the task says what goes wrong."""
         raw = self.observation.observation
         if raw['task'] == 'fail' or self.config is None:
             return self.messages['Empty']()

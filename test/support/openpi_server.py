@@ -40,7 +40,7 @@ DROID_VELOCITIES = np.array([0.5, -0.25, 0.0, 1.0, -1.0, 0.1, 0.0])
 
 
 def infer_droid(request):
-    """Returns a chunk as DROID checkpoints do: (15, 8) joint velocities and gripper positions.
+    """Return a chunk as DROID checkpoints do: (15, 8) joint velocities and gripper positions.
 
     Velocities have the other sign from the eighth action on; the gripper closes from there on.
     """
@@ -59,7 +59,7 @@ def infer_droid(request):
 
 
 def infer(request):
-    """Moves every joint by 0.01 an action; the prompt says what goes wrong."""
+    """Move every joint by 0.01 an action; the prompt says what goes wrong."""
     prompt = request['prompt']
     if 'observation/joint_position' in request:
         return infer_droid(request)

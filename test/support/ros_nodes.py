@@ -138,13 +138,13 @@ class Client:
         self.node.create_subscription(kind, topic, keep, profile)
 
     def publish(self, topic, message, *, latched=False):
-        """Publishes reliably; the first time on a topic waits until the node is connected."""
+        """Publish reliably; the first time on a topic waits until the node is connected."""
         if topic not in self.publishers:
             self.connect_inputs({topic: type(message)}, latched=latched)
         self.publishers[topic].publish(message)
 
     def connect_inputs(self, topics, *, latched=False):
-        """Creates publishers for `{topic: type}` and waits until the node is connected."""
+        """Create publishers for `{topic: type}` and wait until the node is connected."""
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         profile = QoSProfile(depth=10, durability=durability)
         for topic, kind in topics.items():
@@ -170,7 +170,7 @@ class Client:
         return all(reliable) and is_known and is_there and are_matched
 
     def wait(self, condition, what='it', timeout_s=TIMEOUT_S):
-        """Spins until the condition holds."""
+        """Spin until the condition holds."""
         end = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < end, f'waited {timeout_s} s for {what}'
@@ -182,7 +182,7 @@ class Client:
             self.executor.spin_once(timeout_sec=0.02)
 
     def connect_outputs(self, topics, timeout_s=TIMEOUT_S, depth=NUM_FRAMES):
-        """Subscribes to `{topic: type}` and waits for their publishers."""
+        """Subscribe to `{topic: type}` and wait for their publishers."""
         for topic, kind in topics.items():
             self.subscribe(kind, topic, depth)
         for topic in topics:
@@ -220,14 +220,14 @@ class Client:
         return self.call(SetBool, '/world_model/imagine', SetBool.Request(data=on))
 
     def set(self, **values):
-        """Sets parameters of the node; returns the first refusal's reason, or ''."""
+        """Set parameters of the node; return the first refusal's reason, or ''."""
         parameters = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
         request = SetParameters.Request(parameters=parameters)
         results = self.call(SetParameters, '/world_model/set_parameters', request).results
         return next((r.reason for r in results if not r.successful), '')
 
     def get(self, name):
-        """Returns a text parameter of the node."""
+        """Return a text parameter of the node."""
         request = GetParameters.Request(names=[name])
         answer = self.call(GetParameters, '/world_model/get_parameters', request)
         return answer.values[0].string_value
@@ -238,7 +238,7 @@ class Client:
     # what the robot's drivers publish
 
     def send_scene(self, stamp_ns=None, **changes):
-        """Publishes both images, their infos and the joint state, all stamped alike.
+        """Publish both images, their infos and the joint state, all stamped alike.
 
         `changes`: image_<view>, info_<view>, joints = a message instead, or None = not at all.
         """
@@ -286,7 +286,7 @@ class Client:
         return values_of(found[-1]) if found else {}
 
     def wait_for_all(self, topics):
-        """Waits until the frames of all chunks are out and here, on all topics."""
+        """Wait until the frames of all chunks are out and here, on all topics."""
 
         def all_here():
             sent = self.report_values('published')
@@ -298,15 +298,15 @@ class Client:
         self.wait(all_here, 'frames that were reported as published')
 
     def wait_for_state(self, state, since):
-        """Waits for a report of a state after the first `since` reports."""
+        """Wait for a report of a state after the first `since` reports."""
         self.wait(lambda: any(v['state'] == state for v in self.report_values()[since:]), state)
 
     def next_end(self, since):
-        """Waits for the next report after the first `since` that ends a rollout."""
+        """Wait for the next report after the first `since` that ends a rollout."""
         return self.wait_for_ends(1, since)[0]
 
     def wait_for_ends(self, count, since):
-        """Waits until so many rollouts have ended; returns the reports of that."""
+        """Wait until so many rollouts have ended; return the reports of that."""
 
         def ended():
             return [v for v in self.report_values()[since:] if v['state'] in ENDS]
@@ -315,7 +315,7 @@ class Client:
         return ended()
 
     def imagine_one(self, *, scene=None, **fields):
-        """Sends a scene and a trajectory; returns the report of how it ended."""
+        """Send a scene and a trajectory; return the report of how it ended."""
         since = len(self.report_values())
         if scene is None:
             self.send_scene()
@@ -404,7 +404,7 @@ class NodeProcess:
 
 
 def start_node(folder, *parameters, remaps=(), load=load_fake):
-    """Starts the node in this process, with `name:=value` parameters and remappings."""
+    """Start the node in this process, with `name:=value` parameters and remappings."""
     words = ['--ros-args', *node_options(folder, *parameters)]
     words += [part for rule in remaps for part in ('-r', rule)]
 
@@ -421,13 +421,13 @@ def start_node(folder, *parameters, remaps=(), load=load_fake):
 
 
 def run_node(folder, *parameters):
-    """Returns the exit status of a node that ends by itself, and what it said."""
+    """Return the exit status of a node that ends by itself, and what it said."""
     words = ['world_model', '--ros-args', *node_options(folder, *parameters)]
     return run_to_end(lambda: main(words, load_fake))
 
 
 def start_node_process(folder, *parameters, program=(str(FAKE),), remaps=()):
-    """Starts the node in a process of its own."""
+    """Start the node in a process of its own."""
     command = [sys.executable, *program, '--ros-args', *node_options(folder, *parameters)]
     command += [part for rule in remaps for part in ('-r', rule)]
     return NodeProcess(command, folder / 'node.log')
@@ -468,13 +468,13 @@ def policy_options(folder, *parameters, remaps=()):
 
 
 def start_policy(folder, *parameters, remaps=()):
-    """Starts the policy node in this process."""
+    """Start the policy node in this process."""
     words = policy_options(folder, *parameters, remaps=remaps)
     return NodeInProcess(lambda context: PolicyNode(load_fake_policy, context), words)
 
 
 def start_policy_process(folder, *parameters, remaps=()):
-    """Starts the policy node in a process of its own, which some of its faults end."""
+    """Start the policy node in a process of its own, which some of its faults end."""
     words = policy_options(folder, *parameters, remaps=remaps)
     return NodeProcess([sys.executable, str(FAKE_POLICY), *words], folder / 'policy.log')
 

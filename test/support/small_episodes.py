@@ -67,7 +67,7 @@ def scene(shift: float, view: str, grey: int) -> tuple[ByteArray, ByteArray]:
 
 @pytest.fixture(scope='session')
 def make_episode(robot) -> Callable[..., Path]:
-    """Records an episode of 19 frames at 10 Hz; the red block moves `speed` px a frame."""
+    """Record an episode of 19 frames at 10 Hz; the red block moves `speed` px a frame."""
     middle = (robot.lower + robot.upper) / 2
     first = np.arange(len(middle)) == 0
 

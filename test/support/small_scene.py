@@ -22,7 +22,7 @@ SETTINGS = ContactSettings(
 
 
 def batch_of(robot: RobotModel, *solids: Solid, threads: int = 1, **changed: float) -> Batch:
-    """Returns futures of solids; `changed` are settings."""
+    """Return futures of solids; `changed` are settings."""
     engine = Engine(Arms(robot, None), threads)
     settings = SETTINGS.model_copy(update=changed)
     return engine.begin(draw_futures(settings, solids, engine.arms.drives))

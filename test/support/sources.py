@@ -78,7 +78,7 @@ def losses_of(trainer: Trainer, source: BatchSource) -> list[float]:
 
 
 def run_training(out: Path, episodes: Path, preset: Path, **options: Any) -> None:
-    """Trains the bundled robot's model on one thread of this process."""
+    """Train the bundled robot's model on one thread of this process."""
     torch.set_num_threads(1)
     run = TrainingRun(config=load_training_config(preset), dataset=episodes, out=out, **options)
     robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
@@ -95,7 +95,7 @@ def write_preset(folder: Path, config: TrainingConfig, **optimizer: Any) -> Path
 
 
 def run_script(name: str, *arguments: Path, launcher: Sequence[str] = ()) -> None:
-    """Runs a script of this folder to its end, without a GPU."""
+    """Run a script of this folder to its end, without a GPU."""
     script = Path(__file__).with_name(name)
     ended = subprocess.run(
         [sys.executable, *launcher, str(script), *map(str, arguments)],

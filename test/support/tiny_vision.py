@@ -29,7 +29,7 @@ _MEMORY = {
 
 
 def save_sam2(folder: Path, *, present: float = 20.0) -> Path:
-    """Saves a SAM 2; `present` is the logit of seeing the objects."""
+    """Save a SAM 2; `present` is the logit of seeing the objects."""
     from transformers import Sam2VideoConfig, Sam2VideoModel
 
     size = SAM2_SIZE
@@ -65,7 +65,7 @@ def save_sam2(folder: Path, *, present: float = 20.0) -> Path:
 
 
 def save_sam3(folder: Path, *, present: float = 20.0) -> Path:
-    """Saves a SAM 3 with its tokenizer."""
+    """Save a SAM 3 with its tokenizer."""
     from transformers import Sam3VideoConfig, Sam3VideoModel
 
     size, patch = SAM3_SIZE, 14
@@ -138,7 +138,7 @@ def save_sam3(folder: Path, *, present: float = 20.0) -> Path:
 
 
 def save_dino(folder: Path) -> Path:
-    """Saves an MM-Grounding-DINO with its tokenizer and the preparation of its images."""
+    """Save an MM-Grounding-DINO with its tokenizer and the preparation of its images."""
     from transformers import (
         BertTokenizerFast,
         MMGroundingDinoConfig,

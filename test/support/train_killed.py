@@ -22,7 +22,7 @@ _KILLS = 4
 
 
 def start(out: Path, episodes: Path, preset: Path) -> int:
-    """Trains in a process of its own and returns its id."""
+    """Train in a process of its own and return its id."""
     child = os.fork()
     if child:
         return child
@@ -52,7 +52,7 @@ def written_at(out: Path) -> int:
 
 
 def kill(child: int, out: Path, *, saving: bool, after: float) -> str | None:
-    """Kills a process some seconds after it began to step, or then while it writes its state."""
+    """Kill a process some seconds after it began to step, or then while it writes its state."""
     before = written_at(out)
     while written_at(out) in (0, before):
         if finished(child):

@@ -17,7 +17,7 @@ from test.support.sources import run_training
 
 
 def start(number: int, port: int, out: Path, episodes: Path, preset: Path) -> int:
-    """Starts process `number` of two, as a launcher does, and returns its id."""
+    """Start process `number` of two, as a launcher does, and return its id."""
     child = os.fork()
     if child:
         return child

@@ -18,7 +18,7 @@ from test.support.sources import run_training
 
 
 def record(out: Path) -> None:
-    """Makes every trainer write down its first step."""
+    """Make every trainer write down its first step."""
     computed = Trainer.gradients
 
     def gradients(trainer: Trainer, batch: ClipBatch) -> float:

@@ -23,7 +23,7 @@ CHANGES: dict[str, dict[str, Any]] = {
 
 
 def tiny_preset(folder: Path) -> Path:
-    """Writes `wan-1.3b` with those changes as a preset file."""
+    """Write `wan-1.3b` with those changes as a preset file."""
     values = load_training_config('wan-1.3b').model_dump()
     for section, changes in CHANGES.items():
         values[section] |= changes
@@ -40,7 +40,7 @@ def _plain(value: Any) -> Any:
 
 
 def make_base(folder: Path, config: TrainingConfig, prompt: str = 'pick the block') -> Path:
-    """Imports random weights of the published layouts."""
+    """Import random weights of the published layouts."""
     import_weights(
         write_videox(folder / 'public', dtype=torch.float32),
         folder / 'base',

@@ -16,7 +16,7 @@ from test.support.wan_reference import Weights
 
 
 def umt5_encode(w: Weights, ids: Tensor, *, layers: int, heads: int) -> Tensor:
-    """Returns (N, D) of the token numbers (N,), no padding among them."""
+    """Return (N, D) of the token numbers (N,), no padding among them."""
     x = w['token_embedding.weight'][ids]
     buckets = _buckets(len(ids))
     for index in range(layers):
@@ -52,7 +52,7 @@ def _buckets(length: int) -> Tensor:
 
 
 def clip_tokens(w: Weights, pixels: Tensor, *, layers: int, heads: int = 16) -> Tensor:
-    """Returns (N, D), the tokens before the last of `layers` layers, of pixels (3, S, S)."""
+    """Return (N, D), the tokens before the last of `layers` layers, of pixels (3, S, S)."""
     patch = w['visual.patch_embedding.weight']
     x = F.conv2d(pixels[None], patch, stride=patch.shape[-1])[0].flatten(1).T
     x = torch.cat([w['visual.cls_embedding'][0], x]) + w['visual.pos_embedding'][0]

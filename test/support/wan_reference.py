@@ -92,7 +92,7 @@ def _rms_norm(x: Tensor, gain: Tensor) -> Tensor:
 
 
 def _rotate(x: Tensor, angles: Tensor) -> Tensor:
-    """Turns channel pairs of x (B, N, heads, D) as complex numbers by angles (N, D / 2)."""
+    """Turn channel pairs of x (B, N, heads, D) as complex numbers by angles (N, D / 2)."""
     pairs = torch.view_as_complex(x.double().reshape(*x.shape[:-1], -1, 2))
     turned = pairs * torch.polar(torch.ones_like(angles), angles)[None, :, None]
     return torch.view_as_real(turned).flatten(3).to(x.dtype)
@@ -131,7 +131,7 @@ def wan_forward(
     num_heads: int,
     num_layers: int,
 ) -> Tensor:
-    """Returns the flow (B, 16, F, H, W).
+    """Return the flow (B, 16, F, H, W).
 
     Args:
         w: the checkpoint's tensors.

@@ -37,7 +37,7 @@ Change = Callable[[BagMessage], list[bytes]]
 
 
 def rewrite(episode: Path, path: Path, change: Change) -> None:
-    """Copies a bag with some messages left out or replaced."""
+    """Copy a bag with some messages left out or replaced."""
     with BagWriter(path) as writer:
         for message in BagReader(episode).messages():
             for data in change(message):

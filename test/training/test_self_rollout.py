@@ -48,7 +48,7 @@ def run(trainer: Trainer, source: BatchSource) -> list[float]:
 
 
 def seen_batches(monkeypatch: pytest.MonkeyPatch) -> list:
-    """Collects what the trainer's rollouts take and give."""
+    """Collect what the trainer's rollouts take and give."""
     seen = []
     apply = self_rollout.SelfRollout.apply
 

@@ -9,7 +9,7 @@ from mtv_world_ros.cli.shared_options import add_options
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the command."""
+    """Add the command."""
     parser = commands.add_parser(
         'demo', help='replay the bundled episode through the ROS node and score its predictions'
     )

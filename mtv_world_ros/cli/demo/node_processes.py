@@ -47,7 +47,7 @@ class DemoOptions:
 def record_through_node(
     episode: Path, views: Sequence[str], out: Path, options: DemoOptions
 ) -> None:
-    """Plays an episode into a node and records what it publishes in `out/predictions`.
+    """Play an episode into a node and record what it publishes in `out/predictions`.
 
     The cameras' images lie beside them. The episode's clock is the ROS clock, so predictions
     carry the times they are about. After

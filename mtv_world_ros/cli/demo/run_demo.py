@@ -33,7 +33,7 @@ from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
 
 def run_demo(episode: Path, out: Path, options: DemoOptions) -> str:
-    """Replays an episode through the node and returns the printed table.
+    """Replay an episode through the node and return the printed table.
 
     Writes `contact_sheet.png`, `comparison.mp4`, `predictions/` and `report.json` into `out`.
 
@@ -161,7 +161,7 @@ def _object_rows(report: dict[str, Any]) -> list[str]:
 
 
 def sheet_notes(report: dict[str, Any], views: tuple[str, ...]) -> list[str]:
-    """Returns the lines below the contact sheet, which also end the table."""
+    """Return the lines below the contact sheet, which also end the table."""
     lines = []
     for view in views:
         means = report['views'][view]
@@ -218,7 +218,7 @@ class Predictions:
 
 
 def read_predictions(bag: Path, views: Sequence[str]) -> Predictions:
-    """Reads the bag that the recorder made.
+    """Read the bag that the recorder made.
 
     Raises:
         EpisodeError: no chunk in it, or a frame of a chunk is missing.

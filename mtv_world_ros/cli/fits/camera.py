@@ -176,7 +176,7 @@ def _calibrate_one(arguments: argparse.Namespace) -> int:
 def estimate_camera(
     episode: Episode, robot: RobotModel, arguments: argparse.Namespace
 ) -> CameraEstimate:
-    """Returns the estimate for a view, on its mount link.
+    """Return the estimate for a view, on its mount link.
 
     Raises:
         CalibrationError: the recording does not determine it.

@@ -11,7 +11,7 @@ from mtv_world_ros.core.files import check_free, check_output
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the command."""
+    """Add the command."""
     parser = commands.add_parser(
         'contact',
         help='find how arms follow, friction, weight and grip: what foresight is told',

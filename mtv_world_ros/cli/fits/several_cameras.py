@@ -26,7 +26,7 @@ def is_shared(arguments: argparse.Namespace) -> bool:
 
 
 def recordings(paths: Sequence[Path]) -> list[Path]:
-    """Returns recordings, and those in folders.
+    """Return recordings, and those in folders.
 
     Raises:
         ConfigError: there is none.
@@ -45,7 +45,7 @@ def recordings(paths: Sequence[Path]) -> list[Path]:
 
 
 def calibrate_shared(arguments: argparse.Namespace) -> int:
-    """Runs the command on all recordings."""
+    """Run the command on all recordings."""
     from mtv_world_ros.inspection.cameras.shared_camera import load_points
     from mtv_world_ros.robot.file import load_robot
     from mtv_world_ros.robot.shape import load_shape
@@ -120,7 +120,7 @@ def _estimate(
 
 
 def recorded_robot(episode: Path, name: str) -> Path:
-    """Returns the YAML of the robot that an episode shows.
+    """Return the YAML of the robot that an episode shows.
 
     Args:
         episode: its folder; an imported data set has its robot in `robot/` beside the episodes.
@@ -143,7 +143,7 @@ def recorded_robot(episode: Path, name: str) -> Path:
 
 
 def robot_file(arguments: argparse.Namespace, path: Path) -> tuple[Path, EpisodeSource]:
-    """Returns the robot's YAML (`--robot`, the mapping's, the episode's), and the source."""
+    """Return the robot's YAML (`--robot`, the mapping's, the episode's), and the source."""
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.data.episode_reader import read_info
     from mtv_world_ros.robot.file import robot_path
@@ -162,7 +162,7 @@ def read_for_checks(
     *,
     with_masks: bool = False,
 ) -> Episode:
-    """Returns a recording; with `unknown_mount` its cameras may be unknown."""
+    """Return a recording; with `unknown_mount` its cameras may be unknown."""
     from mtv_world_ros.data.episode_reader import read_episode
 
     return read_episode(
@@ -192,7 +192,7 @@ def _read_all(arguments: argparse.Namespace) -> tuple[list[Episode], Path]:
 
 
 def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_known: bool) -> str:
-    """Returns the table: a line a recording, with its place, the doctor's measures and doubts."""
+    """Return the table: a line a recording, with its place, the doctor's measures and doubts."""
     import numpy as np
 
     view, width = estimate.cameras[0].view, estimate.cameras[0].width
@@ -257,7 +257,7 @@ def _write(
     robot: RobotModel,
     parts: Sequence[LinkShape],
 ) -> None:
-    """Writes a calibration file and a picture a place, and with `--apply` into the episodes."""
+    """Write a calibration file and a picture a place, and with `--apply` into the episodes."""
     from dataclasses import replace
 
     from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
@@ -289,7 +289,7 @@ def _write(
 
 
 def _apply(episode: Episode, camera: CameraModel) -> None:
-    """Adds a view to the calibration of an episode that has none of it."""
+    """Add a view to the calibration of an episode that has none of it."""
     from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
     from mtv_world_ros.data.episode import CALIBRATION_FILE
 

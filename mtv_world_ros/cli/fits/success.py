@@ -35,7 +35,7 @@ not be scored; it is not in the fit.
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the command."""
+    """Add the command."""
     parser = commands.add_parser(
         'success',
         help="fit a checkpoint's success estimate to recorded outcomes",
@@ -114,7 +114,7 @@ def _fitted_to(
 
 
 def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
-    """Returns the fault kinds of episodes of scripted policies, by what their results are called.
+    """Return the fault kinds of episodes of scripted policies, by what their results are called.
 
     Raises:
         EpisodeError: the metadata of an episode cannot be used.
@@ -128,7 +128,7 @@ def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
 
 
 def _check_places(arguments: argparse.Namespace, checkpoint: Checkpoint) -> None:
-    """Refuses to write into the installed package, and to replace an earlier calibration."""
+    """Refuse to write into the installed package, and to replace an earlier calibration."""
     from mtv_world_ros.success.calibration import Calibration, fit_path
 
     check_free(arguments.out / 'calibration.json', arguments.overwrite)
@@ -153,7 +153,7 @@ def _is_of_pictures(arguments: argparse.Namespace, checkpoint: Checkpoint) -> bo
 def _imagine(
     arguments: argparse.Namespace, checkpoint: Checkpoint, selection: Selection
 ) -> list[EvaluationSummary]:
-    """Imagines and scores the episodes once a seed."""
+    """Imagine and score the episodes once a seed."""
     from mtv_world_ros.evaluation.evaluate_episodes import evaluate
     from mtv_world_ros.evaluation.result_settings import fingerprint
     from mtv_world_ros.evaluation.settings import EvaluationConfig

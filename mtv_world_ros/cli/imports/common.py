@@ -57,7 +57,7 @@ def write_boxes_page(
     read: Callable[[Any], Episode],
     names: Sequence[str],
 ) -> int:
-    """Writes the page on which boxes are drawn; nothing is imported."""
+    """Write the page on which boxes are drawn; nothing is imported."""
     from mtv_world_ros.core.files import write_whole
     from mtv_world_ros.importing.boxes_page import boxes_page
 
@@ -100,7 +100,7 @@ def object_stage(
 def _refuse_others(
     out: Path, file: Path, examples: ObjectExamples, found: Mapping[str, Any]
 ) -> None:
-    """Keeps the examples that masks of the episodes in a folder were made by."""
+    """Keep the examples that masks of the episodes in a folder were made by."""
     from mtv_world_ros.vision.segmenters.examples import ObjectExamples
 
     there = [name for name in found if (out / name).exists()]
@@ -132,7 +132,7 @@ def _stage_without_boxes(arguments: argparse.Namespace) -> ObjectStage:
 
 
 def import_status(summary: ImportSummary[Any], name: Callable[[Any], str]) -> int:
-    """Prints what came of an import, with the names of its recordings; returns the exit status."""
+    """Print what came of an import, with the names of its recordings; return the exit status."""
     recordings: dict[str, list[str]] = {}  # by warning
     for one, lines in summary.warnings.items():
         for line in lines:

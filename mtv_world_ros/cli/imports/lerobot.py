@@ -76,7 +76,7 @@ def _import_dataset(arguments: argparse.Namespace) -> int:
 
 
 def _guessed_mapping(arguments: argparse.Namespace) -> Path:
-    """Writes OUT/mapping.yaml for columns and views that are named like joints and cameras."""
+    """Write OUT/mapping.yaml for columns and views that are named like joints and cameras."""
     import yaml
 
     from mtv_world_ros.core.files import write_whole

@@ -19,7 +19,7 @@ _ELSEWHERE = ('autoencoder', 'text_encoder', 'image_encoder', 'tokenizer')
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    """Adds the command."""
+    """Add the command."""
     parser = commands.add_parser(
         'wan',
         help='convert public Wan 2.1 weights into a checkpoint',

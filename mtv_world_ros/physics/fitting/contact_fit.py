@@ -84,7 +84,7 @@ class FreeGrippers:
 
     @classmethod
     def of(cls, robot: RobotModel, positions: FloatArray, recorded: FloatArray) -> FreeGrippers:
-        """Returns those of commands and recorded positions (1 + T, J)."""
+        """Return those of commands and recorded positions (1 + T, J)."""
         known = np.full_like(recorded, np.nan)
         last = 1
         for tool in robot.tools:
@@ -105,7 +105,7 @@ class FreeGrippers:
 def fit_fingers(
     grippers: Sequence[FreeGrippers], arms: Arms, settings: ContactSettings
 ) -> ContactSettings:
-    """Returns settings with the numbers of fingers that explain what grippers reported.
+    """Return settings with the numbers of fingers that explain what grippers reported.
 
     The search begins at the settings. Where swinging fingers explain little, they are returned as
     they were, and fingers do not swing.
@@ -275,7 +275,7 @@ class ContactRecording:
     grippers: FreeGrippers
 
     def table(self) -> float:
-        """Returns the height of its own table [m]; NaN = no object tells."""
+        """Return the height of its own table [m]; NaN = no object tells."""
         frame = self.frame
         return table_in(self.names, frame.masks, frame.cameras, frame.poses)
 
@@ -317,7 +317,7 @@ class FittedNumber:
 
 
 def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> ContactRecording:
-    """Reads what an episode says about contact: masks, commands and joint states.
+    """Read what an episode says about contact: masks, command and joint states.
 
     Raises:
         EpisodeError: see `object_displacements`.
@@ -362,12 +362,12 @@ def _unhidden(episode: Episode, views: Sequence[str], num_rows: int) -> BoolArra
 def read_recordings(
     paths: Sequence[Path], robot: RobotModel, views: Sequence[str]
 ) -> tuple[list[ContactRecording], dict[str, str]]:
-    """Returns what episodes say about contact, and why others say nothing, by path."""
+    """Return what episodes say about contact, and why others say nothing, by path."""
     return read_each(paths, lambda path: read_contact(path, robot, views))
 
 
 def first_settings(arms: Arms) -> ContactSettings:
-    """Returns what a search begins with: fingers as their joints follow, objects of plastic."""
+    """Return what a search begins with: fingers as their joints follow, objects of plastic."""
     drives = arms.drives
     stiffness, damping, mass = 200.0, 10.0, 0.05
     if drives.fingers.any():
@@ -395,7 +395,7 @@ def fit_contact(
     report: Callable[[str], None] = lambda line: None,
     progress: Callable[[Sequence[int]], Iterable[int]] = iter,
 ) -> tuple[ContactSettings, list[FittedNumber]]:
-    """Returns likely settings with their spread, and what was found with intervals.
+    """Return likely settings with their spread, and what was found with intervals.
 
     Args:
         recordings: E episodes.
@@ -473,7 +473,7 @@ def settings_of_place(
     recordings: Sequence[ContactRecording],
     report: Callable[[str], None],
 ) -> ContactSettings:
-    """Returns settings for recordings on several tables, or without commands of their own.
+    """Return settings for recordings on several tables, or without commands of their own.
 
     Args:
         first: settings otherwise.
@@ -660,7 +660,7 @@ class _Trial:
 
     @classmethod
     def of(cls, recording: ContactRecording, settings: ContactSettings) -> _Trial:
-        """Returns the trial of a recording on a table as high as the settings say."""
+        """Return the trial of a recording on a table as high as the settings say."""
         frame, points, table = recording.frame, recording.frame.points(), settings.table_m
         if settings.table_varies and np.isfinite(own := recording.table()):
             table = own
@@ -680,7 +680,7 @@ class _Trial:
         )
 
     def likelihoods(self, engine: Engine, settings: Sequence[ContactSettings]) -> FloatArray:
-        """Returns (N,) log likelihoods of where masks show the objects."""
+        """Return (N,) log likelihoods of where masks show the objects."""
         still = np.zeros(len(engine.arms.drives.names))
         drawn = np.random.default_rng(_FIT.seed).normal(size=(len(settings), 3))
         futures = []
@@ -710,7 +710,7 @@ class _Trial:
 
 
 def find_delay(recordings: Sequence[ContactRecording], arms: Arms) -> FittedNumber:
-    """Returns how much later joints move than commands of now would have them move."""
+    """Return how much later joints move than commands of now would have them move."""
     errors = np.stack([_delay_errors(one, arms) for one in recordings])
     known = errors[np.isfinite(errors).all(-1)]
     return _resampled(
@@ -735,7 +735,7 @@ def _delay_errors(recording: ContactRecording, arms: Arms) -> FloatArray:
 
 
 def find_cameras(recordings: Sequence[ContactRecording]) -> FittedNumber:
-    """Returns how far from where they are the cameras see objects, alike for all of a scene.
+    """Return how far from where they are the cameras see objects, alike for all of a scene.
 
     Errors of cameras let the rays of two views pass each other: where each ray is off by a
     deviation, they pass by that times the square root of two. Large objects are left out, whose
@@ -769,7 +769,7 @@ def _ray_gaps(frame: FirstFrame) -> list[float]:
 
 
 def find_table(recordings: Sequence[ContactRecording]) -> FittedNumber:
-    """Returns the height at which what stands on a table ends below."""
+    """Return the height at which what stands on a table ends below."""
     bottoms = []
     for recording in recordings[:: max(1, len(recordings) // _FIT.max_tables)]:
         frame, points = recording.frame, recording.frame.points()

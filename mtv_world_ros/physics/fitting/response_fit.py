@@ -57,7 +57,7 @@ _TOOL_MOVES = 0.02
 
 
 def joint_recording(path: Path, robot: RobotModel) -> Recording:
-    """Reads an episode's commands, and its joint states at the same times.
+    """Read an episode's commands, and its joint states at the same times.
 
     Raises:
         EpisodeError: the episode lacks commands or joint states, or these are too far apart.
@@ -82,7 +82,7 @@ def joint_recording(path: Path, robot: RobotModel) -> Recording:
 
 
 def found_response(paths: Sequence[Path], robot: RobotModel) -> tuple[ArmResponse | None, str]:
-    """Returns how arms follow in recorded episodes, and in words how well.
+    """Return how arms follow in recorded episodes, and in words how well.
 
     None where no episode tells, or where tools are nearer to their commands than to what is
     expected of them, in episodes that the fit was not given.
@@ -117,7 +117,7 @@ def found_response(paths: Sequence[Path], robot: RobotModel) -> tuple[ArmRespons
 def tool_errors(
     robot: RobotModel, recordings: Sequence[Recording], response: ArmResponse | None = None
 ) -> FloatArray:
-    """Returns (N,) how far moving tools are from where they are expected [m].
+    """Return (N,) how far moving tools are from where they are expected [m].
 
     Expected are the positions that the response predicts; without one, the commands themselves.
     """
@@ -133,7 +133,7 @@ def tool_errors(
 
 
 def fit_response(robot: RobotModel, recordings: Sequence[Recording]) -> ArmResponse:
-    """Returns the response that explains recorded joints best."""
+    """Return the response that explains recorded joints best."""
     parts = [_equations(robot, *recording) for recording in recordings]
     left = np.concatenate([part[0] for part in parts])  # (N, J, 4)
     right = np.concatenate([part[1] for part in parts])  # (N, J)
@@ -152,7 +152,7 @@ def fit_response(robot: RobotModel, recordings: Sequence[Recording]) -> ArmRespo
 def with_floor(
     response: ArmResponse, robot: RobotModel, recordings: Sequence[Recording]
 ) -> ArmResponse:
-    """Returns the response with the height at which fingertips stopped though they were to sink.
+    """Return the response with the height at which fingertips stopped though they were to sink.
 
     As it is where too few did, or where that does not explain the recordings better.
     """

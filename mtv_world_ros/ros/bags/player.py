@@ -70,7 +70,7 @@ class Timeline:
 
     @classmethod
     def now(cls, bag_ns: int, rate: float) -> Timeline:
-        """Returns the timeline that has a bag time now."""
+        """Return the timeline that has a bag time now."""
         steady_ns = time.monotonic_ns()
         return cls(bag_ns, steady_ns, rate, time.time_ns() - steady_ns)
 
@@ -90,7 +90,7 @@ class Timeline:
         return self.due(bag_ns) + self.offset_ns
 
     def pause(self, duration_ns: int) -> None:
-        """Delays everything after this moment."""
+        """Delay everything after this moment."""
         self.steady_ns += duration_ns
 
 
@@ -126,7 +126,7 @@ class Player(Node):
         self._timeline: Timeline | None = None
 
     def play(self) -> None:
-        """Waits for subscribers and plays, once or in a loop.
+        """Wait for subscribers and plays, once or in a loop.
 
         Raises:
             ConfigError: nobody subscribes.
@@ -186,7 +186,7 @@ class Player(Node):
         return unsubscribed or self._peers.unconnected(topics)
 
     def _wait_until_settled(self, end_s: float) -> None:
-        """Waits until the number of connections has not changed for a while."""
+        """Wait until the number of connections has not changed for a while."""
         known, since_s = self._connections(), time.monotonic()
         while time.monotonic() < min(since_s + _SETTLED_S, end_s):
             self._executor.spin_once(timeout_sec=0.05)
@@ -233,7 +233,7 @@ class Player(Node):
         self._publish_clock(max(bag_ns, timeline.bag_ns))
 
     def _publish(self, timeline: Timeline, message: BagMessage) -> int:
-        """Publishes a message; returns the stamp it then has, 0 = none [ns]."""
+        """Publish a message; return the stamp it then has, 0 = none [ns]."""
         data, stamp_ns = message.data, 0
         if has_header(message.msgtype):
             stamp_ns = read_stamp(data)
@@ -246,7 +246,7 @@ class Player(Node):
         return stamp_ns
 
     def _flush(self) -> None:
-        """Waits until reliable subscribers have what was published (Fast DDS: up to 3 s)."""
+        """Wait until reliable subscribers have what was published (Fast DDS: up to 3 s)."""
         for publisher in self._outputs.values():
             if publisher.get_subscription_count():
                 publisher.wait_for_all_acked(Duration(seconds=4))
@@ -274,7 +274,7 @@ class Player(Node):
                 self._unpublished.discard(chunk)
 
     def _wait_for_answer(self, timeline: Timeline, bag_ns: int, stamp_ns: int) -> None:
-        """Pauses the bag until the node reports the end of the trajectory."""
+        """Pause the bag until the node reports the end of the trajectory."""
         begin_ns, seen = time.monotonic_ns(), len(self._ends)
         end_s = time.monotonic() + self._options.answer_timeout
         answer: dict[str, str] | None = None
@@ -295,7 +295,7 @@ class Player(Node):
 
 
 def in_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
-    """Yields messages by time, holding two seconds of them; trajectories last among equals.
+    """Yield messages by time, holding two seconds of them; trajectories last among equals.
 
     A trajectory is planned from the messages that have its time.
     """
@@ -348,7 +348,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Plays an episode; returns the exit status."""
+    """Play an episode; return the exit status."""
     arguments = list(sys.argv if args is None else ('player', *args))
     options = _parse(remove_ros_args(arguments)[1:])
     return run(lambda: Player(options), arguments, spin=Player.play)

@@ -85,7 +85,7 @@ class Recorder(Node):
         self._writer = self._open()
 
     def record(self) -> None:
-        """Records for the given duration, or until a signal and the messages sent before it.
+        """Record for the given duration, or until a signal and the messages sent before it.
 
         Raises:
             ConfigError: a topic has no publisher in time.
@@ -103,7 +103,7 @@ class Recorder(Node):
         self._close_bag()
 
     def close(self) -> None:
-        """Closes the bag, whatever ended the recording, and ends the node."""
+        """Close the bag, whatever ended the recording, and end the node."""
         try:
             self._close_bag()
         except EpisodeError as error:
@@ -112,7 +112,7 @@ class Recorder(Node):
             self.destroy_node()
 
     def _close_bag(self) -> None:
-        """Finishes the bag and logs its counts; a bag without messages is dropped."""
+        """Finish the bag and log its counts; a bag without messages is dropped."""
         writer, self._writer = self._writer, None
         if writer is None:
             return
@@ -139,7 +139,7 @@ class Recorder(Node):
         return BagWriter(self._options.out, overwrite=self._options.overwrite, keep=True)
 
     def _after_spin(self) -> None:
-        """Flushes the bag, and names silent topics."""
+        """Flush the bag, and names silent topics."""
         if self._writer is not None and time.monotonic() > self._next_flush_s:
             self._next_flush_s = time.monotonic() + _FLUSH_PERIOD_S
             self._writer.flush()
@@ -163,7 +163,7 @@ class Recorder(Node):
                 waiting.remove(topic)
 
     def _announce(self) -> None:
-        """Logs `recording` once every subscription is connected."""
+        """Log `recording` once every subscription is connected."""
         connected = (s.get_publisher_count() for s in self._taken)
         if not self._is_announced() and all(connected):
             self._announced_s = time.monotonic()
@@ -174,7 +174,7 @@ class Recorder(Node):
         return self._announced_s < float('inf')
 
     def _name_silent(self) -> None:
-        """Logs, once, the topics without messages so far; their first message is logged later."""
+        """Log, once, the topics without messages so far; their first message is logged later."""
         self.silent_after_s = float('inf')
         self._silent = {s.topic_name for s in self._taken if not self._counts[s.topic_name]}
         if self._silent:
@@ -215,7 +215,7 @@ class Recorder(Node):
         self._taken.append(taken)
 
     def _handler(self, topic: str, msgtype: str, leads: bool) -> Callable[[bytes], None]:
-        """Returns the callback that writes; a leading topic dates messages without a header."""
+        """Return the callback that writes; a leading topic dates messages without a header."""
         by_header = self._options.stamp == 'header'
 
         def write(data: bytes) -> None:
@@ -274,7 +274,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Records until SIGINT or SIGTERM; returns the exit status."""
+    """Record until SIGINT or SIGTERM; return the exit status."""
     arguments = list(sys.argv if args is None else ('recorder', *args))
     options = parse(remove_ros_args(arguments)[1:])
     return run(

@@ -32,7 +32,7 @@ class EpisodeRecorder(Recorder):
         return None
 
     def _on_begin(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Begins a bag after closing an ending one; a second call returns the same bag."""
+        """Begin a bag after closing an ending one; a second call returns the same bag."""
         if self._writer is not None and self._end_before_s == float('inf'):
             response.success, response.message = True, str(self._bag)
             return response
@@ -51,7 +51,7 @@ class EpisodeRecorder(Recorder):
         return response
 
     def _on_end(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Closes the bag once the topics are silent."""
+        """Close the bag once the topics are silent."""
         now_s = time.monotonic()
         self.last_message_s, self._end_before_s = now_s, now_s + _LONGEST_DRAIN_S
         response.success = True
@@ -70,7 +70,7 @@ class EpisodeRecorder(Recorder):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Records until SIGINT or SIGTERM; returns the exit status."""
+    """Record until SIGINT or SIGTERM; return the exit status."""
     arguments = list(sys.argv if args is None else ('episode_recorder', *args))
     options = parse(remove_ros_args(arguments)[1:])
     return run(

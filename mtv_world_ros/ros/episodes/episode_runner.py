@@ -65,7 +65,7 @@ class RecorderProcess:
         self._stopped = StoppedProcesses()
 
     def start(self, topics: Sequence[str]) -> None:
-        """Starts the recorder and waits until it is connected to every topic.
+        """Start the recorder and wait until it is connected to every topic.
 
         Raises:
             EpisodeError: the recorder ended.
@@ -79,7 +79,7 @@ class RecorderProcess:
         self._peers.wait(self._is_on, f"the recorder; see '{self._log}'", 2 * _TIMEOUT_S)
 
     def begin(self) -> str:
-        """Begins a bag; returns its path, empty = nothing is recorded."""
+        """Begin a bag; return its path, empty = nothing is recorded."""
         if self._process is None:
             return ''
         answer = self._peers.call(Trigger, 'episode_recorder/begin', Trigger.Request())
@@ -89,7 +89,7 @@ class RecorderProcess:
         return answer.message
 
     def check(self) -> None:
-        """Refuses to go on without the recorder.
+        """Refuse to go on without the recorder.
 
         Raises:
             EpisodeError: the recorder ended, e.g. because the disk is full, or was stopped.
@@ -103,7 +103,7 @@ class RecorderProcess:
             raise EpisodeError(f"{problem}; its log is '{self._log}'")
 
     def end(self) -> None:
-        """Ends the bag and waits until it is closed.
+        """End the bag and wait until it is closed.
 
         Raises:
             EpisodeError: the recorder ended; the bag holds what had been received.
@@ -116,7 +116,7 @@ class RecorderProcess:
         self._peers.wait(lambda: self._is_on() and bag.is_dir(), f"'{bag}'", _TIMEOUT_S)
 
     def stop(self) -> None:
-        """Ends the recorder."""
+        """End the recorder."""
         stop_process(self._process)
         self._process = None
 
@@ -167,7 +167,7 @@ class EpisodeRunner(Node):
         self._next_status_s = 0.0
 
     def run_all(self) -> None:
-        """Runs the episodes and writes `episodes.json`.
+        """Run the episodes and write `episodes.json`.
 
         Raises:
             ConfigError: a node is missing, or died.
@@ -191,7 +191,7 @@ class EpisodeRunner(Node):
                 raise ConfigError(f'episode {number}: {result["how"]}; see its log')
 
     def close(self) -> None:
-        """Closes the bag of a running episode and lists it as interrupted; ends the node."""
+        """Close the bag of a running episode and list it as interrupted; end the node."""
         self._recording.stop()
         bag = self._options.out / f'episode_{self._running.get("episode", 0):05d}'
         if self._running and bag.is_dir():
@@ -201,7 +201,7 @@ class EpisodeRunner(Node):
         self.destroy_node()
 
     def _keep(self, result: dict[str, Any]) -> None:
-        """Adds the result of an episode to `episodes.json`."""
+        """Add the result of an episode to `episodes.json`."""
         self._results.append(result)
         self._running = {}
         text = json.dumps(self._results, indent=2)
@@ -226,7 +226,7 @@ class EpisodeRunner(Node):
         return {**result, **_ending(seen)}
 
     def _live_out(self, number: int, start: EpisodeStart) -> dict[str, str]:
-        """Runs an episode; returns the values of the report of its end."""
+        """Run an episode; return the values of the report of its end."""
         options, peers = self._options, self._peers
         common = {'seed': options.seed + 1000 * number}
         if start.calibration_file:
@@ -253,7 +253,7 @@ class EpisodeRunner(Node):
         return self._wait_for_end()
 
     def _show(self, start: EpisodeStart, only: str = '') -> None:
-        """Publishes the start once, on topics that end with `only`."""
+        """Publish the start once, on topics that end with `only`."""
         for topic, message in start.stamped(self.get_clock().now().nanoseconds):
             if topic.endswith(only):
                 self._outputs[topic].publish(message)
@@ -298,7 +298,7 @@ class EpisodeRunner(Node):
         return live.start(self._options.instruction)
 
     def _connect(self) -> None:
-        """Starts the recorder and waits until it is connected to every publisher."""
+        """Start the recorder and wait until it is connected to every publisher."""
         options = self._options
         shown = [output.topic_name for output in self._outputs.values()]
         least = 2  # the world model and the policy
@@ -401,7 +401,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Runs episodes; returns the exit status."""
+    """Run episodes; return the exit status."""
     arguments = list(sys.argv if args is None else ('episode_runner', *args))
     options = _parse(remove_ros_args(arguments)[1:])
     return run(lambda: EpisodeRunner(options), arguments, spin=EpisodeRunner.run_all)

@@ -68,7 +68,7 @@ class EpisodeStart:
 
 
 def recorded_start(path: Path, views: Sequence[str], start_s: float = 0.0) -> EpisodeStart:
-    """Reads a moment of a recorded episode.
+    """Read a moment of a recorded episode.
 
     Args:
         path: rosbag2 MCAP folder with a calibration.yaml.
@@ -145,12 +145,12 @@ class LiveCameras:
         ]
 
     def refresh(self) -> None:
-        """Matches QoS to the publishers again; call it periodically."""
+        """Match QoS to the publishers again; call it periodically."""
         for subscription in self._subscriptions:
             subscription.refresh()
 
     def clear(self) -> None:
-        """Drops images and joint states, so that the next ones are new."""
+        """Drop images and joint states, so that the next ones are new."""
         self._images.clear()
         self._positions.clear()
 
@@ -161,7 +161,7 @@ class LiveCameras:
         return missing + ([] if self._positions else ['joint_states'])
 
     def start(self, instruction: str) -> EpisodeStart:
-        """Returns the newest messages as the start of an episode."""
+        """Return the newest messages as the start of an episode."""
         names = tuple(self._positions)
         values = np.array([self._positions[name] for name in names])
         return EpisodeStart(

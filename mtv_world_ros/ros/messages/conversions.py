@@ -88,7 +88,7 @@ def make_header(stamp_ns: int, frame_id: str = '') -> Header:
 
 
 def to_trajectory(message: JointTrajectoryMsg) -> JointTrajectory:
-    """Returns the trajectory, see `read_plan`.
+    """Return the trajectory, see `read_plan`.
 
     Raises:
         Rejection: the message cannot be used.
@@ -112,7 +112,7 @@ def to_trajectory_message(trajectory: JointTrajectory, header: Header) -> JointT
 
 
 def to_sample(message: JointState, joints: Collection[str] | None = None) -> JointSample:
-    """Returns the positions of a message by joint, and the joints whose position is no number.
+    """Return the positions of a message by joint, and the joints whose position is no number.
 
     Args:
         message: of one or several joints.
@@ -133,7 +133,7 @@ def to_sample(message: JointState, joints: Collection[str] | None = None) -> Joi
 
 
 def check_sample(sample: JointSample) -> None:
-    """Refuses a sample in which a joint has no position that can be used.
+    """Refuse a sample in which a joint has no position that can be used.
 
     Raises:
         Rejection: names the joints.
@@ -144,7 +144,7 @@ def check_sample(sample: JointSample) -> None:
 
 
 def to_positions(message: JointState) -> dict[str, float]:
-    """Returns position by joint name [rad or m].
+    """Return position by joint name [rad or m].
 
     Raises:
         Rejection: no positions, not one a name, a joint twice with two positions, or not finite.

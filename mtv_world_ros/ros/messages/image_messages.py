@@ -20,7 +20,7 @@ _FORMATS = ('jpeg', 'jpg', 'png')
 
 
 def check(message: Image | CompressedImage) -> None:
-    """Refuses an image that cannot be read by its fields and first bytes, without decoding it.
+    """Refuse an image that cannot be read by its fields and first bytes, without decoding it.
 
     Raises:
         Rejection: unsupported encoding or format, wrong `step`, short data.
@@ -34,7 +34,7 @@ def check(message: Image | CompressedImage) -> None:
 
 
 def to_rgb(message: Image | CompressedImage) -> ByteArray:
-    """Returns (H, W, 3) uint8 RGB; padding at the rows' ends is dropped.
+    """Return (H, W, 3) uint8 RGB; padding at the rows' ends is dropped.
 
     Raises:
         Rejection: see `check`; or a compressed image is damaged.
@@ -75,7 +75,7 @@ def to_compressed(rgb: ByteArray, header: Header, quality: int) -> CompressedIma
 
 
 def info_of_camera(camera: CameraModel, header: Header) -> CameraInfo:
-    """Returns the CameraInfo of a calibrated camera; P = [K 0]."""
+    """Return the CameraInfo of a calibrated camera; P = [K 0]."""
     return CameraInfo(
         header=header,
         width=camera.width,
@@ -91,7 +91,7 @@ def info_of_camera(camera: CameraModel, header: Header) -> CameraInfo:
 
 
 def windowed_camera_info(info: CameraInfo, camera: CameraModel) -> CameraInfo:
-    """Returns `info` for the images that were received: K and P of them, no ROI, no binning.
+    """Return `info` for the images that were received: K and P of them, no ROI, no binning.
 
     Args:
         info: the received CameraInfo.
@@ -116,7 +116,7 @@ def windowed_camera_info(info: CameraInfo, camera: CameraModel) -> CameraInfo:
 
 
 def scale_camera_info(info: CameraInfo, width: int, height: int, header: Header) -> CameraInfo:
-    """Returns `info` for the image resized to width x height: K, P and ROI rescaled, D and R kept.
+    """Return `info` for the image resized to width x height: K, P and ROI rescaled, D and R kept.
 
     As image_proc's resize node does, with the half pixel of `geometry.camera.scaled`.
     """

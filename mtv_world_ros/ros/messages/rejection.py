@@ -57,7 +57,7 @@ class Rejection(MtvWorldError):
 
 @contextmanager
 def rejected_as(reason: Reason) -> Iterator[None]:
-    """Turns a user error or an exceeded limit into a `Rejection`.
+    """Turn a user error or an exceeded limit into a `Rejection`.
 
     Args:
         reason: what it counts under; what is wrong with a plan counts under its own fault.

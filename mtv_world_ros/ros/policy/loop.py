@@ -79,11 +79,11 @@ class PredictedFrames:
         self._joints: dict[int, JointState] = {}
 
     def add_image(self, view: str, message: Image) -> None:
-        """Stores a predicted image."""
+        """Store a predicted image."""
         self._images[view][to_ns(message.header.stamp)] = message
 
     def add_joint_state(self, message: JointState) -> None:
-        """Stores a predicted joint state."""
+        """Store a predicted joint state."""
         self._joints[to_ns(message.header.stamp)] = message
 
     def clear(self) -> None:
@@ -141,19 +141,19 @@ class Outputs(Protocol):
     """Publishers and sensors that the loop uses."""
 
     def send(self, trajectory: JointTrajectory, stamp_ns: int) -> None:
-        """Publishes an answer under the stamp of the observation that it answers."""
+        """Publish an answer under the stamp of the observation that it answers."""
         ...
 
     def report(self, state: str, values: Mapping[str, object]) -> None:
-        """Reports a chunk, or the begin or end of the episode."""
+        """Report a chunk, or the begin or end of the episode."""
         ...
 
     def fault(self, kind: str, text: str) -> None:
-        """Counts a fault."""
+        """Count a fault."""
         ...
 
     def observe(self) -> Observation:
-        """Returns a real observation.
+        """Return a real observation.
 
         Raises:
             Rejection: there is none.
@@ -203,7 +203,7 @@ class PolicyLoop:
         self._observation: Observation | None = None
 
     def start(self, make: Callable[[], Policy], settings: PolicySettings) -> None:
-        """Begins an episode; one that runs ends.
+        """Begin an episode; one that runs ends.
 
         Args:
             make: returns the policy, in the actor's thread.
@@ -227,7 +227,7 @@ class PolicyLoop:
         self._ask('resetting', reset)
 
     def end(self, how: str, text: str = '') -> None:
-        """Ends the episode, if one runs."""
+        """End the episode, if one runs."""
         if self.phase == 'idle':
             return
         if how not in GOOD_ENDS:
@@ -267,7 +267,7 @@ class PolicyLoop:
                 self.end(state, f'{reason}: {values["text"]}' if reason else 'by somebody else')
 
     def tick(self) -> None:
-        """Continues with received data, or ends an overdue episode; call it periodically."""
+        """Continue with received data, or ends an overdue episode; call it periodically."""
         if self.phase == 'observing':
             self._observe()
         elif self.phase == 'collecting':

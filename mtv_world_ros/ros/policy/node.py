@@ -42,7 +42,7 @@ _TICK_S = 0.02
 
 
 def load_named_policy(settings: PolicySettings, robot: RobotModel) -> PolicyMaker:
-    """Returns the maker of the policy that is set, for a robot."""
+    """Return the maker of the policy that is set, for a robot."""
     return assemble_policy(settings.policy, robot)
 
 
@@ -103,7 +103,7 @@ class PolicyNode(Node):
         self.get_logger().info(f"ready: policy '{settings.policy}'")
 
     def close(self) -> None:
-        """Ends a running episode and the node."""
+        """End a running episode and the node."""
         if self.context.ok():
             self._loop.end('stopped', 'the policy node ends')
         self._actor.close()
@@ -112,22 +112,22 @@ class PolicyNode(Node):
     # what the loop does to the world
 
     def send(self, trajectory: JointTrajectory, stamp_ns: int) -> None:
-        """Publishes an answer under the stamp of the observation that it answers."""
+        """Publish an answer under the stamp of the observation that it answers."""
         self._plans.publish(to_trajectory_message(trajectory, make_header(stamp_ns)))
 
     def report(self, state: str, values: Mapping[str, object]) -> None:
-        """Publishes a report and counts it."""
+        """Publish a report and count it."""
         kind = f'episodes_{values["how"]}' if state == 'ended' else f'{state}s'
         self._status.counts[kind] += 1
         self._status.report(state, values)
 
     def fault(self, kind: str, text: str) -> None:
-        """Counts a fault and publishes `/diagnostics` at once."""
+        """Count a fault and publish `/diagnostics` at once."""
         self._status.fault(kind, text)
         self._publish_diagnostics()
 
     def observe(self) -> Observation:
-        """Returns the newest real observation.
+        """Return the newest real observation.
 
         Raises:
             Rejection: there is none.
@@ -235,7 +235,7 @@ class PolicyNode(Node):
 
 
 def main(args: Sequence[str] | None = None, load: Load = load_named_policy) -> int:
-    """Runs the node; returns the exit status."""
+    """Run the node; return the exit status."""
     help_text = parameters.help_text('python -m mtv_world_ros.ros.policy.node', PolicySettings)
     return run(
         lambda: PolicyNode(load),

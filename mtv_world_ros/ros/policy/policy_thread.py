@@ -51,15 +51,15 @@ class Actor:
         self._thread.start()
 
     def ask(self, ticket: int, question: Callable[[], JointTrajectory | None]) -> None:
-        """Asks after the questions before it."""
+        """Ask after the questions before it."""
         self._questions.put((ticket, question))
 
     def take(self) -> list[PolicyAnswer]:
-        """Returns the answers since the last call, in order."""
+        """Return the answers since the last call, in order."""
         return [self._answers.get() for _ in range(self._answers.qsize())]
 
     def close(self) -> None:
-        """Ends the thread, unless the policy hangs."""
+        """End the thread, unless the policy hangs."""
         self._questions.put(None)
         self._thread.join(_CLOSE_S)
 

@@ -59,7 +59,7 @@ class RobotDescription:
         node.create_subscription(String, TOPIC, events.guarded(self._take), LATCHED)
 
     def check(self) -> None:
-        """Refuses to go on while another robot is described.
+        """Refuse to go on while another robot is described.
 
         Raises:
             Rejection: with what is different.
@@ -101,7 +101,7 @@ class RobotDescription:
 
 
 def tf_message() -> Any | None:
-    """Returns tf2_msgs/TFMessage; None = it is not installed."""
+    """Return tf2_msgs/TFMessage; None = it is not installed."""
     try:
         return import_module('tf2_msgs.msg').TFMessage
     except ModuleNotFoundError:
@@ -147,7 +147,7 @@ class Extrinsics:
             node.create_subscription(self._message, topic, take, qos)
 
     def pose(self, view: str, frame: str, stamp_ns: int) -> Mount | None:
-        """Returns the link and pose of a view's camera by TF; None = use the calibration file.
+        """Return the link and pose of a view's camera by TF; None = use the calibration file.
 
         Args:
             view: name of the view.
@@ -187,11 +187,11 @@ class Extrinsics:
         return mount
 
     def accept(self) -> None:
-        """Accepts changed poses."""
+        """Accept changed poses."""
         self._used.clear()
 
     def forget_moving(self) -> None:
-        """Drops the transforms of /tf after the clock jumped back."""
+        """Drop the transforms of /tf after the clock jumped back."""
         self._tree.forget_moving()
 
     def values(self) -> dict[str, object]:
@@ -199,7 +199,7 @@ class Extrinsics:
         return {f'extrinsics.{view}': source for view, source in self._sources.items()}
 
     def show(self, scene: SensedScene) -> None:
-        """Publishes the frames of a scene's views that TF lacks, so that viewers can place them.
+        """Publish the frames of a scene's views that TF lacks, so that viewers can place them.
 
         A camera whose frames TF has, but not where the whole camera is (drivers publish those
         inside of it), gets its topmost frame placed.
@@ -214,7 +214,7 @@ class Extrinsics:
             self._publisher.publish(self._message(transforms=latest))  # type: ignore
 
     def _place(self, frame: str, camera: CameraModel) -> bool:
-        """Adds a camera's frame that TF lacks; returns whether it is new or has moved."""
+        """Add a camera's frame that TF lacks; return whether it is new or has moved."""
         name, link, T_link_frame = self._tree.name(frame), camera.mount_link, camera.T_mount_camera
         if not name or name in self._links or self._tree.is_connected(name, self._links):
             return False

@@ -117,7 +117,7 @@ class ObservationBuffer:
         return min(images.newest[0] if images else 0 for images in self._images.values())
 
     def add_image(self, view: str, message: AnyImage) -> None:
-        """Stores an image.
+        """Store an image.
 
         Raises:
             Rejection: the image cannot be read, comes from the future, or is stale while a newer
@@ -141,7 +141,7 @@ class ObservationBuffer:
     def add_camera_info(
         self, view: str, message: CameraInfo, *, is_rectified: bool = False
     ) -> None:
-        """Stores the first CameraInfo of a view and watches the later ones.
+        """Store the first CameraInfo of a view and watches the later ones.
 
         Args:
             view: name of the view.
@@ -154,7 +154,7 @@ class ObservationBuffer:
         self._intrinsics.add(view, message, is_rectified=is_rectified)
 
     def add_joint_state(self, message: JointState) -> None:
-        """Stores positions; several publishers may each give some of the joints.
+        """Store positions; several publishers may each give some of the joints.
 
         A joint without a position that can be used does not take the others with it, and joints
         that are not the robot's do not matter.
@@ -197,13 +197,13 @@ class ObservationBuffer:
         return f'it jumps from {last:g} to {position:g} in {seconds:.4f} s'
 
     def clear(self) -> None:
-        """Forgets images and joint states (the clock jumped); camera infos stay."""
+        """Forget images and joint states (the clock jumped); camera infos stay."""
         for samples in (*self._images.values(), *self._joints.values()):
             samples.clear()
         self._frames.clear()
 
     def accept_cameras(self, cameras: Sequence[CameraModel]) -> None:
-        """Takes changed camera infos as the valid ones from now on.
+        """Take changed camera infos as the valid ones from now on.
 
         Args:
             cameras: calibrated cameras of the V views.
@@ -230,7 +230,7 @@ class ObservationBuffer:
         return [note for note in self._intrinsics.notes.values() if note]
 
     def problems(self, now_ns: int) -> list[str]:
-        """Returns what is missing or too old for an observation, as text."""
+        """Return what is missing or too old for an observation, as text."""
         limits, missing = self._limits(), []
         for view, images in self._images.items():
             missing += _freshness(
@@ -247,7 +247,7 @@ class ObservationBuffer:
         return missing
 
     def observe(self, now_ns: int) -> SensedScene:
-        """Makes an observation of the newest images that belong together.
+        """Make an observation of the newest images that belong together.
 
         Raises:
             Rejection: something is missing, stale, out of sync or changed.
@@ -277,7 +277,7 @@ class ObservationBuffer:
         )
 
     def _check_sizes(self, frames: Sequence[ByteArray]) -> None:
-        """Refuses images that are too small to show objects."""
+        """Refuse images that are too small to show objects."""
         least = [round(_LEAST_SIDE_FRACTION * side) for side in self._size]
         for view, frame in zip(self.views, frames, strict=True):
             height, width = frame.shape[:2]
@@ -289,7 +289,7 @@ class ObservationBuffer:
                 )
 
     def _check_frames(self, frames: Sequence[str]) -> None:
-        """Refuses images that come from another camera than those before, as after a swap."""
+        """Refuse images that come from another camera than those before, as after a swap."""
         for view, frame in zip(self.views, frames, strict=True):
             before = self._frames.setdefault(view, frame)
             if frame != before:
@@ -417,7 +417,7 @@ class Intrinsics:
         self.notes: dict[str, str] = {}
 
     def add(self, view: str, message: CameraInfo, *, is_rectified: bool = False) -> None:
-        """Stores the first info of a view and watches the later ones.
+        """Store the first info of a view and watches the later ones.
 
         An info that is not calibrated is the same as none.
 
@@ -444,7 +444,7 @@ class Intrinsics:
             raise Rejection(Reason.CAMERA_INFO_CHANGED, text)
 
     def accept(self, cameras: Sequence[CameraModel]) -> None:
-        """Takes changed infos as the valid ones from now on.
+        """Take changed infos as the valid ones from now on.
 
         Args:
             cameras: calibrated cameras of the views. Where they are others than before, the
@@ -494,7 +494,7 @@ class Intrinsics:
         return view in self._infos
 
     def missing(self, view: str) -> list[str]:
-        """Returns what is missing of the view's info, as text."""
+        """Return what is missing of the view's info, as text."""
         if self.has(view):
             return []
         if view in self._uncalibrated:
@@ -522,7 +522,7 @@ class Intrinsics:
         self._uncalibrated.discard(view)
 
     def _size(self, view: str, width: int, height: int) -> None:
-        """Sets the size of the images where the info has none."""
+        """Set the size of the images where the info has none."""
         message = self._infos[view]
         found = self._read(view, message)
         assert found is not None
@@ -534,7 +534,7 @@ class Intrinsics:
         )
 
     def _add_uncalibrated(self, view: str, message: CameraInfo) -> None:
-        """Takes the calibration file's intrinsics in place of an info without any.
+        """Take the calibration file's intrinsics in place of an info without any.
 
         Raises:
             Rejection: there is no such file; at the first of these infos.

@@ -42,7 +42,7 @@ class NodeTime:
 
     @classmethod
     def of(cls, node: Node) -> NodeTime:
-        """Returns the time of a node."""
+        """Return the time of a node."""
         clock = node.get_clock()
 
         def is_simulated() -> bool:
@@ -51,7 +51,7 @@ class NodeTime:
         return cls(lambda: clock.now().nanoseconds, is_simulated)
 
     def step_s(self) -> float:
-        """Returns the step of the system clock since the last call [s]; 0 = none."""
+        """Return the step of the system clock since the last call [s]; 0 = none."""
         if self.is_simulated():
             self._offset_ns = None
             return 0.0
@@ -92,11 +92,11 @@ class Samples(Generic[Value]):
         return [stamp for stamp, _ in self._items]
 
     def nearest(self, stamp_ns: int) -> tuple[int, Value]:
-        """Returns stamp and value of the sample nearest to a time [ns]."""
+        """Return stamp and value of the sample nearest to a time [ns]."""
         return min(self._items, key=lambda sample: abs(sample[0] - stamp_ns))
 
     def add(self, stamp_ns: int, value: Value) -> None:
-        """Takes a sample; one with the stamp of another replaces it."""
+        """Take a sample; one with the stamp of another replaces it."""
         items = self._items
         if items and items[-1][0] - stamp_ns > RESTART_S * NANO:
             items.clear()
@@ -113,7 +113,7 @@ class Samples(Generic[Value]):
             items.insert(place, (stamp_ns, value))
 
     def refuse_reason(self, stamp_ns: int, now_ns: int, limit_s: float) -> str:
-        """Returns why a sample cannot be taken at this time, or an empty text.
+        """Return why a sample cannot be taken at this time, or an empty text.
 
         Samples from the future would stay the newest. What was stored from there, before the clock
         was set back, is dropped. An old sample does not displace a fresh one.
@@ -129,6 +129,6 @@ class Samples(Generic[Value]):
         return ''
 
     def clear(self) -> None:
-        """Drops all samples."""
+        """Drop all samples."""
         self._items.clear()
         self.refusal = ''

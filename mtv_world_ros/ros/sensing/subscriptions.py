@@ -83,7 +83,7 @@ class Inputs:
         self._paths = {f'receive_path.{topic}': PATHS.of(topic) for topic in urgent}
 
     def refresh(self) -> None:
-        """Looks at the publishers again; to be called now and then."""
+        """Look at the publishers again; to be called now and then."""
         for subscription in self._all:
             subscription.refresh()
         self._watch.refresh()
@@ -119,7 +119,7 @@ def subscribe_observations(
     buffer: ObservationBuffer,
     guarded: Callable[[Handler], Handler],
 ) -> list[MatchedSubscription]:
-    """Subscribes to the cameras and joint states; see `Inputs`."""
+    """Subscribe to the cameras and joint states; see `Inputs`."""
     kind, suffix = (CompressedImage, '/compressed') if compressed else (Image, '')
     newest: list[tuple[Any, str, Handler, int]] = []
     for view, topic in parameters.declare_camera_topics(node, views).items():
@@ -194,7 +194,7 @@ class MatchedSubscription:
         return self._current.get_publisher_count()
 
     def refresh(self) -> None:
-        """Looks at the publishers again; to be called now and then."""
+        """Look at the publishers again; to be called now and then."""
         if self._next is not None and self._is_next_connected:
             self._node.destroy_subscription(self._current)
             self._current, self._next = self._next, None

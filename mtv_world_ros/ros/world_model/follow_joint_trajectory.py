@@ -50,7 +50,7 @@ class Goal:
         return self.handle.request.trajectory
 
     def check(self, joint_names: Sequence[str]) -> None:
-        """Refuses what no plan on the topic can have.
+        """Refuse what no plan on the topic can have.
 
         Args:
             joint_names: of the robot.
@@ -107,21 +107,21 @@ class FollowJointTrajectory:
         )
 
     def close(self) -> None:
-        """Ends the server."""
+        """End the server."""
         self._server.destroy()
 
     def started(self, goal: Goal, request: Request) -> None:
-        """Takes the plan that a goal became."""
+        """Take the plan that a goal became."""
         goal.request = request
         self._goals[request.rollout] = goal
 
     def refused(self, goal: Goal, error: Exception) -> None:
-        """Takes why a goal did not become a plan."""
+        """Take why a goal did not become a plan."""
         reason = error.reason if isinstance(error, Rejection) else None
         self._conclude(goal, 'abort', _code(reason), str(error))
 
     def take(self, result: Result) -> None:
-        """Sends feedback of a chunk, or the result, if the plan came from a goal."""
+        """Send feedback of a chunk, or the result, if the plan came from a goal."""
         goal = self._goals.get(result.request.rollout)
         if goal is None:
             return
@@ -144,7 +144,7 @@ class FollowJointTrajectory:
         return CancelResponse.REJECT
 
     def _follow(self, goal: Goal, chunk: Chunk) -> None:
-        """Publishes the feedback of a chunk and holds it to the goal's tolerances."""
+        """Publish the feedback of a chunk and hold it to the goal's tolerances."""
         prediction, request, plan = chunk.prediction, chunk.request, chunk.plan
         path, offset_s = plan.trajectory, (plan.given_ns - plan.stamp_ns) / NANO
         times, actual = prediction.video.times, prediction.positions
@@ -210,10 +210,10 @@ class _Server(ActionServer):
     """
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
-        """Does nothing yet."""
+        """Do nothing yet."""
 
     def conclude(self, handle: ServerGoalHandle, conclude: Callable[[Any], Any]) -> None:
-        """Runs what sets the goal's last state and returns its result."""
+        """Run what sets the goal's last state and return its result."""
         super().notify_execute(handle, conclude)
 
     def _send_result_response(self, request_header: Any, future: Any) -> None:
@@ -222,7 +222,7 @@ class _Server(ActionServer):
 
 
 def find_action() -> Any:
-    """Returns the type of the action; None = control_msgs is not installed."""
+    """Return the type of the action; None = control_msgs is not installed."""
     try:
         return importlib.import_module('control_msgs.action').FollowJointTrajectory
     except ImportError:

@@ -127,7 +127,7 @@ class LiveFidelity:
         self._thread = Thread(target=self._run, name='fidelity')
 
     def replan(self, request: Request) -> Request:
-        """Drops imagined frames after a new request's start, which nobody executes; returns it."""
+        """Drop imagined frames after a new request's start, which nobody executes; return it."""
         starts_ns = request.stamp_ns or request.scene.observation.stamp_ns
         with self._changed:
             for expected in self._expected:
@@ -135,7 +135,7 @@ class LiveFidelity:
         return request
 
     def expect(self, result: Result) -> None:
-        """Remembers a chunk until its real frames are here."""
+        """Remember a chunk until its real frames are here."""
         if isinstance(result, Chunk) and not result.request.imagine:
             with self._changed:
                 self._num_missed += len(self._expected) == MAX_CHUNKS
@@ -146,17 +146,17 @@ class LiveFidelity:
                 self._thread.start()
 
     def use_robot(self, robot: RobotModel) -> None:
-        """Observes with another description of the same robot from the next chunk on."""
+        """Observe with another description of the same robot from the next chunk on."""
         self._pipeline = self._pipeline.with_robot(robot)
 
     def see(self, view: str, message: Image | CompressedImage) -> None:
-        """Takes a real image; it is looked at in the thread."""
+        """Take a real image; it is looked at in the thread."""
         with self._changed:
             self._images.append((view, message))
             self._changed.notify_all()
 
     def reset(self) -> None:
-        """Forgets chunks and frames: reset, or the clock went back."""
+        """Forget chunks and frames: reset, or the clock went back."""
         with self._changed:
             self._expected.clear()
             self._images.clear()
@@ -164,7 +164,7 @@ class LiveFidelity:
                 frames.clear()
 
     def close(self) -> None:
-        """Ends the thread."""
+        """End the thread."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -208,7 +208,7 @@ class LiveFidelity:
                 self._done.trigger()
 
     def _keep(self, view: str, message: Image | CompressedImage) -> None:
-        """Stores a real frame at the model's size, unless there is one of nearly the same time."""
+        """Store a real frame at the model's size, unless there is one of nearly the same time."""
         stamp_ns = to_ns(message.header.stamp)
         frames = self._frames[view]
         if frames and abs(frames.nearest(stamp_ns)[0] - stamp_ns) < self._tolerance_ns / 4:

@@ -34,11 +34,11 @@ class TakesAdapters(Protocol):
     own_adapter: Path | None
 
     def read_adapter(self, path: Path | None) -> Adapter:
-        """Returns an adapter that fits."""
+        """Return an adapter that fits."""
         ...
 
     def use_adapter(self, adapter: Adapter) -> None:
-        """Exchanges it."""
+        """Exchange it."""
         ...
 
 
@@ -89,7 +89,7 @@ class AdapterSwitch:
         return model.read_adapter(None if value == NONE else Path(value))
 
     def _read_named(self, parameters: list[Parameter]) -> None:
-        """Reads what is named, so that taking it cannot fail for what the user gave."""
+        """Read what is named, so that taking it cannot fail for what the user gave."""
         for parameter in parameters:
             if parameter.name == NAME:
                 value = str(parameter.value)
@@ -122,7 +122,7 @@ _READ_S = 3.0
 
 
 def load_named_pipeline(settings: Settings) -> Pipeline:
-    """Loads the checkpoint, on the device and for the robot and task that are set."""
+    """Load the checkpoint, on the device and for the robot and task that are set."""
     return Pipeline.load(
         settings.checkpoint,
         robot=settings.robot_file or None,
@@ -138,7 +138,7 @@ def load_named_pipeline(settings: Settings) -> Pipeline:
 
 
 def load_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[CameraModel, ...]:
-    """Loads the calibrated camera of every view, in the model's order.
+    """Load the calibrated camera of every view, in the model's order.
 
     Raises:
         CalibrationError: the file is wrong or lacks a view, or there is none.
@@ -165,7 +165,7 @@ def reload_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[Camera
 
 
 def _in_time(read: Callable[[], Cameras], path: str) -> Cameras:
-    """Reads in a thread, so that a disk or network that hangs does not hang the node.
+    """Read in a thread, so that a disk or network that hangs does not hang the node.
 
     Raises:
         CalibrationError: it takes too long.
@@ -193,7 +193,7 @@ def _in_time(read: Callable[[], Cameras], path: str) -> Cameras:
 def check_calibration(
     changed: Sequence[Parameter], settings: NodeSettings, spec: WorldModelSpec
 ) -> None:
-    """Refuses a `calibration_file` that is wrong or lacks a view, before it is taken.
+    """Refuse a `calibration_file` that is wrong or lacks a view, before it is taken.
 
     Raises:
         Rejection: the calibration cannot be used.

@@ -57,7 +57,7 @@ class WorldModelNode(LifecycleNode):
         return self._settings
 
     def start(self) -> None:
-        """Configures and activates itself, unless a lifecycle manager is to do that.
+        """Configure and activate the node, unless a lifecycle manager is to do that.
 
         Raises:
             MtvWorldError: a parameter, the checkpoint or a file it names cannot be used.
@@ -70,12 +70,12 @@ class WorldModelNode(LifecycleNode):
         self.trigger_activate()
 
     def close(self) -> None:
-        """Ends the threads and the node."""
+        """End the threads and the node."""
         self._release()
         self.destroy_node()
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Loads the model; where that fails, says why and stays unconfigured."""
+        """Load the model; where that fails, says why and stays unconfigured."""
         self._error = None
         try:
             pipeline = self._load(self._settings)
@@ -91,7 +91,7 @@ class WorldModelNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Takes plans from now on."""
+        """Take plans from now on."""
         assert self._rollouts is not None
         self._rollouts.activate()
         self.get_logger().info(f'ready: {self._rollouts.description}')
@@ -104,7 +104,7 @@ class WorldModelNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Frees the model, whose parts refer to each other, at once."""
+        """Free the model, whose parts refer to each other, at once."""
         self._release()
         gc.collect()
         return TransitionCallbackReturn.SUCCESS
@@ -123,7 +123,7 @@ class WorldModelNode(LifecycleNode):
     def _on_change_state(
         self, request: ChangeState.Request, response: ChangeState.Response
     ) -> ChangeState.Response:
-        """Refuses a transition that the present state does not have; rclpy would raise."""
+        """Refuse a transition that the present state does not have; rclpy would raise."""
         offered = [transition[0] for transition in self._state_machine.available_transitions]
         if not request.transition.label and request.transition.id not in offered:
             self.get_logger().warning(
@@ -172,7 +172,7 @@ class WorldModelNode(LifecycleNode):
 
 
 def main(args: Sequence[str] | None = None, load: Load = load_named_pipeline) -> int:
-    """Runs the node; returns the exit status."""
+    """Run the node; return the exit status."""
 
     def make() -> WorldModelNode:
         node = WorldModelNode(load)

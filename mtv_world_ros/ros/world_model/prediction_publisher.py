@@ -59,7 +59,7 @@ class ImageStream:
         return any(publisher.get_subscription_count() for publisher in self.publishers)
 
     def publish(self, pixels: ByteArray, header: Header, info: CameraInfo, quality: int) -> None:
-        """Publishes a frame and its CameraInfo.
+        """Publish a frame and its CameraInfo.
 
         Args:
             pixels: (H, W, 3) uint8 RGB, or (H, W) uint8 labels.
@@ -76,7 +76,7 @@ class ImageStream:
             self._jpeg.publish(to_compressed(pixels, header, quality))
 
     def _scale(self, info: CameraInfo, width: int, height: int, header: Header) -> CameraInfo:
-        """Scales an info once for all frames of a rollout."""
+        """Scale an info once for all frames of a rollout."""
         if self._scaled is None or self._scaled[0] is not info:
             self._scaled = info, scale_camera_info(info, width, height, header)
         self._scaled[1].header = header
@@ -156,7 +156,7 @@ class PredictionPublisher:
         return {f'subscribers.{o.topic_name}': o.get_subscription_count() for o in outputs}
 
     def add(self, result: Result) -> None:
-        """Publishes a result.
+        """Publish a result.
 
         Without imagine mode, frames of older rollouts that are not out yet are dropped by the
         first chunk of a newer one: they show a future that is no longer planned.
@@ -175,7 +175,7 @@ class PredictionPublisher:
             frames.add(result)
 
     def reset(self) -> None:
-        """Drops all frames that are not out yet."""
+        """Drop all frames that are not out yet."""
         for frames in (self._masks, self._images):
             frames.drop_others(None)
 
@@ -222,7 +222,7 @@ class PredictionPublisher:
         sent.out_s.append(time.monotonic())
 
     def _publish(self, chunk: Chunk, streams: Sequence[str], index: int) -> int:
-        """Publishes a frame of streams that somebody subscribes to; returns its stamp [ns]."""
+        """Publish a frame of streams that somebody subscribes to; return its stamp [ns]."""
         stamp_ns = stamp_of(chunk, index, self._settings().stamp_mode)
         quality = self._settings().jpeg_quality
         for view, offered in enumerate(self._streams):
@@ -281,19 +281,19 @@ class FrameQueue:
         self._timer.cancel()
 
     def add(self, chunk: Chunk) -> None:
-        """Publishes the frames of a chunk after those before it."""
+        """Publish the frames of a chunk after those before it."""
         self._chunks.append(chunk)
         if self._timer.is_canceled():
             self._timer.reset()
             self._tick()
 
     def drop_others(self, rollout: int | None) -> None:
-        """Drops the frames of all rollouts but one."""
+        """Drop the frames of all rollouts but one."""
         while self._chunks and self._chunks[0].request.rollout != rollout:
             self._finish()
 
     def _tick(self) -> None:
-        """Publishes the next frame if its time has come; without one the timer stops."""
+        """Publish the next frame if its time has come; without one the timer stops."""
         if not self._chunks:
             self._timer.cancel()
             return

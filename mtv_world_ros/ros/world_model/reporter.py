@@ -64,22 +64,22 @@ class Reporter:
         self.name_robot('')
 
     def name_robot(self, name: str) -> None:
-        """Sets the hardware id: a robot's name behind the node's namespace."""
+        """Set the hardware id: a robot's name behind the node's namespace."""
         self._status.hardware_id = f'{self._node.get_namespace()}/{name}'.strip('/')
 
     def count(self, what: str) -> None:
-        """Counts something that is no rejection."""
+        """Count something that is no rejection."""
         self._tally.counts[what] += 1
 
     def reject(self, error: Rejection) -> None:
-        """Counts a refused message; `/diagnostics` says why at its next period."""
+        """Count a refused message; `/diagnostics` says why at its next period."""
         self._tally.reject(error, time.monotonic())
         self._node.get_logger().warning(
             f'rejected ({error.reason}): {error}', throttle_duration_sec=1.0
         )
 
     def reject_trajectory(self, error: Exception, trajectory_stamp_ns: int) -> None:
-        """Counts and reports a refused trajectory; `/diagnostics` says why at once."""
+        """Count and report a refused trajectory; `/diagnostics` says why at once."""
         if not isinstance(error, Rejection):
             self.crash(error)
             error = Rejection(Reason.INTERNAL_ERROR, f'{type(error).__name__}: {error}')
@@ -89,7 +89,7 @@ class Reporter:
         self.publish_diagnostics()
 
     def guarded(self, handle: Callable[..., None]) -> Callable[..., None]:
-        """Returns the handler as a callback that no message makes raise."""
+        """Return the handler as a callback that no message makes raise."""
 
         def callback(*messages: Any) -> None:
             try:
@@ -102,7 +102,7 @@ class Reporter:
         return callback
 
     def served(self, serve: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Returns the service's callback as one that always answers."""
+        """Return the service's callback as one that always answers."""
 
         def callback(request: Any, response: Any) -> Any:
             try:
@@ -115,7 +115,7 @@ class Reporter:
         return callback
 
     def crash(self, error: Exception) -> None:
-        """Counts an error that nobody raised on purpose."""
+        """Count an error that nobody raised on purpose."""
         if not self._node.context.ok():
             return  # ROS was shut down under a callback
         self._node.get_logger().error(''.join(traceback.format_exception(error)))
@@ -123,7 +123,7 @@ class Reporter:
         self._tally.reject(Rejection(Reason.INTERNAL_ERROR, text), time.monotonic())
 
     def judged(self, chunk: Chunk) -> None:
-        """Counts and reports a chunk that was predicted; its estimate is out."""
+        """Count and report a chunk that was predicted; its estimate is out."""
         values = _chunk_values(chunk, self._settings())
         self._tally.counts['chunks'] += 1
         if isnan(chunk.prediction.success.probability):
@@ -133,7 +133,7 @@ class Reporter:
         self._publish_report('chunk', values, *(() if is_seen else (DiagnosticStatus.WARN,)))
 
     def sent(self, chunk: Chunk, sent: Sent) -> None:
-        """Counts and reports a chunk whose frames are out, or whose rest was dropped."""
+        """Count and report a chunk whose frames are out, or whose rest was dropped."""
         values, counts = _sent_values(chunk, sent), self._tally.counts
         counts['frames_published'] += sent.num_frames
         counts['frames_dropped'] += len(chunk.prediction.video.times) - sent.num_frames
@@ -142,11 +142,11 @@ class Reporter:
         self._publish_report('published', values)
 
     def scored(self, scored: ScoredChunk) -> None:
-        """Reports how a chunk compares with the real frames that came for it."""
+        """Report how a chunk compares with the real frames that came for it."""
         self._publish_report('fidelity', _fidelity_values(scored))
 
     def ended(self, ended: Ended) -> None:
-        """Counts and reports the end of a rollout."""
+        """Count and report the end of a rollout."""
         self._tally.end(ended.state, ended.num_chunks)
         if ended.trace:
             self._node.get_logger().error(ended.trace)
@@ -161,7 +161,7 @@ class Reporter:
             self.publish_diagnostics()
 
     def publish_diagnostics(self) -> None:
-        """Publishes `/diagnostics`."""
+        """Publish `/diagnostics`."""
         now_s = time.monotonic()
         state = self._state()
         num_policies, missing = int(str(state['policies'])), self._missing()
@@ -170,7 +170,7 @@ class Reporter:
         self._status.diagnose(level, message, values)
 
     def _add_seconds(self, values: Mapping[str, object]) -> None:
-        """Keeps the durations for `/diagnostics`."""
+        """Keep the durations for `/diagnostics`."""
         kept = {
             name: value
             for name, value in values.items()
@@ -196,18 +196,18 @@ class Tally:
         self._fruitless = 0
 
     def reject(self, error: Rejection, now_s: float) -> None:
-        """Counts a refused message or rollout."""
+        """Count a refused message or rollout."""
         self._rejected[error.reason] += 1
         self._last = (now_s, error.reason, str(error))
 
     def end(self, state: str, num_chunks: int) -> None:
-        """Counts the end of a rollout."""
+        """Count the end of a rollout."""
         self.counts[f'rollouts_{state}'] += 1
         starved = state == 'preempted' and num_chunks == 0
         self._fruitless = self._fruitless + 1 if starved else 0
 
     def add_seconds(self, seconds: Mapping[str, float]) -> None:
-        """Takes the durations of a chunk [s], by name."""
+        """Take the durations of a chunk [s], by name."""
         for name, value in seconds.items():
             self._seconds.setdefault(name, deque(maxlen=_WINDOW)).append(value)
 

@@ -80,7 +80,7 @@ class RequestMaker:
         self.instruction: str | None = None
 
     def make(self, message: JointTrajectoryMsg, now_ns: int, received_s: float) -> Request:
-        """Returns the request.
+        """Return the request.
 
         Args:
             message: the policy's plan.
@@ -125,7 +125,7 @@ class RequestMaker:
         return scene
 
     def _check_measured(self, positions: FloatArray) -> None:
-        """Refuses measured joints that are far beyond their limits (wrong unit or joint)."""
+        """Refuse measured joints that are far beyond their limits (wrong unit or joint)."""
         robot = self.robot
         slack = _MEASURED_SLACK * (1.0 + np.abs(robot.upper - robot.lower))
         outside = (positions < robot.lower - slack) | (positions > robot.upper + slack)
@@ -167,7 +167,7 @@ class _Arrived(NamedTuple):
 
 
 def _with_delay(error: Exception, transport_s: float) -> Exception:
-    """Returns the rejection of a stale plan with the delay that the middleware made."""
+    """Return the rejection of a stale plan with the delay that the middleware made."""
     is_stale = isinstance(error, Rejection) and error.reason is Reason.TRAJECTORY_STALE
     if not is_stale or transport_s < _LATE_S:
         return error
@@ -285,22 +285,22 @@ class Rollouts:
         return action
 
     def activate(self) -> None:
-        """Takes plans from now on."""
+        """Take plans from now on."""
         self._is_active = True
 
     def deactivate(self) -> None:
-        """Refuses plans from now on; one that runs or waits is reported as pre-empted."""
+        """Refuse plans from now on; one that runs or waits is reported as pre-empted."""
         self._is_active = False
         self.start_waiting()  # plans that came before are reported as well
         self._give_up('preempted', 'the node was deactivated')
         self._publish_results()
 
     def close(self) -> None:
-        """Ends the threads and takes all inputs and outputs from the node."""
+        """End the threads and take all inputs and outputs from the node."""
         self._undo.close()
 
     def refresh(self) -> None:
-        """Looks at the worker and at the publishers again; to be called now and then."""
+        """Look at the worker and at the publishers again; to be called now and then."""
         self._check_clock()
         self._worker.supervise(self.settings().stuck_after_s)
         self._inputs.refresh()
@@ -341,7 +341,7 @@ class Rollouts:
         }
 
     def on_results(self) -> None:
-        """Wakes the executor, which publishes the results; called from any thread."""
+        """Wake the executor, which publishes the results; called from any thread."""
         self._results.trigger()
 
     def give_up(self, rollout: int, text: str) -> None:
@@ -349,7 +349,7 @@ class Rollouts:
         self._worker.give_up(rollout, text)
 
     def on_image(self, view: str, message: Image | CompressedImage) -> None:
-        """Passes real images on, and one observation of all views per frame of the model."""
+        """Pass real images on, and one observation of all views per frame of the model."""
         if not self._is_active or self._check_clock():
             return
         self._look_again()
@@ -361,7 +361,7 @@ class Rollouts:
                 )
 
     def on_instruction(self, message: String) -> None:
-        """Takes the instruction for the plans to come."""
+        """Take the instruction for the plans to come."""
         with rejected_as(Reason.INSTRUCTION_TOO_LONG):
             check_limit('instruction_characters', len(message.data), 'the instruction')
         self._maker.instruction = message.data
@@ -372,12 +372,12 @@ class Rollouts:
         self._arrivals.trigger()
 
     def start_waiting(self) -> None:
-        """Starts the plans that wait, up to one that is early."""
+        """Start the plans that wait, up to one that is early."""
         while self._arrived and not (self._is_active and self._is_early(self._arrived[0])):
             self.guarded(self._start_rollout)(self._arrived.popleft())
 
     def _look_again(self) -> None:
-        """Checks a waiting plan again: its observation may be here, or it waited long enough."""
+        """Check a waiting plan again: its observation may be here, or it waited long enough."""
         if self._arrived:
             self._arrivals.trigger()
 
@@ -451,7 +451,7 @@ class Rollouts:
         return response
 
     def on_robot(self, robot: RobotModel) -> None:
-        """Takes the robot as it describes itself."""
+        """Take the robot as it describes itself."""
         self._maker.robot = robot
         for part in (self._worker, self._fidelity):
             part.use_robot(robot)
@@ -478,7 +478,7 @@ class Rollouts:
         return step_s < 0
 
     def _on_jump(self, _: object) -> None:
-        """Drops what is stored when the clock jumps back, as when a bag starts over."""
+        """Drop what is stored when the clock jumps back, as when a bag starts over."""
         self._reporter.count('clock_jumps_back')
         self._buffer.clear()
         self._extrinsics.forget_moving()
@@ -492,7 +492,7 @@ def _entities(node: Node) -> dict[str, list[object]]:
 
 
 def _destroy_others(node: Node, kept: Mapping[str, Sequence[object]]) -> None:
-    """Destroys what the node was given since."""
+    """Destroy what the node was given since."""
     for kind, entities in _entities(node).items():
         for entity in entities:
             if not any(entity is one for one in kept[kind]):

@@ -146,11 +146,11 @@ class RolloutWorker:
         self._thread = self._new_thread()
 
     def start(self) -> None:
-        """Starts the thread; requests wait until then."""
+        """Start the thread; requests wait until then."""
         self._thread.start()
 
     def supervise(self, longest_s: float) -> bool:
-        """Gives up a thread that is stuck in the model, and goes on in a new one.
+        """Give up a thread that is stuck in the model, and go on in a new one.
 
         Args:
             longest_s: longest time between two denoising steps [s].
@@ -196,7 +196,7 @@ class RolloutWorker:
             return self._running is not None or self._pending is not None
 
     def submit(self, request: Request) -> None:
-        """Starts a request; it pre-empts a running one and replaces a waiting one.
+        """Start a request; it pre-empts a running one and replaces a waiting one.
 
         From when a rollout was pre-empted without a chunk until one ends with none waiting, each
         completes its first chunk: of plans that come faster than chunks, as many as there is time
@@ -209,23 +209,23 @@ class RolloutWorker:
             self._changed.notify_all()
 
     def sees(self, stamp_ns: int) -> bool:
-        """Returns whether `see` takes an observation of this stamp [ns]."""
+        """Return whether `see` takes an observation of this stamp [ns]."""
         return self._observed.is_due(stamp_ns)
 
     def see(self, observation: Observation) -> None:
-        """Adds a real observation between plans to what later plans are judged with."""
+        """Add a real observation between plans to what later plans are judged with."""
         self._observed.see(observation)
         with self._changed:
             self._changed.notify_all()
 
     def run_between(self, job: Callable[[], None]) -> None:
-        """Runs a job that must not raise, never during a rollout; jobs run in order."""
+        """Run a job that must not raise, never during a rollout; jobs run in order."""
         with self._changed:
             self._between.append(job)
             self._changed.notify_all()
 
     def use_robot(self, robot: RobotModel) -> None:
-        """Imagines with another description of the same robot from the next rollout on."""
+        """Imagine with another description of the same robot from the next rollout on."""
 
         def use() -> None:
             with self._changed:
@@ -237,7 +237,7 @@ class RolloutWorker:
         self.run_between(use)
 
     def reset(self, state: str = 'reset', text: str = '') -> None:
-        """Gives up what runs and waits, drops chunks not taken, forgets the last frames.
+        """Give up what runs and waits, drop chunks not taken, forget the last frames.
 
         Args:
             state: how it ended, for `Ended`.
@@ -272,14 +272,14 @@ class RolloutWorker:
                 self._abandoned = True
 
     def take(self) -> list[Result]:
-        """Returns the results since the last call, in order."""
+        """Return the results since the last call, in order."""
         with self._changed:
             taken = list(self._results)
             self._results.clear()
             return taken
 
     def close(self) -> None:
-        """Ends the thread; a running rollout is given up at its next denoising step."""
+        """End the thread; a running rollout is given up at its next denoising step."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -325,7 +325,7 @@ class RolloutWorker:
         return bool(is_asked) or self._observed.is_behind
 
     def _catch_up(self) -> None:
-        """Segments real frames while no rollout runs; after a failure they are dropped."""
+        """Segment real frames while no rollout runs; after a failure they are dropped."""
         try:
             self._observed.catch_up()
         except Exception:
@@ -374,7 +374,7 @@ class RolloutWorker:
         )
 
     def _imagine(self, request: Request) -> None:
-        """Imagines the chunks of a request and hands each on."""
+        """Imagine the chunks of a request and hand each on."""
         scene, episode = self._begin(request, self._options(request))
         # rollouts before this one may have moved the robot in imagination
         plan = request.plan.after(episode.observation)

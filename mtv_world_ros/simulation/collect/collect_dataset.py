@@ -62,7 +62,7 @@ def collect(
     sheets: bool = False,
     progress: bool = True,
 ) -> list[CardEntry]:
-    """Makes the missing episodes of a data set, its card and its contact sheet.
+    """Make the missing episodes of a data set, its card and its contact sheet.
 
     The same arguments give the same episodes, whatever the number of workers; episodes that
     are there already are kept, so an interrupted run is continued by starting it again.
@@ -118,7 +118,7 @@ def _maker(config: CollectConfig) -> Callable[[CollectJob], None]:
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Holds the data set's lock, which ends with the process however that ends.
+    """Hold the data set's lock, which ends with the process however that ends.
 
     Raises:
         SimulatorError: another process collects into the folder, or it cannot be written.
@@ -158,7 +158,7 @@ class _DataSet:
     def make(
         self, jobs: Sequence[CollectJob], workers: int, config: CollectConfig, *, progress: bool
     ) -> None:
-        """Makes the missing episodes."""
+        """Make the missing episodes."""
         missing = [job for job in jobs if job.path.name not in self.entries]
         done = len(jobs) - len(missing)
         try:
@@ -187,7 +187,7 @@ class _DataSet:
         bar.set_postfix_str(f'{success} success{share}, {len(outcomes) - success} failure')
 
     def describe(self, *, sheets: bool) -> None:
-        """Writes the card as data and as text, and the contact sheets."""
+        """Write the card as data and as text, and the contact sheets."""
         self._write_card()
         entries = list(self.entries.values())
         write_file(self._out / SHEET_FILE, encode_png(contact_sheet(self._out, entries)))

@@ -25,7 +25,7 @@ _TEXT_COLOUR = (40, 40, 40)
 
 
 def film_strip(path: Path, num_frames: int, width: int) -> ByteArray:
-    """Returns frames of an episode, evenly from first to last: time to the right, views below.
+    """Return frames of an episode, evenly from first to last: time to the right, views below.
 
     Args:
         path: the episode.
@@ -51,7 +51,7 @@ def _small(frame: ByteArray, width: int) -> ByteArray:
 
 
 def titled(text: str, picture: ByteArray) -> ByteArray:
-    """Returns a picture (H, W, 3) with a line of text above it."""
+    """Return a picture (H, W, 3) with a line of text above it."""
     line = np.full((_LINE_PX, picture.shape[1], 3), _BACKGROUND, np.uint8)
     cv2.putText(line, text, (2, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _TEXT_COLOUR, 1, cv2.LINE_AA)
     return np.concatenate([line, picture])
@@ -96,7 +96,7 @@ def contact_sheet(
     num_frames: int = 6,
     width: int = 128,
 ) -> ByteArray:
-    """Returns a picture (H, W, 3) uint8 RGB with a row per task, read from the episodes.
+    """Return a picture (H, W, 3) uint8 RGB with a row per task, read from the episodes.
 
     Args:
         out: folder of the data set.

@@ -66,7 +66,7 @@ class CardEntry:
 
 
 def read_entry(path: Path) -> CardEntry:
-    """Returns the entry of a finished episode folder.
+    """Return the entry of a finished episode folder.
 
     Raises:
         EpisodeError: the folder holds no episode of the simulator.
@@ -106,7 +106,7 @@ def read_entry(path: Path) -> CardEntry:
 
 
 def read_entries(out: Path, wanted: Collection[str]) -> dict[str, CardEntry]:
-    """Returns the finished episodes of a data set by name, also those that are not wanted now.
+    """Return the finished episodes of a data set by name, also those that are not wanted now.
 
     Raises:
         EpisodeError: something else has the name of a wanted episode.
@@ -124,7 +124,7 @@ def read_entries(out: Path, wanted: Collection[str]) -> dict[str, CardEntry]:
 
 
 def check_same_set(out: Path, kind: str, seed: int, config: dict[str, Any]) -> None:
-    """Refuses to add to a data set that was made from another seed or configuration.
+    """Refuse to add to a data set that was made from another seed or configuration.
 
     Raises:
         SimulatorError: says what differs.
@@ -156,7 +156,7 @@ def check_same_set(out: Path, kind: str, seed: int, config: dict[str, Any]) -> N
 
 
 def remove_leftovers(out: Path) -> None:
-    """Removes the hidden folders of episodes whose recording was killed."""
+    """Remove the hidden folders of episodes whose recording was killed."""
     for folder in out.glob('.*_*.tmp'):
         if _IN_PROGRESS.fullmatch(folder.name):
             shutil.rmtree(folder, ignore_errors=True)
@@ -184,7 +184,7 @@ def _by(key: str, entries: Sequence[CardEntry]) -> dict[str, Any]:
 def card_of(
     kind: str, seed: int, config: dict[str, Any], entries: Iterable[CardEntry]
 ) -> dict[str, Any]:
-    """Returns the card as plain data, in the order of the episodes' names."""
+    """Return the card as plain data, in the order of the episodes' names."""
     listed = sorted(entries, key=lambda entry: entry.name)
     splits = {
         split: [entry.name for entry in listed if entry.split == split]
@@ -203,12 +203,12 @@ def card_of(
 
 
 def write_card(out: Path, card: dict[str, Any]) -> None:
-    """Writes `dataset.json`, whole or not at all."""
+    """Write `dataset.json`, whole or not at all."""
     write_file(out / CARD_FILE, (json.dumps(card, indent=1) + '\n').encode())
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Writes a file, whole or not at all.
+    """Write a file, whole or not at all.
 
     Raises:
         SimulatorError: it cannot be written; what was there before is still there.

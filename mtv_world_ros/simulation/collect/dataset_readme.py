@@ -55,7 +55,7 @@ def _counts(
 
 
 def commands(card: Mapping[str, Any], entries: Iterable[CardEntry]) -> list[str]:
-    """Returns the commands that make the data set again; several where tasks differ in number."""
+    """Return the commands that make the data set again; several where tasks differ in number."""
     config = card['config']
     plain = plain_config(CollectConfig(robot=_robot(config)))
     given = {
@@ -146,7 +146,7 @@ def _objects(entries: Iterable[CardEntry]) -> Table:
 
 
 def readme(out: Path, card: Mapping[str, Any], entries: Sequence[CardEntry]) -> str:
-    """Returns the text of the card.
+    """Return the text of the card.
 
     Args:
         out: folder of the data set.
@@ -181,5 +181,5 @@ def readme(out: Path, card: Mapping[str, Any], entries: Sequence[CardEntry]) -> 
 
 
 def write_readme(out: Path, card: Mapping[str, Any], entries: Sequence[CardEntry]) -> None:
-    """Writes `README.md`, whole or not at all."""
+    """Write `README.md`, whole or not at all."""
     write_file(out / README_FILE, readme(out, card, entries).encode())

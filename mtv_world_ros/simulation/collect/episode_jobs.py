@@ -44,7 +44,7 @@ class CollectJob:
 def episode_seed(
     seed: int, task: str, index: int, attempt: int, zero_shot: str | None = None
 ) -> int:
-    """Returns the seed of one attempt at an episode; it alone reproduces the scene."""
+    """Return the seed of one attempt at an episode; it alone reproduces the scene."""
     entropy = [seed, _number(task, zero_shot), index, attempt]
     return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
@@ -52,7 +52,7 @@ def episode_seed(
 def misses(
     seed: int, task: str, index: int, zero_shot: str | None = None, num_of_ten: int = NUM_MISSED
 ) -> bool:
-    """Returns whether this episode is one of the `num_of_ten` whose grasp misses."""
+    """Return whether this episode is one of the `num_of_ten` whose grasp misses."""
     block, place = divmod(index, BLOCK)
     rng = np.random.default_rng([seed, _number(task, zero_shot), block])
     if num_of_ten == NUM_MISSED:
@@ -73,7 +73,7 @@ def jobs_of(
     num_of_ten: int = NUM_MISSED,
     policies: Sequence[str] = (),
 ) -> list[CollectJob]:
-    """Returns `num_episodes` of each task; tasks take turns, so a growing set stays mixed.
+    """Return `num_episodes` of each task; tasks take turns, so a growing set stays mixed.
 
     Args:
         tasks: the tasks to carry out.
@@ -107,7 +107,7 @@ def jobs_of(
 def zero_shot_jobs(
     kinds: Sequence[str], tasks: Sequence[Task], num_episodes: int, seed: int, out: Path
 ) -> list[CollectJob]:
-    """Returns `num_episodes` in all; kinds take turns, and within a kind its tasks do."""
+    """Return `num_episodes` in all; kinds take turns, and within a kind its tasks do."""
     chosen = {kind: tasks_of(kind, tasks) for kind in kinds}
     jobs = []
     for number in range(num_episodes):

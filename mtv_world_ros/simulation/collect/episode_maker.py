@@ -70,7 +70,7 @@ class CollectConfig:
 
 
 def plain_config(config: CollectConfig) -> dict[str, Any]:
-    """Returns the configuration as the card has it, with the cameras of the robot's workcell."""
+    """Return the configuration as the card has it, with the cameras of the robot's workcell."""
     workcell = workcell_of(load_robot(bundled('robots', config.robot, '--robot')))
     config = replace(config, randomization=config.randomization.of(workcell))
     values = json.loads(json.dumps(asdict(config)))
@@ -89,7 +89,7 @@ class EpisodeMaker:
         self._expert = Expert(self._robot, config.expert, config.physics)
 
     def make(self, job: CollectJob) -> None:
-        """Simulates attempts until one is as wanted, and writes it.
+        """Simulate attempts until one is as wanted, and write it.
 
         Raises:
             SimulatorError: none of `max_attempts` seeds gave the wanted outcome, or the episode
@@ -160,7 +160,7 @@ class EpisodeMaker:
 
 
 def cameras_of(seed: int, config: CollectConfig) -> RandomizationConfig:
-    """Returns the randomisation of an ordinary episode; some have their cameras moved."""
+    """Return the randomisation of an ordinary episode; some have their cameras moved."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(3,)))
     if rng.uniform() >= config.moved_share:
         return config.randomization

@@ -66,7 +66,7 @@ class RecordConfig:
                 )
 
     def frame_at(self, number: int) -> int:
-        """Returns the control period at which a frame is taken."""
+        """Return the control period at which a frame is taken."""
         return round(number * self.frame_period_s / CONTROL_PERIOD_S)
 
 
@@ -97,7 +97,7 @@ class Take:
     object_poses: FloatArray
 
     def is_as_wanted(self) -> bool:
-        """Returns whether the expert succeeded to the end, or a miss moved nothing."""
+        """Return whether the expert succeeded to the end, or a miss moved nothing."""
         if self.any_outcome:
             return True
         if self.missed is not None:
@@ -106,7 +106,7 @@ class Take:
 
 
 def expert_generator(seed: int) -> np.random.Generator:
-    """Returns the generator of the expert's choices in an episode of this seed."""
+    """Return the generator of the expert's choices in an episode of this seed."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
 
 
@@ -120,7 +120,7 @@ def simulate(
     miss: bool,
     variant: PolicyVariant | None = None,
 ) -> Take:
-    """Runs the expert, or a faulty variant of it, open loop on the episode of a seed.
+    """Run the expert, or a faulty variant of it, open loop on the episode of a seed.
 
     Args:
         sim: is reset.
@@ -193,7 +193,7 @@ def carry_out(
 
 
 def as_published(commands: JointTrajectory, config: RecordConfig) -> JointTrajectory:
-    """Returns commands at every control period, interpolated between action chunks' points.
+    """Return commands at every control period, interpolated between action chunks' points.
 
     Chunks have fewer points, so that what is quicker than them is not in them. The arms do what
     the recording says, so that commands and motion match.
@@ -214,7 +214,7 @@ def as_published(commands: JointTrajectory, config: RecordConfig) -> JointTrajec
 
 
 def chunk(commands: JointTrajectory, start_s: float, config: RecordConfig) -> JointTrajectory:
-    """Returns the action chunk that starts at `start_s`; past the end the arms hold still."""
+    """Return the action chunk that starts at `start_s`; past the end the arms hold still."""
     stride = round(config.point_period_s / CONTROL_PERIOD_S)
     num = round(config.chunk_s / config.point_period_s)
     at = round(start_s / CONTROL_PERIOD_S) + stride * np.arange(1, num + 1)
@@ -241,7 +241,7 @@ def write_take(
     config: RecordConfig,
     **extra: str,
 ) -> None:
-    """Writes a take as a rosbag2 MCAP folder; it appears at `path` once it is complete.
+    """Write a take as a rosbag2 MCAP folder; it appears at `path` once it is complete.
 
     Args:
         path: folder to make.

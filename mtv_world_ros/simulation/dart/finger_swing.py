@@ -36,7 +36,7 @@ class FingerDrives:
     def swings(
         self, pulls: FloatArray, ways: FloatArray, step_s: float, start: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Returns deviations (1 + T, F) of fingers from their ways, and the last row of `start`.
+        """Return deviations (1 + T, F) of fingers from their ways, and the last row of `start`.
 
         Args:
             pulls: (T, F) forces of the moving hand [N or N m].

@@ -162,7 +162,7 @@ class RigidBodies:
         )
 
     def passes(self, way: FloatArray, velocity: FloatArray) -> bool:
-        """Moves the arms along their way (D,) if they touch nothing there, else not at all."""
+        """Move the arms along their way (D,) if they touch nothing there, else not at all."""
         skeleton = self.arms.skeleton
         before = np.array(skeleton.getPositions())
         skeleton.setPositions(way)
@@ -173,7 +173,7 @@ class RigidBodies:
         return True
 
     def notice_touch(self) -> None:
-        """Sets the friction of solids that fingers touch to that of grips, else to the table's.
+        """Set the friction of solids that fingers touch to that of grips, else to the table's.
 
         So what is gripped holds to fingers and slides on others. Friction of what is held or
         pushed is solved as a cone; else as a pyramid along x and y, which is quicker, and exact
@@ -199,7 +199,7 @@ class RigidBodies:
             pad.setActuatorType(_COMPLIANT_PAD if is_soft else _RIGID_PAD)
 
     def solve_friction(self, *, as_cone: bool) -> None:
-        """Solves friction from here on as a cone or as a pyramid, see `notice_touch`."""
+        """Solve friction from here on as a cone or as a pyramid, see `notice_touch`."""
         solver = self._cone if as_cone else self._pyramid
         self._world.getConstraintSolver().setBoxedLcpSolver(solver)
 
@@ -229,7 +229,7 @@ class RigidBodies:
         self._world.step()
 
     def poses(self) -> FloatArray:
-        """Returns T_base_solid (O, 4, 4) [m]."""
+        """Return T_base_solid (O, 4, 4) [m]."""
         found = [solid.getBodyNode(0).getWorldTransform().matrix() for solid in self._solids]
         return np.array(found).reshape(-1, 4, 4)
 
@@ -350,7 +350,7 @@ class DrivenArms:
         return self._means @ (self.skeleton.getPositions() - self._offsets)
 
     def check_stable(self, step_s: float) -> None:
-        """Refuses drives that the engine's explicit steps would excite.
+        """Refuse drives that the engine's explicit steps would excite.
 
         Args:
             step_s: step of the engine [s].
@@ -376,7 +376,7 @@ class DrivenArms:
         )
 
     def ways(self, positions: FloatArray) -> FloatArray:
-        """Returns positions (T, D) of the degrees of freedom at joints (T, J)."""
+        """Return positions (T, D) of the degrees of freedom at joints (T, J)."""
         return positions @ self._follows.T + self._offsets
 
     def carried(
@@ -405,7 +405,7 @@ class DrivenArms:
         return forces, (1 - added) * pulls
 
     def forces(self, carried: FloatArray, way: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Returns (D,) forces: what carries the arms, and what pulls them back to the way."""
+        """Return (D,) forces: what carries the arms, and what pulls them back to the way."""
         off = way - self.skeleton.getPositions()
         slow = velocity - self.skeleton.getVelocities()
         return carried + self._stiffness * off + self._damping * slow
@@ -484,7 +484,7 @@ def _boxed(shape: Any) -> Any:
 
 
 def _add_pads(tree: ElementTree.Element, robot: RobotModel, grips: set[str]) -> set[str]:
-    """Gives fingers pads to touch with, in a robot's description; returns the pads' joints.
+    """Give fingers pads to touch with, in a robot's description; return the pads' joints.
 
     A pad is what a finger of a joint of `grips` touches with. It has half of its mass, and gives
     way along the tool's z axis.
@@ -570,7 +570,7 @@ def _described(path: Path) -> ElementTree.Element:
 
 
 def _add_drive(joint: Any, armature: float, *, is_finger: bool) -> None:
-    """Gives a joint's body the inertia of its drive; only fingers have stops."""
+    """Give a joint's body the inertia of its drive; only fingers have stops."""
     body = joint.getChildBodyNode()
     if 'Prismatic' in joint.getType():
         body.setMass(body.getMass() + armature)
@@ -588,7 +588,7 @@ def _add_drive(joint: Any, armature: float, *, is_finger: bool) -> None:
 def _settle(
     skeleton: Any, described: set[str], fingers: set[str], settings: ContactSettings
 ) -> None:
-    """Removes the weight of all links, which drives carry, and sets their friction."""
+    """Remove the weight of all links, which drives carry, and set their friction."""
     for number in range(skeleton.getNumBodyNodes()):
         body = skeleton.getBodyNode(number)
         body.setGravityMode(False)

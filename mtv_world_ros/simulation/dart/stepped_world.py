@@ -88,7 +88,7 @@ class SteppedWorld:
             )
 
     def _run(self, course: DriveTargets) -> None:
-        """Steps the engine over a period, or moves arms that only pass by."""
+        """Step the engine over a period, or moves arms that only pass by."""
         bodies = self._bodies
         self._num_still = self._num_still + 1 if bodies.is_at_rest else 0
         is_free = self._num_still > _STILL_PERIODS and bodies.arms.is_on(
@@ -127,7 +127,7 @@ class DriveTargets:
 def course_of(
     arms: DrivenArms, where: FloatArray, speeds: FloatArray, swings: FloatArray
 ) -> tuple[DriveTargets, FloatArray]:
-    """Returns what arms are to do in a period, and the swings (2, F) of the fingers after it.
+    """Return what arms are to do in a period, and the swings (2, F) of the fingers after it.
 
     Args:
         arms: arms of a world.
@@ -152,7 +152,7 @@ def course_of(
 
 
 def _step(bodies: RigidBodies, course: DriveTargets) -> None:
-    """Steps the engine through a course."""
+    """Step the engine through a course."""
     for forces, way, velocity in zip(
         course.forces, course.ways[:-1], course.velocities[:-1], strict=True
     ):

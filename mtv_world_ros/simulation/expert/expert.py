@@ -70,13 +70,13 @@ def grasp_of(subject: SceneObject) -> Grasp:
 
 
 def tool_yaw(item: SceneObject) -> float:
-    """Returns the yaw nearest to none under which the object looks the same to a gripper."""
+    """Return the yaw nearest to none under which the object looks the same to a gripper."""
     step = SHAPES[item.shape].step
     return float((item.yaw + step / 2) % step - step / 2)
 
 
 def tool_offset(subject: SceneObject, yaw: float) -> FloatArray:
-    """Returns the way (3,) from an object's centre, turned by `yaw`, to the tool that holds it."""
+    """Return the way (3,) from an object's centre, turned by `yaw`, to the tool that holds it."""
     grasp = grasp_of(subject)
     out = grasp.offset(subject.size, side_of(subject))
     height = (grasp.height - 0.5) * subject.size[2]
@@ -125,7 +125,7 @@ class ExpertConfig:
 
 
 def top_down(position: FloatArray, yaw: float, lean: float = 0.0) -> FloatArray:
-    """Returns base_T_tool (4, 4) of a tool that points down; the fingers close along `yaw`.
+    """Return base_T_tool (4, 4) of a tool that points down; the fingers close along `yaw`.
 
     The tool's frame has z along the fingers and y along their travel; at yaw 0 the fingers move
     along the base's x. `lean` [rad] swings the tool about its own x, in the plane of the travel.
@@ -139,7 +139,7 @@ def top_down(position: FloatArray, yaw: float, lean: float = 0.0) -> FloatArray:
 
 
 def home_positions(robot: RobotModel) -> FloatArray:
-    """Returns the joint positions (J,) of all arms at rest, grippers open."""
+    """Return the joint positions (J,) of all arms at rest, grippers open."""
     positions, workcell = np.zeros(len(robot.joint_names)), workcell_of(robot)
     for tool in robot.tools:
         solver, near = ArmSolver(robot, tool), workcell.home_joints[tool.arm]
@@ -185,7 +185,7 @@ class Expert:
         miss: bool,
         faults: WayPointFaults | None = None,
     ) -> JointTrajectory:
-        """Returns the trajectory (T, J) with velocities that carries out the task's moves.
+        """Return the trajectory (T, J) with velocities that carries out the task's moves.
 
         Two moves of different arms overlap: one arm reaches out while the other goes home.
 
@@ -242,11 +242,11 @@ class Expert:
 
     @staticmethod
     def missed_object(task: Task, rng: np.random.Generator) -> str:
-        """Returns the role that `plan` with the same generator misses."""
+        """Return the role that `plan` with the same generator misses."""
         return task.moves[_missed_move(task, rng)].subject
 
     def _lay(self, whole: FloatArray, rows: FloatArray, start: int, arm: str) -> FloatArray:
-        """Puts one arm's rows into the whole plan from `start` on; the arms rest at home."""
+        """Put one arm's rows into the whole plan from `start` on; the arms rest at home."""
         num = max(len(whole), start + len(rows))
         longer = np.concatenate([whole, np.repeat(self.home[None], num - len(whole), axis=0)])
         columns = self._columns(arm)

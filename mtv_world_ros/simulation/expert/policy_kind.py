@@ -16,7 +16,7 @@ __all__ = ['check', 'fault_kinds', 'policy_maker', 'refuse_test_kinds']
 
 
 def check(settings: ScriptedPolicySettings) -> None:
-    """Checks the name of a variant.
+    """Check the name of a variant.
 
     Raises:
         PolicyError: there is no such policy, or a fault's size is out of range.
@@ -27,7 +27,7 @@ def check(settings: ScriptedPolicySettings) -> None:
 def policy_maker(
     settings: ScriptedPolicySettings, robot: RobotModel
 ) -> Callable[[EpisodeOrigin], Policy]:
-    """Returns what makes the policy of a variant for an episode's task and scene."""
+    """Return what makes the policy of a variant for an episode's task and scene."""
     variant, expert = settings.variant, Expert(robot)
 
     def make(origin: EpisodeOrigin) -> Policy:
@@ -45,7 +45,7 @@ def policy_maker(
 
 
 def fault_kinds(variant: str) -> tuple[str, ...]:
-    """Returns the fault kinds of a variant.
+    """Return the fault kinds of a variant.
 
     Raises:
         PolicyError: it has an unknown fault.

@@ -38,7 +38,7 @@ _MAX_DRAWS = 20
 
 
 def fault_generator(seed: int) -> np.random.Generator:
-    """Returns the generator that draws which move of an episode goes wrong, and to which side."""
+    """Return the generator that draws which move of an episode goes wrong, and to which side."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(4,)))
 
 
@@ -103,7 +103,7 @@ class ScriptedPolicy:
         self._plan = with_faults(plan, self.variant, self._expert.robot, rng)
 
     def act(self, observation: Observation, instruction: str = '') -> JointTrajectory | None:
-        """Returns the next commands, or None where the episode is over.
+        """Return the next commands, or None where the episode is over.
 
         Args:
             observation: its stamp counts from the episode's first one; nothing else is looked at.
@@ -245,7 +245,7 @@ def scripted_policy(
     expert: Expert,
     hold_s: float = HOLD_S,
 ) -> ScriptedPolicy:
-    """Returns the policy of a name, for the scene that the simulator draws for a task and a seed.
+    """Return the policy of a name, for the scene that the simulator draws for a task and a seed.
 
     Args:
         name: e.g. `expert` or `expert-miss-0.5`; see `parse_variant`.
@@ -266,7 +266,7 @@ def scripted_policy(
 def policy_of_recording(
     name: str, recording: Path, expert: Expert, hold_s: float = HOLD_S
 ) -> ScriptedPolicy:
-    """Returns the policy of a name, for the scene of a simulated episode.
+    """Return the policy of a name, for the scene of a simulated episode.
 
     Args:
         name: as in `scripted_policy`.

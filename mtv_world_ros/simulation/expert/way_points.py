@@ -31,7 +31,7 @@ class WayPoint:
     lean: float = 0.0
 
     def moved(self, way: FloatArray) -> WayPoint:
-        """Returns it shifted by (3,) [m]."""
+        """Return it shifted by (3,) [m]."""
         return replace(self, position=self.position + way)
 
 

@@ -37,7 +37,7 @@ Steps = ListOf[dict[str, dict[str, Any]]]
 
 
 def _known_steps(primitives: Mapping[str, Callable[..., Any]], steps: Steps) -> Steps:
-    """Refuses steps whose primitive does not exist, or does not have their options."""
+    """Refuse steps whose primitive does not exist, or does not have their options."""
     for name, options in (item for step in steps for item in step.items()):
         if name not in primitives:
             raise ValueError(f"unknown step '{name}'{nearest(name, primitives)}")
@@ -130,7 +130,7 @@ _ALL = f"the {len(FAULTS)} kinds that 'mtv-world rank --list-faults' prints"
 
 
 def kind_named(name: str) -> str:
-    """Returns the kind of a name or an alias.
+    """Return the kind of a name or an alias.
 
     Raises:
         PolicyError: no such kind; the text names the nearest known one.
@@ -146,7 +146,7 @@ def kind_named(name: str) -> str:
 
 
 def kinds_named(text: str) -> tuple[str, ...]:
-    """Returns the fault kinds of a split, or of a comma-separated list, as they are called there.
+    """Return the fault kinds of a split, or of a comma-separated list, as they are called there.
 
     Raises:
         PolicyError: no such split or kind; the text names the nearest known one.
@@ -160,7 +160,7 @@ def kinds_named(text: str) -> tuple[str, ...]:
 
 
 def kinds_of(split: str) -> tuple[str, ...]:
-    """Returns the fault kinds of a split, of `drawn:SEED` or of `drawn_contact:SEED`.
+    """Return the fault kinds of a split, of `drawn:SEED` or of `drawn_contact:SEED`.
 
     Raises:
         PolicyError: no such split.
@@ -194,13 +194,13 @@ class PolicyVariant:
 
     @classmethod
     def of(cls, sizes: Mapping[str, float]) -> PolicyVariant:
-        """Returns the variant of sizes by kind; kinds whose size means no fault are left out."""
+        """Return the variant of sizes by kind; kinds whose size means no fault are left out."""
         names = in_order(sizes)
         given = ((name, float(sizes[name])) for name in names)
         return cls(tuple((n, s) for n, s in given if s != FAULTS[kind_named(n)].size.none))
 
     def size(self, kind: str) -> float:
-        """Returns the size of one fault."""
+        """Return the size of one fault."""
         return dict(self.faults).get(kind_named(kind), FAULTS[kind_named(kind)].size.none)
 
     @property
@@ -225,13 +225,13 @@ class PolicyVariant:
 
 
 def in_order(names: Iterable[str]) -> list[str]:
-    """Returns names of kinds in the order of the catalogue; drawn kinds follow."""
+    """Return names of kinds in the order of the catalogue; drawn kinds follow."""
     order = {kind: number for number, kind in enumerate(FAULTS)}
     return sorted(names, key=lambda name: (order.get(kind_named(name), len(order)), name))
 
 
 def parse_variant(text: str) -> PolicyVariant:
-    """Returns the variant of a name: `expert`, then any of its faults, each with its size.
+    """Return the variant of a name: `expert`, then any of its faults, each with its size.
 
     Raises:
         PolicyError: no such name, a fault twice or without a size, a size out of range.
@@ -258,7 +258,7 @@ def parse_variant(text: str) -> PolicyVariant:
 
 
 def draw_variant(kinds: Sequence[str], rng: np.random.Generator) -> PolicyVariant:
-    """Returns a random policy: the expert, or one or two faults of sizes around the typical one.
+    """Return a random policy: the expert, or one or two faults of sizes around the typical one.
 
     Args:
         kinds: fault kinds to choose from.
@@ -275,7 +275,7 @@ def draw_variant(kinds: Sequence[str], rng: np.random.Generator) -> PolicyVarian
 
 
 def policies_of(split: str) -> tuple[str, ...]:
-    """Returns the policies of a ranking: the expert, and kinds of a split in their sizes.
+    """Return the policies of a ranking: the expert, and kinds of a split in their sizes.
 
     Raises:
         PolicyError: no such split.
@@ -285,7 +285,7 @@ def policies_of(split: str) -> tuple[str, ...]:
 
 
 def refuse_test_kinds(names: Iterable[str], what: str) -> None:
-    """Refuses policies with faults of the split `test`.
+    """Refuse policies with faults of the split `test`.
 
     Args:
         names: names of policies.

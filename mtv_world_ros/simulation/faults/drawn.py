@@ -34,12 +34,12 @@ def _parts() -> dict[str, Any]:
 
 
 def drawn_names(seed: int, drawn: str = 'drawn') -> tuple[str, ...]:
-    """Returns the names of the kinds of a seed, in one of the sets."""
+    """Return the names of the kinds of a seed, in one of the sets."""
     return tuple(f'{drawn}_{seed}_{number}' for number in range(NUM_DRAWN))
 
 
 def is_drawn(name: str) -> bool:
-    """Returns whether it is the name of a drawn kind."""
+    """Return whether it is the name of a drawn kind."""
     return _NAME.fullmatch(name) is not None
 
 

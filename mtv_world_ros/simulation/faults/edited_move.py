@@ -58,7 +58,7 @@ class EditedMove:
         return min(stop.position[2] for stop in self.stops)
 
     def index(self, name: str) -> int:
-        """Returns the number of a way point: `start`, `carry_end`, `over`, or a phase's first."""
+        """Return the number of a way point: `start`, `carry_end`, `over`, or a phase's first."""
         match name:
             case 'start':
                 return 0
@@ -69,32 +69,32 @@ class EditedMove:
         return next(i for i, stop in enumerate(self.stops) if stop.phase == name)
 
     def number_of(self, stop: WayPoint) -> int:
-        """Returns the number of a way point."""
+        """Return the number of a way point."""
         return next(i for i, other in enumerate(self.stops) if other is stop)
 
     def stop(self, name: str) -> WayPoint:
-        """Returns a way point by name."""
+        """Return a way point by name."""
         return self.there if name == 'there' else self.stops[self.index(name)]
 
     def at(self, where: str) -> int:
-        """Returns where way points are inserted: `start`, `before X`, `after X`, `after last`."""
+        """Return where way points are inserted: `start`, `before X`, `after X`, `after last`."""
         if where == 'start':
             return 0
         word, name = where.split()
         return self.end if name == 'last' else self.index(name) + (word == 'after')
 
     def put(self, where: str, stops: Stops, drop: int = 0) -> None:
-        """Inserts way points, in place of `drop` that follow."""
+        """Insert way points, in place of `drop` that follow."""
         number = self.at(where)
         self.stops = [*self.stops[:number], *stops, *self.stops[number + drop :]]
         self.end = number + len(stops)
 
     def place(self, name: str) -> FloatArray:
-        """Returns a place (3,) by name [m]: of an object, or of a way point."""
+        """Return a place (3,) by name [m]: of an object, or of a way point."""
         return PLACES[name](self) if name in PLACES else self.stop(name).position
 
     def length(self, value: Any) -> float:
-        """Returns a length, angle or opening."""
+        """Return a length, angle or opening."""
         match value:
             case 'size':
                 return self.size
@@ -109,7 +109,7 @@ class EditedMove:
         return float(value)
 
     def way(self, by: By, stop: WayPoint, factor: float = 1.0) -> FloatArray:
-        """Returns a way (3,) as lengths along directions; each of those is drawn once."""
+        """Return a way (3,) as lengths along directions; each of those is drawn once."""
         total = np.zeros(3)
         for name, far in by.items():
             way = self._direction(name, stop)
@@ -126,7 +126,7 @@ class EditedMove:
         return self._ways[name]
 
     def side(self, which: str) -> float:
-        """Returns +1 or -1: the move's, or one that every draw of a plan has anew."""
+        """Return +1 or -1: the move's, or one that every draw of a plan has anew."""
         if which == 'given':
             return self.draws.sign
         self._side = self._side or float(self.draws.play.choice((-1.0, 1.0)))
@@ -137,7 +137,7 @@ OfMove = Callable[[EditedMove], FloatArray]
 
 
 def ring(angle: float) -> FloatArray:
-    """Returns the unit vector (3,) in the plane at an angle [rad] from x."""
+    """Return the unit vector (3,) in the plane at an angle [rad] from x."""
     return np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
@@ -205,7 +205,7 @@ def _other_arm(move: EditedMove) -> FloatArray:
 
 
 def unit(way: FloatArray) -> FloatArray:
-    """Returns the unit vector of a way; none where there is no way."""
+    """Return the unit vector of a way; none where there is no way."""
     return way / max(float(np.linalg.norm(way)), 1e-9)
 
 

@@ -32,11 +32,11 @@ class Commands:
     robot: RobotModel
 
     def at(self, positions: FloatArray) -> Commands:
-        """Returns other positions (T, J), within the joints' limits."""
+        """Return other positions (T, J), within the joints' limits."""
         return replace(self, positions=np.clip(positions, self.robot.lower, self.robot.upper))
 
     def num(self, seconds: float) -> int:
-        """Returns how many rows a time has."""
+        """Return how many rows a time has."""
         return round(seconds / self.period)
 
     @property
@@ -95,29 +95,29 @@ class Commands:
         return whole
 
     def moving(self, rng: np.random.Generator) -> int:
-        """Returns the column of one of the arm joints that move, drawn."""
+        """Return the column of one of the arm joints that move, drawn."""
         travel = np.ptp(self.positions, axis=0)
         travel[self.grippers] = 0.0
         return int(rng.choice(np.flatnonzero(travel >= min(_MIN_TRAVEL_RAD, travel.max()))))
 
     def delayed(self, num: int) -> tuple[FloatArray, FloatArray]:
-        """Returns (T + num, J) twice: with the end held, and `num` rows later."""
+        """Return (T + num, J) twice: with the end held, and `num` rows later."""
         first = np.repeat(self.positions[:1], num, axis=0)
         last = np.repeat(self.positions[-1:], num, axis=0)
         return np.concatenate([self.positions, last]), np.concatenate([first, self.positions])
 
     def pulse(self, begin: float, rises: float, lasts: float, falls: float) -> FloatArray:
-        """Returns (T,) from 0 to 1 and back, from a row on; times [s] that each part takes."""
+        """Return (T,) from 0 to 1 and back, from a row on; times [s] that each part takes."""
         since = (self.rows - begin) * self.period
         return np.interp(since, np.cumsum([0.0, rises, lasts, falls]), [0.0, 1.0, 1.0, 0.0])
 
     def ramp(self, seconds: float, since: FloatArray | float = 0.0) -> FloatArray:
-        """Returns (T,) from 0 at a time to 1 after some seconds."""
+        """Return (T,) from 0 at a time to 1 after some seconds."""
         return np.clip((self.times - since) / seconds, 0.0, 1.0)
 
 
 def crossed(positions: FloatArray, to_next: int) -> FloatArray:
-    """Returns (T, J), from the first row on, the mirrored motion of joints `to_next` before.
+    """Return (T, J), from the first row on, the mirrored motion of joints `to_next` before.
 
     Joints that are at opposite angles in the first row turn to opposite sides.
     """

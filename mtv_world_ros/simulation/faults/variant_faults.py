@@ -50,13 +50,13 @@ class WayPointFaults:
         return any(fault.keeps_tempo for fault, _ in self._faults)
 
     def move_of(self, num_moves: int) -> int:
-        """Returns the number of the faulty move."""
+        """Return the number of the faulty move."""
         return int(self._move * num_moves)
 
     def draws(
         self, yaw: float, objects: Sequence[FloatArray], other_home: FloatArray | None = None
     ) -> Draws:
-        """Returns the random draws for the faulty move.
+        """Return the random draws for the faulty move.
 
         Args:
             yaw: of its grasp [rad]; the fingers travel along it.
@@ -66,7 +66,7 @@ class WayPointFaults:
         return Draws(yaw=yaw, objects=objects, other_home=other_home, **self._drawn)
 
     def applied(self, stops: Stops, draws: Draws) -> Stops:
-        """Returns the way points of a move with all faults, in the catalogue's order."""
+        """Return the way points of a move with all faults, in the catalogue's order."""
         for fault, size in self._faults:
             stops = edited(fault.edits, stops, size, draws)
         return stops
@@ -74,7 +74,7 @@ class WayPointFaults:
     def visits(
         self, stops: Stops, draws: Draws, home: WayPoint, times: Sequence[float]
     ) -> list[Visit]:
-        """Returns the visits of a second arm during the move.
+        """Return the visits of a second arm during the move.
 
         Args:
             stops: way points of the move, with its faults.
@@ -93,7 +93,7 @@ class WayPointFaults:
 def with_faults(
     plan: JointTrajectory, variant: PolicyVariant, robot: RobotModel, rng: np.random.Generator
 ) -> JointTrajectory:
-    """Returns the plan (T, J) as a variant carries it out; joints stay within their limits.
+    """Return the plan (T, J) as a variant carries it out; joints stay within their limits.
 
     Args:
         plan: equally spaced.
@@ -126,7 +126,7 @@ def with_faults(
 
 
 def refuse_robot(variant: PolicyVariant, robot: RobotModel) -> None:
-    """Refuses faults that a robot cannot have.
+    """Refuse faults that a robot cannot have.
 
     Raises:
         PolicyError: a fault of two arms, of a robot that has one, or of a gripper, of a robot

@@ -46,12 +46,12 @@ KEYS = tuple(item.name for item in fields(DescribedObject))
 
 
 def names_of(objects: Iterable[DescribedObject]) -> tuple[str, ...]:
-    """Returns the objects' names, in order."""
+    """Return the objects' names, in order."""
     return tuple(item.name for item in objects)
 
 
 def check_objects(items: Any, *, complete: bool) -> tuple[DescribedObject, ...]:
-    """Returns the objects that a list of plain values describes; an empty list is a valid answer.
+    """Return the objects that a list of plain values describes; an empty list is a valid answer.
 
     Args:
         items: list of mappings with the keys of `SceneObject`.
@@ -185,7 +185,7 @@ class Describer(Protocol):
     """Names the objects of a scene."""
 
     def describe(self, first_frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
-        """Returns the objects; empty if there are none.
+        """Return the objects; empty if there are none.
 
         Args:
             first_frame: (H, W, 3) uint8 RGB, a real frame, never a predicted one.
@@ -201,7 +201,7 @@ class InstructionDescriber:
     """Finds the objects that the instruction names by colour; uses no image."""
 
     def describe(self, first_frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
-        """Returns what `objects_from_instruction` finds; no more than colours is known of it."""
+        """Return what `objects_from_instruction` finds; no more than colours is known of it."""
         del first_frame
         names = objects_from_instruction(instruction)
         return check_objects(
@@ -217,7 +217,7 @@ def name_objects(
     first_frame: Callable[[], ByteArray] | None = None,
     stored: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Returns the names of a scene's objects; empty if there are none.
+    """Return the names of a scene's objects; empty if there are none.
 
     Import, training, node, replay, evaluation and ranking name objects by this rule: the names
     that are `given`, else the describer's, else those `stored` with the episode, else those that
@@ -241,7 +241,7 @@ def name_objects(
 
 
 def objects_from_instruction(instruction: str) -> tuple[str, ...]:
-    """Returns the objects an instruction names by colour, in order of appearance.
+    """Return the objects an instruction names by colour, in order of appearance.
 
     `place the red block to the left of the blue block` gives `('red block', 'blue block')`.
     A name starts at its colour word and ends at the first preposition, article or mark.
@@ -270,5 +270,5 @@ def _phrase(tokens: list[str]) -> list[str]:
 
 
 def ends_phrase(word: str) -> bool:
-    """Returns whether a word belongs to no object's name: a preposition, an article."""
+    """Return whether a word belongs to no object's name: a preposition, an article."""
     return _STOP.fullmatch(word) is not None

@@ -35,7 +35,7 @@ class ObjectList:
         self.source = source
 
     def describe(self, first_frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
-        """Returns the objects listed for the instruction.
+        """Return the objects listed for the instruction.
 
         Raises:
             DescriptionError: `unlisted`.
@@ -75,7 +75,7 @@ class _Lists(Schema):
 
 
 def load_object_list(path: Path) -> ObjectList:
-    """Reads `objects` (for all instructions) and `instructions` (each with its own objects).
+    """Read `objects` (for all instructions) and `instructions` (each with its own objects).
 
     An object is its name, or a mapping with `name` and other keys of `SceneObject`.
 
@@ -133,7 +133,7 @@ class DescriberConfig(Schema):
 
 
 def load_describer_config(path: Path) -> DescriberConfig:
-    """Reads a file like `config/describer.yaml`.
+    """Read a file like `config/describer.yaml`.
 
     Raises:
         ConfigError: it cannot be read, a key is unknown or missing, a value is wrong.

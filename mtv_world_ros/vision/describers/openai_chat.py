@@ -81,7 +81,7 @@ class OpenAIChat:
         return f'{self.config.model} at {self.config.base_url}'
 
     def ask(self, frame: ByteArray, turns: Sequence[str]) -> ChatAnswer:
-        """Returns the answer to the last turn; see `Chat`. No error quotes the key."""
+        """Return the answer to the last turn; see `Chat`. No error quotes the key."""
         try:
             return self._ask(frame, turns)
         except DescriptionError as error:
@@ -252,7 +252,7 @@ _LONGEST_WAIT_S = 30.0
 
 
 def _attempt(request: Callable[[], bytes], config: OpenAIConfig) -> bytes:
-    """Calls until it succeeds, fails for good, or the next attempt would exceed the budget.
+    """Call until it succeeds, fails for good, or the next attempt would exceed the budget.
 
     The SDK's own retries know a number of attempts but no budget of time, and repeat timeouts and
     what an account without credit asks.
@@ -285,7 +285,7 @@ def _is_passing(status: int, code: str | None) -> bool:
 
 
 def retry_after(headers: Mapping[str, str]) -> float | None:
-    """Returns the wait that a server asks for [s], given in seconds or as a date; else None.
+    """Return the wait that a server asks for [s], given in seconds or as a date; else None.
 
     Source: RFC 9110, section 10.2.3.
     """

@@ -60,7 +60,7 @@ ANSWER_SCHEMA: dict[str, Any] = {
 
 
 def question(instruction: str) -> str:
-    """Returns the text that goes with the frame."""
+    """Return the text that goes with the frame."""
     told = f'The robot was told: "{instruction}".' if instruction.strip() else ''
     return f"""This is a camera image of a robot's workspace. {told}
 Which separate objects can the robot move, put things on, or put things into? Leave out the robot \
@@ -79,7 +79,7 @@ If there are no such objects, answer {{"objects": []}}."""
 
 
 def repair_request(problem: str) -> str:
-    """Returns the text that follows an answer that could not be used."""
+    """Return the text that follows an answer that could not be used."""
     return (
         f'That answer is not valid: {problem}. Answer again with the whole JSON in the form that '
         'was asked for, and nothing else.'
@@ -87,7 +87,7 @@ def repair_request(problem: str) -> str:
 
 
 def read_answer(text: str) -> tuple[DescribedObject, ...]:
-    """Returns the objects of an answer; prose, a code fence or thoughts around the JSON are fine.
+    """Return the objects of an answer; prose, a code fence or thoughts around the JSON are fine.
 
     Raises:
         DescriptionError: `invalid`; its text says what is wrong.
@@ -114,7 +114,7 @@ def _json_in(text: str) -> dict[str, Any]:
 
 
 def excerpt(text: str, length: int = 160) -> str:
-    """Returns the start of a text on one line, for messages."""
+    """Return the start of a text on one line, for messages."""
     line = ''.join(c if c.isprintable() else ' ' for c in text)
     line = ' '.join(line.split())
     return line if len(line) <= length else f'{line[:length]}...'
@@ -136,11 +136,11 @@ class Chat(Protocol):
 
     @property
     def identity(self) -> str:
-        """Names the model; other weights or another server, another text."""
+        """Name the model; other weights or another server, another text."""
         ...
 
     def ask(self, frame: ByteArray, turns: Sequence[str]) -> ChatAnswer:
-        """Returns the answer to the last turn.
+        """Return the answer to the last turn.
 
         Args:
             frame: (H, W, 3) uint8 RGB, shown with the first turn.
@@ -165,7 +165,7 @@ class VlmDescriber:
         self.cache = cache
 
     def describe(self, first_frame: ByteArray, instruction: str) -> tuple[DescribedObject, ...]:
-        """Returns the objects that the model sees; empty if it sees none.
+        """Return the objects that the model sees; empty if it sees none.
 
         Raises:
             DescriptionError: the call failed; its status says how.
@@ -219,7 +219,7 @@ class DescriptionCache:
 
     @staticmethod
     def key(frame: ByteArray, instruction: str, prompt_version: str, model: str) -> str:
-        """Returns the sha256 of everything that the answer depends on."""
+        """Return the sha256 of everything that the answer depends on."""
         digest = hashlib.sha256()
         for part in (str(frame.shape), instruction, prompt_version, model):
             digest.update(f'{len(part)}:{part}'.encode())
@@ -227,7 +227,7 @@ class DescriptionCache:
         return digest.hexdigest()
 
     def get(self, key: str) -> tuple[DescribedObject, ...] | None:
-        """Returns a stored description; None if there is none that can be read."""
+        """Return a stored description; None if there is none that can be read."""
         try:
             kept = read_json(self._file(key))
             return check_objects(kept['objects'], complete=False)
@@ -235,7 +235,7 @@ class DescriptionCache:
             return None  # asked again, and written over
 
     def put(self, key: str, objects: tuple[DescribedObject, ...], model: str) -> None:
-        """Stores a description; a reader sees the whole file or none.
+        """Store a description; a reader sees the whole file or none.
 
         Raises:
             ConfigError: the folder cannot be written to.

@@ -23,7 +23,7 @@ WEIGHTS_VARIABLE = 'MTV_WORLD_WEIGHTS'
 def choose_segmenter(
     choice: str = 'auto', *, weights: Path | None = None, device: str = 'cpu'
 ) -> Segmenter:
-    """Returns the segmenter of that name; `Segmenter.name` says what it became.
+    """Return the segmenter of that name; `Segmenter.name` says what it became.
 
     Args:
         choice: `auto` (SAM 2 where the weights are present, else by colour), `colour`, `sam2`

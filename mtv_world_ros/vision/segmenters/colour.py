@@ -39,7 +39,7 @@ PALETTE: MappingProxyType[str, tuple[int, int, int]] = MappingProxyType(
 
 
 def colour_of(name: str) -> str | None:
-    """Returns the palette word in an object's name, or None."""
+    """Return the palette word in an object's name, or None."""
     return next((word for word in name.lower().split() if word in PALETTE), None)
 
 
@@ -163,7 +163,7 @@ class ColourSegmenter:
         return with_part(tracks[index], pixels, others, first, _TRACKING)
 
     def _look(self, frames: ByteArray, names: tuple[str, ...]) -> _Images:
-        """Looks at (T, H, W, 3) frames for pixels of the hues that the names speak of.
+        """Look at (T, H, W, 3) frames for pixels of the hues that the names speak of.
 
         What is too pale or dark to be of a word shows in HSV, at a fifth of the cost of CIELAB:
         most of an image is, and is looked at no further.
@@ -264,7 +264,7 @@ def _lab(rgb: ByteArray) -> Floats:
 
 
 def _centred(lab: ByteArray) -> Floats:
-    """Undoes OpenCV's 8-bit packing of CIELAB."""
+    """Undo OpenCV's 8-bit packing of CIELAB."""
     centred = lab.astype(np.float32)
     centred[..., 0] *= 100 / 255
     centred[..., 1:] -= 128

@@ -81,7 +81,7 @@ class Example:
 
     @staticmethod
     def in_box(name: str, frame: ByteArray, box: Box) -> Example:
-        """Cuts the object in a box out of its background, by GrabCut.
+        """Cut the object in a box out of its background, by GrabCut.
 
         Args:
             name: of the object.
@@ -135,7 +135,7 @@ class ObjectExamples:
 
     @staticmethod
     def of(frames: Sequence[tuple[ByteArray, Mapping[str, Box]]]) -> ObjectExamples:
-        """Learns from frames (H, W, 3) uint8 RGB with a box by name of object."""
+        """Learn from frames (H, W, 3) uint8 RGB with a box by name of object."""
         found, around = [], []
         for frame, boxes in frames:
             outside = np.ones(frame.shape[:2], np.bool_)
@@ -148,7 +148,7 @@ class ObjectExamples:
         return ObjectExamples(examples=tuple(found), elsewhere=np.concatenate(around))
 
     def checked(self) -> ObjectExamples:
-        """Returns itself.
+        """Return itself.
 
         Raises:
             ValueError: shapes or kinds do not fit each other, or there is nothing.
@@ -185,7 +185,7 @@ class ObjectExamples:
         return [example for example in self.examples if example.name == name]
 
     def save(self, path: Path) -> None:
-        """Writes them as safetensors."""
+        """Write them as safetensors."""
         tensors: dict[str, NDArray[np.generic]] = {'elsewhere': self.elsewhere}
         for number, example in enumerate(self.examples):
             tensors |= {f'{number}.frame': np.ascontiguousarray(example.frame),
@@ -196,7 +196,7 @@ class ObjectExamples:
 
     @staticmethod
     def load(path: Path) -> ObjectExamples:
-        """Reads what `save` wrote.
+        """Read what `save` wrote.
 
         Raises:
             ConfigError: there is no such file, or it is something else.
@@ -358,7 +358,7 @@ class _Follower:
     def follow(
         self, frames: ByteArray, taken: BoolArray, first: BoolArray | None, start: ByteArray
     ) -> tuple[BoolArray, str]:
-        """Returns masks (T, H, W) and a status.
+        """Return masks (T, H, W) and a status.
 
         Args:
             frames: (T, H, W, 3) uint8 RGB.
@@ -424,7 +424,7 @@ class _Follower:
         start: ByteArray,
         masks: BoolArray,
     ) -> None:
-        """Fills masks (T, H, W) of the frames after `start`."""
+        """Fill masks (T, H, W) of the frames after `start`."""
         lab = _lab(start)
         area = np.count_nonzero(first)
         by_colour = np.count_nonzero(first & self.near[_bins(start)]) > _MIN_COLOUR_FRACTION * area
@@ -443,7 +443,7 @@ class _Follower:
 
 
 def cut_out(frame: ByteArray, box: Box) -> BoolArray:
-    """Returns the mask (H, W) of the object in a box, see `Example.in_box`."""
+    """Return the mask (H, W) of the object in a box, see `Example.in_box`."""
     found = Example.in_box('', frame, box)
     left, top, right, bottom = (round(edge) for edge in box)
     x, y = max(0, left - (right - left)), max(0, top - (bottom - top))

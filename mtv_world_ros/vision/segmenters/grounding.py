@@ -36,7 +36,7 @@ DINO_EDGES = (800, 1333)
 
 
 def stated_normalisation(config: dict[str, Any], default: Normalisation) -> Normalisation:
-    """Returns what a preprocessor_config.json states, else the model family's own.
+    """Return what a preprocessor_config.json states, else the model family's own.
 
     Raises:
         CheckpointError: the preprocessor is not for images of three channels.
@@ -52,7 +52,7 @@ def stated_normalisation(config: dict[str, Any], default: Normalisation) -> Norm
 
 
 def stated_edges(config: dict[str, Any]) -> tuple[int, int]:
-    """Returns the shorter edge and the bound of the longer one [px] that a config states."""
+    """Return the shorter edge and the bound of the longer one [px] that a config states."""
     size = config.get('size')
     if not isinstance(size, dict) or 'shortest_edge' not in size:
         return DINO_EDGES
@@ -60,7 +60,7 @@ def stated_edges(config: dict[str, Any]) -> tuple[int, int]:
 
 
 def size_with_edges(height: int, width: int, edges: tuple[int, int]) -> tuple[int, int]:
-    """Returns (height, width) of the image whose shorter edge is `edges[0]`.
+    """Return (height, width) of the image whose shorter edge is `edges[0]`.
 
     It is smaller where the longer edge would exceed `edges[1]`. DETR's rule.
     """
@@ -77,7 +77,7 @@ def size_with_edges(height: int, width: int, edges: tuple[int, int]) -> tuple[in
 def prepare(
     frame: ByteArray, size: tuple[int, int], normalisation: Normalisation, device: str
 ) -> Tensor:
-    """Returns the (1, 3, height, width) float32 tensor of a frame.
+    """Return the (1, 3, height, width) float32 tensor of a frame.
 
     Args:
         frame: (H, W, 3) uint8 RGB.
@@ -145,7 +145,7 @@ class MMGroundingDino:
     def __init__(
         self, folder: Path, *, device: str = 'cpu', config: GroundingConfig | None = None
     ) -> None:
-        """Loads the weights; see `load_vision_model` for the errors."""
+        """Load the weights; see `load_vision_model` for the errors."""
         self.config = config or GroundingConfig()
         self._model = load_vision_model(folder, 'mm-grounding-dino', device)
         self._tokenizer = load_tokenizer(folder)
@@ -155,7 +155,7 @@ class MMGroundingDino:
         self._device = device
 
     def find(self, frame: ByteArray, names: tuple[str, ...]) -> Detections:
-        """Returns a box per name.
+        """Return a box per name.
 
         Args:
             frame: (H, W, 3) uint8 RGB.
@@ -194,7 +194,7 @@ class MMGroundingDino:
 def choose_boxes(
     boxes: FloatArray, scores: FloatArray, names: tuple[str, ...], config: GroundingConfig
 ) -> Detections:
-    """Returns the best box of every name; a place belongs to the name that fits it best.
+    """Return the best box of every name; a place belongs to the name that fits it best.
 
     Args:
         boxes: (Q, 4) corners of candidates [px].
@@ -228,7 +228,7 @@ def choose_boxes(
 
 
 def box_iou(boxes: FloatArray, box: FloatArray) -> FloatArray:
-    """Returns the (N,) intersection over union of (N, 4) corner boxes with one.
+    """Return the (N,) intersection over union of (N, 4) corner boxes with one.
 
     NaN boxes overlap with none.
     """

@@ -29,11 +29,11 @@ class SamVideo(Protocol):
         ...
 
     def open_session(self, height: int, width: int) -> Any:
-        """Returns an empty session for frames of that size [px]."""
+        """Return an empty session for frames of that size [px]."""
         ...
 
     def advance(self, session: Any, frame: ByteArray, index: int) -> Any:
-        """Runs one (H, W, 3) frame, the session's `index`-th, and returns the model's output."""
+        """Run one (H, W, 3) frame, the session's `index`-th, and return the model's output."""
         ...
 
 
@@ -65,7 +65,7 @@ def track_masks(
 
 
 def start_session(model: SamVideo, first_frame: ByteArray, first_masks: BoolArray) -> Any:
-    """Returns a session that remembers the objects of the first frame; arguments as above."""
+    """Return a session that remembers the objects of the first frame; arguments as above."""
     session = model.open_session(*first_frame.shape[:2])
     for number, mask in enumerate(first_masks):
         index = session.obj_id_to_idx(number)
@@ -76,7 +76,7 @@ def start_session(model: SamVideo, first_frame: ByteArray, first_masks: BoolArra
 
 
 def output_masks(output: Any, height: int, width: int) -> BoolArray:
-    """Returns the (O, H, W) masks of a model's output, at the size of the frames."""
+    """Return the (O, H, W) masks of a model's output, at the size of the frames."""
     import torch
 
     logits = torch.nn.functional.interpolate(
@@ -86,12 +86,12 @@ def output_masks(output: Any, height: int, width: int) -> BoolArray:
 
 
 def reach(config: Any) -> int:
-    """Returns how many frames back a tracker looks: mask memories and object pointers."""
+    """Return how many frames back a tracker looks: mask memories and object pointers."""
     return max(config.num_maskmem, config.max_object_pointers_in_encoder) + 1
 
 
 def drop_old(session: Any, index: int, kept: int) -> None:
-    """Forgets frames up to `index` and what was found more than `kept` frames before it."""
+    """Forget frames up to `index` and what was found more than `kept` frames before it."""
     for old in [number for number in session.processed_frames if number <= index]:
         del session.processed_frames[old]
     for item, outputs in session.output_dict_per_obj.items():
@@ -130,7 +130,7 @@ class Finder(Protocol):
     """Finds named objects in one frame."""
 
     def find(self, frame: ByteArray, names: tuple[str, ...]) -> FirstMasks:
-        """Returns the masks of O names in an (H, W, 3) uint8 RGB frame."""
+        """Return the masks of O names in an (H, W, 3) uint8 RGB frame."""
         ...
 
 
@@ -190,7 +190,7 @@ class PromptedSegmenter:
         given: tuple[ByteArray, BoolArray] | None,
         masks: BoolArray,
     ) -> tuple[str, ...]:
-        """Fills the (O, T, H, W) masks of one view and returns the statuses."""
+        """Fill the (O, T, H, W) masks of one view and return the statuses."""
         if given is None:
             found = self.finder.find(frames[0], names)
             start, firsts = frames[0], found.masks
@@ -214,7 +214,7 @@ class PromptedSegmenter:
 
 @contextmanager
 def memory_errors(name: str, device: str) -> Iterator[None]:
-    """Turns torch's error into one that says what can be done."""
+    """Turn torch's error into one that says what can be done."""
     import torch
 
     try:

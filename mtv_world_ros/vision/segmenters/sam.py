@@ -46,7 +46,7 @@ class Sam2Video:
     """`Sam2VideoModel` frame by frame; a `SamVideo`."""
 
     def __init__(self, folder: Path, *, device: str = 'cpu') -> None:
-        """Loads the weights; see `load_vision_model` for the errors."""
+        """Load the weights; see `load_vision_model` for the errors."""
         self.tracker = load_vision_model(folder, 'sam2_video', device)
         self.device = device
         self._normalisation = stated_normalisation(preprocessor_config(folder), IMAGENET)
@@ -64,7 +64,7 @@ class Sam2Video:
         return self.tracker(session, frame=pixels, frame_idx=index)
 
     def masks_in_boxes(self, frame: ByteArray, boxes: FloatArray) -> BoolArray:
-        """Returns the (N, H, W) masks of what is in (N, 4) corner boxes [px] of a frame."""
+        """Return the (N, H, W) masks of what is in (N, 4) corner boxes [px] of a frame."""
         import torch
 
         height, width = frame.shape[:2]
@@ -104,7 +104,7 @@ def sam2_segmenter(
     grounding: GroundingConfig | None = None,
     tracking: TrackingConfig | None = None,
 ) -> PromptedSegmenter:
-    """Loads both models.
+    """Load both models.
 
     Raises:
         CheckpointError: a folder does not hold the model.
@@ -137,7 +137,7 @@ class Sam3Video:
     def __init__(
         self, folder: Path, *, device: str = 'cpu', config: GroundingConfig = SAM3_SCORES
     ) -> None:
-        """Loads the weights; see `load_vision_model` for the errors."""
+        """Load the weights; see `load_vision_model` for the errors."""
         self._model = load_vision_model(folder, 'sam3_video', device)
         self._tokenizer = load_tokenizer(folder)
         self._normalisation = stated_normalisation(preprocessor_config(folder), SYMMETRIC)
@@ -233,7 +233,7 @@ def sam3_segmenter(
     grounding: GroundingConfig = SAM3_SCORES,
     tracking: TrackingConfig | None = None,
 ) -> PromptedSegmenter:
-    """Loads the model.
+    """Load the model.
 
     Raises:
         CheckpointError: the folder does not hold it.

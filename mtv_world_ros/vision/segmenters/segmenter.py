@@ -27,7 +27,7 @@ class Segmenter(Protocol):
         first_masks: BoolArray | None = None,
         first_frames: ByteArray | None = None,
     ) -> ObjectMasks:
-        """Returns the objects' masks in every frame, with a status per view and object.
+        """Return the objects' masks in every frame, with a status per view and object.
 
         Args:
             frames: (V, T, H, W, 3) uint8 RGB.
@@ -47,7 +47,7 @@ def check_request(
     first_masks: BoolArray | None,
     first_frames: ByteArray | None,
 ) -> None:
-    """Checks what a segmenter is given, see `Segmenter.segment`.
+    """Check what a segmenter is given, see `Segmenter.segment`.
 
     Raises:
         ObservationError: sizes or numbers do not fit each other.
@@ -73,7 +73,7 @@ def check_request(
 
 
 def masks_from_ids(ids: ByteArray, objects: Sequence[str], names: Sequence[str]) -> ObjectMasks:
-    """Returns the true masks of a simulator's identity images.
+    """Return the true masks of a simulator's identity images.
 
     Args:
         ids: (V, T, H, W) uint8; 0 = no object, i + 1 = `objects[i]`.
@@ -88,7 +88,7 @@ def masks_from_ids(ids: ByteArray, objects: Sequence[str], names: Sequence[str])
 
 
 def resize_masks(masks: BoolArray, width: int, height: int) -> BoolArray:
-    """Returns (..., height, width) masks; a pixel is set where at least half of it is covered."""
+    """Return (..., height, width) masks; a pixel is set where at least half of it is covered."""
     if masks.shape[-2:] == (height, width):
         return masks
     shrinks = height <= masks.shape[-2] and width <= masks.shape[-1]

@@ -65,7 +65,7 @@ class ObjectTrack:
 
     @staticmethod
     def missing(shape: tuple[int, int, int], status: str) -> ObjectTrack:
-        """Returns empty masks with a reason."""
+        """Return empty masks with a reason."""
         return ObjectTrack(masks=np.zeros(shape, np.bool_), status=status)
 
 
@@ -85,7 +85,7 @@ class _State:
     slivers: int = 0
 
     def doubt(self, status: str) -> None:
-        """Keeps the first reason for doubt."""
+        """Keep the first reason for doubt."""
         if self.status == 'ok':
             self.status = status
 
@@ -97,7 +97,7 @@ def track(
     taken: BoolArray | None = None,
     out: BoolArray | None = None,
 ) -> ObjectTrack:
-    """Follows one object through the pixels of its colour.
+    """Follow one object through the pixels of its colour.
 
     Args:
         pixels: (T, H, W) pixels of the object's colour.
@@ -120,7 +120,7 @@ def track(
 
 
 def judge(masks: BoolArray, first: BoolArray, config: TrackingConfig) -> str:
-    """Returns the status of masks that another method tracked.
+    """Return the status of masks that another method tracked.
 
     Args:
         masks: (T, H, W) as tracked.
@@ -155,7 +155,7 @@ class _Patch(NamedTuple):
     shape: tuple[int, int]
 
     def inside(self, mask: BoolArray) -> BoolArray:
-        """Returns the view of an (H, W) mask that the patch covers."""
+        """Return the view of an (H, W) mask that the patch covers."""
         height, width = self.pixels.shape
         return mask[self.top : self.top + height, self.left : self.left + width]
 
@@ -173,7 +173,7 @@ def _patch(frame: BoolArray) -> _Patch:
 
 
 def _doubt_whole(num_frames: int, state: _State, config: TrackingConfig) -> None:
-    """Sets the status of an object that is absent, out of view, lost or barely visible."""
+    """Set the status of an object that is absent, out of view, lost or barely visible."""
     if state.shown >= (1 - config.max_missing) * num_frames and state.shown:
         if state.slivers > config.max_slivers * state.shown:
             state.doubt('barely_visible')
@@ -297,7 +297,7 @@ _MAX_AREA_RATIO = 3.0
 
 
 def part_of(name: str, colour: str | None) -> str | None:
-    """Returns the colour word of the part that an object of that name has, or None."""
+    """Return the colour word of the part that an object of that name has, or None."""
     word = PARTS.get(name.lower().split()[-1]) if name.split() else None
     return None if word == colour else word
 
@@ -309,7 +309,7 @@ def with_part(
     first: BoolArray | None,
     config: TrackingConfig,
 ) -> ObjectTrack:
-    """Adds the pieces of the part's colour that touch the main piece.
+    """Add the pieces of the part's colour that touch the main piece.
 
     Args:
         found: the object by its main colour.

@@ -22,7 +22,7 @@ VISION_MODELS = {
 
 
 def find_weights(root: Path) -> dict[str, Path]:
-    """Returns the folders of vision models in or up to two levels below a folder, by type.
+    """Return the folders of vision models in or up to two levels below a folder, by type.
 
     The folders' names do not matter; of two models of a type the first by name is taken.
 
@@ -44,7 +44,7 @@ def find_weights(root: Path) -> dict[str, Path]:
 
 
 def load_vision_model(folder: Path, kind: str, device: str) -> Any:
-    """Returns a model of `transformers`, float32, in evaluation mode.
+    """Return a model of `transformers`, float32, in evaluation mode.
 
     Args:
         folder: as `hf download <name> --local-dir <folder>` leaves it.
@@ -82,7 +82,7 @@ def load_vision_model(folder: Path, kind: str, device: str) -> Any:
 
 
 def import_transformers() -> Any:
-    """Returns the package `transformers`.
+    """Return the package `transformers`.
 
     Raises:
         ConfigError: the package is not installed.
@@ -109,7 +109,7 @@ def load_tokenizer(folder: Path) -> Any:
 
 
 def preprocessor_config(folder: Path) -> dict[str, Any]:
-    """Returns what the folder says of the preparation of images; empty where it says nothing."""
+    """Return what the folder says of the preparation of images; empty where it says nothing."""
     path = folder / 'preprocessor_config.json'
     return _read(path) if path.is_file() else {}
 

@@ -19,7 +19,7 @@ CHANNEL = {'topic': '/noise', 'message_encoding': 'cdr'}
 
 
 def payload(index: int, size: int = 20_000) -> bytes:
-    """Does not compress, so that cuts fall anywhere."""
+    """Do not compress, so that cuts fall anywhere."""
     return b'\0\1\0\0' + np.random.default_rng(index).bytes(size)
 
 

@@ -63,7 +63,7 @@ def episode(tmp_path_factory, ros):
 
 @pytest.fixture
 def launch(ros):
-    """Starts `python -m mtv_world_ros.ros.bags.<module>`; what still runs is stopped."""
+    """Start `python -m mtv_world_ros.ros.bags.<module>`; what still runs is stopped."""
     started = []
 
     def launch(module, *arguments):

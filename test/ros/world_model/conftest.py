@@ -5,7 +5,7 @@ import pytest
 
 @pytest.fixture
 def start(tmp_path, ros):
-    """Starts the node with parameters; it must end cleanly at the test's end."""
+    """Start the node with parameters; it must end cleanly at the test's end."""
     started = []
 
     def start(*parameters):

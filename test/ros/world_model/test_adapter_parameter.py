@@ -102,7 +102,7 @@ def roll_out(client, seconds=0.8):
 
 
 def use(client, value):
-    """Sets the parameter and waits until it holds."""
+    """Set the parameter and wait until it holds."""
     assert client.set(adapter=str(value)) == ''
     wait_for(client, str(value))
 

@@ -50,7 +50,7 @@ class Controller:
         self.feedback = []
 
     def send(self, trajectory, **fields):
-        """Sends a goal; returns its handle once it is accepted."""
+        """Send a goal; return its handle once it is accepted."""
         goal = self.messages.Goal(trajectory=trajectory, **fields)
         asked = self.actions.send_goal_async(goal, self.keep)
         self.client.wait(asked.done, 'acceptance')
@@ -61,12 +61,12 @@ class Controller:
         self.feedback.append(message.feedback)
 
     def wait_for_feedback(self, count):
-        """Returns what came; a result may overtake it, for it takes another way."""
+        """Return what came; a result may overtake it, for it takes another way."""
         self.client.wait(lambda: len(self.feedback) >= count, 'feedback')
         return self.feedback
 
     def result(self, handle):
-        """Returns status, code and text of a goal's end."""
+        """Return status, code and text of a goal's end."""
         asked = handle.get_result_async()
         self.client.wait(asked.done, 'a result')
         result = asked.result().result

@@ -54,7 +54,7 @@ def node(ros, tmp_path_factory):
 
 
 def show(client, recording, frame, stamp_ns, hidden=()):
-    """Publishes a recorded frame of every view, grey of hidden ones, and where the joints were."""
+    """Publish a recorded frame of every view, grey of hidden ones, and where the joints were."""
     for view, camera in enumerate(recording.cameras):
         header = make_header(stamp_ns, f'{camera.view}_optical_frame')
         info = CameraInfo(header=header, width=camera.width, height=camera.height)
@@ -69,7 +69,7 @@ def show(client, recording, frame, stamp_ns, hidden=()):
 
 
 def send_plan(client, recording, start_ns, hidden=()):
-    """Shows the first frame and sends the plan that was recorded from there; returns its end."""
+    """Show the first frame and send the plan that was recorded from there; return its end."""
     commands, since = recording.commands, len(client.report_values())
     kept = (commands.times > 1e-6) & (commands.times <= PLAN_S)
     plan = JointTrajectory(
@@ -84,7 +84,7 @@ def send_plan(client, recording, start_ns, hidden=()):
 
 
 def execute(client, recording, at):
-    """Sends the plan, then the recorded frames of some times [s] as if they came of it."""
+    """Send the plan, then the recorded frames of some times [s] as if they came of it."""
     start_ns = client.now_ns()
     compared = len(client.report_values('fidelity'))
     assert send_plan(client, recording, start_ns)['state'] == 'done'

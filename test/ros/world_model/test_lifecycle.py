@@ -40,7 +40,7 @@ def client(ros):
 
 
 def start_blocked_rollout(client, ros):
-    """Starts a plan that is imagined until something stops it; returns the reports before."""
+    """Start a plan that is imagined until something stops it; return the reports before."""
     client.connect_inputs(ros.INPUTS)
     client.set(seed=BLOCKS)
     since = len(client.report_values())

@@ -31,7 +31,7 @@ def new_client(ros):
 
 
 def describe(client, urdf):
-    """Publishes a description as robot_state_publisher does, and waits until it is looked at."""
+    """Publish a description as robot_state_publisher does, and wait until it is looked at."""
     before = client.diagnostic_values().get('robot_description')
     publisher = client.node.create_publisher(String, '/robot_description', LATCHED)
     publisher.publish(String(data=urdf))
@@ -96,7 +96,7 @@ class Broadcaster:
         client.wait(lambda: self.moving.get_subscription_count(), 'a listener of /tf')
 
     def send(self, *edges, moving=False, stamp_ns=None):
-        """Publishes (parent, child, T)."""
+        """Publish (parent, child, T)."""
         stamp_ns = self.client.now_ns() if stamp_ns is None else stamp_ns
         items = [self.transform(stamp_ns, *edge) for edge in edges]
         (self.moving if moving else self.static).publish(self.kind(transforms=items))
@@ -169,7 +169,7 @@ def test_a_camera_on_a_head_that_turns_is_where_it_was_at_the_time_of_the_image(
         return stamp_ns
 
     def draw():
-        """Returns the trajectory video of a plan from the newest images."""
+        """Return the trajectory video of a plan from the newest images."""
         client.received[shown].clear()
         since = len(client.report_values())
         client.send_trajectory()
@@ -204,7 +204,7 @@ def test_a_head_that_turned_may_be_elsewhere_when_the_clock_starts_over(
     tf.send(('base', LOW, cameras['low'].T_mount_camera), ('head', HIGH, np.eye(4)))
 
     def end_at(second, x):
-        """Returns how a plan ends at a time with the head at a place."""
+        """Return how a plan ends at a time with the head at a place."""
 
         def follows():
             clock.publish(Clock(clock=to_stamp(second * NANO)))

@@ -20,7 +20,7 @@ BLOCKS = 1200
 
 @pytest.fixture
 def start(tmp_path, ros):
-    """Starts the node with parameters; it must end cleanly at the test's end."""
+    """Start the node with parameters; it must end cleanly at the test's end."""
     started = []
 
     def start(*parameters, **options):

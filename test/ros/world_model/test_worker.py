@@ -58,7 +58,7 @@ class Plans:
             raise RolloutPreempted('a newer plan came')
 
     def run(self, monkeypatch, *bursts: list[int]) -> list[Ended]:
-        """Sends a plan, and those that come during its chunks and the next ones, of each burst.
+        """Send a plan, and those that come during its chunks and the next ones, of each burst.
 
         Returns:
             How all ended.

@@ -35,7 +35,7 @@ def _camera(view):
 
 @pytest.fixture
 def make(tmp_path):
-    """Writes an episode whose k-th frame is of grey level 20 k (low) and 255 - 20 k (high)."""
+    """Write an episode whose k-th frame is of grey level 20 k (low) and 255 - 20 k (high)."""
 
     def write(task, index, outcome='success', frames=11, attempt=0, **more):
         name = '_'.join(filter(None, (more.get('zero_shot'), task, f'{index:05d}')))

@@ -17,7 +17,7 @@ def sim(robot, expert):
 
 
 def first_takes(sim, expert, name, count, *, miss):
-    """Yields the first takes of a task that are as wanted; four seeds have so many."""
+    """Yield the first takes of a task that are as wanted; four seeds have so many."""
     found = 0
     for seed in range(4):
         take = _simulate(sim, expert, TASKS[name], seed, miss=miss)

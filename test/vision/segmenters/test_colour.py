@@ -80,13 +80,13 @@ RED, ELSEWHERE = {'red': (40, 40)}, {'blue': (10, 10)}
 
 
 def with_twin(frames):
-    """Copies the block at (20, 40) to (60, 40)."""
+    """Copy the block at (20, 40) to (60, 40)."""
     frames[:, :, 40:48, 60:68] = frames[:, :, 40:48, 20:28]
     return frames
 
 
 def with_sliver(frames, first):
-    """Shows one row of red from a frame on."""
+    """Show one row of red from a frame on."""
     frames[:, first:, 40, 40:52] = PALETTE['red']
     return frames
 
@@ -172,7 +172,7 @@ def test_frames_that_are_not_bytes_are_refused():
 
 
 def carrot(num_frames=3, leaf=(40, 36), names=('orange carrot',), **more):
-    """Segments an orange square under a green one, and returns both masks of the truth."""
+    """Segment an orange square under a green one, and return both masks of the truth."""
     blocks = {'orange': (40, 40), 'green': leaf, **more}
     frames, true = video([blocks] * num_frames, size=4)
     return segment(frames, *names), true
