@@ -175,8 +175,8 @@ _RENAMED = {'ImaginedEpisode': 'Rollout', 'load_pipeline': 'Pipeline.load'}
 # takes a core, those that wait use up the time that the last one needs, and all is many times as
 # slow. The library reads this as it is loaded.
 os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
-# NumPy's matrices are small here, and its threads spin, too: several of them take more time of the
-# processor than one, four times as much in a search, and no less time by the clock.
+# NumPy's matrices are small here, and its threads spin, too: several threads take more CPU time
+# than one (four times as much in a search) and the same wall-clock time.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 

@@ -72,8 +72,8 @@ def project(
 
     Returns:
         Pixels (..., 2), pixel centres at integers, and depths (...) [m] along the optical axis.
-        Pixels are NaN where the point is not in front of the camera, or so far off its axis
-        that the distortion model would fold it back into the image.
+        Pixels are NaN where the point is not in front of the camera, or at an angle to its axis
+        where the distortion model would fold it back into the image.
     """
     T_camera_base = inverse(np.asarray(T_base_camera, dtype=float))
     local = (T_camera_base[..., :3, :3] @ np.asarray(points, dtype=float)[..., None])[..., 0]

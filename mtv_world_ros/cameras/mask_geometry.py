@@ -164,7 +164,7 @@ def widest_swing(leans: FloatArray) -> FloatArray:
 
 
 def count_reversals(angles: FloatArray, swing: float) -> FloatArray:
-    """Return (T,) the number of reversals of the angle so far, each by more than `swing`.
+    """Return the cumulative number (T,) of reversals of an angle, each by more than `swing`.
 
     Args:
         angles: (T,) without jumps of whole turns [rad].

@@ -79,8 +79,8 @@ def make_parser(*wanted: str) -> argparse.ArgumentParser:
     """Return the parser of the command line.
 
     Args:
-        wanted: commands of the table to add, such as 'train' or 'import bag'; default: all of them
-            and those of other packages. Modules of commands that are not wanted are not imported.
+        wanted: commands of the table to add, such as 'train' or 'import bag'; default: all
+            commands, with those of other packages. Modules of other commands are not imported.
 
     Raises:
         ConfigError: a command of another package cannot be loaded.

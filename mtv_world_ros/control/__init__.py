@@ -1,1 +1,1 @@
-"""Controls: methods by which a plan enters the model, one file each."""
+"""Controls: how a plan enters the model, one method a file."""

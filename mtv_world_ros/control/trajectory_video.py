@@ -361,10 +361,10 @@ class _Paint:
         """Blend the colour into an (H, W, 3) image.
 
         Args:
-            image: drawn upon.
-            box: inside the image.
-            glow: (h, w) of the box, in 0 .. 1.
-            drawn: boxes outside of which the image is black; this one is added.
+            image: image that is drawn on.
+            box: part of the image that changes.
+            glow: (h, w) opacity in the box, 0 to 1.
+            drawn: boxes drawn before, the image is black elsewhere; `box` is added.
         """
         if is_empty(box):
             return

@@ -221,7 +221,7 @@ class History:
     Attributes:
         anchor: (V, H, W, 3) uint8 RGB, the first frame of the rollout: the observed one.
         frames: (V, N, H, W, 3) uint8 RGB, the last frames before the chunk's start frame, oldest
-            first, on the model's clock; none of them at the first chunk.
+            first, on the model's clock; N = 0 at the first chunk.
     """
 
     anchor: ByteArray
@@ -255,8 +255,8 @@ class History:
     def filled(self, num_frames: int) -> ByteArray:
         """Return (V, num_frames, H, W, 3) frames; where there are fewer, the oldest is repeated.
 
-        Between its first chunk and the N-th predicted frame a rollout has less than N of them, and
-        a causal autoencoder takes no less. Zeros where there is none at all.
+        A rollout has fewer than N frames until its N-th predicted one, but a causal autoencoder
+        needs N. Zeros if there are no frames.
         """
         count = self.frames.shape[1]
         if not count:

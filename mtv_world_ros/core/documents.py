@@ -93,7 +93,7 @@ def number(value: float | None, digits: int = 3) -> str:
 def with_interval(
     value: float | None, interval: Sequence[float | None] | None, digits: int = 3
 ) -> str:
-    """Return a number and its interval in brackets, as far as they are known."""
+    """Return a number and its interval in brackets; what is not known is left out."""
     text = number(value, digits)
     low, high = interval or (None, None)
     if text == DASH or low is None or high is None or not isfinite(low):

@@ -45,7 +45,7 @@ def share_path(*parts: str) -> Path:
     Looks in the source tree, then in the ament share folder, then in the pip prefix.
 
     Raises:
-        ConfigError: none of them holds it.
+        ConfigError: there is no such file in these folders.
     """
     roots = _candidates()
     for root in roots:
@@ -224,7 +224,7 @@ def plain(value: Any) -> Any:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Write a file beside its name and renames it, in a folder that is made where it is missing.
+    """Write a file under a temporary name and rename it; its folder is made if missing.
 
     Args:
         path: the file; what was there before stays until the new content is complete.
@@ -250,9 +250,9 @@ def write_whole(path: Path, content: bytes | str) -> None:
 def whole_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder that gets the name `folder` when the block ends without an error.
 
-    A folder of that name stays until then. What is written has a hidden name of its own beside it,
-    `.<folder>.mtv-new-<process>`, and what is replaced, `.<folder>.mtv-old-<process>`; nothing
-    else is touched. What a killed process left under those names is tidied up by the next call;
+    A folder of that name stays until then. Hidden names in the same parent folder hold what is
+    written, `.<folder>.mtv-new-<process>`, and what is replaced, `.<folder>.mtv-old-<process>`;
+    nothing else is touched. The next call removes what a killed process left under those names;
     see `recover_folder`.
 
     Raises:
@@ -307,17 +307,17 @@ def recover_folder(folder: Path) -> None:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-#: words in the hidden names beside a folder: being written, replaced, to be removed
+#: words in the hidden names of a folder: being written, replaced, to be removed
 _WORDS = _NEW, _OLD, _WASTE = 'mtv-new', 'mtv-old', 'mtv-waste'
 
 
 def _own_name(path: Path, word: str) -> Path:
-    """A hidden name beside a file or folder, of this package and process."""
+    """Return the hidden name that this process gives a file or folder, in the same parent."""
     return path.with_name(f'.{path.name}.{word}-{os.getpid()}')
 
 
 def _own_folders(folder: Path) -> list[Path]:
-    """The folders beside one that `whole_folder` made for it."""
+    """Return the hidden folders that `whole_folder` made for a folder."""
     name = re.compile(rf'\.{re.escape(folder.name)}\.({"|".join(_WORDS)})-\d+')
     try:
         beside = sorted(folder.parent.iterdir())

@@ -49,7 +49,7 @@ def encode_png(image: ByteArray) -> bytes:
 
 
 def write_png(path: Path, image: ByteArray) -> None:
-    """Write an (H, W, 3) RGB picture beside its name and renames it."""
+    """Write an (H, W, 3) RGB picture under a temporary name and rename it."""
     write_whole(path, encode_png(image))
 
 

@@ -1,4 +1,4 @@
-"""Processes: signals that end this one, and nodes beside it."""
+"""Processes: signals that end this one, and child nodes."""
 
 from __future__ import annotations
 

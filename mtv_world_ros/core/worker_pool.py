@@ -114,14 +114,14 @@ def _in_processes(
 class WorkerPool(ProcessPoolExecutor):
     """Processes whose `run_job` runs jobs; they end with this process, however that ends.
 
-    One that stands still (SIGSTOP) is killed: the pool breaks, and no call waits on. So is one
-    that ignores the SIGTERM of a broken pool, e.g. as it was forked with another's handler.
+    A stopped process (SIGSTOP) is killed: the pool breaks, and no call waits any longer. A process
+    that ignores the SIGTERM of a broken pool, e.g. with a forked signal handler, is killed, too.
 
     Args:
-        make_run: makes what runs a job, once in every process.
-        workers: processes.
-        threads: of OpenCV in each of them.
-        method: `spawn`, or `fork`, where nothing is copied or pickled.
+        make_run: factory of the function that runs a job, called once in every process.
+        workers: number of processes.
+        threads: number of OpenCV's threads in each process.
+        method: start method, `spawn` or `fork`; `fork` copies and pickles nothing.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class WorkerPool(ProcessPoolExecutor):
         threading.Thread(target=self._kill_stopped, daemon=True).start()
 
     def submit(self, *job: Any, **options: Any) -> Future[Any]:
-        """Start processes; none of them gets a Ctrl-C that it does not ignore yet."""
+        """Start processes; a Ctrl-C is held back until each ignores it."""
         resource_tracker.ensure_running()  # which lets SIGINT through
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
@@ -306,8 +306,8 @@ def score_with_ray(
 class _Actors:
     """Actors of a Ray cluster that run jobs; the job of one that dies goes to another.
 
-    An actor gets its first job when it has started: a cluster with less cores than actors starts
-    some of them later, or never.
+    An actor gets its first job when it has started: a cluster with fewer cores than actors starts
+    the others later, or never.
     """
 
     def __init__(self, ray: Any, actors: Sequence[Any]) -> None:

@@ -8,8 +8,8 @@ and the bias forces b (J,) of the robot's description at positions q:
 
 The numbers are found in recordings (`training/object_motion/response_fit.py`), so gains need not
 be known; a robot described without inertias has M = 0, and its joints respond each for itself.
-Fingertips stop at the table, which pushes back like a stiff spring and rubs; what stops arms when
-they touch something else is learned beside where that goes (`network.py`).
+Fingertips stop at the table, which pushes back like a stiff spring with friction. Other contacts
+are not part of this response.
 
 Shape letters: T steps, J joints, P fingertips.
 """

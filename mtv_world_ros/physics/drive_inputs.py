@@ -29,9 +29,9 @@ class FreeMotion:
 
     Attributes:
         controls: (S, D) set points of the drives [rad or m].
-        pushes: (S, D) with which they help themselves beside, as what moves fingers [N m or N].
-        positions: (S + 1, D) where they are [rad or m]; row 0 at the begin.
-        velocities: (S + 1, D).
+        pushes: (S, D) feed-forward effort of the drives [N m or N].
+        positions: (S + 1, D) joint positions [rad or m]; row 0 at the start.
+        velocities: (S + 1, D) joint velocities [rad/s or m/s].
     """
 
     controls: FloatArray

@@ -445,7 +445,7 @@ class _Run:
 
 
 class _Nearby:
-    """Test whether arms come near solids, or fingers near the table."""
+    """Test for contact range between arms and solids, and between fingers and the table."""
 
     def __init__(self, scene: CompiledScene, model: Any) -> None:
         self._scene, self._model = scene, model.__copy__()

@@ -18,8 +18,7 @@ from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import ChunkPlan
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
-#: says which futures (K,) end as most of them do, of the motions until then; None = they do not
-#: tell
+#: maps the motions so far to the futures (K,) that end as the majority does; None = no majority
 Majority = Callable[[ForeseenMotions], BoolArray | None]
 
 
@@ -28,12 +27,12 @@ class ObjectForesight:
     """Objects of an episode; immutable, so calls that change something return a new one.
 
     Attributes:
-        model: says where objects go; None = no foresight, verdicts rest on frames alone.
-        segmenter: finds them in real frames.
-        robot: whose commands move them.
-        first: the episode's first real observation, at its own size.
-        source: the last one, likewise.
-        found: where they are by now, and how they got there; None = not looked for since.
+        model: motion model of the objects; None = no foresight, verdicts rest on frames alone.
+        segmenter: segmenter of real frames.
+        robot: robot that is commanded.
+        first: first real observation of the episode, at the cameras' size.
+        source: newest real observation, at the cameras' size.
+        found: the objects in `source` and their motion since; None = not looked for yet.
     """
 
     model: ObjectMotionModel | None
@@ -66,13 +65,13 @@ class ObjectForesight:
         Pictures go on to show the future that they showed, unless it ends otherwise than most.
 
         Args:
-            plan: the chunk.
-            observation: first of the episode, at the model's size.
-            names: O of them.
-            start_masks: in its frames.
-            majority: says which futures end as most do.
-            is_begun: whether nothing real was seen since the episode began.
-            should_stop: asked all the time.
+            plan: commands of the chunk.
+            observation: first observation of the episode, at the model's size.
+            names: names of the O objects.
+            start_masks: masks of the objects in `observation`.
+            majority: selects the futures that end as the majority does.
+            is_begun: whether no real frame was seen since the episode began.
+            should_stop: polled while futures are simulated; true cancels.
 
         Raises:
             RolloutPreempted: `should_stop` said so.
@@ -131,10 +130,10 @@ class ObjectForesight:
 
     @property
     def refusal(self) -> str:
-        """The reason to give no verdict; empty = none.
+        """Reason to give no verdict; empty = none.
 
-        Where the episode begins, what cannot be foreseen of an object is a reason, too: pictures
-        of objects that cannot be where they were found tell nothing.
+        In the episode's first part, an object whose motion cannot be simulated is a reason, too:
+        pictures of objects that cannot be where they were found are no evidence.
         """
         if self.found is None:
             return ''
@@ -185,14 +184,14 @@ class ObjectForesight:
         masks: BoolArray,
         whole: FoundObjects | None = None,
     ) -> FoundObjects:
-        """Objects of masks (V, O, H, W) in frames (V, H, W, 3) uint8 RGB at the model's size.
+        """Return the objects of masks in the frames of an observation, at the model's size.
 
         Args:
             source: the same observation at the recorded size.
-            names: O of them.
-            frames: of all views.
-            masks: in them.
-            whole: the same objects when nothing hid them; None = now.
+            names: names of the O objects.
+            frames: (V, H, W, 3) uint8 RGB.
+            masks: (V, O, H, W) masks of the objects.
+            whole: the objects when nothing hid them; None = nothing hides them now.
         """
         assert self.model is not None
         sharp = self.segmenter.segment(source.frames[:, None], names).masks[:, :, 0]

@@ -24,11 +24,11 @@ class Future:
     """Sample of the unknown quantities: one future.
 
     Attributes:
-        settings: of contact.
-        solids: O.
-        zeros: (D,) by which the arms are elsewhere than they report [rad or m].
-        delay_s: by which they follow later.
-        shift: (3,) by which the cameras see all solids elsewhere; `solids` have it [m].
+        settings: contact settings.
+        solids: the O solids.
+        zeros: (D,) offsets of the joint encoders [rad or m].
+        delay_s: extra delay of the arms [s].
+        shift: (3,) common position error of all solids, contained in `solids` [m].
     """
 
     settings: ContactSettings

@@ -47,7 +47,7 @@ class RobotMechanics:
     def fingertips(self, positions: FloatArray) -> FloatArray:
         """Return the tips of all fingers (P, 3) in the base frame [m].
 
-        Two of each tool, as far apart as the gripper is open.
+        Two tips a tool; their distance is the gripper's opening.
         """
         model, data = self._model, self._data
         q = self._robot.configurations(positions[None])[0]

@@ -169,18 +169,18 @@ class ObjectMotionModel(Protocol):
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
     ) -> tuple[TrackedObjects, BoolArray, BoolArray]:
-        """Return the objects where they may be partly hidden by now.
+        """Return the objects in a frame in which they may be partly hidden.
 
         Args:
-            whole: what `find` returned on a frame in which nothing hid the objects.
-            names: see `find`; so are the others.
-            masks: of what is seen of them now.
-            cameras: of the V views.
+            whole: result of `find` for a frame in which nothing hid the objects.
+            names: see `find`.
+            masks: visible parts of the objects, see `find`.
+            cameras: cameras of the V views.
             poses: T_base_camera of each view, (4, 4) [m].
 
         Returns:
-            The objects; which of them (O,) were found with certainty, at their former size; and
-            which are partly hidden: their motions count from the frame in which they were whole.
+            The objects; mask (O,) of the objects found with certainty, at their former size; mask
+            (O,) of the partly hidden ones, whose motion counts from the frame of `whole`.
         """
         ...
 
@@ -198,9 +198,9 @@ class FoundObjects:
         cuts: (V, O, H, W, 4) `cut_outs` of the frame that shows each best, at the model's size.
         poses: (V, O, 4, 4) T_base_camera then.
         tracked: current poses of the objects.
-        motions: from there on, `tracked.step_s` apart; of the first one places and sizes are as
-            the masks have them.
-        positions: (N, J) joints at their rows [rad or m].
+        motions: motions since that frame, rows `tracked.step_s` apart; row 0 has the places and
+            sizes of the masks.
+        positions: (N, J) joint positions at these rows [rad or m].
         part_row: row at which the last part of a plan begins.
         shown: index of the motion that the pictures show.
         shown_before: index of the motion that the pictures of the part before showed.

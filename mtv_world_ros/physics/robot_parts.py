@@ -75,9 +75,9 @@ class RobotParts:
 def load_parts(robot: RobotModel) -> RobotParts:
     """Return the parts that can touch something.
 
-    The URDF's collision elements; for links that have none, what is drawn of them. A mesh counts
-    as its convex hull, that of a gripper as convex pieces, between which there is room for what
-    it holds. Rods from joint to joint where nothing is described.
+    These are the URDF's collision elements, or the visual ones of a link without collisions. A
+    mesh is replaced by its convex hull; a gripper's mesh by convex pieces, so that an object fits
+    between its fingers. Links without any shape become rods from joint to joint.
 
     Raises:
         RobotError: a mesh is missing or cannot be read.

@@ -87,8 +87,8 @@ class SolidForesight:
         """Return the objects of masks (V, O, H, W), best of the camera's own size.
 
         Args:
-            names: O of them; those of vessels say that they are hollow.
-            masks: of one frame.
+            names: names of the O objects; the name of a vessel makes it hollow.
+            masks: masks of one frame.
             cameras: V cameras at the masks' size.
             poses: V of T_base_camera (4, 4).
         """
@@ -155,7 +155,7 @@ class SolidForesight:
         poses: Sequence[FloatArray],
         known: Sequence[Solid | None],
     ) -> TrackedSolids:
-        """Objects, of which those that are not known are fitted to their masks."""
+        """Return the objects; those that are not known are fitted to their masks."""
         points, floor = locate_all(cameras, poses, centroids(masks)), self.settings.table_m
         solids = tuple(
             solid
@@ -183,15 +183,15 @@ class TrackedSolids:
     """State of the objects between two chunks.
 
     Attributes:
-        foresight: says where they go.
-        names: O of them.
-        solids: O, as found; None = not seen by two views.
-        doubts: number of an object -> why nothing is foreseen of it.
-        note: what was corrected, in words; empty = nothing.
-        reference: (O, 3) where their motions count from [m]; None = where they were found.
-        turned: (O, 3, 3) from there to where they were found.
-        batch: what computes their futures; None = nothing has moved yet.
-        state: where the futures are by now.
+        foresight: motion model of the objects.
+        names: names of the O objects.
+        solids: the O solids as fitted; None = not seen by two views.
+        doubts: index of an object -> reason why its motion is not simulated.
+        note: corrections that were made, as text; empty = none.
+        reference: (O, 3) origin of the motions [m]; None = where the objects were found.
+        turned: (O, 3, 3) rotation from the origin to where the objects were found.
+        batch: simulation of the futures; None = nothing has moved yet.
+        state: present state of the futures.
     """
 
     foresight: SolidForesight

@@ -44,7 +44,7 @@ MOVED_YAW_GUESSES_RAD = (0.5, -0.5, 1.0, -1.0)
 MAX_OVERHANG_PX = 1.0
 #: the same limit as a multiple of the overhang when the solid was whole
 MAX_OVERHANG_RATIO = 1.5
-#: smallest fraction of the outline that lies as near to the masks
+#: smallest fraction of the outline within that distance of the masks
 MIN_VISIBLE_FRACTION = 0.4
 #: fill of the outline, relative to the fill before, below which a mask is partly hidden
 MIN_FILL_RATIO = 0.9
@@ -147,17 +147,17 @@ def fit_solid(
 ) -> Solid | None:
     """Return the solid whose outlines are nearest to those of an object.
 
-    Of a block whose masks are whole at 384 x 288, place and size are found to half a millimetre.
-    What a mask does not show (hidden parts, hollows) the solid does not have, but `is_open`.
+    The place and size of a block with whole masks at 384 x 288 are found to half a millimetre.
+    The solid lacks what no mask shows (hidden parts, hollows), apart from `is_open`.
 
     Args:
-        masks: (V, H, W) of one frame.
-        point: (3,) where it is, roughly [m].
+        masks: (V, H, W) masks of the object in one frame.
+        point: (3,) approximate position of the object [m].
         cameras: V cameras at the masks' size.
         poses: V of T_base_camera (4, 4).
-        floor: height on which things stand, most of them [m].
+        floor: height of the surface on which most objects stand [m].
         is_open: see `Solid`.
-        is_box: it is no cylinder.
+        is_box: whether the object is known to be no cylinder.
 
     Returns:
         None where no two views see it.

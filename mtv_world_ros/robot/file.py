@@ -115,7 +115,7 @@ _ERROR = re.compile(rb'^Error: *(.+)$', re.MULTILINE)
 
 @contextmanager
 def parser_errors() -> Iterator[list[str]]:
-    """Take the parser's errors off stderr; all else that is written there meanwhile goes on.
+    """Capture the parser's errors from stderr; other text on stderr is passed on.
 
     Yields:
         The errors, filled at the end.

@@ -84,7 +84,7 @@ def _named_mesh(name: str, urdf: Path) -> Path | None:
 def _mesh_by_end(name: str, urdf: Path) -> Path | None:
     """Return the mesh near the URDF whose path ends as the name does; the longest end counts.
 
-    A file name alone counts beside the URDF only, and not for a mesh of a package.
+    A bare file name is accepted in the URDF's own folder alone, and never for a package's mesh.
     """
     scheme, separator, path = name.rpartition('://')
     text = unquote(path) if separator else path

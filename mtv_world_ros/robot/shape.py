@@ -287,14 +287,14 @@ def element_shapes(
     urdf: Path,
     cut: Callable[[FloatArray, NDArray[np.int64]], list[FloatArray]] | None = None,
 ) -> Iterator[LinkShape]:
-    """Yield the convex parts of a `visual` or `collision`: none where it describes nothing.
+    """Yield the convex parts of a `visual` or `collision`; none if it describes no shape.
 
     Args:
-        element: of the URDF.
+        element: element of the URDF.
         link: name of its link.
-        urdf: its file, beside which meshes are looked for.
-        cut: makes convex parts of a mesh's vertices and edges, e.g. `convex_pieces`; None = its
-            hull stands for it.
+        urdf: file of the URDF; meshes are looked for in its folder.
+        cut: splits a mesh's vertices and edges into convex parts, e.g. `convex_pieces`; None =
+            the convex hull of the mesh is used.
 
     Raises:
         MissingMeshError: a mesh is not there or cannot be read.

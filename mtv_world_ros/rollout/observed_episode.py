@@ -20,12 +20,12 @@ _MOST_WAITING_CHUNKS = 8
 
 
 class ObservedEpisode:
-    """The real frames of an episode so far, so that every plan is judged with what came before.
+    """Real frames of an episode, which every later plan is judged with.
 
-    `see` may be called from another thread than the others.
+    `see` may be called from another thread than the other methods.
 
     Args:
-        pipeline: finds and judges objects in the frames.
+        pipeline: pipeline that finds and judges objects in the frames.
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
@@ -61,7 +61,7 @@ class ObservedEpisode:
                 del self._waiting[::2]
 
     def forget(self) -> None:
-        """Drop the episode so far: the next plan begins a new one."""
+        """Drop the episode: the next plan begins a new one."""
         with self._lock:
             self._seen, self._waiting = None, []
 

@@ -51,5 +51,5 @@ class RolloutOptions:
             )
 
 
-#: options of a rollout of which nothing is asked
+#: options of a rollout without an instruction
 DEFAULT_OPTIONS = RolloutOptions()

@@ -111,9 +111,9 @@ def mean_of_seeds(predictions: Sequence[Prediction]) -> Prediction:
 def mean_estimate(estimates: Sequence[SuccessEstimate]) -> SuccessEstimate:
     """Return the mean over rollouts that differ in their seeds alone.
 
-    `spread` is their standard deviation; the interval is Student's of the mean: where more
-    rollouts of this world model would put it, not where reality lies. Abstains where most of them
-    do. J and features are those of the first.
+    `spread` is their standard deviation; the interval is Student's interval of the mean: it bounds
+    the mean of many rollouts of this world model, not reality. The mean abstains if most rollouts
+    do. J and features are those of the first rollout.
     """
     first = estimates[0]
     known = [e.probability for e in estimates if isfinite(e.probability)]

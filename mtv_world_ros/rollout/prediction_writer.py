@@ -26,18 +26,18 @@ ERROR = 2
 
 
 class PredictionWriter(BagWriter):
-    """Records chunks: images, masks, joint states, estimates; stamps are the predicted times.
+    """Writer of chunks into a bag: images, masks, joint states, estimates, at predicted times.
 
-    Beside them what the cameras really showed then, where that is known.
+    Real frames of the same times are recorded with them where they are known.
 
     Args:
-        path: folder to make; written beside and renamed when the block ends.
+        path: folder to make; it has a temporary name until the block ends.
         joint_names: J names, in the robot's order.
         overwrite: replace an existing folder.
         keep: keep what was recorded before an error, see `BagWriter`.
 
     Attributes:
-        frame_stamps: of the frames that were recorded [ns].
+        frame_stamps: stamps of the recorded frames [ns].
     """
 
     def __init__(

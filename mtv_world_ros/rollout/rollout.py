@@ -85,7 +85,7 @@ class Rollout:
     Attributes:
         pipeline: imagines and judges.
         options: options of the next call; may be replaced between two calls.
-        num_chunks: number of chunks imagined so far.
+        num_chunks: number of imagined chunks.
     """
 
     pipeline: ChunkMaker
@@ -182,9 +182,8 @@ class Rollout:
     def branch(self, observation: Observation) -> Rollout:
         """Return an episode that begins at a later real observation and remembers this one.
 
-        What the estimate remembers (grasps, first masks, where objects have been) goes on, and
-        what objects look like where nothing hides them; the model's history begins again. This
-        episode stays as it is.
+        The estimate's memory (grasps, first masks, positions of objects) and the appearance of
+        whole objects are kept; the model's history begins again. This episode is not changed.
 
         Raises:
             ObservationError: the views are not the model's.

@@ -104,7 +104,7 @@ def run_policy(
         chunk_s: the policy is asked again after this time, or where its answer ends [s]; 0 = the
             world's.
         hold: the episode also ends when the task is done, or the estimate abstains, after this
-            number of answers in a row; 0 = then it goes on.
+            number of answers in a row; 0 = the episode does not end for that.
 
     Raises:
         PolicyError: the policy cannot answer.
@@ -129,7 +129,7 @@ def run_policy(
 
 
 def _end_of(verdicts: Sequence[bool | None]) -> End | None:
-    """The end of an episode after these verdicts; None = it goes on."""
+    """Return the end of an episode after these verdicts; None = no end."""
     if all(verdicts):
         return End.HELD
     return End.ABSTAINS if all(verdict is None for verdict in verdicts) else None

@@ -44,7 +44,7 @@ class ImagineOptions:
         max_seconds: an episode takes at most, on the wall [s].
         instruction: text for the robot.
         seed: episode k uses seed + 1000 k.
-        watch: arguments of a viewer that runs beside it; None = there is none.
+        watch: arguments of a viewer that is started, too; None = there is none.
         checkpoint, robot, device, num_threads, num_inference_steps, segmenter, describer: of the
             world model.
     """

@@ -80,4 +80,4 @@ class NodeEvents(Protocol):
 
 
 def ignore_sent(chunk: Any, sent: Any) -> None:
-    """Take frames of which nobody is told."""
+    """Ignore frames: the default callback."""

@@ -330,10 +330,10 @@ def declare_one(
 def refuse_unknown(node: Node) -> None:
     """Refuse parameters that were given at start-up and that the node does not have.
 
-    To be called when all of them are declared.
+    Call it when all parameters are declared.
 
     Raises:
-        ConfigError: naming the nearest ones.
+        ConfigError: there are unknown parameters; the error names similar ones.
     """
     known = node.list_parameters([], 0).names
     # rclpy has no public way to ask for what was given

@@ -18,7 +18,7 @@ from mtv_world_ros.ros.messages.conversions import values_of
 
 #: a service that does not answer within this long is gone [s]
 _ANSWER_S = 30.0
-#: where several nodes offer a service, one of them killed, a request is sent again after this [s]
+#: if several nodes offer a service and one was killed, a request is sent again after this [s]
 _ASK_AGAIN_S = 2.0
 #: rmw_fastrtps drops the answer to whom it has not matched yet: asked again after this [s]
 _LOST_ANSWER_S = 8.0

@@ -51,7 +51,7 @@ def best_offer(publishers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfil
 
 
 class QosWatch:
-    """Watch for peers whose quality of service does not match, of which nothing is received.
+    """Watch for peers with a quality of service that does not match: no message gets through.
 
     Attributes:
         mismatches: present ones, as text with topic, both policies and the fix.

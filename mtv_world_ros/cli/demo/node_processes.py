@@ -49,10 +49,9 @@ def record_through_node(
 ) -> None:
     """Play an episode into a node and record what it publishes in `out/predictions`.
 
-    The cameras' images lie beside them. The episode's clock is the ROS clock, so predictions
-    carry the times they are about. After
-    each trajectory the player waits until the node has answered it (a slow machine loses
-    nothing). Logs of the processes go to `out/logs`.
+    The bag also holds the cameras' images. The episode's clock is the ROS clock, so predictions
+    carry the times that they show. After each trajectory the player waits until the node has
+    answered it, so a slow machine loses nothing. Logs of the processes go to `out/logs`.
 
     Raises:
         EpisodeError: a process failed; the message has its last line and names its log.

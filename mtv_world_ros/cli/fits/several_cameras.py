@@ -123,8 +123,8 @@ def recorded_robot(episode: Path, name: str) -> Path:
     """Return the YAML of the robot that an episode shows.
 
     Args:
-        episode: its folder; an imported data set has its robot in `robot/` beside the episodes.
-        name: of the robot, by the episode's metadata.
+        episode: folder of the episode; an imported data set has its robot in `../robot/`.
+        name: name of the robot in the episode's metadata.
 
     Raises:
         ConfigError: there is no file of that name.

@@ -1,9 +1,9 @@
 """Friction, weight, grip, delay and table, from masks and joint states of what commands did.
 
-Settings are drawn, and objects foreseen under each of them; those under which objects keep nearest
-to where later masks show them are likelier. Draws are repeated where they are likely (population
-Monte Carlo, Cappe et al. 2004), so that every number has an interval, which becomes its spread in
-futures. Nothing is taken from a simulator, and no pose of an object but those that masks show.
+Settings are drawn, and the objects are simulated with each draw. A draw is likelier the nearer its
+objects are to the later masks. New draws are made around likely ones (population Monte Carlo,
+Cappe et al. 2004), so that every number has an interval, which becomes its spread in futures.
+Object poses come from the masks alone, never from a simulator.
 
 Shape letters: T steps, O objects, J joints, N draws, P numbers, E episodes.
 """
@@ -75,8 +75,9 @@ class FreeGrippers:
     """Grippers of an episode before they close.
 
     Attributes:
-        positions: (1 + T, J) commanded, `PERIOD_S` apart [rad or m].
-        recorded: (1 + T, J) recorded likewise; NaN = no gripper, or it may touch something.
+        positions: (1 + T, J) commanded positions, `PERIOD_S` apart [rad or m].
+        recorded: (1 + T, J) recorded positions at the same times; NaN = no gripper, or contact is
+            possible.
     """
 
     positions: FloatArray
@@ -476,9 +477,9 @@ def settings_of_place(
     """Return settings for recordings on several tables, or without commands of their own.
 
     Args:
-        first: settings otherwise.
-        recordings: E.
-        report: is told what differs.
+        first: default settings.
+        recordings: the E recordings.
+        report: callback that gets a line of text for each difference.
     """
     changed: dict[str, bool | float] = {}
     each = recordings[:: max(1, len(recordings) // _FIT.max_tables)]

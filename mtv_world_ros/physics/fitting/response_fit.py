@@ -82,10 +82,10 @@ def joint_recording(path: Path, robot: RobotModel) -> Recording:
 
 
 def found_response(paths: Sequence[Path], robot: RobotModel) -> tuple[ArmResponse | None, str]:
-    """Return how arms follow in recorded episodes, and in words how well.
+    """Return the fitted response of the arms in recorded episodes, and its accuracy as text.
 
-    None where no episode tells, or where tools are nearer to their commands than to what is
-    expected of them, in episodes that the fit was not given.
+    None if no episode can be used, or if in held-out episodes the tools are nearer to their
+    commands than to the fitted response.
     """
     recordings, reason = [], ''
     for path in paths[:: max(1, len(paths) // _MOST)]:
@@ -165,7 +165,7 @@ def with_floor(
             stopped += heights[sinks].tolist()
     if len(stopped) < _LEAST_ROWS:
         return response
-    # what lies on the table stops some of them, too
+    # objects on the table stop some fingertips above it
     floor = replace(response, floor=float(np.percentile(stopped, _LOWEST_PERCENT)))
     errors = [tool_errors(robot, recordings, one).mean() for one in (response, floor)]
     return floor if errors[1] < errors[0] else response

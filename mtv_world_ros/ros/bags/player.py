@@ -295,9 +295,9 @@ class Player(Node):
 
 
 def in_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
-    """Yield messages by time, holding two seconds of them; trajectories last among equals.
+    """Yield messages by time from a buffer of two seconds; trajectories last among equal times.
 
-    A trajectory is planned from the messages that have its time.
+    A trajectory is planned from the messages of the same time, so they go first.
     """
     heap: list[tuple[int, bool, int, BagMessage]] = []
     for number, message in enumerate(messages):

@@ -174,7 +174,7 @@ class Recorder(Node):
         return self._announced_s < float('inf')
 
     def _name_silent(self) -> None:
-        """Log, once, the topics without messages so far; their first message is logged later."""
+        """Log, once, the topics without messages; their first message is logged later."""
         self.silent_after_s = float('inf')
         self._silent = {s.topic_name for s in self._taken if not self._counts[s.topic_name]}
         if self._silent:

@@ -91,11 +91,11 @@ def info_of_camera(camera: CameraModel, header: Header) -> CameraInfo:
 
 
 def windowed_camera_info(info: CameraInfo, camera: CameraModel) -> CameraInfo:
-    """Return `info` for the images that were received: K and P of them, no ROI, no binning.
+    """Return `info` with K and P for the images that were received, without ROI and binning.
 
     Args:
         info: the received CameraInfo.
-        camera: at the images' size.
+        camera: the camera at the images' size.
     """
     window = window_of(info)
     if window == WHOLE and (camera.width, camera.height) == (info.width, info.height):

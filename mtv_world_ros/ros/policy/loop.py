@@ -331,7 +331,7 @@ class PolicyLoop:
             self._why_waiting = 'the rollout is done, but of its chunk there was no report'
             return
         num_frames = int(report['frames'])
-        # beside a real robot the world model starts from frames newer than those answered
+        # with a real robot the world model starts from frames newer than those answered
         is_strict = self._settings.mode == 'imagine'
         start_ns = before.stamp_ns if is_strict else int(report['observation_stamp_ns'])
         stamps = chunk_stamps(start_ns, num_frames, self._spec.fps)

@@ -65,7 +65,7 @@ class SensedScene:
 
 
 class ObservationBuffer:
-    """Keeps the newest messages and makes observations of them.
+    """Buffer of the newest messages, from which observations are made.
 
     Args:
         cameras: calibrated cameras of the V views, in the model's order.

@@ -89,7 +89,7 @@ class Inputs:
         self._watch.refresh()
 
     def mismatches(self) -> list[str]:
-        """Peers of which nothing is received, or that receive nothing, for their QoS."""
+        """Return the peers whose QoS prevents messages to or from this node."""
         return self._watch.mismatches
 
     def unpublished(self) -> list[str]:
@@ -137,12 +137,12 @@ def subscribe_observations(
 
 
 class MatchedSubscription:
-    """Starts with the weakest QoS and asks for the strongest that all publishers offer.
+    """Subscription with the strongest QoS that all publishers offer.
 
-    Nothing is lost between the two: the first goes only at a refresh after the second is
-    connected. Until then a message may come twice, so that this is for messages of which the
-    newest counts. `qos_overrides.<topic>.subscription.reliability` (match, reliable, best_effort)
-    and `.depth` override what it does.
+    It starts with the weakest QoS. Nothing is lost at the change: the first subscription goes
+    at a refresh after the second is connected. Until then a message may come twice, so it suits
+    topics where the newest message counts. `qos_overrides.<topic>.subscription.reliability`
+    (match, reliable, best_effort) and `.depth` override the reliability and the depth.
 
     Args:
         node: owner.

@@ -260,7 +260,7 @@ class LiveFidelity:
         self._done.trigger()
 
     def _real_episode(self, chunk: Chunk) -> Rollout:
-        """The real frames of the chunk's rollout so far; a new episode where some are missing."""
+        """Return the real frames of the chunk's rollout; a new episode if some are missing."""
         prediction, rollout = chunk.prediction, chunk.request.rollout
         seen = self._seen
         if seen is None or (seen.rollout, seen.num_chunks) != (rollout, prediction.chunk):

@@ -166,7 +166,7 @@ class PredictionPublisher:
             return
         try:
             self._publish_estimate(result)
-        except Exception as error:  # the node goes on
+        except Exception as error:  # an error must not stop the node
             self._events.on_error(error)
         self._events.on_judged(result)
         for frames in (self._masks, self._images):
@@ -245,7 +245,7 @@ class PredictionPublisher:
 
 
 class Last(NamedTuple):
-    """The frame before: when it went out [s] of `time.monotonic`, and of which chunk it was."""
+    """Frame that was published last: `time.monotonic` [s], and its rollout and chunk."""
 
     out_s: float = 0.0
     rollout: int = 0
@@ -303,7 +303,7 @@ class FrameQueue:
             if wait_s <= 0:
                 self._publish(chunk, index, self._sent)
                 self._last = Last(time.monotonic(), chunk.request.rollout, chunk.prediction.chunk)
-        except Exception as error:  # the node goes on
+        except Exception as error:  # an error must not stop the node
             self._on_error(error)
             self._finish()
             return

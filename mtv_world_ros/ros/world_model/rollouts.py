@@ -51,16 +51,16 @@ _MEASURED_SLACK = 0.1
 
 
 class RequestMaker:
-    """Checks trajectories and gives each what it is imagined with.
+    """Maker of requests: checks a trajectory, adds the scene, instruction and options.
 
     Attributes:
-        imagine: whether rollouts go on from the last predicted frames.
+        imagine: whether rollouts start from the last predicted frames.
         instruction: text for the robot.
-        num_requests: made so far.
-        robot: whose joints trajectories move.
+        num_requests: number of requests made.
+        robot: robot that the trajectories command.
 
     Args:
-        robot: whose joints trajectories move.
+        robot: robot that the trajectories command.
         buffer: newest real images and joint states.
         settings: the present parameters.
         last_scene: the last predicted frames; None = there are none yet.

@@ -95,10 +95,10 @@ class Ended:
         request: the plan.
         state: `done`, `preempted`, `rejected`, `failed` or `reset`.
         num_chunks: number of predicted chunks.
-        last: the last one of them: what was known of the plan; None = nothing.
-        reason: why it was rejected or failed.
-        text: the same in words, or why it was pre-empted if not by a newer plan.
-        trace: of an error that nobody raised on purpose.
+        last: last predicted chunk; None = no chunk was predicted.
+        reason: code of the reason why the plan was rejected or failed.
+        text: the reason in words, also of a pre-emption by anything but a newer plan.
+        trace: traceback of an unexpected error.
     """
 
     request: Request
@@ -185,7 +185,7 @@ class RolloutWorker:
 
     @property
     def last_scene(self) -> SensedScene | None:
-        """The last predicted frames, from which imagine mode goes on; None = there are none."""
+        """Last predicted frames, from which imagine mode continues; None = there are none."""
         with self._changed:
             return self._last
 
@@ -256,11 +256,11 @@ class RolloutWorker:
             self._observed.forget()
 
     def give_up(self, rollout: int, text: str) -> None:
-        """Pre-empts one plan if it still runs or waits; imagine mode goes on from its chunks.
+        """Pre-empt a plan that runs or waits; imagine mode continues from its chunks.
 
         Args:
-            rollout: its number.
-            text: why, in words.
+            rollout: number of the plan's rollout.
+            text: reason in words.
         """
         with self._changed:
             running, pending = self._running, self._pending
@@ -410,7 +410,7 @@ class RolloutWorker:
         )
 
     def _begin(self, request: Request, options: RolloutOptions) -> tuple[SensedScene, Rollout]:
-        """The scene to start from and its episode: the one that goes on, or a new one."""
+        """Return the start scene and its episode: the present one, or a new one."""
         with self._changed:
             if request.imagine and self._episode is not None and self._last is not None:
                 self._episode.options = options
