@@ -37,6 +37,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, *, page: Page, **_: object) -> str:
     """Point the links to the copies, and those of copied pages back into docs/."""
-    if page.file.src_uri.startswith(_FOLDER):
-        return markdown.replace('](docs/', '](../')
+    source = page.file.src_uri
+    if source.startswith(_FOLDER):  # one folder deeper than in the repository
+        up = '../' * (source.count('/') - 1)
+        return markdown.replace(f']({up}docs/', f']({up}../')
     return _LINK.sub(rf'\1{_FOLDER}/\2', markdown)

@@ -18,7 +18,7 @@ from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import ChunkPlan
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
-#: maps the motions so far to the futures (K,) that end as the majority does; None = no majority
+#: maps the motions until now to the futures (K,) that end as the majority does; None = no majority
 Majority = Callable[[ForeseenMotions], BoolArray | None]
 
 
