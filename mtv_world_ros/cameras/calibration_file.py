@@ -66,20 +66,33 @@ _Pixels = Annotated[
 ]
 
 
-class _View(Schema):
+class CalibratedView(Schema):
     """Camera of a calibration file; see `load_calibration`."""
 
     section = ''
 
-    width: _Pixels
-    height: _Pixels
-    K: Annotated[Any, AfterValidator(_intrinsics)]
-    distortion_model: str = 'none'
-    distortion: ListOf[Number] = ()
-    mount_link: str
-    T_mount_camera: Annotated[Any, AfterValidator(_rigid)] = None
-    position: ListOf[Metres] = ()
-    quaternion_xyzw: ListOf[Quaternion] = ()
+    width: _Pixels = Field(description='width of the images that K is for [px]')
+    height: _Pixels = Field(description='height of the images that K is for [px]')
+    K: Annotated[Any, AfterValidator(_intrinsics)] = Field(
+        description='fx, fy, cx, cy, or a 3 x 3 matrix [px]'
+    )
+    distortion_model: str = Field(
+        default='none', description='none, plumb_bob, rational_polynomial or equidistant (fisheye)'
+    )
+    distortion: ListOf[Number] = Field(
+        default=(), description="coefficients of the model, in OpenCV's order"
+    )
+    mount_link: str = Field(description='link that carries the camera')
+    T_mount_camera: Annotated[Any, AfterValidator(_rigid)] = Field(
+        default=None, description='pose of the optical frame in `mount_link`, 4 x 4 [m]'
+    )
+    position: ListOf[Metres] = Field(
+        default=(),
+        description='x, y, z of the optical frame in `mount_link` [m], without a matrix',
+    )
+    quaternion_xyzw: ListOf[Quaternion] = Field(
+        default=(), description='rotation of the optical frame in `mount_link`, without a matrix'
+    )
 
     def camera(self, view: str) -> CameraModel:
         """Return the camera.
@@ -143,7 +156,7 @@ def save_calibration(path: Path | str, cameras: Mapping[str, CameraModel]) -> No
 
 
 def _camera(view: str, row: Any, where: str) -> CameraModel:
-    given = validated(_View, row, where, error=CalibrationError)
+    given = validated(CalibratedView, row, where, error=CalibrationError)
     try:
         camera = given.camera(view)
         check_plausible(camera)

@@ -43,13 +43,17 @@ class Written(Schema):
     """Description and encoding of the episodes that an import writes."""
 
     task: str = Field(default='', description='name of the task; empty = none')
-    outcome: Annotated[str, AfterValidator(check_outcome)] = 'unknown'
+    outcome: Annotated[str, AfterValidator(check_outcome)] = Field(
+        default='unknown', description='success, failure or unknown'
+    )
     objects: ListOf[str] = Field(default=(), description='names of the objects')
     chunk_s: Seconds = Field(default=3.2, description='length of a joint trajectory message [s]')
     limit_tolerance: Length = Field(
         default=0.05, description='positions further outside the joint limits fail [rad or m]'
     )
-    jpeg_quality: int = Field(default=95, ge=1, le=100)
+    jpeg_quality: int = Field(
+        default=95, ge=1, le=100, description='quality of the JPEG images that are written'
+    )
 
 
 class BagMapping(Written):
@@ -60,11 +64,13 @@ class BagMapping(Written):
         description="name of a bundled robot or a robot's YAML relative to this file; empty = "
         'the one of `/robot_description`',
     )
-    namespace: str = Field(default='', description='of the robot, e.g. `left_arm`')
+    namespace: str = Field(default='', description='namespace of the robot, e.g. `left_arm`')
     views: dict[str, Annotated[ViewSource, BeforeValidator(_view)]] = Field(
         default={}, description='topic of the images by view; empty = `<view>/image_raw`'
     )
-    joint_states: str = 'joint_states'
+    joint_states: str = Field(
+        default='joint_states', description='topic of the measured positions (JointState)'
+    )
     joints: dict[str, str] = Field(
         default={}, description="the robot's name of a joint, by the recorded one"
     )
@@ -86,10 +92,14 @@ class BagMapping(Written):
         description='views and streams (`joint_states`, `action`, arms of `tools`) whose receive '
         "times are taken in place of their headers' stamps",
     )
-    robot_description: str = 'robot_description'
-    tf_prefix: str = Field(default='', description='of frame names in TF, removed')
-    instruction_topic: str = 'instruction'
-    instruction: str = Field(default='', description='of the robot; empty = the topic')
+    robot_description: str = Field(
+        default='robot_description', description='topic of the URDF, without `robot`'
+    )
+    tf_prefix: str = Field(default='', description='prefix of frame names in TF, which is removed')
+    instruction_topic: str = Field(default='instruction', description='topic of the instruction')
+    instruction: str = Field(
+        default='', description='text for the robot; empty = the messages of `instruction_topic`'
+    )
 
     def topic(self, name: str) -> str:
         """Return the absolute name of a topic."""

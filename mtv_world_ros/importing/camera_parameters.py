@@ -32,18 +32,28 @@ class CameraParameters(Schema):
     file: str | None = Field(
         default=None, description='JSON, may hold `{episode_index}`; null = features'
     )
-    intrinsics: str
-    extrinsics: str | None = None
-    rotation: str | None = None
-    translation: str | None = None
-    pose: Literal['camera_in_mount', 'mount_in_camera'] = 'camera_in_mount'
-    axes: Literal['opencv', 'opengl'] = 'opencv'
-    quaternion: Literal['xyzw', 'wxyz'] = 'xyzw'
-    unit: Unit = Field(default='m', description='of the translation')
-    distortion: str | None = None
-    distortion_model: str | None = None
+    intrinsics: str = Field(description='path of K, or of fx, fy, cx and cy [px]')
+    extrinsics: str | None = Field(default=None, description='path of the pose as a matrix')
+    rotation: str | None = Field(
+        default=None, description='path of the rotation, with `translation` in place of a matrix'
+    )
+    translation: str | None = Field(default=None, description='path of the translation')
+    pose: Literal['camera_in_mount', 'mount_in_camera'] = Field(
+        default='camera_in_mount', description='what the pose maps: from camera to mount, or back'
+    )
+    axes: Literal['opencv', 'opengl'] = Field(
+        default='opencv', description='axes of the camera: z ahead (OpenCV) or backward (OpenGL)'
+    )
+    quaternion: Literal['xyzw', 'wxyz'] = Field(
+        default='xyzw', description='order of a rotation with four numbers'
+    )
+    unit: Unit = Field(default='m', description='unit of the translation')
+    distortion: str | None = Field(default=None, description='path of the coefficients')
+    distortion_model: str | None = Field(
+        default=None, description='model of the distortion, see the calibration file'
+    )
     size: Pair | None = Field(default=None, description='width and height that K is for [px]')
-    mount_link: str
+    mount_link: str = Field(description='link that carries the camera')
     moves: bool = Field(
         default=False,
         description='the pose is a feature that changes from row to row: a camera that no joint '
@@ -74,11 +84,13 @@ class CameraSource(Schema):
     """Source of a view: image feature and calibration."""
 
     view: str = Field(default='', description='its name; set by the mapping')
-    feature: str = Field(description='of its images')
+    feature: str = Field(description='feature of the images')
     calibration: Annotated[Path | None, BeforeValidator(_is_there)] = Field(
         default=None, description='YAML with this view'
     )
-    camera: CameraParameters | None = None
+    camera: CameraParameters | None = Field(
+        default=None, description="the dataset's own camera parameters, in place of a file"
+    )
 
     @model_validator(mode='after')
     def _has_one_source(self) -> Self:

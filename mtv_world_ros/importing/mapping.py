@@ -44,7 +44,9 @@ class Stream(JointTable):
     feature: str | Annotated[ListOf[str], Field(min_length=1)] = Field(
         description='name in the dataset, or a list of names'
     )
-    joints: JointEntries | None = None
+    joints: JointEntries | None = Field(
+        default=None, description='column of each joint; null = columns have their names'
+    )
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -173,7 +175,9 @@ class DatasetMapping(Written):
     outcome_feature: str = Field(
         default='', description='feature that is true in a frame of an episode that succeeds'
     )
-    jpeg_quality: int = Field(default=90, ge=1, le=100)
+    jpeg_quality: int = Field(
+        default=90, ge=1, le=100, description='quality of the JPEG images that are written'
+    )
     _key: str = PrivateAttr(default='')
     _robot_file: Path = PrivateAttr(default=Path())
 

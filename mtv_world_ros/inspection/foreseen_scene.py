@@ -54,15 +54,15 @@ LONGEST_S = 120.0
 class SolidEntry(Schema):
     """An object: a box, or an upright cylinder."""
 
-    name: str
+    name: str = Field(description='name; that of a vessel makes it hollow')
     centre: Annotated[tuple[Metres, Metres, Metres], Strict(False)] = Field(
         description='x, y, z in the base frame [m]'
     )
     size: Annotated[tuple[Length, Length, Length], Strict(False)] = Field(
-        description='along its own x, y, z [m]'
+        description='extents along its own x, y, z [m]'
     )
-    yaw: float = Field(default=0.0, ge=-10, le=10, description='[rad]')
-    round: bool = False
+    yaw: float = Field(default=0.0, ge=-10, le=10, description='turn about the vertical [rad]')
+    round: bool = Field(default=False, description='whether it is a cylinder, else a box')
 
     def solid(self) -> Solid:
         """Return the object as foresight takes it."""
@@ -78,12 +78,18 @@ class SolidEntry(Schema):
 class SceneFile(Schema):
     """Objects, and a plan of joint positions."""
 
-    objects: ListOf[SolidEntry] = Field(min_length=1, max_length=50)
-    joints: ListOf[str] | None = Field(default=None, description="null = the robot's order")
-    times: ListOf[Annotated[float, Field(ge=0, le=LONGEST_S)]] = Field(
-        min_length=2, description='of the positions, increasing; the first is 0 [s]'
+    objects: ListOf[SolidEntry] = Field(
+        min_length=1, max_length=50, description='objects on the table'
     )
-    positions: ListOf[ListOf[Position]] = Field(description='a row a time [rad or m]')
+    joints: ListOf[str] | None = Field(
+        default=None, description="order of the joints in `positions`; null = the robot's"
+    )
+    times: ListOf[Annotated[float, Field(ge=0, le=LONGEST_S)]] = Field(
+        min_length=2, description='times of the positions, increasing; the first is 0 [s]'
+    )
+    positions: ListOf[ListOf[Position]] = Field(
+        description='joint positions, a row a time [rad or m]'
+    )
 
     @model_validator(mode='after')
     def _is_told_apart_and_begins_now(self) -> Self:

@@ -48,7 +48,7 @@ class LeRobotConfig(ServerMapping):
     tls: bool = Field(
         default=False, description='encrypt, and check the certificate of the server'
     )
-    policy: LeRobotPolicySettings
+    policy: LeRobotPolicySettings = Field(description='policy that the server loads')
 
     @model_validator(mode='after')
     def _fits_the_protocol(self) -> Self:

@@ -42,12 +42,14 @@ Key = Annotated[
 class ImageInput(Schema):
     """One image of a request."""
 
-    key: Key = Field(description='where it goes')
-    view: str
+    key: Key = Field(description='key of the request that gets the image')
+    view: str = Field(description='name of the view')
     width: int = Field(
-        default=0, ge=0, le=16_384, description='that the server wants [px]; 0 = as it is'
+        default=0, ge=0, le=16_384, description='width that the server wants [px]; 0 = unchanged'
     )
-    height: int = Field(default=0, ge=0, le=16_384, description='see `width`')
+    height: int = Field(
+        default=0, ge=0, le=16_384, description='height that the server wants [px]; 0 = unchanged'
+    )
     layout: Literal['hwc', 'chw'] = Field(default='hwc', description='order of the axes')
     fit: Literal['pad', 'stretch'] = Field(
         default='pad', description='`pad` keeps the aspect ratio and fills with black'
@@ -235,9 +237,9 @@ class ActionOutput(JointTable):
 class ServerMapping(Schema):
     """Inputs and outputs of a server: part of a policy file."""
 
-    images: ListOf[ImageInput] = ()
-    state: ListOf[StateInput] = ()
-    actions: ActionOutput
+    images: ListOf[ImageInput] = Field(default=(), description='images of a request')
+    state: ListOf[StateInput] = Field(default=(), description='vectors of measured positions')
+    actions: ActionOutput = Field(description='actions of an answer')
 
 
 def fitted(frame: ByteArray, width: int, height: int, fit: str = 'pad') -> ByteArray:

@@ -46,7 +46,7 @@ class PolicyEntry(Schema):
 
     name: Annotated[
         str, Field(pattern=_NAME), expected('letters, digits and . _ -, e.g. act_late')
-    ] = Field(description='under which its results are listed')
+    ] = Field(description='name under which its results are listed')
     policy: str | dict[str, Any] = Field(
         description='a scripted policy, a policy file, or what stands in one (`kind: ...`)'
     )
@@ -61,7 +61,7 @@ class PolicyEntry(Schema):
         default=120.0, description='longest wait until the server listens [s]'
     )
     tasks: ListOf[str] = Field(
-        default=(), description='that it is ranked on; empty = all of `--tasks`'
+        default=(), description='tasks that it is ranked on; empty = all of `--tasks`'
     )
 
     @model_validator(mode='after')
@@ -74,7 +74,7 @@ class PolicyEntry(Schema):
 class PolicyList(Schema):
     """A file of policies."""
 
-    policies: ListOf[PolicyEntry] = Field(min_length=1)
+    policies: ListOf[PolicyEntry] = Field(min_length=1, description='policies that are ranked')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

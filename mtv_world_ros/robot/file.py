@@ -158,7 +158,9 @@ class PoseEntry(Schema):
     """A pose, by default the identity."""
 
     position: ListOf[Metres] = Field(default=(0, 0, 0), description='x, y, z [m]')
-    quaternion_xyzw: ListOf[Quaternion] = (0, 0, 0, 1)
+    quaternion_xyzw: ListOf[Quaternion] = Field(
+        default=(0, 0, 0, 1), description='rotation as a quaternion'
+    )
 
     @model_validator(mode='after')
     def _is_a_pose(self) -> Self:
@@ -173,9 +175,9 @@ class PoseEntry(Schema):
 class JointEntry(Schema):
     """A joint that moves between two limits [rad or m]."""
 
-    joint: str
-    lower: Position
-    upper: Position
+    joint: str = Field(description='name of the joint')
+    lower: Position = Field(description='lower limit [rad or m]')
+    upper: Position = Field(description='upper limit [rad or m]')
 
     @model_validator(mode='after')
     def _limits_are_in_order(self) -> Self:
@@ -187,21 +189,23 @@ class JointEntry(Schema):
 class DhEntry(JointEntry):
     """A row of a Denavit-Hartenberg table [m, rad]; its link is named `<joint>_link`."""
 
-    a: Metres
-    alpha: Position
-    d: Metres
-    theta: Position = 0.0
-    type: Literal['revolute', 'prismatic'] = 'revolute'
+    a: Metres = Field(description='link length [m]')
+    alpha: Position = Field(description='link twist [rad]')
+    d: Metres = Field(description='link offset [m]')
+    theta: Position = Field(default=0.0, description='joint angle at position 0 [rad]')
+    type: Literal['revolute', 'prismatic'] = Field(
+        default='revolute', description='whether the joint turns or slides'
+    )
 
 
 class DhArmEntry(PoseEntry):
     """An arm as a Denavit-Hartenberg table; its pose is that of frame 0 in the base."""
 
-    arm: str
+    arm: str = Field(description='name of the arm')
     convention: Literal['standard', 'modified'] = Field(
-        default='standard', description='`modified` is Craig'
+        default='standard', description="`modified` is J. Craig's"
     )
-    joints: ListOf[DhEntry]
+    joints: ListOf[DhEntry] = Field(description='rows of the table, from the base on')
     gripper: JointEntry | None = Field(
         default=None, description="a slide along the last frame's z"
     )
@@ -210,29 +214,35 @@ class DhArmEntry(PoseEntry):
 class MimicEntry(Schema):
     """A joint that follows another one."""
 
-    joint: str
-    source: str
-    multiplier: Position = 1.0
-    offset: Position = 0.0
+    joint: str = Field(description='joint that follows')
+    source: str = Field(description='joint that is followed')
+    multiplier: Position = Field(default=1.0, description='position per position of `source`')
+    offset: Position = Field(default=0.0, description='position where `source` is at 0 [rad or m]')
 
 
 class ToolEntry(PoseEntry):
     """The tool of an arm; its pose is that of the tool in its link."""
 
-    arm: str
-    link: str
-    gripper_joint: str | None = None
-    gripper_closed: Position = Field(default=0.0, description="the gripper joint's, [rad or m]")
-    gripper_open: Position = Field(default=1.0, description="the gripper joint's, [rad or m]")
+    arm: str = Field(description='name of the arm')
+    link: str = Field(description='link that carries the tool')
+    gripper_joint: str | None = Field(
+        default=None, description='joint that opens the gripper; null = no gripper'
+    )
+    gripper_closed: Position = Field(
+        default=0.0, description='position of the gripper joint when closed [rad or m]'
+    )
+    gripper_open: Position = Field(
+        default=1.0, description='the same when open [rad or m]; either may be the larger'
+    )
     finger_travel_m: float | None = Field(
-        default=None, ge=-1, le=1, description='way of a finger from closed to open [m]'
+        default=None, ge=-1, le=1, description='travel of each finger from closed to open [m]'
     )
 
 
 class RobotFile(Schema):
     """A robot file: `urdf` or `dh`, and the tools."""
 
-    name: str
+    name: str = Field(description='name of the robot; episodes and checkpoints name it')
     urdf: str | None = Field(default=None, description='file, relative to the YAML')
     dh: ListOf[DhArmEntry] | None = Field(default=None, description='arms, in place of a URDF')
     base_link: str | None = Field(default=None, description="null = the URDF's root, or `base`")
@@ -240,7 +250,7 @@ class RobotFile(Schema):
         default=None, description='order of position vectors; null = all that move by themselves'
     )
     mimic: ListOf[MimicEntry] = Field(default=(), description="added to the URDF's own")
-    tools: ListOf[ToolEntry]
+    tools: ListOf[ToolEntry] = Field(description='one an arm')
 
     @model_validator(mode='after')
     def _has_one_description(self) -> Self:

@@ -40,7 +40,9 @@ class JointColumn:
 class ColumnEntry(Schema):
     """Source of a joint's values: a column with unit, sign and offset, or with a range."""
 
-    column: Annotated[int | str | None, expected('a name or a number')] = None
+    column: Annotated[int | str | None, expected('a name or a number')] = Field(
+        default=None, description='name or number of the column'
+    )
     unit: Unit | None = Field(default=None, description="null = that of the joints' table")
     sign: float = Field(default=1, ge=-1, le=1, description='1 or -1')
     offset: Number = Field(default=0.0, description='added last [rad or m]')
@@ -105,8 +107,11 @@ class JointTable(Schema):
 
     allow_missing: ClassVar[bool] = False
 
-    unit: Unit = Field(default='rad', description='of joints that say no other')
-    joints: JointEntries | None
+    unit: Unit = Field(default='rad', description='unit of joints without one of their own')
+    joints: JointEntries | None = Field(
+        description='column of each joint: its name or number, or a mapping; null = columns have '
+        'the names of the joints'
+    )
     _columns: tuple[JointColumn, ...] = PrivateAttr(default=())
     _joint_names: tuple[str, ...] = PrivateAttr(default=())
 

@@ -39,12 +39,12 @@ class VideoConfig(Schema):
 
     section: ClassVar = 'video'
 
-    views: ListOf[str] = ('low', 'high')
+    views: ListOf[str] = Field(default=('low', 'high'), description='names of the views')
     fps: float = Field(default=5.0, gt=0, le=1000, description='frames a second')
     num_frames: Count = Field(default=16, description='T, predicted frames of a chunk')
-    width: Count = Field(default=96, description='[px]')
-    height: Count = Field(default=72, description='[px]')
-    robot: str = 'yam_bimanual'
+    width: Count = Field(default=96, description='width of a frame [px]')
+    height: Count = Field(default=72, description='height of a frame [px]')
+    robot: str = Field(default='yam_bimanual', description='bundled robot, or a robot YAML')
     control: Annotated[str, AfterValidator(check_control_name)] = Field(
         default=TRAJECTORY_VIDEO,
         description='how a plan enters the model: trajectory_video (the paper), policy2vec, '
@@ -174,7 +174,7 @@ class SamplingConfig(Schema):
         default=1.0,
         ge=-1000,
         le=1000,
-        description='of models with text; 1 = no guidance, and half the work',
+        description='text guidance; 1 = none, which halves the time',
     )
     negative_prompt: str = Field(default='', description='text that guidance leads away from')
 
@@ -185,9 +185,9 @@ class OptimizerConfig(Schema):
     section: ClassVar = 'optimizer'
 
     learning_rate: float = Field(default=6e-4, ge=0, le=100, description='after the warm-up')
-    weight_decay: Weight = 0.01
+    weight_decay: Weight = Field(default=0.01, description='weight decay of AdamW')
     warmup_steps: int = Field(
-        default=200, description='of the learning rate; at most a fifth of the steps'
+        default=200, description='steps of the warm-up; at most a fifth of all steps'
     )
     decay_share: Share = Field(
         default=0.35, description='share of the steps in which the rate decays'
@@ -195,7 +195,9 @@ class OptimizerConfig(Schema):
     max_grad_norm: float = Field(
         default=1.0, gt=0, le=1e6, description='longer gradients are scaled down to it'
     )
-    ema_decay: Share = Field(default=0.999, description='of the averaged weights, the checkpoint')
+    ema_decay: Share = Field(
+        default=0.999, description='decay of the averaged weights, which become the checkpoint'
+    )
     batch_size: int = Field(
         default=4, description='clips of a step, over all processes and accumulated parts'
     )
@@ -209,7 +211,7 @@ class OptimizerConfig(Schema):
     compile: bool = Field(
         default=False, description="compile the transformer's repeated block; minutes on a CPU"
     )
-    steps: int = Field(default=5000, description='of the whole training')
+    steps: int = Field(default=5000, description='number of training steps')
     epochs: Annotated[float | None, expected('positive, or null')] = Field(
         default=None,
         gt=0,
@@ -240,7 +242,7 @@ class LoraSettings(Schema):
     rank: Annotated[int, expected('positive, at most 4096, or 0 for none')] = Field(
         default=0, ge=0, le=4096, description='0 = all weights are trained'
     )
-    alpha: Factor = 32.0
+    alpha: Factor = Field(default=32.0, description='scale of the adapter; divided by `rank`')
 
 
 class TrainingConfig(Schema):
@@ -253,15 +255,21 @@ class TrainingConfig(Schema):
     )
     autoencoder: dict[str, Any] = Field(default={}, description='arguments of the autoencoder')
     scheduler: dict[str, Any] = Field(default={}, description='arguments of the noise schedule')
-    video: VideoConfig = VideoConfig()
-    rendering: TrajectoryVideoConfig = TrajectoryVideoConfig()
-    objective: ObjectiveConfig = ObjectiveConfig()
-    augment: AugmentConfig = AugmentConfig()
-    history: HistoryConfig = HistoryConfig()
-    self_rollout: SelfRolloutConfig = SelfRolloutConfig()
-    sampling: SamplingConfig = SamplingConfig()
-    lora: LoraSettings = LoraSettings()
-    optimizer: OptimizerConfig = OptimizerConfig()
+    video: VideoConfig = Field(default=VideoConfig(), description='views, size, rate, robot')
+    rendering: TrajectoryVideoConfig = Field(
+        default=TrajectoryVideoConfig(), description='appearance of the trajectory video'
+    )
+    objective: ObjectiveConfig = Field(default=ObjectiveConfig(), description='loss')
+    augment: AugmentConfig = Field(default=AugmentConfig(), description='data augmentation')
+    history: HistoryConfig = Field(default=HistoryConfig(), description='earlier frames')
+    self_rollout: SelfRolloutConfig = Field(
+        default=SelfRolloutConfig(), description="clips from the model's own rollouts"
+    )
+    sampling: SamplingConfig = Field(
+        default=SamplingConfig(), description='sampling settings of the checkpoint'
+    )
+    lora: LoraSettings = Field(default=LoraSettings(), description='LoRA adapter')
+    optimizer: OptimizerConfig = Field(default=OptimizerConfig(), description='optimiser')
 
     @property
     def spec(self) -> WorldModelSpec:

@@ -56,7 +56,7 @@ TERMS = re.compile(
 
 @table('page', sorted((ROOT / 'docs').glob('*.md')))
 def test_terms_are_linked_to_the_glossary_where_a_page_uses_them_first(page):
-    if page.stem in ('glossary', 'parameters', 'commands'):
+    if page.stem in ('glossary', 'parameters', 'commands', 'configuration'):
         return
     text = re.sub(r'```.*?```|<!--.*?-->', '', page.read_text(), flags=re.S)
     used = TERMS.search(text)
@@ -71,14 +71,27 @@ def test_every_page_is_linked_from_the_index():
         assert f'({page.name})' in index or page.name == 'index.md', page.name
 
 
-def test_the_reference_of_commands_is_what_the_commands_say():
-    spec = importlib.util.spec_from_file_location('pages', ROOT / 'docs' / 'command_pages.py')
+def generator(name):
+    """Return a module of docs/ that writes a page."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / 'docs' / f'{name}.py')
     assert spec is not None
     assert spec.loader is not None
-    pages = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(pages)
-    written = (ROOT / 'docs' / 'commands.md').read_text()
-    assert written == pages.page(), 'write it again: python docs/command_pages.py'
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@table('name, page', [('command_pages', 'commands'), ('configuration_page', 'configuration')])
+def test_generated_pages_are_what_the_code_says(name, page):
+    written = (ROOT / 'docs' / f'{page}.md').read_text()
+    assert written == generator(name).page(), f'write it again: python docs/{name}.py'
+
+
+def test_every_key_of_a_configuration_file_has_a_meaning():
+    rows = re.findall(r'^\| `.*\|$', (ROOT / 'docs' / 'configuration.md').read_text(), re.M)
+    assert len(rows) > 200
+    assert not [row for row in rows if row.endswith('|  |') or 'see the guide' in row]
 
 
 def test_the_index_of_benchmarks_has_every_page():
