@@ -22,6 +22,7 @@ from mtv_world_ros.ranking.policy_list import load_policy_list
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.success.relations import KINDS
 from mtv_world_ros.success.task import load_task
+from test.support.pages import generator
 from test.support.tables import table
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -69,17 +70,6 @@ def test_every_page_is_linked_from_the_index():
     index = (ROOT / 'docs' / 'index.md').read_text()
     for page in (ROOT / 'docs').glob('*.md'):
         assert f'({page.name})' in index or page.name == 'index.md', page.name
-
-
-def generator(name):
-    """Return a module of docs/ that writes a page."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / 'docs' / f'{name}.py')
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @table('name, page', [('command_pages', 'commands'), ('configuration_page', 'configuration')])
