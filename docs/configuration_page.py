@@ -35,6 +35,7 @@ from mtv_world_ros.ranking.policy_list import PolicyList
 from mtv_world_ros.robot.file import RobotFile
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.physics import Physics
+from mtv_world_ros.simulation.tasks import SceneSpec
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.training.training_config import TrainingConfig
 from mtv_world_ros.vision.describers.describer_config import DescriberConfig
@@ -87,6 +88,13 @@ FILES = (
         'Task',
         "`--task FILE`, the node's `task`. The guide has the keys of every relation.",
         TaskSpec,
+        'tasks.md',
+        'tasks/stack_blocks_two.yaml',
+    ),
+    ConfigFile(
+        'Scene of a task',
+        'The key `scene` of a task, for the simulator.',
+        SceneSpec,
         'tasks.md',
         'tasks/stack_blocks_two.yaml',
     ),

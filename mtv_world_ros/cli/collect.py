@@ -18,7 +18,11 @@ def add(commands: argparse._SubParsersAction) -> None:
         description='Makes the episodes of a data set that are not there yet, its card '
         '(dataset.json, README.md) and a contact sheet.',
     )
-    parser.add_argument('--task', default='all', help="names, comma-separated, or 'all'")
+    parser.add_argument(
+        '--task',
+        default='all',
+        help="names, or YAML files with a scene, comma-separated; or 'all'",
+    )
     parser.add_argument(
         '--robot',
         default='yam_bimanual',

@@ -61,7 +61,14 @@ def _draw_object(
     role: ObjectRole, side: float, taken: set[str], rng: Rng, scale: float
 ) -> SceneObject:
     """Draw an object of a role in a free colour; `side` -1 exchanges left and right."""
-    name = str(rng.choice([shape for shape in role.shapes if SHAPES[shape].free(taken)]))
+    free = [shape for shape in role.shapes if SHAPES[shape].free(taken)]
+    if not free:
+        raise SimulatorError(
+            f"no colour is left for role '{role.role}' ({', '.join(role.shapes)}): the other "
+            f"objects are {', '.join(sorted(taken))}; give scene.roles of the task's file fewer "
+            'roles or other shapes'
+        )
+    name = str(rng.choice(free))
     shape = SHAPES[name]
     word = str(rng.choice([word for word in shape.colours if word not in taken]))
     x, y, z = shape.size(float(rng.uniform(*role.size_share)))
@@ -143,7 +150,7 @@ def draw_scene(
     else:
         raise SimulatorError(
             f"no feasible placement for task '{task.name}' in {MAX_DRAWS} draws; widen x_range "
-            'and y_range of its roles (config/scenes.yaml) or lower the clearance '
+            "and y_range of its roles (scene.roles of the task's file) or lower the clearance "
             '(workcell.yaml)'
         )
     cameras = tuple(

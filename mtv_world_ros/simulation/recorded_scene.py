@@ -11,6 +11,7 @@ from pydantic import TypeAdapter
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.core.bounded_input import parse_json
+from mtv_world_ros.core.config import validated
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.episode import CALIBRATION_FILE, Episode, NOMINAL, PHYSICS
 from mtv_world_ros.data.episode_reader import read_episode
@@ -18,11 +19,14 @@ from mtv_world_ros.simulation.physics import physics_named
 from mtv_world_ros.simulation.randomize import draw_scene
 from mtv_world_ros.simulation.scene import Place, Scene, SceneLook, SceneObject
 from mtv_world_ros.simulation.simulator import scene_generator
-from mtv_world_ros.simulation.tasks import Task, task_named
+from mtv_world_ros.simulation.tasks import Task, task_named, TASKS
 from mtv_world_ros.simulation.workcell import Workcell
+from mtv_world_ros.success.task import TaskSpec
 
 #: key of the metadata that holds objects, look and goals
 SCENE = 'drawn_scene'
+#: key of the metadata that holds the definition of a task that is not a bundled one
+TASK_DEFINITION = 'task_definition'
 #: a scene that is drawn anew has its objects where they were recorded, up to this [m]
 _SAME_PLACE_M = 1e-3
 
@@ -37,6 +41,15 @@ def dump_scene(scene: Scene) -> str:
     return json.dumps({'objects': objects, 'look': asdict(scene.look), 'goals': scene.goals})
 
 
+def dump_task(task: Task) -> dict[str, str]:
+    """Return the metadata of a task's definition as JSON; empty for a bundled task."""
+    name = task.name
+    if name in TASKS and TASKS[name].definition == task.definition:
+        return {}
+    values = task.definition.model_dump(mode='json', exclude_unset=True, serialize_as_any=True)
+    return {TASK_DEFINITION: json.dumps(values)}
+
+
 def recorded_scene(path: Path, workcell: Workcell) -> tuple[Task, Scene]:
     """Return task and scene of a simulated episode.
 
@@ -49,7 +62,25 @@ def recorded_scene(path: Path, workcell: Workcell) -> tuple[Task, Scene]:
         SimulatorError: there is no such task.
     """
     episode = read_episode(path, with_cameras=False, with_masks=False)
-    return task_named(episode.info.task), scene_of(episode, workcell)
+    return recorded_task(episode), scene_of(episode, workcell)
+
+
+def recorded_task(episode: Episode) -> Task:
+    """Return the task of a simulated episode: the stored one, else the bundled one of its name.
+
+    Raises:
+        ConfigError: the stored definition cannot be used.
+        SimulatorError: there is no such task.
+    """
+    stored = episode.info.metadata.get(TASK_DEFINITION)
+    if stored is None:
+        return task_named(episode.info.task)
+    where = f"'{TASK_DEFINITION}' of '{episode.info.path}'"
+    try:
+        values = parse_json(stored, where)
+    except ValueError as error:
+        raise EpisodeError(f'{where} cannot be used: {error}') from error
+    return Task.of(validated(TaskSpec, values, where), where)
 
 
 def scene_of(episode: Episode, workcell: Workcell) -> Scene:
@@ -107,7 +138,7 @@ def _drawn(episode: Episode, workcell: Workcell) -> Scene:
         )
     physics = physics_named(info.metadata.get(PHYSICS, NOMINAL))
     workcell = physics.workcell(workcell)
-    scene = draw_scene(task_named(info.task), scene_generator(info.seed), workcell)
+    scene = draw_scene(recorded_task(episode), scene_generator(info.seed), workcell)
     drawn = np.array([item.position for item in scene.objects])
     recorded = poses.T_base_object[0, :, :3, 3]
     if drawn.shape != recorded.shape or np.abs(drawn - recorded).max() > _SAME_PLACE_M:

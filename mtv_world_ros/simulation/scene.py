@@ -121,7 +121,7 @@ def check_cameras(scene: Scene, base_link: str) -> None:
             raise SimulatorError(
                 f"camera '{camera.view}' does not see {', '.join(hidden)} as a whole; move its "
                 'target or widen visible_width (workcell.yaml), or narrow the region of '
-                'the objects (config/scenes.yaml)'
+                "the objects (scene.roles of the task's file)"
             )
 
 

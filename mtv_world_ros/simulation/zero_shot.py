@@ -11,7 +11,14 @@ from mtv_world_ros.core.errors import nearest, SimulatorError
 from mtv_world_ros.simulation.cameras import CameraMoves, moved
 from mtv_world_ros.simulation.randomize import RandomizationConfig
 from mtv_world_ros.simulation.shapes import SHAPES
-from mtv_world_ros.simulation.tasks import ObjectRole, PickPlace, Shake, Task, task_named
+from mtv_world_ros.simulation.tasks import (
+    ANY_SIZE,
+    ObjectRole,
+    PickPlace,
+    Shake,
+    Task,
+    task_named,
+)
 
 #: kinds of novelty: cameras, task or objects (paper, "Zero-Shot Ability")
 KINDS = ('view', 'task', 'object')
@@ -113,7 +120,7 @@ def _exchangeable(task: Task) -> tuple[str, ...]:
         for role in _movable(task)
         if role.role not in carriers | shaken
         and 'plate' not in role.shapes
-        and role.size_share == ObjectRole(role='').size_share
+        and role.size_share == ANY_SIZE
     )
 
 
@@ -125,7 +132,7 @@ def _with_unseen_objects(task: Task, rng: np.random.Generator) -> Task:
     return replace(
         task,
         roles=tuple(
-            replace(role, shapes=UNSEEN_SHAPES) if role.role in chosen else role
+            role.replace(shapes=UNSEEN_SHAPES) if role.role in chosen else role
             for role in task.roles
             if role.probability == 1
         ),

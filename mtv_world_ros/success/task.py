@@ -22,6 +22,11 @@ GRIPPERS = ('open', 'any')
 HELD_SAMPLES = 5
 #: maximum length of an object's name in an instruction; it bounds the matching time [characters]
 _LONGEST_NAME = 64
+#: error about a table of scenes, which version 0.1.0 read
+SCENES_REPLACED = (
+    "scenes are no longer read from a table: a task is one file, 'config/tasks/NAME.yaml' or your "
+    "own, and its entry of the table is its key 'scene' (docs/tasks.md)"
+)
 
 
 def _relation(data: Any) -> Relation:
@@ -69,6 +74,8 @@ class TaskSpec(Schema):
         gripper: `open`: every gripper has let go at the end; `any`: that does not matter.
         views: names of the views to look at; empty = all.
         softness_m: length that counts as one in the margins [m].
+        scene: objects on the table and moves of the expert, for the simulator; None = the task can
+            be judged, but not simulated. `simulation/tasks.py` reads it.
     """
 
     name: str
@@ -82,6 +89,7 @@ class TaskSpec(Schema):
     gripper: str = 'open'
     views: _Words = ()
     softness_m: Length = 0.01
+    scene: dict[str, Any] | None = None
 
     @model_validator(mode='after')
     def _is_about_the_instruction(self) -> Self:
@@ -166,7 +174,16 @@ def load_task(path: Path) -> TaskSpec:
         ConfigError: the file is no YAML mapping, a key is unknown or missing, a value is wrong.
     """
     values = read_yaml(path, 'task file', 'task')
+    if isinstance(values, Mapping) and _is_table_of_scenes(values):
+        raise ConfigError(f'{path}: {SCENES_REPLACED}')
     return validated(TaskSpec, values, str(path))
+
+
+def _is_table_of_scenes(values: Mapping[str, Any]) -> bool:
+    return bool(values) and all(
+        isinstance(scene, Mapping) and {'roles', 'moves'} <= set(scene)
+        for scene in values.values()
+    )
 
 
 def load_tasks(folder: Path) -> tuple[TaskSpec, ...]:

@@ -20,6 +20,7 @@ from mtv_world_ros.importing.object_boxes import load_object_boxes
 from mtv_world_ros.policies.policy import load_policy_config
 from mtv_world_ros.ranking.policy_list import load_policy_list
 from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.simulation.tasks import Task
 from mtv_world_ros.success.relations import KINDS
 from mtv_world_ros.success.task import load_task
 from test.support.pages import generator
@@ -72,7 +73,14 @@ def test_every_page_is_linked_from_the_index():
         assert f'({page.name})' in index or page.name == 'index.md', page.name
 
 
-@table('name, page', [('command_pages', 'commands'), ('configuration_page', 'configuration')])
+@table(
+    'name, page',
+    [
+        ('command_pages', 'commands'),
+        ('configuration_page', 'configuration'),
+        ('task_table', 'tasks'),
+    ],
+)
 def test_generated_pages_are_what_the_code_says(name, page):
     written = (ROOT / 'docs' / f'{page}.md').read_text()
     assert written == generator(name).page(), f'write it again: python docs/{name}.py'
@@ -82,6 +90,12 @@ def test_every_key_of_a_configuration_file_has_a_meaning():
     rows = re.findall(r'^\| `.*\|$', (ROOT / 'docs' / 'configuration.md').read_text(), re.M)
     assert len(rows) > 200
     assert not [row for row in rows if row.endswith('|  |') or 'see the guide' in row]
+
+
+def test_every_task_is_in_the_table_of_tasks():
+    written = (ROOT / 'docs' / 'tasks.md').read_text()
+    for path in (ROOT / 'config' / 'tasks').rglob('*.yaml'):
+        assert f'(../{path.relative_to(ROOT)})' in written
 
 
 def test_the_index_of_benchmarks_has_every_page():
@@ -123,7 +137,8 @@ def test_yaml_in_the_pages_can_be_used(block, tmp_path):
     if 'relations' in values:
         for name in re.findall(r'\w+\.png', block):
             cv2.imwrite(str(tmp_path / name), np.full((72, 96, 3), 255, np.uint8))
-        load_task(file)
+        task = load_task(file)
+        assert task.scene is None or Task.of(task, block).name == task.name
     elif 'dh' in values or 'urdf' in values:
         (tmp_path / 'my_robot.urdf').write_text(URDF)
         load_robot(file)

@@ -31,6 +31,7 @@ from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.joint_plans import read_plan
 from mtv_world_ros.importing.recover import recover
 from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.simulation.tasks import Task
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from test.robustness import parameter_calls, wild_numbers, wild_plans, wild_scenes
@@ -119,6 +120,12 @@ def _reads(name: str, function: str, *more: Callable[[], Any]) -> Callable[[byte
 
 def _config(folder: str) -> Callable[[], list[bytes]]:
     return lambda: [file.read_bytes() for file in share_path('config').glob(f'{folder}.yaml')]
+
+
+def _read_task(data: bytes, folder: Path) -> Any:
+    """With its scene, as `collect` reads it."""
+    path = _file(folder / 'task.yaml', data)
+    return Task.of(load_task(path), str(path))
 
 
 def _read_robot(data: bytes, folder: Path) -> Any:
@@ -446,7 +453,7 @@ KINDS = {
     'robot': Kind(_config('robots/*/robot'), _read_robot),
     'urdf': Kind(_urdfs, _read_urdf),
     'COLLADA': Kind(_colladas, _read_collada),
-    'task': Kind(_config('tasks/*'), lambda d, f: load_task(_file(f / 'task.yaml', d))),
+    'task': Kind(_config('tasks/*'), _read_task),
     'policy': Kind(_config('policies/*'), READS_POLICY),
     'policy list': Kind(
         _config('rankings/*'),
@@ -497,8 +504,7 @@ KINDS = {
     'checkpoint, numbers': Kind(
         CHECKPOINT_PARTS, judged(LOADS_CHECKPOINT, wild_numbers.plausible_checkpoint), 20.0,
         with_wild_number, 0.1),
-    'task, numbers': Kind(_config('tasks/*'), lambda d, f: load_task(_file(f / 'task.yaml', d)),
-                          damage=with_wild_number),
+    'task, numbers': Kind(_config('tasks/*'), _read_task, damage=with_wild_number),
     'policy, numbers': Kind(_config('policies/*'), READS_POLICY, damage=with_wild_number),
     'preset, numbers': Kind(_config('models/*'), READS_PRESET, damage=with_wild_number),
     'weights, numbers': Kind(

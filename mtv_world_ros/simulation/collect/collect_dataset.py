@@ -68,7 +68,7 @@ def collect(
     are there already are kept, so an interrupted run is continued by starting it again.
 
     Args:
-        tasks: names, comma-separated names, or `all`.
+        tasks: names or YAML files of tasks, also comma-separated, or `all`.
         num_episodes: episodes per task; of zero-shot sets, in all.
         seed: the data set's random seed.
         out: folder of the data set; one episode folder appears in it at a time.

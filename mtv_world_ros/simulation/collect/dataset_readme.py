@@ -22,6 +22,7 @@ from mtv_world_ros.simulation.tasks import TASKS
 README_FILE = 'README.md'
 KEYS = {
     'task': 'name of the task',
+    'task_definition': 'JSON of a task that is not among the bundled ones, with its scene',
     'instruction': 'what the robot is told, also on `/instruction`',
     'objects': 'JSON list of names; masks number them from 1',
     'outcome': '`success`: the task was done at some frame and in the last five; else `failure`',
@@ -86,10 +87,15 @@ def commands(card: Mapping[str, Any], entries: Iterable[CardEntry]) -> list[str]
         numbers.setdefault(highest + 1, []).append(task)
     ordinary = {name for name, task in TASKS.items() if not task.zero_shot}
     return [
-        f'mtv-world collect --task {"all" if set(names) == ordinary else ",".join(names)} '
+        f'mtv-world collect --task {"all" if set(names) == ordinary else _named(names)} '
         f'--episodes {number} {end}'
         for number, names in numbers.items()
     ]
+
+
+def _named(names: Sequence[str]) -> str:
+    """Return the names of tasks as an option; a task that is not a bundled one as its file."""
+    return ','.join(name if name in TASKS else f'{name}.yaml' for name in names)
 
 
 def _zero_shot_numbers(groups: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, int]]:

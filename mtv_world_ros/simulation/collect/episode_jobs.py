@@ -23,7 +23,7 @@ class CollectJob:
     """One episode to make.
 
     Attributes:
-        task: name of the task.
+        task: the task.
         index: number within the task, in a zero-shot set within its kind and task.
         seed: the data set's random seed.
         miss: whether the grasp misses.
@@ -32,7 +32,7 @@ class CollectJob:
         policy: name of the scripted policy that acts in place of the expert; empty = the expert.
     """
 
-    task: str
+    task: Task
     index: int
     seed: int
     miss: bool
@@ -100,7 +100,7 @@ def jobs_of(
         return jobs
     count = len(policies)
     first = {task.name: number * count // len(tasks) for number, task in enumerate(tasks)}
-    turns = [policies[(first[job.task] + job.index) % count] for job in jobs]
+    turns = [policies[(first[job.task.name] + job.index) % count] for job in jobs]
     return [replace(job, miss=False, policy=turn) for job, turn in zip(jobs, turns, strict=True)]
 
 
@@ -127,7 +127,7 @@ def _job(
 ) -> CollectJob:
     name = f'{task.name}_{index:05d}'
     return CollectJob(
-        task=task.name,
+        task=task,
         index=index,
         seed=seed,
         miss=misses(seed, task.name, index, kind, num_of_ten),

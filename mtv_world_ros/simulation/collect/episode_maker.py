@@ -21,7 +21,6 @@ from mtv_world_ros.simulation.faults.catalogue import draw_variant, parse_varian
 from mtv_world_ros.simulation.physics import physics_named
 from mtv_world_ros.simulation.randomize import RandomizationConfig
 from mtv_world_ros.simulation.simulator import SimEpisode
-from mtv_world_ros.simulation.tasks import task_named
 from mtv_world_ros.simulation.workcell import workcell_of
 from mtv_world_ros.simulation.zero_shot import variant, with_moved_cameras
 
@@ -97,7 +96,7 @@ class EpisodeMaker:
         """
         attempts = range(self._config.record.max_attempts)
         for attempt in attempts:
-            seed = episode_seed(job.seed, job.task, job.index, attempt, job.zero_shot)
+            seed = episode_seed(job.seed, job.task.name, job.index, attempt, job.zero_shot)
             sim, take = self._attempt(job, seed)
             try:
                 if take is not None and take.is_as_wanted():
@@ -105,7 +104,7 @@ class EpisodeMaker:
                     return
             finally:
                 sim.close()
-        episode = f"episode {job.index} of task '{job.task}' (seed {job.seed})"
+        episode = f"episode {job.index} of task '{job.task.name}' (seed {job.seed})"
         if job.policy:
             raise SimulatorError(
                 f"{episode}: policy '{job.policy}' cannot be carried out in any of "
@@ -120,7 +119,7 @@ class EpisodeMaker:
         """The episode of a seed; no take where its scene or plan is impossible."""
         config = self._config
         task, randomization = variant(
-            job.zero_shot, task_named(job.task), seed, config.randomization, config.zero_shot
+            job.zero_shot, job.task, seed, config.randomization, config.zero_shot
         )
         if job.zero_shot is None:
             randomization = cameras_of(seed, config)

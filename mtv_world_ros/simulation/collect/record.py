@@ -17,7 +17,7 @@ from mtv_world_ros.robot.resample import resample
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import ScriptedPolicy
 from mtv_world_ros.simulation.faults.catalogue import PolicyVariant
-from mtv_world_ros.simulation.recorded_scene import dump_scene, SCENE
+from mtv_world_ros.simulation.recorded_scene import dump_scene, dump_task, SCENE
 from mtv_world_ros.simulation.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
 from mtv_world_ros.simulation.tasks import Task
 from mtv_world_ros.success.task import ever_and_final
@@ -257,6 +257,7 @@ def write_take(
         'final': str(take.final).lower(),
         PHYSICS: sim.physics,
         SCENE: dump_scene(sim.scene),
+        **dump_task(sim.task),
         **extra,
     }
     with EpisodeWriter(

@@ -212,7 +212,7 @@ class ScriptedPolicy:
         if not isinstance(move, PickPlace):
             return [back]
         reference = move.subject if move.reference == other else move.reference
-        return [replace(move, subject=other, reference=reference), back]
+        return [move.replace(subject=other, reference=reference), back]
 
     def _seen(self, scene: Scene, rng: np.random.Generator) -> Scene:
         """The scene with the policy's errors of object and goal positions."""

@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_typestore, Stores
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.core.errors import EpisodeError, SimulatorError
+from mtv_world_ros.core.errors import EpisodeError, MtvWorldError, SimulatorError
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.simulation.collect.collect_dataset import collect, locked
@@ -22,11 +22,16 @@ from mtv_world_ros.simulation.collect.episode_jobs import episode_seed, jobs_of,
 from mtv_world_ros.simulation.collect.episode_maker import CollectConfig
 from mtv_world_ros.simulation.collect.record import RecordConfig
 from mtv_world_ros.simulation.randomize import RandomizationConfig
-from mtv_world_ros.simulation.recorded_scene import SCENE, scene_of
+from mtv_world_ros.simulation.recorded_scene import (
+    recorded_task,
+    SCENE,
+    scene_of,
+    TASK_DEFINITION,
+)
 from mtv_world_ros.simulation.simulator import situation_of
-from mtv_world_ros.simulation.tasks import task_named, tasks_named
+from mtv_world_ros.simulation.tasks import Task, task_named, tasks_named
 from mtv_world_ros.simulation.workcell import workcell_of
-from mtv_world_ros.success.task import ever_and_final
+from mtv_world_ros.success.task import ever_and_final, load_task
 
 SMALL = CollectConfig(randomization=RandomizationConfig(width=96, height=72))
 #: one of a single move and one of two, whose episodes are longer
@@ -36,6 +41,19 @@ COMMAND = (
     sys.executable, '-m', 'mtv_world_ros.cli', 'collect', '--task', TASKS, '--seed', str(SEED),
     '--width', '96', '--height', '72',
 )  # fmt: skip
+
+
+SHIFTED = """
+name: shift_right
+instruction: shift the {a} to the right
+relations: [{kind: shifted, subject: a, offset_m: [0.1, 0, 0]}]
+scene:
+  roles:
+    - {role: a, shapes: [cup], x_range: [-0.2, -0.15]}
+    - {role: b, x_range: [0.1, 0.2]}
+  moves:
+    - {subject: a, reference: start, offset: [0.1, 0.0]}
+"""
 
 
 def _collect(out, tasks=TASKS, episodes=2, seed=SEED, **options):
@@ -118,6 +136,40 @@ def test_the_command_says_what_was_made_and_draws_no_bar_into_a_file(data_set, t
     counted = ', '.join(f'{w} {n}' for w, n in (('failure', 4 - good), ('success', good)) if n)
     said = capsys.readouterr()
     assert said.out == f'4 episodes ({counted}): {out}\n' and '%|' not in said.err
+
+
+def test_a_task_of_ones_own_is_collected_and_known_again_from_its_episodes(tmp_path, opengl):
+    own = tmp_path / 'shift_right.yaml'
+    own.write_text(SHIFTED)
+    out = tmp_path / 'set'
+    (entry,) = collect(str(own), 1, SEED, out, config=SMALL, failures_of_ten=0, progress=False)
+    assert (entry.task, entry.outcome) == ('shift_right', 'success')
+    episode = read_episode(out / 'shift_right_00000')
+    assert episode.info.instruction.startswith('shift the ')
+    own.unlink()  # the episode has it
+    assert recorded_task(episode) == Task.of(load_task(_written(own)), 'own')
+    text = (out / 'README.md').read_text()
+    assert f'--task shift_right.yaml --episodes 1 --seed {SEED}' in text
+    assert 'JSON of a task that is not among the bundled ones' in text
+
+
+def _written(path):
+    path.write_text(SHIFTED)
+    return path
+
+
+def test_episodes_of_bundled_tasks_name_theirs_alone(data_set):
+    episode = read_episode(data_set / _names(data_set)[0])
+    assert TASK_DEFINITION not in episode.info.metadata
+    assert recorded_task(episode) is task_named(episode.info.task)
+
+
+@pytest.mark.parametrize('stored', ['{"name": ', '{"name": "x"}', '[1]'])
+def test_a_stored_task_that_cannot_be_used_is_named(stored, data_set):
+    episode = read_episode(data_set / _names(data_set)[0])
+    info = replace(episode.info, metadata={**episode.info.metadata, TASK_DEFINITION: stored})
+    with pytest.raises(MtvWorldError, match="'task_definition' of '.*"):
+        recorded_task(replace(episode, info=info))
 
 
 def test_unknown_policy_is_refused_before_anything_is_made(tmp_path, capsys):
@@ -314,7 +366,7 @@ def test_so_many_of_ten_episodes_of_a_task_are_to_miss(tmp_path, num):
     tasks = tasks_named('stack_blocks_two,shake_bottle')
     jobs = jobs_of(tasks, 20, 3, tmp_path, num)
     for task in tasks:
-        missed = [job.miss for job in jobs if job.task == task.name]
+        missed = [job.miss for job in jobs if job.task is task]
         assert sum(missed[:10]) == sum(missed[10:]) == num
 
 
@@ -323,10 +375,10 @@ def test_many_policies_come_up_in_few_episodes_as_each_task_begins_elsewhere(tmp
     tasks = tasks_named('stack_blocks_two,shake_bottle,place_cup_plate')
     few, more = (jobs_of(tasks, count, 3, tmp_path, policies=names) for count in (4, 24))
     assert {job.policy for job in few} == set(names)
-    turns = {(job.task, job.index): job.policy for job in more}
-    assert all(turns[job.task, job.index] == job.policy for job in few)  # a set may grow
+    turns = {(job.task.name, job.index): job.policy for job in more}
+    assert all(turns[job.task.name, job.index] == job.policy for job in few)  # a set may grow
     for task in tasks:
-        own = [job.policy for job in more if job.task == task.name]
+        own = [job.policy for job in more if job.task is task]
         assert all(own.count(name) == 2 for name in names)
 
 
