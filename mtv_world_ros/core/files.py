@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
+import ctypes
 import errno
 import fcntl
 import hashlib
@@ -21,6 +22,9 @@ from typing import Any
 from mtv_world_ros.core.errors import ConfigError, nearest
 
 PACKAGE = 'mtv_world_ros'
+#: arguments of renameat2(2): paths as they are, and exchange both [linux/fcntl.h, linux/fs.h]
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
 #: what the names of files in progress have besides the name [bytes]
 _OWN_NAME_BYTES = 24
 #: file of a robot in a folder of its own
@@ -282,6 +286,42 @@ def whole_folder(folder: Path) -> Iterator[Path]:
                 old.rename(folder)
             raise
     shutil.rmtree(waste, ignore_errors=True)
+
+
+def replace_folder(new: Path, folder: Path) -> None:
+    """Give a complete folder the name of another one, which is removed.
+
+    At every moment one of the two has the name, if the file system can exchange names (those of
+    Linux can; some on the network cannot).
+
+    Args:
+        new: complete folder on the same file system.
+        folder: folder that is replaced; a link stays a link.
+
+    Raises:
+        OSError: the folder cannot be replaced; the old one has the name.
+    """
+    folder = Path(os.path.realpath(folder))
+    if _exchange_names(new, folder):
+        shutil.rmtree(new, ignore_errors=True)
+        return
+    old = new.with_suffix('.old')
+    folder.rename(old)
+    try:
+        new.rename(folder)
+    except OSError:
+        old.rename(folder)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _exchange_names(one: Path, other: Path) -> bool:
+    """Exchange the names of two paths in one step; return whether the system can."""
+    exchange = getattr(ctypes.CDLL(None, use_errno=True), 'renameat2', None)
+    if exchange is None:
+        return False
+    names = os.fsencode(one), os.fsencode(other)
+    return exchange(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE) == 0
 
 
 def recover_folder(folder: Path) -> None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-import shutil
 
 from mtv_world_ros.core.errors import EpisodeError
-from mtv_world_ros.data.bag.metadata import parse_qos
+from mtv_world_ros.data.bag.copying import copy_companions, copy_metadata, write_copies
 from mtv_world_ros.data.bag.reader import BagReader
-from mtv_world_ros.data.bag.writer import BagWriter, RESERVE_NAME
+from mtv_world_ros.data.bag.writer import BagWriter
 
 #: folders of recordings in progress: .<name>.<random>.tmp
 _HIDDEN = '.*.tmp'
@@ -70,28 +69,16 @@ def recover(source: Path, out: Path | None = None) -> Recovered:
     counts: dict[str, int] = {}
     first_ns, last_ns = 2**63, 0
     with BagWriter(path) as writer:
-        for message in reader.messages():
-            if message.topic not in counts:
-                msgtype, text, profiles = reader.declared()[message.topic]
-                writer.declare(message.topic, msgtype, parse_qos(profiles), text)
+        for message in write_copies(reader, writer, reader.messages()):
             counts[message.topic] = counts.get(message.topic, 0) + 1
             first_ns, last_ns = min(first_ns, message.stamp_ns), max(last_ns, message.stamp_ns)
-            writer.write_raw(
-                message.topic,
-                message.msgtype,
-                message.stamp_ns,
-                message.data,
-                publish_ns=message.publish_ns,
-            )
         if reader.truncated and not counts:
             raise EpisodeError(
                 f"nothing can be recovered of '{source}', which has no whole message: "
                 f'{reader.truncated}'
             )
-        for name, values in reader.metadata.items():
-            if name != 'rosbag2':
-                writer.set_metadata(name, values)
-        _copy_companions(source, writer.folder)
+        copy_metadata(reader, writer)
+        copy_companions(source, writer.folder)
     lost = [reader.truncated] if reader.truncated else []
     return Recovered(
         source=source,
@@ -108,13 +95,3 @@ def _default_path(source: Path) -> Path:
         name = name[1:].rsplit('.', 2)[0]
     path = source.with_name(name)
     return path.with_name(f'{name}_recovered') if path.exists() else path
-
-
-def _copy_companions(source: Path, folder: Path) -> None:
-    """Other files of the recording, such as its calibration."""
-    if source.is_file():
-        return
-    for file in source.iterdir():
-        is_ours = file.suffix == '.mcap' or file.name in ('metadata.yaml', RESERVE_NAME)
-        if file.is_file() and not is_ours:
-            shutil.copyfile(file, folder / file.name)

@@ -7,7 +7,14 @@ import time
 
 import pytest
 
-from mtv_world_ros.core.files import copy_folder, recover_folder, whole_folder, write_whole
+from mtv_world_ros.core import files
+from mtv_world_ros.core.files import (
+    copy_folder,
+    recover_folder,
+    replace_folder,
+    whole_folder,
+    write_whole,
+)
 
 #: number of a process that never is: above the kernel's greatest (4194304)
 NO_PROCESS = 9999999
@@ -221,3 +228,45 @@ def test_copies_of_folders_hold_regular_files_alone(tmp_path):
         (bad / 'x').symlink_to(place) if place else os.mkfifo(bad / 'x')
         with pytest.raises(OSError, match='regular file|named pipe'):
             copy_folder(bad, tmp_path / f'{name}_copy')
+
+
+def two_folders(tmp_path):
+    for name in ('old', 'new'):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / 'file').write_text(name)
+    return tmp_path / 'old', (tmp_path / 'new').rename(tmp_path / '.old.1234.tmp')
+
+
+@pytest.mark.parametrize('exchanges', [True, False])
+def test_a_folder_is_replaced_whether_or_not_names_can_be_exchanged(
+    exchanges, tmp_path, monkeypatch
+):
+    if not exchanges:
+        monkeypatch.setattr(files, '_exchange_names', lambda *_: False)
+    folder, new = two_folders(tmp_path)
+    link = tmp_path / 'link'
+    link.symlink_to(folder)
+    replace_folder(new, link)
+    assert (folder / 'file').read_text() == 'new' and link.is_symlink()
+    assert sorted(os.listdir(tmp_path)) == ['link', 'old']
+
+
+def test_the_name_is_never_free_where_names_can_be_exchanged(tmp_path, monkeypatch):
+    """A process that is killed at any call to the file system leaves one of the two."""
+    folder, new = two_folders(tmp_path)
+    monkeypatch.setattr('pathlib.Path.rename', lambda *_: pytest.fail('two steps'))
+    monkeypatch.setattr(files.shutil, 'rmtree', lambda *_, **__: None)  # killed before
+    replace_folder(new, folder)
+    assert (folder / 'file').read_text() == 'new'
+    assert (new / 'file').read_text() == 'old'
+
+
+def test_a_folder_that_cannot_be_replaced_keeps_its_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, '_exchange_names', lambda *_: False)
+    folder, new = two_folders(tmp_path)
+    (new / 'file').unlink()
+    new.rmdir()
+    with pytest.raises(FileNotFoundError):
+        replace_folder(new, folder)
+    assert (folder / 'file').read_text() == 'old'
+    assert os.listdir(tmp_path) == ['old']

@@ -82,8 +82,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--apply',
         action='store_true',
-        help="write the poses into the recordings' calibration.yaml, where they have none",
+        help='write the cameras into the imported recordings, where they have none: poses into '
+        'calibration.yaml, CameraInfo into the bag',
     )
+    add_options(parser, 'overwrite')
     parser.add_argument(
         '--no-guess',
         dest='guess',
@@ -141,8 +143,11 @@ def _calibrate_one(arguments: argparse.Namespace) -> int:
 
     out = arguments.out or Path('out/camera') / f'{arguments.view}.yaml'
     known = load_calibration(out) if out.is_file() else {}
-    if arguments.view in known and arguments.out is not None:
-        raise ConfigError(f"'{out}' has view '{arguments.view}' already; name another --out")
+    if arguments.view in known and arguments.out is not None and not arguments.overwrite:
+        raise ConfigError(
+            f"'{out}' has view '{arguments.view}' already; name another --out, or --overwrite to "
+            'replace it'
+        )
     file, source = robot_file(arguments, arguments.episode)
     robot = load_robot(file)
     episode = read_for_checks(

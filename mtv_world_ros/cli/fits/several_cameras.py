@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+import sys
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.core.errors import ConfigError
@@ -52,12 +53,24 @@ def calibrate_shared(arguments: argparse.Namespace) -> int:
 
     if arguments.mount_link or arguments.between:
         raise ConfigError('--mount-link and --between are for one recording')
+    files = [path for path in recordings(arguments.episodes) if path.is_file()]
+    if arguments.apply and files:
+        raise ConfigError(
+            f"--apply writes into folders of episodes, and '{files[0]}' is a file: import it "
+            '(mtv-world import bag), or leave --apply out'
+        )
     views = arguments.views
     points = arguments.points and {view: load_points(arguments.points, view) for view in views}
     episodes, file = _read_all(arguments)
     robot = load_robot(file)
     if arguments.click:
         return _write_page(arguments, episodes, robot)
+    if _has_all_poses(arguments, episodes):
+        print(
+            'the recordings have the poses of all views already, and nothing is estimated; '
+            '--overwrite estimates them anew and replaces them'
+        )
+        return _apply(arguments, episodes, {})
     shape = load_shape(robot)
     if not shape.is_known:
         raise ConfigError(
@@ -65,9 +78,24 @@ def calibrate_shared(arguments: argparse.Namespace) -> int:
             'the meshes of its URDF'
         )
     groups = [views] if arguments.same_focal else [[view] for view in views]
+    status = 0
     for group in groups:
-        _estimate(arguments, group, points, episodes, robot, shape.parts)
-    return 0
+        found = _estimate(arguments, group, points, episodes, robot, shape.parts)
+        if arguments.apply:
+            by_view = {one.cameras[0].view: one.cameras for one in found}
+            status = max(status, _apply(arguments, episodes, by_view))
+    return status
+
+
+def _has_all_poses(arguments: argparse.Namespace, episodes: Sequence[Episode]) -> bool:
+    """Return whether `--apply` has nothing to estimate, and nothing is asked for otherwise."""
+    from mtv_world_ros.data.episode_cameras import calibrated_views
+
+    asked = arguments.overwrite or arguments.points or arguments.focal or arguments.out
+    if not arguments.apply or asked or arguments.calibration:
+        return False
+    wanted = set(arguments.views)
+    return all(wanted <= calibrated_views(episode.info.path).keys() for episode in episodes)
 
 
 def _write_page(
@@ -94,8 +122,8 @@ def _estimate(
     episodes: Sequence[Episode],
     robot: RobotModel,
     parts: Sequence[LinkShape],
-) -> None:
-    """Estimates views that share their focal length, prints and writes them."""
+) -> Sequence[SharedEstimate]:
+    """Estimates views that share their focal length; prints them and writes their files."""
     from mtv_world_ros.inspection.cameras.shared_camera import estimate_shared
 
     unknown = [episode.unknown.get(view, '') for episode in episodes for view in views]
@@ -117,6 +145,7 @@ def _estimate(
     for estimate in found:
         print(describe(estimate, episodes, focal_known=known))
         _write(arguments, estimate, episodes, robot, parts)
+    return found
 
 
 def recorded_robot(episode: Path, name: str) -> Path:
@@ -257,7 +286,7 @@ def _write(
     robot: RobotModel,
     parts: Sequence[LinkShape],
 ) -> None:
-    """Write a calibration file and a picture a place, and with `--apply` into the episodes."""
+    """Write a calibration file and a picture a place."""
     from dataclasses import replace
 
     from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
@@ -273,8 +302,11 @@ def _write(
     for place in dict.fromkeys(numbers):
         file = out.with_stem(f'{stem}_{place}' if several else stem)
         known = load_calibration(file) if file.is_file() else {}
-        if view in known and arguments.out is not None:
-            raise ConfigError(f"'{file}' has view '{view}' already; name another --out")
+        if view in known and arguments.out is not None and not arguments.overwrite:
+            raise ConfigError(
+                f"'{file}' has view '{view}' already; name another --out, or --overwrite to "
+                'replace it'
+            )
         first = numbers.index(place)
         save_calibration(file, {**known, view: estimate.cameras[first]})
         states = episodes[first].joint_states
@@ -283,19 +315,55 @@ def _write(
         picture = overlay_picture(shown, view, robot, parts, JointTrack(states, robot))
         write_png(file.with_suffix('.png'), picture)
         print(f'calibration: {file}\nlook at it: {file.with_suffix(".png")}')
-    if arguments.apply:
-        for episode, camera in zip(episodes, estimate.cameras, strict=True):
-            _apply(episode, camera)
 
 
-def _apply(episode: Episode, camera: CameraModel) -> None:
-    """Add a view to the calibration of an episode that has none of it."""
-    from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
+def _apply(
+    arguments: argparse.Namespace,
+    episodes: Sequence[Episode],
+    found: dict[str, tuple[CameraModel, ...]],
+) -> int:
+    """Write cameras into the episodes: `found`, where they have none or are to be replaced.
+
+    Cameras that an episode has already get their CameraInfo, where the bag lacks it.
+
+    Returns:
+        The exit status: 1 if an episode could not be written, which is said on stderr.
+    """
+    from mtv_world_ros.core.errors import MtvWorldError
+
+    status = 0
+    for number, episode in enumerate(episodes):
+        cameras = {view: each[number] for view, each in found.items()}
+        try:
+            print(_write_into(episode, cameras, arguments.views, overwrite=arguments.overwrite))
+        except MtvWorldError as error:
+            sys.stderr.write(f'mtv-world: {error}\n')
+            status = 1
+    return status
+
+
+def _write_into(
+    episode: Episode, found: dict[str, CameraModel], views: Sequence[str], *, overwrite: bool
+) -> str:
+    """Write cameras into an episode; returns what was done, in a line."""
+    from mtv_world_ros.cameras.calibration_file import save_calibration
     from mtv_world_ros.data.episode import CALIBRATION_FILE
+    from mtv_world_ros.data.episode_cameras import calibrated_views, is_imported, write_cameras
 
-    file = episode.info.path / CALIBRATION_FILE
-    known = load_calibration(file) if file.is_file() else {}
-    if camera.view in known:
-        print(f"'{file}' has view '{camera.view}' already and is left as it is")
-        return
-    save_calibration(file, {**known, camera.view: camera})
+    path = episode.info.path
+    filed = calibrated_views(path)
+    kept = [view for view in views if view in filed and not (overwrite and view in found)]
+    new = {view: camera for view, camera in found.items() if view not in kept}
+    known = {view: episode.cameras[view] for view in kept if not found or view in found}
+    words = [f'{", ".join(new)} written'] if new else []
+    words += [f'{", ".join(known)} left as in {CALIBRATION_FILE}'] if known else []
+    if not is_imported(path):
+        if new:
+            save_calibration(path / CALIBRATION_FILE, {**filed, **new})
+        words.append(
+            'its bag, a recording of your own, stays as it is: mtv-world import bag makes an '
+            'episode for the node and ROS tools of it'
+        )
+    elif write_cameras(path, new, known):
+        words.append('its bag has their CameraInfo now')
+    return f'{path.name}: {"; ".join(words)}'

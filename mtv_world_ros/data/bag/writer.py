@@ -15,7 +15,7 @@ from typing import cast, IO, Self
 from mcap.writer import CompressionType, Writer
 
 from mtv_world_ros.core.errors import EpisodeError
-from mtv_world_ros.core.files import is_free
+from mtv_world_ros.core.files import is_free, replace_folder
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.metadata import (
     bag_information,
@@ -284,10 +284,7 @@ class BagWriter:
         if is_free(path):
             self._folder.rename(path)
             return
-        old = self._folder.with_suffix('.old')
-        path.rename(old)
-        self._folder.rename(path)
-        shutil.rmtree(old, ignore_errors=True)
+        replace_folder(self._folder, path)
 
     def _drop(self) -> None:
         self._file.close()

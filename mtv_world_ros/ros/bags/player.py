@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import heapq
 from pathlib import Path
 import sys
@@ -20,8 +20,15 @@ from rclpy.qos import QoSProfile
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
-from mtv_world_ros.core.errors import ConfigError, EpisodeError
+from mtv_world_ros.core.errors import (
+    CalibrationError,
+    ConfigError,
+    EpisodeError,
+    TrajectoryError,
+)
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
+from mtv_world_ros.data.episode import CALIBRATION_FILE
+from mtv_world_ros.data.episode_cameras import views_without_info
 from mtv_world_ros.ros.messages.conversions import (
     has_header,
     message_class,
@@ -40,6 +47,7 @@ TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
 _WINDOW_NS = 2 * NANO
 #: topics whose last message late subscribers get
 _STATES = ('instruction', 'tf_static', 'robot_description')
+_NOT_PLAYED = ('/clock', '/parameter_events')
 _CLOCK_PERIOD_NS = 10_000_000
 #: a change of the system clock against the monotonic one that is a step, not a drift [ns]
 _CLOCK_STEP_NS = 50_000_000
@@ -48,6 +56,11 @@ _SETTLED_S = 0.5
 #: after this long it says what it waits for
 _SILENT_S = 2.0
 ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
+#: ends of a plan that are no fault; without lock-step a plan is pre-empted by the next one
+_GOOD_ENDS = ('done', 'preempted')
+UNANSWERED = 'unanswered'
+#: maximum number of plans that are listed by their times for one reason
+_MAX_LISTED = 8
 
 
 @dataclass(slots=True)
@@ -94,6 +107,45 @@ class Timeline:
         self.steady_ns += duration_ns
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlayedPlan:
+    """A trajectory that was published, and how it ended.
+
+    Attributes:
+        bag_s: time since the start of playing [s].
+        stamp_ns: stamp that it was published with [ns].
+        state: one of `ENDS`; `UNANSWERED` = nothing was reported in time; empty = it is open.
+        reason: reason of a rejection or failure, with its text.
+    """
+
+    bag_s: float
+    stamp_ns: int
+    state: str = ''
+    reason: str = ''
+
+    @property
+    def is_open(self) -> bool:
+        """Whether an answer is waited for."""
+        return not self.state
+
+
+def describe_failed(plans: Sequence[PlayedPlan]) -> str:
+    """Return which of the plans were rejected, failed or not answered, and why; empty = none."""
+    failed = [plan for plan in plans if plan.state not in _GOOD_ENDS]
+    if not failed:
+        return ''
+    groups: dict[tuple[str, str], list[float]] = {}
+    for plan in failed:
+        groups.setdefault((plan.state, plan.reason), []).append(plan.bag_s)
+    lines = [f'{len(failed)} of {len(plans)} plans were not imagined']
+    for (state, reason), times in groups.items():
+        shown = ', '.join(f'{t:.2f}' for t in times[:_MAX_LISTED])
+        rest = len(times) - _MAX_LISTED
+        shown += f' and {rest} more' if rest > 0 else ''
+        lines.append(f'  {len(times)} {state}, at {shown} s{": " if reason else ""}{reason}')
+    return '\n'.join(lines)
+
+
 class Player(Node):
     """Publishes what an episode holds.
 
@@ -109,15 +161,14 @@ class Player(Node):
         self._options = options
         self._reader = BagReader(options.episode)
         types = self._reader.topics()
-        self._outputs = {
-            topic: self._offer(types[topic], topic) for topic in _chosen(types, options)
-        }
+        self._outputs = {topic: self._offer(types[topic], topic) for topic in self._chosen(types)}
         clock = self._played_name('/clock')
         self._clock_output = self.create_publisher(Clock, clock, 10) if options.clock else None
+        self._plans: list[PlayedPlan] = []
         self._ends: list[dict[str, str]] = []
         self._unpublished: set[tuple[str, str]] = set()
-        if options.lock_step:
-            self.create_subscription(DiagnosticArray, options.report_topic, self._on_report, 100)
+        self.create_subscription(DiagnosticArray, options.report_topic, self._on_report, 100)
+        self._hint = self._describe_cameras(types)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         self._peers = Peers(self, lambda: self._executor.spin_once(timeout_sec=0.05))
@@ -130,6 +181,7 @@ class Player(Node):
 
         Raises:
             ConfigError: nobody subscribes.
+            TrajectoryError: plans were rejected, failed or not answered.
         """
         if not self._options.no_wait:
             self._wait_for_subscribers()
@@ -140,10 +192,63 @@ class Player(Node):
                 self.get_logger().warning(problem)
             if not self._options.loop:
                 break
+        self._wait_for_ends()
         self._wait_for_frames()
         self._flush()
         counted = ', '.join(f'{number} {what}' for what, number in self._counts.items())
         self.get_logger().info(f'played {counted or "nothing"}')
+        failed = describe_failed(self._plans)
+        if failed:
+            raise TrajectoryError('\n'.join(filter(None, (failed, self._hint))))
+
+    def _chosen(self, types: dict[str, str]) -> list[str]:
+        """Topics to play; those whose type is not installed are left out, unless named."""
+        options = self._options
+        unknown = [topic for topic in options.topics if topic not in types]
+        if unknown:
+            raise EpisodeError(
+                f"'{options.episode}' has no topics {unknown}; it has {sorted(types)}"
+            )
+        if options.topics:
+            return options.topics
+        found = []
+        for topic in types:
+            try:
+                message_class(types[topic])
+            except EpisodeError as error:
+                self.get_logger().warning(f"'{topic}' is not played: {error}")
+                continue
+            found += [topic] if topic not in _NOT_PLAYED else []
+        return found
+
+    def _describe_cameras(self, types: dict[str, str]) -> str:
+        """Return what the episode's cameras lack for the node; empty = nothing is known to.
+
+        Says where the cameras' poses are, which the node takes from its calibration file.
+        """
+        episode = self._options.episode
+        if TRAJECTORY not in {types[topic] for topic in self._outputs}:
+            return ''
+        try:
+            bare = views_without_info(episode, types)
+        except CalibrationError as error:
+            self.get_logger().warning(str(error))
+            return ''
+        file = episode / CALIBRATION_FILE
+        if file.is_file():
+            self.get_logger().info(
+                f"the cameras' poses of this episode are in '{file.resolve()}': world_model takes "
+                "them with -p calibration_file:=FILE, else the checkpoint's, or TF's"
+            )
+        if not bare:
+            return ''
+        text = (
+            f"views {', '.join(bare)} of '{episode}' have no CameraInfo, without which the node "
+            f'rejects plans: mtv-world fit camera {episode} --view {",".join(bare)} --apply '
+            'writes it'
+        )
+        self.get_logger().warning(text)
+        return text
 
     def _offer(self, msgtype: str, topic: str) -> Publisher:
         is_state = topic.rsplit('/', 1)[-1] in _STATES
@@ -202,13 +307,20 @@ class Player(Node):
 
     def _play_once(self) -> None:
         timeline = self._timeline = None
+        self._plans, self._ends = [], []  # of this pass: a loop has no end
         for message in self._messages():
             if timeline is None:
                 timeline = Timeline.now(self._first_ns, self._options.rate)
                 self._timeline = timeline
             self._wait_until_due(timeline, message.stamp_ns)
-            stamp_ns = self._publish(timeline, message)
             if self._options.lock_step and message.msgtype == TRAJECTORY:
+                self._flush()  # the plan starts from what came before it
+            stamp_ns = self._publish(timeline, message)
+            if message.msgtype != TRAJECTORY:
+                continue
+            bag_s = (message.stamp_ns - self._first_ns) / NANO
+            self._plans.append(PlayedPlan(bag_s=bag_s, stamp_ns=stamp_ns))
+            if self._options.lock_step:
                 self._wait_for_answer(timeline, message.stamp_ns, stamp_ns)
 
     def _messages(self) -> Iterator[BagMessage]:
@@ -254,8 +366,9 @@ class Player(Node):
     def _wait_for_frames(self) -> None:
         """In lock-step, advances the clock until the frames of the last answer are published."""
         end_s = time.monotonic() + self._options.answer_timeout
-        while self._unpublished and self._timeline is not None and time.monotonic() < end_s:
-            self._publish_clock(self._timeline.bag_time(time.monotonic_ns()))
+        timeline = self._timeline if self._options.lock_step else None
+        while self._unpublished and timeline is not None and time.monotonic() < end_s:
+            self._publish_clock(timeline.bag_time(time.monotonic_ns()))
             self._executor.spin_once(timeout_sec=_CLOCK_PERIOD_NS / NANO)
 
     def _publish_clock(self, bag_ns: int) -> None:
@@ -273,25 +386,57 @@ class Player(Node):
             elif values.get('state') == 'published':
                 self._unpublished.discard(chunk)
 
+    def _open_plans(self) -> list[PlayedPlan]:
+        """Give plans the ends that were reported for them; return those that wait for one."""
+        for index, plan in enumerate(self._plans):
+            if not plan.is_open:
+                continue
+            stamp = str(plan.stamp_ns)
+            end = next((e for e in self._ends if e.get('trajectory_stamp_ns') == stamp), None)
+            if end is not None:
+                self._ends.remove(end)
+                reason = ': '.join(filter(None, (end.get('reason', ''), end.get('text', ''))))
+                self._end(index, end['state'], reason)
+        return [plan for plan in self._plans if plan.is_open]
+
+    def _end(self, index: int, state: str, reason: str) -> None:
+        """Set how a plan ended."""
+        self._plans[index] = replace(self._plans[index], state=state, reason=reason)
+        self._counts[state] += 1
+
+    def _give_up(self) -> None:
+        """End the plans that wait for an answer: they are unanswered."""
+        for index, plan in enumerate(self._plans):
+            if plan.is_open:
+                reason = f'no answer within {self._options.answer_timeout:g} s'
+                self._end(index, UNANSWERED, reason)
+
     def _wait_for_answer(self, timeline: Timeline, bag_ns: int, stamp_ns: int) -> None:
-        """Pause the bag until the node reports the end of the trajectory."""
-        begin_ns, seen = time.monotonic_ns(), len(self._ends)
+        """Pause the bag until the node reports the end of the last plan."""
+        begin_ns = time.monotonic_ns()
         end_s = time.monotonic() + self._options.answer_timeout
-        answer: dict[str, str] | None = None
-        while answer is None and time.monotonic() < end_s:
+        while self._open_plans() and time.monotonic() < end_s:
             self._publish_clock(bag_ns)
             self._executor.spin_once(timeout_sec=0.02)
-            answer = next(
-                (e for e in self._ends[seen:] if e.get('trajectory_stamp_ns') == str(stamp_ns)),
-                None,
-            )
         timeline.pause(time.monotonic_ns() - begin_ns)
-        state = 'unanswered' if answer is None else answer['state']
-        self._counts[state] += 1
-        self.get_logger().info(f'trajectory is answered: {state}')
-        if state != 'done':
-            text = '' if answer is None else answer.get('text', '')
-            self.get_logger().warning(f'trajectory at {stamp_ns} ns: {state} {text}')
+        self._give_up()
+        plan = self._plans[-1]
+        self.get_logger().info(f'trajectory is answered: {plan.state}')
+        if plan.state != 'done':
+            text = f'{plan.state} {plan.reason}'.strip()
+            self.get_logger().warning(f'trajectory at {stamp_ns} ns: {text}')
+
+    def _wait_for_ends(self) -> None:
+        """Wait for the answers that are due, if a node reports any."""
+        if not self._options.lock_step and not self.count_publishers(self._options.report_topic):
+            self._plans = []  # nobody reports: whether they were answered is not known
+            return
+        end_s = time.monotonic() + self._options.answer_timeout
+        while self._open_plans() and time.monotonic() < end_s:
+            if self._timeline is not None:
+                self._publish_clock(self._timeline.bag_time(time.monotonic_ns()))
+            self._executor.spin_once(timeout_sec=_CLOCK_PERIOD_NS / NANO)
+        self._give_up()
 
 
 def in_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
@@ -309,14 +454,6 @@ def in_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
         yield heapq.heappop(heap)[-1]
 
 
-def _chosen(types: dict[str, str], options: argparse.Namespace) -> list[str]:
-    """Topics to play."""
-    unknown = [topic for topic in options.topics if topic not in types]
-    if unknown:
-        raise EpisodeError(f"'{options.episode}' has no topics {unknown}; it has {sorted(types)}")
-    return options.topics or [t for t in types if t not in ('/clock', '/parameter_events')]
-
-
 def _rate(text: str) -> float:
     rate = float(text)
     if not 0 < rate <= 1000:
@@ -328,7 +465,10 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog='mtv-world replay',
         description=__doc__,
-        epilog='Topics are renamed by --ros-args -r /joint_trajectory:=/plan',
+        epilog='Topics are renamed by --ros-args -r /joint_trajectory:=/plan. Exit status: 1 if '
+        'the episode could not be played, or if a node reports that it rejected a plan or failed '
+        'at it, or does not answer one; the last lines say which and why. Plans that the next '
+        'one pre-empts, and Ctrl-C, are no failure.',
     )
     add = parser.add_argument
     add('episode', type=Path, help='rosbag2 MCAP folder or .mcap file')

@@ -9,12 +9,10 @@ from pathlib import Path
 
 import numpy as np
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
 from mtv_world_ros.core.errors import EpisodeError
-from mtv_world_ros.data.bag.reader import BagReader
-from mtv_world_ros.data.episode import CALIBRATION_FILE, camera_info_topic, optical_frame
+from mtv_world_ros.data.episode import CALIBRATION_FILE, optical_frame
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.ros.messages.conversions import (
     make_header,
@@ -23,7 +21,7 @@ from mtv_world_ros.ros.messages.conversions import (
     to_positions,
     to_stamp,
 )
-from mtv_world_ros.ros.messages.image_messages import to_image
+from mtv_world_ros.ros.messages.image_messages import info_of_camera, to_image
 from mtv_world_ros.ros.sensing.subscriptions import Handler, MatchedSubscription
 
 
@@ -107,16 +105,12 @@ def recorded_start(path: Path, views: Sequence[str], start_s: float = 0.0) -> Ep
         instruction=info.instruction,
         calibration_file=str(calibration.absolute()) if calibration.is_file() else '',
         images=images,
-        camera_infos={view: _recorded_info(path, view) for view in views},
+        camera_infos={
+            view: info_of_camera(episode.cameras[view], make_header(0, optical_frame(view)))
+            for view in views
+        },
         joint_state=to_joint_state(states.joint_names, states.positions[nearest], make_header(0)),
     )
-
-
-def _recorded_info(path: Path, view: str) -> CameraInfo:
-    topic = camera_info_topic(view)
-    for message in BagReader(path).messages({topic}):
-        return deserialize_message(message.data, CameraInfo)
-    raise EpisodeError(f"episode '{path}' has no '{topic}'")
 
 
 class LiveCameras:

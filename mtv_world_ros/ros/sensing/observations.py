@@ -116,6 +116,12 @@ class ObservationBuffer:
         """The newest moment that every view has seen [ns]; 0 = none yet."""
         return min(images.newest[0] if images else 0 for images in self._images.values())
 
+    @property
+    def awaits_first(self) -> bool:
+        """Whether images of a view, or states of a joint, never came; refused ones did."""
+        samples = (*self._images.values(), *self._joints.values())
+        return any(not one and not one.refusal for one in samples)
+
     def add_image(self, view: str, message: AnyImage) -> None:
         """Store an image.
 

@@ -141,6 +141,9 @@ class RequestMaker:
 #: the first plan of an imagined episode may come this long before what it answers [s]: a lost
 #: message without a next one comes again after the sender's heartbeat, by default every 3 s
 _EARLY_S = 5.0
+#: a plan may come this long before the first images and joint states of topics that have a
+#: publisher [s]
+_FIRST_S = 1.0
 #: a plan that is under way for longer was lost and sent again [s]
 _LATE_S = 0.5
 #: what a node makes and can destroy
@@ -382,11 +385,15 @@ class Rollouts:
             self._arrivals.trigger()
 
     def _is_early(self, arrived: _Arrived) -> bool:
-        """Return whether the first plan of an imagined episode arrived before its observation.
+        """Return whether a first plan arrived before the observation that it belongs to.
 
-        Nothing orders topics: a policy may answer before this node receives the start.
+        Nothing orders topics: a policy may answer before this node receives the start of an
+        imagined episode, and the first plan of a replay overtakes the first images.
         """
-        if not self._maker.imagine or self._worker.last_scene is not None or self._worker.busy:
+        if not self._maker.imagine:
+            is_first = self._buffer.awaits_first and not self._inputs.unpublished()
+            return is_first and time.monotonic() - arrived.received_s < _FIRST_S
+        if self._worker.last_scene is not None or self._worker.busy:
             return False
         is_behind = self._buffer.newest_stamp_ns < to_ns(arrived.message.header.stamp)
         now_ns = self._node.get_clock().now().nanoseconds

@@ -1,8 +1,14 @@
-"""The order of what is played, and when."""
+"""The order of what is played, and when; how plans ended."""
 
 from mtv_world_ros.data.bag.reader import BagMessage
 from mtv_world_ros.ros.bags import player
-from mtv_world_ros.ros.bags.player import in_order, Timeline
+from mtv_world_ros.ros.bags.player import (
+    describe_failed,
+    in_order,
+    PlayedPlan,
+    Timeline,
+    UNANSWERED,
+)
 from mtv_world_ros.ros.messages.conversions import NANO
 
 
@@ -46,3 +52,21 @@ def test_a_system_clock_that_is_set_changes_stamps_and_not_the_pace(monkeypatch)
     system[0] -= 90 * NANO
     assert timeline.due(102 * NANO) == 1002 * NANO
     assert timeline.stamp(102 * NANO) == 4912 * NANO + 3_000_000
+
+
+def test_plans_that_were_not_imagined_are_listed_by_reason_and_others_are_no_failure():
+    def plan(bag_s, state, reason=''):
+        return PlayedPlan(bag_s=bag_s, stamp_ns=round(bag_s * NANO), state=state, reason=reason)
+
+    good = [plan(0.0, 'done'), plan(0.8, 'preempted')]
+    assert describe_failed(good) == ''
+    bare, silent = 'camera_info_missing: none of ext1', 'no answer within 2 s'
+    bad = [plan(1.6, 'rejected', bare), plan(2.4, UNANSWERED, silent), plan(3.2, 'rejected', bare)]
+    assert describe_failed([*good, *bad, plan(4.0, 'failed')]).splitlines() == [
+        '4 of 6 plans were not imagined',
+        f'  2 rejected, at 1.60, 3.20 s: {bare}',
+        f'  1 unanswered, at 2.40 s: {silent}',
+        '  1 failed, at 4.00 s',
+    ]
+    many = describe_failed([plan(float(k), 'rejected', bare) for k in range(11)])
+    assert '11 rejected, at 0.00, ' in many and '7.00 and 3 more s: ' in many

@@ -37,7 +37,16 @@ RECORDED = (PREDICTED, '/world_model/low/predicted/camera_info', '/world_model/r
 @pytest.fixture(scope='module')
 def episode(tmp_path_factory, ros):
     """Nine frames of two views at 10 Hz, a plan at 0 s and one at 0.4 s."""
-    folder = tmp_path_factory.mktemp('episodes')
+    return write_episode(tmp_path_factory.mktemp('episodes'), ros)
+
+
+@pytest.fixture(scope='module')
+def bare_episode(tmp_path_factory, ros):
+    """The same with a calibration, but without CameraInfo."""
+    return write_episode(tmp_path_factory.mktemp('bare'), ros, has_infos=False)
+
+
+def write_episode(folder, ros, *, has_infos=True):
     cameras = load_calibration(ros.make_calibration(folder / 'calibration.yaml'))
     with EpisodeWriter(
         folder / 'episode',
@@ -55,7 +64,8 @@ def episode(tmp_path_factory, ros):
                 plan = Trajectory(joint_names=ros.JOINTS, times=times, positions=rows)
                 writer.write_trajectory(stamp_ns, plan)
             for view, camera in cameras.items():
-                writer.write_camera_info(view, stamp_ns, camera)
+                if has_infos:
+                    writer.write_camera_info(view, stamp_ns, camera)
                 writer.write_image(view, stamp_ns, ros.make_pixels(view))
             writer.write_joint_states(stamp_ns, ros.JOINTS, ros.HOME)
     return folder / 'episode'
@@ -205,6 +215,49 @@ def test_loop_with_a_clock_starts_over_and_the_node_goes_on(node, episode, launc
         assert code == 0 and 'Traceback' not in said
     finally:
         client.close()
+
+
+@pytest.mark.slow
+def test_plans_that_a_node_rejects_are_a_failure_that_says_which_and_why(
+    node, bare_episode, launch
+):
+    for options in (('--lock-step',), ()):
+        code, said = finish(launch('player', bare_episode, '--clock', *options))
+        assert code == 1, said
+        assert '2 of 2 plans were not imagined' in said
+        assert '2 rejected, at 0.00, 0.40 s: camera_info_missing: no camera_info of view' in said
+        mending = f'mtv-world fit camera {bare_episode} --view low,high --apply'
+        assert said.rstrip().endswith(f'{mending} writes it'), said
+        assert 'Traceback' not in said
+
+
+@pytest.mark.slow
+def test_plans_that_the_next_one_preempts_are_no_failure(node, episode, launch):
+    code, said = finish(launch('player', episode, '--clock', '--rate', '50'))
+    assert code == 0, said
+    assert '2 trajectories' in said and ('1 preempted' in said or '2 done' in said)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('stops', [False, True])
+def test_a_plan_without_an_answer_is_a_failure_unless_the_player_is_stopped(
+    stops, episode, launch, client, ros
+):
+    """Somebody reports, takes plans, and never answers."""
+    client.subscribe(JointTrajectory, '/joint_trajectory', depth=10)
+    client.node.create_publisher(ros.REPORT, '/world_model/report', 10)
+    taken = client.received['/joint_trajectory']
+    taken.clear()
+    timeout = '60' if stops else '0.5'
+    player = launch('player', episode, '--rate', '4', '--answer-timeout', timeout)
+    client.wait(lambda: len(taken) >= len(PLANS), 'both plans')
+    code, said = finish(player, signal.SIGINT if stops else None)
+    assert 'Traceback' not in said
+    if stops:
+        assert code == 0, said
+    else:
+        assert code == 1, said
+        assert '2 unanswered, at 0.00, 0.40 s: no answer within 0.5 s' in said
 
 
 def test_truncated_bag_is_played_up_to_the_cut_and_says_so(episode, launch, tmp_path, ros):
