@@ -123,7 +123,7 @@ def _estimate(
     robot: RobotModel,
     parts: Sequence[LinkShape],
 ) -> Sequence[SharedEstimate]:
-    """Estimates views that share their focal length; prints them and writes their files."""
+    """Estimate views that share their focal length; print them and write their files."""
     from mtv_world_ros.inspection.cameras.shared_camera import estimate_shared
 
     unknown = [episode.unknown.get(view, '') for episode in episodes for view in views]
