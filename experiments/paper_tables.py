@@ -1,11 +1,17 @@
 """The paper's tables by one command: data, trainings, evaluations, Tables 1, 2 and 3.
 
-    python experiments/paper_tables.py --out runs/paper_tables --clips 8000
+    python experiments/paper_tables.py --out runs/paper_tables --clips 500,1000,2000,4000,8000
 
 makes the data of the fifteen tasks (half of the episodes for training, half for testing) and the
 395 zero-shot episodes, trains every row with the same number of clips, evaluates it with its own
-commands and with those of another episode, and writes `tables.md` after each row. The same command
-goes on where it was stopped. Rows, seeds and weights for FID and FVD may be added later.
+commands and with those of another episode, and writes `tables.md` after each row. `--clips` names
+the stages: all rows are trained and evaluated with one number before any goes on to the next.
+The same command goes on where it was stopped. Stages, rows, seeds and weights for FID and FVD may
+be added later. Several processes may share a folder: each takes the rows that no other works on.
+
+Tables 1 to 3 are those of the last stage that all rows have; a learning curve shows all stages.
+The learning rate is constant after a short warm-up, so that a stage does not depend on those after
+it; the checkpoints hold moving averages of the weights.
 
 Table 2 needs real recordings as `mtv-world import videos`, `import bag` or `import lerobot` makes
 them: `--real data/lab --real-view ext1 --real-segmenter data/lab/objects.safetensors`.
@@ -38,7 +44,7 @@ from mtv_world_ros.control.registry import control_class, TRAJECTORY_VIDEO
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.documents import DASH, Table
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
-from mtv_world_ros.core.files import share_path, write_json, write_whole
+from mtv_world_ros.core.files import share_path, whole_folder, write_json, write_whole
 from mtv_world_ros.data.splits import CARD_FILE, EVERY, select
 from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, Group
 from mtv_world_ros.evaluation.metrics.frechet_features import clip_features, frame_features
@@ -53,6 +59,12 @@ ROOT = Path(__file__).resolve().parents[1]
 #: views of the simulated episodes: the paper's View 1 and View 2
 VIEWS = ('low', 'high')
 SETTINGS, TIMES, TABLES = 'settings.json', 'times.json', 'tables.md'
+#: default stages: training clips a row
+STAGES = (500, 1000, 2000, 4000, 8000)
+#: steps of the learning rate's warm-up, the same for all stages
+WARMUP_STEPS = 50
+#: pause before rows that another process works on are looked at again [s]
+WAIT_S = 20.0
 #: episodes of a task, half of them for training; the paper has 1,492 of 15 tasks
 EPISODES_PER_TASK = 100
 ZERO_SHOT_EPISODES = 395
@@ -116,7 +128,7 @@ _ABOUT = (
     'reacts to its actions where the interval of the difference is above 0. Brackets: 95 % t '
     'intervals over episodes of one seed, of Frechet distances jackknife; with several seeds the '
     'least and the greatest value of a seed. A dash: not measured so far, or a view that the '
-    'model does not have.'
+    'model does not have. n: episodes that are tested.'
 )
 
 
@@ -146,6 +158,7 @@ class PaperTables:
     def __init__(self, options: argparse.Namespace, run: Runner = mtv_world) -> None:
         self.options, self._run = options, run
         self.out: Path = options.out
+        self._did_something = False
         self.rows = chosen_rows(options.rows, has_real=options.real is not None)
         self.seeds: list[int] = options.seeds
 
@@ -159,6 +172,11 @@ class PaperTables:
         """Folder of the zero-shot episodes."""
         return self.options.zero_shot or self.out / 'zero_shot'
 
+    @property
+    def stages(self) -> list[int]:
+        """Training clips a row of all stages, in order."""
+        return self.options.clips
+
     def run(self) -> None:
         """Do everything that is left, and write the tables after each row.
 
@@ -168,14 +186,36 @@ class PaperTables:
         """
         self._check_before()
         self.out.mkdir(parents=True, exist_ok=True)
-        with locked(self.out):
+        with locked(self.out, wait=True):
             check_settings(self.out / SETTINGS, self._settings())
+            for stage in self.stages:
+                check_settings(self.out / 'stages' / f'{stage}.json', self._tested(stage))
             self._make_data()
-            for seed in self.seeds:
-                for row in self.rows:
-                    self._do_row(row, seed)
-                    self.write_tables()
-            print(self.write_tables())
+        left = [(s, seed, row) for s in self.stages for seed in self.seeds for row in self.rows]
+        while left:
+            left = self._try(left)
+            if left:  # of other processes, which may be stopped
+                print(f'waiting for {len(left)} stages of rows of other processes', flush=True)
+                time.sleep(WAIT_S)
+        print(self.write_tables())
+
+    def _try(self, left: Sequence[tuple[int, int, Row]]) -> list[tuple[int, int, Row]]:
+        """Do what no other process works on; return the rest."""
+        busy = []
+        for stage, seed, row in left:
+            folder = self.folder(row, seed)
+            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                with locked(folder):
+                    # an earlier stage that another process left unfinished comes first
+                    for earlier in self.stages[: self.stages.index(stage) + 1]:
+                        self._do_stage(row, seed, earlier)
+            except FolderInUse:
+                busy.append((stage, seed, row))
+            if self._did_something:
+                self.write_tables()
+                self._did_something = False
+        return busy
 
     def _check_before(self) -> None:
         """Refuse what would fail after hours: weights of another network, missing packages."""
@@ -188,22 +228,32 @@ class PaperTables:
             clip_features(options.fvd_weights)
         if options.lite_features:
             lite_features()
-        if options.clips < 1:
-            raise ConfigError(f'--clips is {options.clips}; give at least 1')
+        if self.stages != sorted(set(self.stages)) or self.stages[0] < 1:
+            given = ','.join(map(str, self.stages))
+            raise ConfigError(f'--clips is {given}; give numbers that rise, from 1 on')
 
     def _settings(self) -> dict[str, Any]:
-        """What all rows share; a later run with other values would mix two experiments."""
+        """Settings that all rows and stages share; others would mix two experiments."""
         options = self.options
         return {
-            'clips': options.clips,
             'tasks': sorted(options.tasks),
             # what is made in OUT moves with it
             'data': options.data and str(options.data.resolve()),
             'zero_shot': options.zero_shot and str(options.zero_shot.resolve()),
-            'test_episodes': options.test_episodes,
             'zero_shot_episodes': options.zero_shot_episodes,
             'preset': str(options.preset),
             'set': sorted(options.set),
+        }
+
+    def _tested(self, stage: int) -> dict[str, int | None]:
+        """Return how many episodes the rows of a stage are tested on; None = all."""
+        options, index = self.options, self.stages.index(stage)
+        return {
+            name: numbers and numbers[min(index, len(numbers) - 1)]
+            for name, numbers in (
+                ('test_episodes', options.test_episodes),
+                ('zero_shot_tested', options.zero_shot_tested),
+            )
         }
 
     def _make_data(self) -> None:
@@ -216,27 +266,32 @@ class PaperTables:
                 done=_has_episodes(self.data, options.episodes * len(options.tasks)),
             )  # fmt: skip
         check_tasks(self.data, options.tasks)
-        self._link(self.data, 'test', 'test', options.test_episodes)
-        if options.zero_shot is None and self._wants_zero_shot:
+        if options.real is not None:
+            self._split_real()
+
+    def _make_zero_shot(self) -> None:
+        """Make the zero-shot episodes, which the last row of the simulation is tested on."""
+        options = self.options
+        with locked(self.out, wait=True):
             self._command(
                 'zero-shot data', ['collect', '--zero-shot', ZERO_SHOT_KINDS, '--episodes',
                                    str(options.zero_shot_episodes), '--seed',
                                    str(options.data_seed + 1), '--out', str(self.zero_shot),
                                    '--workers', str(options.workers)],
-                done=_has_episodes(self.zero_shot, options.zero_shot_episodes),
+                done=options.zero_shot is not None
+                or _has_episodes(self.zero_shot, options.zero_shot_episodes),
             )  # fmt: skip
-        if options.real is not None:
-            self._split_real()
 
     @property
     def _wants_zero_shot(self) -> bool:
-        has_some = self.options.zero_shot is not None or self.options.zero_shot_episodes > 0
-        return has_some and any(row.name == FULL for row in self.rows)
+        return self.options.zero_shot is not None or self.options.zero_shot_episodes > 0
 
-    def _link(self, source: Path, name: str, split: str, count: int | None) -> None:
-        """Link a number of episodes of a split, spread over the tasks, into a folder of `OUT`."""
+    def _linked(self, source: Path, split: str, name: str, count: int | None) -> Path:
+        """Return a folder with links to a number of episodes of a split, spread over its tasks."""
+        folder = self.out / 'tests' / (name if count is None else f'{name}_{count}')
         paths = spread(select(source, split).paths, count)
-        link_episodes(paths, self.out / name, source / CARD_FILE)
+        link_episodes(paths, folder, source / CARD_FILE)
+        return folder
 
     def _split_real(self) -> None:
         paths = select(self.options.real, EVERY).paths
@@ -250,31 +305,52 @@ class PaperTables:
         link_episodes(trained, self.out / 'real_train')
         link_episodes(tested, self.out / 'real_test')
 
-    def _do_row(self, row: Row, seed: int) -> None:
-        """Train and test a row."""
-        label, folder = f'{row.name}, seed {seed}', self.folder(row, seed)
-        checkpoint = folder / 'training' / 'checkpoint'
-        self._command(
-            f'{label}: training', self._training(row, seed),
-            done=_is_trained(checkpoint, self.steps), times=folder,
-        )  # fmt: skip
-        tests = {'test': self.out / ('real_test' if row.is_real else 'test')}
-        if row.name == FULL and self._wants_zero_shot:
-            tests['zero_shot'] = self.zero_shot
-        for name, dataset in tests.items():
-            out = folder / name
+    def _do_stage(self, row: Row, seed: int, stage: int) -> None:
+        """Train a row to the clips of a stage, keep its checkpoint and test it."""
+        label = f'{row.name}, seed {seed}, {stage} clips'
+        folder, training = self.folder(row, seed), self.folder(row, seed) / 'training'
+        held = self.stage_folder(row, seed, stage)
+        checkpoint, steps = held / 'checkpoint', self.steps(stage)
+        if trained_steps(checkpoint) != steps:
+            if (trained_steps(training / 'checkpoint') or 0) > steps:
+                print(f'{label}: left out, the row was trained further before', flush=True)
+                return
+            self._command(
+                f'{label}: training', self._training(row, seed, stage),
+                done=trained_steps(training / 'checkpoint') == steps, times=folder,
+            )  # fmt: skip
+            with whole_folder(checkpoint) as new:
+                shutil.copytree(training / 'checkpoint', new, dirs_exist_ok=True)
+        for name, dataset in self._tests(row, stage):
+            out = held / name
             self._command(
                 f'{label}: {name}', self._evaluation(row, seed, checkpoint, dataset, out),
                 done=self._is_evaluated(out), times=folder,
             )  # fmt: skip
-            file = folder / f'{name}_features.npz'
+            file = held / f'{name}_features.npz'
             if self.options.lite_features and not file.is_file():
                 print(f'{label}: {name}: features of {LITE}', flush=True)
                 write_features(read_evaluations(out)[0], lite_features(), file)
 
+    def _tests(self, row: Row, stage: int) -> Iterator[tuple[str, Path]]:
+        """Yield name and episodes of the tests of a row; the zero-shot episodes are made last."""
+        counts = self._tested(stage)
+        if row.is_real:
+            yield 'test', self.out / 'real_test'
+            return
+        yield 'test', self._linked(self.data, 'test', 'test', counts['test_episodes'])
+        if row.name == FULL and self._wants_zero_shot:
+            self._make_zero_shot()
+            count = counts['zero_shot_tested']
+            yield 'zero_shot', self._linked(self.zero_shot, EVERY, 'zero_shot', count)
+
     def folder(self, row: Row, seed: int) -> Path:
-        """Return the folder of a row's training and evaluations."""
+        """Return the folder of a row's training and stages."""
         return self.out / 'rows' / row.name / f'seed_{seed}'
+
+    def stage_folder(self, row: Row, seed: int, stage: int) -> Path:
+        """Return the folder of a stage: the row's checkpoint and evaluations."""
+        return self.folder(row, seed) / f'clips_{stage:06d}'
 
     def _overrides(self, row: Row) -> list[str]:
         """Settings of the preset that a row changes, the user's last."""
@@ -296,12 +372,11 @@ class PaperTables:
         config = load_training_config(options.preset, set_overrides(options.set))
         return config.optimizer.batch_size
 
-    @property
-    def steps(self) -> int:
-        """Training steps of the budget of clips."""
-        return ceil(self.options.clips / self.batch_size)
+    def steps(self, stage: int) -> int:
+        """Return the training steps of a number of clips."""
+        return ceil(stage / self.batch_size)
 
-    def _training(self, row: Row, seed: int) -> list[str]:
+    def _training(self, row: Row, seed: int, stage: int) -> list[str]:
         dataset = self.out / 'real_train' if row.is_real else self.data
         words = [
             'train', str(dataset), '--out', str(self.folder(row, seed) / 'training'), '--preset',
@@ -310,7 +385,9 @@ class PaperTables:
         ]  # fmt: skip
         if row.is_real:
             words += self._real_segmenter()
-        sets = [*self._overrides(row), f'optimizer.steps={self.steps}']
+        # the learning rate of a step must not depend on how many more there are
+        schedule = [f'optimizer.warmup_steps={WARMUP_STEPS}', 'optimizer.decay_share=0.0']
+        sets = [*schedule, *self._overrides(row), f'optimizer.steps={self.steps(stage)}']
         return [*words, *(f'--set={text}' for text in sets)]
 
     def _evaluation(
@@ -352,6 +429,7 @@ class PaperTables:
         """
         if done:
             return
+        self._did_something = True
         print(f'{label}: {shlex.join(["mtv-world", *words])}', flush=True)
         begun, cpu = time.monotonic(), time.process_time()
         try:
@@ -365,54 +443,125 @@ class PaperTables:
 
     def write_tables(self) -> str:
         """Write the tables of what is finished, and return them."""
-        found = Results(self)
-        text = '\n\n'.join(found.sections()) + '\n'
+        text = '\n\n'.join(Sections(self).all()) + '\n'
         write_whole(self.out / TABLES, text)
         return text
 
 
-class Results:
-    """Finished evaluations as tables.
+class Sections:
+    """Sections of the page of tables.
 
     Args:
         run: whose rows are read.
     """
 
     def __init__(self, run: PaperTables) -> None:
-        self._run, self._seeds = run, run.seeds
+        self._run = run
+        self._stages = sorted(
+            int(path.stem) for path in (run.out / 'stages').glob('*.json') if path.stem.isdigit()
+        )
+        self._results = {stage: Results(run, stage) for stage in self._stages}
+
+    def all(self) -> Iterator[str]:
+        """Yield headings, tables and what they mean."""
+        options = self._run.options
+        seeds = ', '.join(map(str, self._run.seeds))
+        yield (
+            f'# Tables of the paper\n\nStages of {", ".join(map(str, self._stages))} clips a row, '
+            f'seeds {seeds}, preset {options.preset}, learning rate constant after '
+            f'{WARMUP_STEPS} steps, averaged weights; commit {commit()}; {machine()}.\n\n{_ABOUT}'
+        )
+        stage, found, which = self._last(is_real=False)
+        yield f'## Table 1: methods by view, {which}\n\n{found.methods(TABLE_1, VIEWS).text()}'
+        yield f'## Do they react to their actions? {which}\n\n{found.reactions().text()}'
+        for key, words in (('j_union', 'J x 100'), ('j_moving', 'J moving x 100')):
+            yield f'## Table 3: {words} by task and view, {which}\n\n{found.by_task(key).text()}'
+        if any(row.is_real for row in self._run.rows):
+            stage, found, which = self._last(is_real=True)
+            names = tuple(row.name for row in ROWS if row.is_real)
+            table = found.methods(names, (options.real_view,)).text()
+            yield f'## Table 2: real recordings, one view, {which}\n\n{table}'
+            yield (
+                f'## Do they react to their actions? Real recordings, {which}\n\n'
+                f'{found.reactions(is_real=True).text()}'
+            )
+        yield f'## Learning curve\n\n{self._curve().text()}'
+        yield f'## Clips and time\n\n{self._times().text()}'
+
+    def _last(self, *, is_real: bool) -> tuple[int, Results, str]:
+        """Return the last stage that all rows have, else the first, and words for a heading."""
+        rows = [row for row in self._run.rows if row.is_real == is_real]
+        finished = [s for s in self._stages if all(self._results[s].has(row) for row in rows)]
+        stage = finished[-1] if finished else self._stages[0]
+        results = self._results[stage]
+        there = sum(map(results.has, rows))
+        part = '' if there == len(rows) else f', {there} of {len(rows)} rows so far'
+        return stage, results, f'{stage} clips a row{part}'
+
+    def _curve(self) -> Table:
+        """J of moving objects of all rows and stages, with true and with other commands."""
+        head = ['Row', 'clips', *REACTION_HEAD, HELD]
+        rows = [
+            [row.name, str(stage), *found.reaction(row.name), found.cell(row.name, None, HELD_KEY)]
+            for row in ROWS
+            for stage, found in self._results.items()
+            if found.evaluations(row.name)
+        ]
+        return Table(head=head, rows=rows)
+
+    def _times(self) -> Table:
+        head = ['Row', 'seed', 'clips', 'training CPU [h]', 'testing CPU [h]']
+        rows = []
+        for row in ROWS:
+            for seed in self._run.seeds:
+                folder = self._run.folder(row, seed)
+                steps = trained_steps(folder / 'training' / 'checkpoint')
+                if steps is None:
+                    continue
+                spent = read_json(folder / TIMES) if (folder / TIMES).is_file() else {}
+                hours = [
+                    f'{sum(spent.get(n, {}).get("cpu_s", 0) for n in names) / 3600:.2f}'
+                    for names in (('training',), ('test', 'zero_shot'))
+                ]
+                rows.append([row.name, str(seed), str(steps * self._run.batch_size), *hours])
+        return Table(head=head, rows=rows)
+
+
+#: columns of what tells whether a method reacts to its actions
+REACTION_HEAD = ['n', 'J moving', 'other commands', 'difference', 'reacts']
+REACTION_KEYS = ('j_moving', 'j_shuffled_moving', 'margin_over_shuffled')
+HELD_KEY = 'j_copy_moving'
+
+
+class Results:
+    """Finished evaluations of a stage as tables.
+
+    Args:
+        run: whose rows are read.
+        stage: its number of clips.
+    """
+
+    def __init__(self, run: PaperTables, stage: int) -> None:
+        self._run, self._stage, self._seeds = run, stage, run.seeds
         self._rows = {row.name: row for row in ROWS}
         self._read = {
             (row.name, seed, name): read_evaluations(folder)[0]
             for row in ROWS
             for seed in self._seeds
             for name in ('test', 'zero_shot')
-            if ((folder := run.folder(row, seed) / name) / 'metrics.json').is_file()
+            if ((folder := run.stage_folder(row, seed, stage) / name) / 'metrics.json').is_file()
         }
 
-    def sections(self) -> Iterator[str]:
-        """Yield headings, tables and what they mean."""
-        options = self._run.options
-        seeds = ', '.join(map(str, self._seeds))
-        yield (
-            f'# Tables of the paper\n\n{options.clips} clips a row, seeds {seeds}, preset '
-            f'{options.preset}; commit {commit()}; {machine()}.\n\n{_ABOUT}'
-        )
-        yield f'## Table 1: methods by view\n\n{self._methods(TABLE_1, VIEWS).text()}'
-        yield f'## Do they react to their actions?\n\n{self._reactions().text()}'
-        for key, words in (('j_union', 'J x 100'), ('j_moving', 'J moving x 100')):
-            yield f'## Table 3: {words} by task and view\n\n{self._by_task(key).text()}'
-        real = tuple(row.name for row in ROWS if row.is_real)
-        if any(name in real for name, _, _ in self._read):
-            views = (options.real_view,)
-            table = self._methods(real, views).text()
-            yield f'## Table 2: real recordings, one view\n\n{table}'
-        yield f'## Clips and time\n\n{self._times().text()}'
+    def has(self, row: Row) -> bool:
+        """Return True if a row is tested with all seeds."""
+        return len(self.evaluations(row.name)) == len(self._seeds)
 
-    def _evaluations(self, name: str, test: str = 'test') -> list[EvaluationSummary]:
+    def evaluations(self, name: str, test: str = 'test') -> list[EvaluationSummary]:
+        """Return the evaluations of a row, one a seed."""
         keys = [(name, seed, test) for seed in self._seeds]
         return [self._read[key] for key in keys if key in self._read]
 
-    def _cell(
+    def cell(
         self,
         name: str,
         view: str | None,
@@ -423,73 +572,78 @@ class Results:
         digits: int = 3,
         factor: float = 1.0,
     ) -> str:
-        """A number of a row: of one seed with its interval, else mean and range of the seeds."""
+        """Return a number of a row: with its interval, or mean and range of several seeds."""
         found = [
             evaluated.estimates(view, Group(task=task))[key]
-            for evaluated in self._evaluations(name, test)
+            for evaluated in self.evaluations(name, test)
             if (view is None or view in evaluated.spec.views)
             and evaluated.chosen(Group(task=task))
             and key in evaluated.estimates(view, Group(task=task))
         ]
         return joined(found, digits, factor)
 
-    def _methods(self, names: Sequence[str], views: Sequence[str]) -> Table:
-        """Table 1 or 2: FID, FVD, the distance of Lite0, J and J of what moves by view."""
+    def methods(self, names: Sequence[str], views: Sequence[str]) -> Table:
+        """Return Table 1 or 2: FID, FVD, the distance of Lite0, J and J of what moves by view."""
         columns = ('FID', 'FVD', LITE, 'J', 'J moving')
-        head = ['Method', *(f'{view} {what}' for view in views for what in columns)]
+        head = ['Method', 'n', *(f'{view} {what}' for view in views for what in columns)]
         rows = []
         for name in names:
-            cells = [self._rows[name].title]
+            cells = [self._rows[name].title, self.count(name)]
             for view in views:
                 cells += [self._distance(name, view, key) for key in ('fid', 'fvd')]
                 cells.append(self._lite(name, view))
-                cells += [self._cell(name, view, key) for key in ('j_union', 'j_moving')]
+                cells += [self.cell(name, view, key) for key in ('j_union', 'j_moving')]
             rows.append(cells)
-        held = [HELD]
-        first = next((n for n in reversed(names) if self._evaluations(n)), names[-1])
+        first = next((n for n in reversed(names) if self.evaluations(n)), names[-1])
+        held = [HELD, self.count(first)]
         for view in views:
-            copies = [self._cell(first, view, k) for k in ('j_copy_union', 'j_copy_moving')]
+            copies = [self.cell(first, view, k) for k in ('j_copy_union', 'j_copy_moving')]
             held += [DASH] * 3 + copies
         return Table(head=head, rows=[*rows, held])
 
     def _distance(self, name: str, view: str, key: str) -> str:
         if getattr(self._run.options, f'{key}_weights') is None:
             return 'no weights' if self._has_view(name, view) else DASH
-        return self._cell(name, view, key, digits=1)
+        return self.cell(name, view, key, digits=1)
 
     def _has_view(self, name: str, view: str) -> bool:
-        return any(view in evaluated.spec.views for evaluated in self._evaluations(name))
+        return any(view in evaluated.spec.views for evaluated in self.evaluations(name))
 
     def _lite(self, name: str, view: str) -> str:
-        folders = (self._run.folder(self._rows[name], seed) for seed in self._seeds)
+        row = self._rows[name]
+        folders = (self._run.stage_folder(row, seed, self._stage) for seed in self._seeds)
         found = [distance(folder / 'test_features.npz', view) for folder in folders]
         return joined([one for one in found if one is not None], 1)
 
-    def _reactions(self) -> Table:
-        """J of moving objects with true and other commands, and whether they differ."""
-        head = ['Method', 'J moving', 'other commands', 'difference', 'reacts']
-        rows = []
-        for row in ROWS:
-            if not self._evaluations(row.name):
-                continue
-            keys = ('j_moving', 'j_shuffled_moving', 'margin_over_shuffled')
-            cells = [self._cell(row.name, None, key) for key in keys]
-            lows = [
-                evaluated.estimates(None)['margin_over_shuffled'].interval[0]
-                for evaluated in self._evaluations(row.name)
-            ]
-            known = [low for low in lows if isfinite(low)]
-            reacts = 'cannot tell' if not known else ('yes' if min(known) > 0 else 'not shown')
-            where = f' ({row.name})' if row.is_real or row.views else ''
-            rows.append([f'{row.title}{where}', *cells, reacts])
-        return Table(head=head, rows=rows)
+    def reactions(self, *, is_real: bool = False) -> Table:
+        """Return J of moving objects with true and other commands, and whether they differ."""
+        rows = [
+            [f'{row.title} ({row.name})', *self.reaction(row.name)]
+            for row in ROWS
+            if row.is_real == is_real and self.evaluations(row.name)
+        ]
+        return Table(head=['Method', *REACTION_HEAD], rows=rows)
 
-    def _by_task(self, key: str) -> Table:
-        """Table 3: the paper's rows, tasks by view, and all tasks together, times 100."""
+    def reaction(self, name: str) -> list[str]:
+        """Return the cells of a row under `REACTION_HEAD`."""
+        lows = [
+            evaluated.estimates(None)['margin_over_shuffled'].interval[0]
+            for evaluated in self.evaluations(name)
+        ]
+        known = [low for low in lows if isfinite(low)]
+        reacts = 'cannot tell' if not known else ('yes' if min(known) > 0 else 'not shown')
+        return [self.count(name), *(self.cell(name, None, key) for key in REACTION_KEYS), reacts]
+
+    def count(self, name: str, test: str = 'test') -> str:
+        """Return how many episodes a row is tested on, of all seeds."""
+        return str(sum(len(e.results) for e in self.evaluations(name, test)) or DASH)
+
+    def by_task(self, key: str) -> Table:
+        """Return Table 3: the paper's rows, tasks by view, and all tasks together, times 100."""
         tasks = sorted(self._run.options.tasks)
         columns = [(task, view) for task in tasks for view in VIEWS]
         columns += [(None, view) for view in VIEWS]
-        head = ['Method', *(f'{task or "Task Averaged"} {view}' for task, view in columns)]
+        head = ['Method', 'n', *(f'{task or "Task Averaged"} {view}' for task, view in columns)]
         lines: list[tuple[str, dict[str, str], str, str]] = [
             (self._rows[name].title, dict.fromkeys(VIEWS, name), 'test', key)
             for name in ('policy2vec', 'ee_mlp', 'fast_tokens')
@@ -511,36 +665,15 @@ class Results:
         rows = [
             [
                 title,
+                ' + '.join(dict.fromkeys(self.count(name, test) for name in names.values())),
                 *(
-                    self._cell(names[view], view, k, task, test=test, digits=1, factor=100.0)
+                    self.cell(names[view], view, k, task, test=test, digits=1, factor=100.0)
                     for task, view in columns
                 ),
             ]
             for title, names, test, k in lines
         ]
         return Table(head=head, rows=rows)
-
-    def _times(self) -> Table:
-        head = ['Row', 'seed', 'clips', 'training CPU [h]', 'testing CPU [h]', 'episodes tested']
-        rows = []
-        for row in ROWS:
-            for seed in self._seeds:
-                folder = self._run.folder(row, seed)
-                checkpoint = folder / 'training' / 'checkpoint'
-                if not (checkpoint / 'world_model.json').is_file():
-                    continue
-                spent = read_json(folder / TIMES) if (folder / TIMES).is_file() else {}
-                hours = [f'{spent.get(n, {}).get("cpu_s", 0) / 3600:.2f}' for n in _TIMED]
-                held = read_card(checkpoint).trained_on
-                steps = held.get('steps', 0)
-                tested = sum(len(e.results) for e in self._evaluations(row.name))
-                rows.append(
-                    [row.name, str(seed), str(steps * self._run.batch_size), *hours, str(tested)]
-                )
-        return Table(head=head, rows=rows)
-
-
-_TIMED = ('training', 'test')
 
 
 def joined(found: Sequence[Estimate], digits: int, factor: float = 1.0) -> str:
@@ -610,6 +743,7 @@ def check_settings(file: Path, settings: dict[str, Any]) -> None:
         ConfigError: says what differs.
     """
     if not file.is_file():
+        file.parent.mkdir(parents=True, exist_ok=True)
         write_json(file, settings)
         return
     there = read_json(file)
@@ -617,23 +751,31 @@ def check_settings(file: Path, settings: dict[str, Any]) -> None:
              if there.get(k) != v]  # fmt: skip
     if other:
         raise ConfigError(
-            f"'{file.parent}' holds a run of other settings: {'; '.join(other)}. Give the same, "
+            f"'{file}' is of a run of other settings: {'; '.join(other)}. Give the same, "
             'or another --out'
         )
 
 
+class FolderInUse(ConfigError):
+    """Another process works in a folder."""
+
+
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Hold a folder, so that one process alone works in it.
 
+    Args:
+        folder: to hold.
+        wait: for another process to release the folder.
+
     Raises:
-        ConfigError: another process does.
+        FolderInUse: another process holds the folder, and `wait` is off.
     """
     with (folder / '.lock').open('w') as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError as error:
-            raise ConfigError(f"another process works in '{folder}'; wait for it") from error
+            raise FolderInUse(f"another process works in '{folder}'; wait for it") from error
         yield
 
 
@@ -666,9 +808,10 @@ def add_time(file: Path, name: str, wall_s: float, cpu_s: float) -> None:
     write_json(file, spent)
 
 
-def _is_trained(checkpoint: Path, steps: int) -> bool:
+def trained_steps(checkpoint: Path) -> int | None:
+    """Return the steps that a checkpoint was trained for; None if there is none."""
     card = checkpoint / 'world_model.json'
-    return card.is_file() and read_card(checkpoint).trained_on.get('steps') == steps
+    return read_card(checkpoint).trained_on.get('steps') if card.is_file() else None
 
 
 def _has_episodes(dataset: Path, count: int) -> bool:
@@ -695,20 +838,38 @@ def parser() -> argparse.ArgumentParser:
     )
     add = made.add_argument
     add('--out', type=Path, required=True, help='goes on with what is there')
-    add('--clips', type=int, default=8000, help='training clips a row')
+    add(
+        '--clips',
+        type=_numbers,
+        default=list(STAGES),
+        metavar='N,N,...',
+        help='training clips a row of each stage; default: ' + ','.join(map(str, STAGES)),
+    )
     add('--seeds', type=_numbers, default=[0], help='of trainings, comma-separated')
     add('--rows', type=_names, help=f'of {", ".join(row.name for row in ROWS)}; default: all')
     add('--tasks', type=_names, default=all_tasks(), help='default: the fifteen of the package')
     add('--data', type=Path, help='of collect; default: made in OUT/data')
     add('--episodes', type=int, default=EPISODES_PER_TASK, help='per task, where data are made')
     add('--data-seed', type=int, default=20000, help='of the data that are made')
-    add('--test-episodes', type=int, help='spread over the tasks; default: all of the split')
+    add(
+        '--test-episodes',
+        type=_numbers,
+        metavar='N,N,...',
+        help='tested in each stage, the last number in all further ones, spread over the tasks; '
+        'default: all of the split',
+    )
     add('--zero-shot', type=Path, help='of collect --zero-shot; default: made in OUT/zero_shot')
     add(
         '--zero-shot-episodes',
         type=int,
         default=ZERO_SHOT_EPISODES,
         help='where they are made; 0 = no row of zero-shot',
+    )
+    add(
+        '--zero-shot-tested',
+        type=_numbers,
+        metavar='N,N,...',
+        help='tested in each stage, the last number in all further ones; default: all',
     )
     add('--real', type=Path, help='folder of imported real episodes, for Table 2')
     add('--real-view', help='the view of Table 2')
