@@ -61,8 +61,8 @@ VIEWS = ('low', 'high')
 SETTINGS, TIMES, TABLES = 'settings.json', 'times.json', 'tables.md'
 #: default stages: training clips a row
 STAGES = (500, 1000, 2000, 4000, 8000)
-#: steps of the learning rate's warm-up, the same for all stages
-WARMUP_STEPS = 50
+#: steps of the learning rate's warm-up, the same for all stages of 250 clips or more
+WARMUP_STEPS = 25
 #: pause before rows that another process works on are looked at again [s]
 WAIT_S = 20.0
 #: episodes of a task, half of them for training; the paper has 1,492 of 15 tasks

@@ -15,8 +15,11 @@ from safetensors.torch import save_file
 import torch
 
 from mtv_world_ros.cli import main as mtv_world
+from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.training.trainer import learning_rate
+from mtv_world_ros.training.training_config import load_training_config
 from test.support.sources import set_options, TINY_MODEL
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -100,7 +103,9 @@ def test_rows_are_trained_and_tested_and_their_cells_are_filled(finished: Path):
     single = next(line for line in text.splitlines() if line.startswith('| Single-View '))
     assert '–' in single or '.' in single
     trained = json.loads(
-        (finished / 'rows/single_view_low/seed_0/training/checkpoint/world_model.json').read_text()
+        (
+            finished / 'rows/single_view_low/seed_0/clips_000001/checkpoint/world_model.json'
+        ).read_text()
     )
     assert trained['views'] == ['low'] and trained['trained_on']['steps'] == 1
     assert trained['rendering']['link_width_m'] is None  # the paper draws trails alone
@@ -142,7 +147,7 @@ def test_a_command_that_is_stopped_says_how_to_go_on(
     stopped = Recorder(lambda words: 130)
     assert tables.main(words_of(tmp_path / 'out', data), stopped) == 130
     told = capsys.readouterr().err
-    assert 'single_view_low, seed 0: training' in told and 'ended with status 130' in told
+    assert 'single_view_low, seed 0, 1 clips: training' in told and 'ended with status 130' in told
     assert 'run the same command again to go on' in told
     again = Recorder(lambda words: 130)
     tables.main(words_of(tmp_path / 'out', data), again)
@@ -194,17 +199,111 @@ def test_a_run_of_other_settings_is_not_mixed_with_this_one(
     nothing, out = Recorder(lambda words: 1), tmp_path / 'out'
     tables.main(words_of(out, data), nothing)
     capsys.readouterr()
-    assert tables.main([*words_of(out, data), '--clips', '5'], nothing) == 1
-    assert 'clips is 1 there, 5 now' in capsys.readouterr().err
+    assert tables.main([*words_of(out, data), '--preset', 'small'], nothing) == 1
+    assert "preset is 'paper' there, 'small' now" in capsys.readouterr().err
+    assert tables.main([*words_of(out, data), '--test-episodes', '1'], nothing) == 1
+    assert 'test_episodes is None there, 1 now' in capsys.readouterr().err
 
 
-def test_two_processes_do_not_work_in_one_folder(
-    tables: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+def test_a_row_that_another_process_works_on_is_left_to_it_and_looked_at_again(
+    tables: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    (tmp_path / 'out').mkdir()
-    with tables.locked(tmp_path / 'out'):
-        assert tables.main(words_of(tmp_path / 'out', data), Recorder(lambda words: 1)) == 1
-    assert 'another process works in' in capsys.readouterr().err
+    """While single_view_low is held, mtv_world is begun; then the other, once it is free."""
+    begun, busy = [], tmp_path / 'out' / 'rows' / 'single_view_low' / 'seed_0'
+    busy.mkdir(parents=True)
+    held = tables.locked(busy)
+    held.__enter__()
+    monkeypatch.setattr(tables.time, 'sleep', lambda _: held.__exit__(None, None, None))
+    monkeypatch.setattr(
+        tables.PaperTables, '_do_stage', lambda run, row, seed, stage: begun.append(row.name)
+    )
+    assert tables.main(words_of(tmp_path / 'out', data), Recorder(lambda words: 1)) == 0
+    assert begun == ['mtv_world', 'single_view_low']
+
+
+def test_all_rows_have_a_stage_before_any_goes_on_to_the_next(
+    tables: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    begun = []
+    monkeypatch.setattr(
+        tables.PaperTables,
+        '_do_stage',
+        lambda run, row, seed, stage: (
+            (stage, row.name) in begun or begun.append((stage, row.name))
+        ),
+    )
+    words = words_of(tmp_path / 'out', data, ROWS, '--clips', '2,4')
+    assert tables.main(words, Recorder(lambda words: 1)) == 0
+    rows = ['single_view_low', 'mtv_world']
+    assert begun == [(stage, name) for stage in (2, 4) for name in rows]
+
+
+@pytest.mark.parametrize('clips', ['4,2', '2,2', '0'])
+def test_stages_that_do_not_rise_are_refused(
+    tables: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture, clips: str
+):
+    words = words_of(tmp_path / 'out', data, ROWS, '--clips', clips)
+    assert tables.main(words, Recorder(lambda words: 1)) == 1
+    assert f'--clips is {clips}; give numbers that rise' in capsys.readouterr().err
+
+
+def test_the_learning_rate_of_a_step_does_not_depend_on_later_stages(
+    tables: ModuleType, data: Path, tmp_path: Path
+):
+    """Rates of the first stage's steps, from the words of the trainings of two stages."""
+    options = tables.parser().parse_args(['--out', str(tmp_path), '--clips', '500,8000'])
+    run = tables.PaperTables(options)
+    rates = []
+    for stage in (500, 8000):
+        words = run._training(tables.ROWS[0], 0, stage)
+        sets = [word.partition('=')[2] for word in words if word.startswith('--set=')]
+        config = load_training_config('paper', set_overrides(sets)).optimizer
+        rates.append([learning_rate(step, config) for step in range(250)])
+    assert rates[0] == rates[1]
+    assert rates[0][-1] == 6e-4  # of the preset: it does not decay
+
+
+@pytest.mark.slow
+def test_a_row_goes_on_to_a_further_stage_and_keeps_the_earlier_numbers(
+    tables: ModuleType, run_folder: Path, data: Path
+):
+    """From 1 clip (1 step) to 4 (2 steps): the curve has both, the tables the last of all rows."""
+    before = (run_folder / 'rows/mtv_world/seed_0/clips_000001/test/metrics.json').read_bytes()
+    further = Recorder()
+    words = words_of(run_folder, data, ROWS, '--clips', '1,4', '--test-episodes', '2,1')
+    # a stage that is there is tested as it was
+    assert tables.main(words, further) == 1 and further.commands == []
+    words = words_of(run_folder, data, ROWS, '--clips', '1,4')
+    assert tables.main([*words, '--rows', 'mtv_world'], further) == 0
+    assert [command[0] for command in further.commands] == ['train', 'evaluate']
+    row = run_folder / 'rows/mtv_world/seed_0'
+    assert (row / 'clips_000001/test/metrics.json').read_bytes() == before
+    steps = [tables.trained_steps(row / name / 'checkpoint') for name in
+             ('clips_000001', 'clips_000004', 'training')]  # fmt: skip
+    assert steps == [1, 2, 2]
+    tables.main(words, Recorder(lambda words: 130))  # the other row is stopped at once
+    text = (run_folder / 'tables.md').read_text()
+    assert '## Table 1: methods by view, 4 clips a row\n' in text  # of the one row asked for
+    options = tables.parser().parse_args(words)
+    text = tables.PaperTables(options).write_tables()
+    assert '## Table 1: methods by view, 1 clips a row\n' in text
+    curve = text.partition('## Learning curve')[2].partition('##')[0]
+    points = [line.split('|')[1:3] for line in curve.splitlines() if '_' in line]
+    assert [[cell.strip() for cell in point] for point in points] == [
+        ['single_view_low', '1'], ['mtv_world', '1'], ['mtv_world', '4']
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_stage_below_what_a_row_was_trained_for_is_left_out(
+    tables: ModuleType, run_folder: Path, data: Path, capsys: pytest.CaptureFixture
+):
+    words = words_of(run_folder, data, 'mtv_world', '--clips', '1,8')
+    assert tables.main(words, Recorder()) == 0
+    nothing = Recorder(lambda words: 1)
+    words = words_of(run_folder, data, 'mtv_world', '--clips', '1,4,8')
+    assert tables.main(words, nothing) == 0 and nothing.commands == []
+    assert '4 clips: left out, the row was trained further' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -255,7 +354,7 @@ def test_all_rows_have_the_same_budget_and_differ_in_what_they_are_named_after(
          '--real-view', 'ext1']
     )  # fmt: skip
     run = tables.PaperTables(options, Recorder(lambda words: 1))
-    found = {row.name: ' '.join(run._training(row, 0)) for row in run.rows}
+    found = {row.name: ' '.join(run._training(row, 0, 8000)) for row in run.rows}
     assert len(found) == len(tables.ROWS)
     assert all('optimizer.steps=4000' in words for words in found.values())
     for control in ('policy2vec', 'ee_mlp', 'fast_tokens'):
