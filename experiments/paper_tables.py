@@ -20,11 +20,12 @@ them: `--real data/lab --real-view ext1 --real-segmenter data/lab/objects.safete
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 import fcntl
-from math import ceil, isfinite
+from itertools import pairwise
+from math import ceil, isfinite, nan
 from pathlib import Path
 import shlex
 import shutil
@@ -46,9 +47,13 @@ from mtv_world_ros.core.documents import DASH, Table
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
 from mtv_world_ros.core.files import share_path, whole_folder, write_json, write_whole
 from mtv_world_ros.data.splits import CARD_FILE, EVERY, select
-from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, Group
+from mtv_world_ros.evaluation.evaluation_summary import (
+    EvaluationSummary,
+    Group,
+    NOT_MEASURED,
+)
 from mtv_world_ros.evaluation.metrics.frechet_features import clip_features, frame_features
-from mtv_world_ros.evaluation.metrics.statistics import Estimate
+from mtv_world_ros.evaluation.metrics.statistics import Estimate, mean_interval
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.reports.read_back import read_evaluations
 from mtv_world_ros.success.task import load_tasks
@@ -120,6 +125,20 @@ ROWS = (
 #: the row whose model is tested on the zero-shot episodes, and the title of that row
 FULL, ZERO_SHOT = 'mtv_world', 'Zero-Shot'
 HELD = 'First frame held'
+#: rows from worst to best by the paper's Table 3, with J x 100 averaged over its tasks, by view
+PAPER_ORDER: tuple[tuple[Mapping[str, str], Mapping[str, float]], ...] = (
+    ({'high': 'policy2vec'}, {'high': 18.3}),
+    (dict.fromkeys(VIEWS, 'ee_mlp'), {'low': 35.3, 'high': 22.2}),
+    (dict.fromkeys(VIEWS, 'fast_tokens'), {'low': 36.7, 'high': 26.3}),
+    (
+        {'low': 'single_view_low', 'high': 'single_view_high'},
+        {'low': 51.3, 'high': 38.0},
+    ),
+    (dict.fromkeys(VIEWS, 'without_mask'), {'low': 54.8, 'high': 42.6}),
+    (dict.fromkeys(VIEWS, 'mtv_world'), {'low': 54.9, 'high': 45.0}),
+)
+#: rows of Table 2 from worst to best by the paper
+REAL_ORDER = ('real_ee_mlp', 'real_fast_tokens', 'real_mtv_world')
 #: rows of Table 1 (without the ablations), and of Table 3 in the paper's order
 TABLE_1 = ('policy2vec', 'ee_mlp', 'fast_tokens', 'mtv_world')
 _ABOUT = (
@@ -467,39 +486,51 @@ class Sections:
         options = self._run.options
         seeds = ', '.join(map(str, self._run.seeds))
         yield (
-            f'# Tables of the paper\n\nStages of {", ".join(map(str, self._stages))} clips a row, '
-            f'seeds {seeds}, preset {options.preset}, learning rate constant after '
-            f'{WARMUP_STEPS} steps, averaged weights; commit {commit()}; {machine()}.\n\n{_ABOUT}'
+            f'# Tables of the paper\n\nStages of clips a row, seeds {seeds}, preset '
+            f'{options.preset}, learning rate constant after {WARMUP_STEPS} steps, averaged '
+            f'weights; commit {commit()}; {machine()}.\n\n{_ABOUT}'
         )
-        stage, found, which = self._last(is_real=False)
+        found, which = self._last(is_real=False)
         yield f'## Table 1: methods by view, {which}\n\n{found.methods(TABLE_1, VIEWS).text()}'
-        yield f'## Do they react to their actions? {which}\n\n{found.reactions().text()}'
+        yield f'## Do they react to their actions? {which}\n\n{found.reactions().markdown()}'
+        yield f"## The paper's order, {which}\n\n{_ORDER}\n\n{found.order().markdown()}"
         for key, words in (('j_union', 'J x 100'), ('j_moving', 'J moving x 100')):
             yield f'## Table 3: {words} by task and view, {which}\n\n{found.by_task(key).text()}'
-        if any(row.is_real for row in self._run.rows):
-            stage, found, which = self._last(is_real=True)
-            names = tuple(row.name for row in ROWS if row.is_real)
-            table = found.methods(names, (options.real_view,)).text()
-            yield f'## Table 2: real recordings, one view, {which}\n\n{table}'
+        if self._rows(is_real=True):
+            found, which = self._last(is_real=True)
             yield (
-                f'## Do they react to their actions? Real recordings, {which}\n\n'
-                f'{found.reactions(is_real=True).text()}'
+                f'## Table 2: real recordings, one view, {which}\n\n'
+                f'{found.methods(REAL_ORDER, found.real_views).text()}\n\n'
+                f'{found.reactions(is_real=True).markdown()}\n\n'
+                f'{found.real_order().markdown()}'
             )
-        yield f'## Learning curve\n\n{self._curve().text()}'
+        yield f'## Learning curve\n\n{self._curve().markdown()}'
         yield f'## Clips and time\n\n{self._times().text()}'
 
-    def _last(self, *, is_real: bool) -> tuple[int, Results, str]:
+    def _rows(self, *, is_real: bool) -> list[Row]:
+        """Return the rows that are asked for or there."""
+        return [
+            row
+            for row in ROWS
+            if row.is_real == is_real
+            and (
+                row in self._run.rows
+                or any(r.evaluations(row.name) for r in self._results.values())
+            )
+        ]
+
+    def _last(self, *, is_real: bool) -> tuple[Results, str]:
         """Return the last stage that all rows have, else the first, and words for a heading."""
-        rows = [row for row in self._run.rows if row.is_real == is_real]
-        finished = [s for s in self._stages if all(self._results[s].has(row) for row in rows)]
+        rows = self._rows(is_real=is_real)
+        finished = [s for s in self._stages if rows and all(map(self._results[s].has, rows))]
         stage = finished[-1] if finished else self._stages[0]
         results = self._results[stage]
         there = sum(map(results.has, rows))
         part = '' if there == len(rows) else f', {there} of {len(rows)} rows so far'
-        return stage, results, f'{stage} clips a row{part}'
+        return results, f'{stage} clips a row{part}'
 
     def _curve(self) -> Table:
-        """J of moving objects of all rows and stages, with true and with other commands."""
+        """Return J of moving objects of all rows and stages, with true and other commands."""
         head = ['Row', 'clips', *REACTION_HEAD, HELD]
         rows = [
             [row.name, str(stage), *found.reaction(row.name), found.cell(row.name, None, HELD_KEY)]
@@ -531,6 +562,12 @@ class Sections:
 REACTION_HEAD = ['n', 'J moving', 'other commands', 'difference', 'reacts']
 REACTION_KEYS = ('j_moving', 'j_shuffled_moving', 'margin_over_shuffled')
 HELD_KEY = 'j_copy_moving'
+#: columns of the difference of two rows
+_DIFFERENCES = ['n', 'J x 100', 'J moving x 100', "paper's order"]
+_ORDER = (
+    'Differences of J x 100, paired by episode, of rows in the order of the paper\'s "Task '
+    'Averaged". Confirmed: the interval of the difference of J is above 0; contradicted: below 0.'
+)
 
 
 class Results:
@@ -599,7 +636,7 @@ class Results:
         for view in views:
             copies = [self.cell(first, view, k) for k in ('j_copy_union', 'j_copy_moving')]
             held += [DASH] * 3 + copies
-        return Table(head=head, rows=[*rows, held])
+        return Table(head=head, rows=[*rows, held], num_labels=2)
 
     def _distance(self, name: str, view: str, key: str) -> str:
         if getattr(self._run.options, f'{key}_weights') is None:
@@ -622,7 +659,7 @@ class Results:
             for row in ROWS
             if row.is_real == is_real and self.evaluations(row.name)
         ]
-        return Table(head=['Method', *REACTION_HEAD], rows=rows)
+        return Table(head=['Method', *REACTION_HEAD], rows=rows, num_labels=2)
 
     def reaction(self, name: str) -> list[str]:
         """Return the cells of a row under `REACTION_HEAD`."""
@@ -633,6 +670,63 @@ class Results:
         known = [low for low in lows if isfinite(low)]
         reacts = 'cannot tell' if not known else ('yes' if min(known) > 0 else 'not shown')
         return [self.count(name), *(self.cell(name, None, key) for key in REACTION_KEYS), reacts]
+
+    @property
+    def real_views(self) -> tuple[str, ...]:
+        """The view of the real recordings."""
+        found = [e for name in REAL_ORDER for e in self.evaluations(name)]
+        return found[0].spec.views if found else (self._run.options.real_view,)
+
+    def order(self) -> Table:
+        """Return differences of rows that the paper has in another order, paired by episode."""
+        neighbours = list(pairwise(PAPER_ORDER))
+        best = PAPER_ORDER[-1]
+        lines = []
+        for (worse, theirs), (better, mine) in [
+            *neighbours,
+            *((o, best) for o in PAPER_ORDER[:-2]),
+        ]:
+            for view in VIEWS:
+                if view in worse:
+                    pair = better[view], worse[view]
+                    lines.append([*pair, view, f'{mine[view] - theirs[view]:.1f}',
+                                  *self._differences(*pair, view)])  # fmt: skip
+        return Table(head=['Better', 'than', 'view', 'in the paper', *_DIFFERENCES], rows=lines)
+
+    def real_order(self) -> Table:
+        """Return differences of neighbours of the paper's Table 2, paired by episode."""
+        (view,) = self.real_views
+        lines = [
+            [better, worse, view, *self._differences(better, worse, view)]
+            for worse, better in pairwise(REAL_ORDER)
+        ]
+        return Table(head=['Better', 'than', 'view', *_DIFFERENCES], rows=lines)
+
+    def _differences(self, better: str, worse: str, view: str) -> list[str]:
+        """Return the cells of a pair of rows under `_DIFFERENCES`."""
+        whole, moving = (self.difference(better, worse, view, k) for k in ('j_union', 'j_moving'))
+        low, high = whole.interval
+        says = 'confirmed' if low > 0 else 'contradicted' if high < 0 else 'cannot be told'
+        cells = [joined([one], 1, 100.0) for one in (whole, moving)]
+        return [str(whole.num_episodes or DASH), *cells, says if isfinite(whole.value) else DASH]
+
+    def difference(self, better: str, worse: str, view: str, key: str) -> Estimate:
+        """Return the mean difference of two rows over the episodes that both have."""
+        held: list[dict[tuple[int, str], float]] = []
+        for name in (better, worse):
+            found = [(seed, r) for seed in self._seeds if (name, seed, 'test') in self._read
+                     for r in self._read[name, seed, 'test'].results]  # fmt: skip
+            held.append({(seed, r.episode): r.means(view).get(key, nan) for seed, r in found})
+        both = [held[0][k] - held[1][k] for k in held[0] if k in held[1]]
+        values = np.array([value for value in both if isfinite(value)])[:, None]
+        if not len(values):
+            return NOT_MEASURED
+        means, ends = mean_interval(values, np.ones_like(values), low=-1.0)
+        return Estimate(
+            value=float(means[0]),
+            interval=(float(ends[0, 0]), float(ends[1, 0])),
+            num_episodes=len(values),
+        )
 
     def count(self, name: str, test: str = 'test') -> str:
         """Return how many episodes a row is tested on, of all seeds."""
@@ -673,7 +767,7 @@ class Results:
             ]
             for title, names, test, k in lines
         ]
-        return Table(head=head, rows=rows)
+        return Table(head=head, rows=rows, num_labels=2)
 
 
 def joined(found: Sequence[Estimate], digits: int, factor: float = 1.0) -> str:

@@ -8,7 +8,8 @@ import json
 from pathlib import Path
 import shutil
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
+from typing import NamedTuple
 
 import pytest
 from safetensors.torch import save_file
@@ -267,7 +268,7 @@ def test_the_learning_rate_of_a_step_does_not_depend_on_later_stages(
 def test_a_row_goes_on_to_a_further_stage_and_keeps_the_earlier_numbers(
     tables: ModuleType, run_folder: Path, data: Path
 ):
-    """From 1 clip (1 step) to 4 (2 steps): the curve has both, the tables the last of all rows."""
+    """From 1 clip to 4, in steps of one: the curve has both, the tables the last of all rows."""
     before = (run_folder / 'rows/mtv_world/seed_0/clips_000001/test/metrics.json').read_bytes()
     further = Recorder()
     words = words_of(run_folder, data, ROWS, '--clips', '1,4', '--test-episodes', '2,1')
@@ -280,13 +281,9 @@ def test_a_row_goes_on_to_a_further_stage_and_keeps_the_earlier_numbers(
     assert (row / 'clips_000001/test/metrics.json').read_bytes() == before
     steps = [tables.trained_steps(row / name / 'checkpoint') for name in
              ('clips_000001', 'clips_000004', 'training')]  # fmt: skip
-    assert steps == [1, 2, 2]
-    tables.main(words, Recorder(lambda words: 130))  # the other row is stopped at once
+    assert steps == [1, 4, 4]
     text = (run_folder / 'tables.md').read_text()
-    assert '## Table 1: methods by view, 4 clips a row\n' in text  # of the one row asked for
-    options = tables.parser().parse_args(words)
-    text = tables.PaperTables(options).write_tables()
-    assert '## Table 1: methods by view, 1 clips a row\n' in text
+    assert '## Table 1: methods by view, 1 clips a row\n' in text  # the other row has no more
     curve = text.partition('## Learning curve')[2].partition('##')[0]
     points = [line.split('|')[1:3] for line in curve.splitlines() if '_' in line]
     assert [[cell.strip() for cell in point] for point in points] == [
@@ -366,6 +363,52 @@ def test_all_rows_have_the_same_budget_and_differ_in_what_they_are_named_after(
     assert [n for n, words in found.items() if 'object_mask=false' in words] == ['without_mask']
     real = found['real_mtv_world']
     assert 'video.views=[ext1] ' in real and 'robot/robot.yaml' in real
+
+
+class Scored(NamedTuple):
+    """An episode's result, as far as differences of rows read it."""
+
+    episode: str
+    j: float
+
+    def means(self, view: str) -> dict[str, float]:
+        """Return J of a view; `high` is .1 less."""
+        value = self.j - 0.1 * (view == 'high')
+        return {'j_union': value, 'j_moving': value / 2}
+
+
+def test_the_order_of_two_rows_is_told_from_episodes_that_both_have(
+    tables: ModuleType, tmp_path: Path
+):
+    """Differences .02, .03, .04: mean .03, standard error .01/sqrt(3), t(2) = 4.303."""
+    options = tables.parser().parse_args(['--out', str(tmp_path)])
+    results = tables.Results(tables.PaperTables(options), 500)
+    scores = {
+        'without_mask': {'a': 0.50, 'b': 0.60, 'c': 0.70, 'd': float('nan')},
+        'mtv_world': {'a': 0.52, 'b': 0.63, 'c': 0.74, 'd': 0.9, 'e': 0.1},
+        'fast_tokens': {'a': 0.52, 'b': 0.63, 'c': 0.64},
+    }
+    results._read = {
+        (name, 0, 'test'): SimpleNamespace(results=[Scored(e, j) for e, j in found.items()])
+        for name, found in scores.items()
+    }
+    found = results.difference('mtv_world', 'without_mask', 'low', 'j_union')
+    assert found.num_episodes == 3 and found.value == pytest.approx(0.03)
+    half = 4.303 * 0.01 / 3**0.5
+    assert found.interval == pytest.approx((0.03 - half, 0.03 + half), abs=1e-5)
+    lines = {tuple(row[:3]): row[3:] for row in results.order().rows}
+    assert lines['mtv_world', 'without_mask', 'high'] == [
+        '2.4', '3', '3.0 [0.5, 5.5]', '1.5 [0.3, 2.7]', 'confirmed'
+    ]  # fmt: skip
+    assert lines['mtv_world', 'fast_tokens', 'low'][-1] == 'cannot be told'  # 0, 0, .1
+    assert lines['mtv_world', 'policy2vec', 'high'][1:] == ['–'] * 4
+    turned = tables.Results(tables.PaperTables(options), 500)
+    turned._read = {
+        ('mtv_world', 0, 'test'): results._read['without_mask', 0, 'test'],
+        ('without_mask', 0, 'test'): results._read['mtv_world', 0, 'test'],
+    }
+    lines = {tuple(row[:3]): row[3:] for row in turned.order().rows}
+    assert lines['mtv_world', 'without_mask', 'high'][-1] == 'contradicted'
 
 
 def test_real_recordings_are_split_three_to_one(
