@@ -206,6 +206,8 @@ one. Numbers have the units that stand in brackets. This page is written by
 own](parameters.md).
 """
 _ATTRIBUTE = re.compile(r'^ {4}(\w+): (.*(?:\n {8}.*)*)', re.M)
+#: spelling of names in headings
+_NAMES = {'Dh': 'DH', 'Lora': 'LoRA', 'Lerobot': 'LeRobot'}
 _PLAIN = {
     str: 'text',
     int: 'whole number',
@@ -235,10 +237,10 @@ def page() -> str:
 
 def _title(kind: type[Schema]) -> str:
     """Return the heading of a section, e.g. `OptimizerConfig` -> `Optimizer`."""
-    name = re.sub(r'(Config|Settings|Entry)$', '', kind.__name__)
-    words = re.findall(r'[A-Z]+(?![a-z])|[A-Z][a-z0-9]*', name.replace('LeRobot', 'Lerobot'))
-    first, *rest = (word if word.isupper() else word.lower() for word in words)
-    return ' '.join([first[:1].upper() + first[1:], *rest])
+    name = re.sub(r'(Config|Settings|Entry)$', '', kind.__name__).replace('LeRobot', 'Lerobot')
+    first, *rest = re.findall(r'[A-Z]+(?![a-z])|[A-Z][a-z0-9]*', name)
+    words = [first, *(word if word.isupper() else word.lower() for word in rest)]
+    return ' '.join(_NAMES.get(word, word) for word in words)
 
 
 def _first_line(kind: type[Schema]) -> str:
