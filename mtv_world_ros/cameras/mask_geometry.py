@@ -13,6 +13,8 @@ from mtv_world_ros.core.data_types import BoolArray, CameraModel, FloatArray
 
 #: error of the centroid of a small mask [px]
 CENTROID_NOISE_PX = 0.3
+#: smallest height of an object that masks show, as of a plate seen from above [m]
+MIN_HEIGHT_M = 0.005
 #: ridge on the lean that no view determines, as a squared share of a view that shows it fully
 _RIDGE = 0.02
 
@@ -96,6 +98,47 @@ def block_size(
         pixels_per_metre2 = camera.K[0, 0] * camera.K[1, 1] / _depth(pose, point) ** 2
         sizes.append(np.sqrt(area / pixels_per_metre2 / shown))
     return float(np.median(sizes)) if sizes else float('nan')
+
+
+def upright_extents(
+    cameras: Sequence[CameraModel],
+    T_base_camera: Sequence[FloatArray],
+    masks: BoolArray,
+    point: FloatArray,
+) -> tuple[float, float]:
+    """Return the mean width and the height of an upright object [m]; NaN if no view shows it.
+
+    A view at elevation e shows an extent of `height * cos e + depth * sin e` along the image's
+    vertical. The depth along the line of sight is taken to be the mean width of the views.
+
+    Args:
+        cameras: of the V views.
+        T_base_camera: pose of each camera, (4, 4) [m].
+        masks: of the object in each view, (V, H, W); empty = not seen.
+        point: (3,) its centre [m].
+    """
+    shown = []
+    for camera, pose, mask in zip(cameras, T_base_camera, masks, strict=True):
+        if not mask.any():
+            continue
+        wide, high = _largest_box(mask)
+        depth, ray = _depth(pose, point), pose[:3, 3] - point
+        sine = abs(ray[2]) / np.linalg.norm(ray)
+        shown.append((wide * depth / camera.K[0, 0], high * depth / camera.K[1, 1], sine))
+    if not shown:
+        return float('nan'), float('nan')
+    widths, heights, sines = np.array(shown).T
+    width = float(widths.mean())
+    cosines = np.sqrt(1 - sines**2)  # a view from above shows no height
+    height = cosines @ (heights - width * sines) / max(float(cosines @ cosines), 1e-6)
+    return width, max(float(height), MIN_HEIGHT_M)
+
+
+def _largest_box(mask: BoolArray) -> tuple[int, int]:
+    """Width and height of the box around the largest connected part of a mask [px]."""
+    stats = np.asarray(cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)[2])
+    largest = stats[1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))]
+    return int(largest[cv2.CC_STAT_WIDTH]), int(largest[cv2.CC_STAT_HEIGHT])
 
 
 def lean(

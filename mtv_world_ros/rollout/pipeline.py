@@ -514,8 +514,13 @@ def _check_inputs(name: str, control: Control, transformer: Mapping[str, Any]) -
 
 
 def _tasks(task: str | None) -> tuple[tuple[TaskSpec, ...], str | None]:
-    """The known tasks, and the name of the one to judge; a file of the user's own is one more."""
-    known = load_tasks(share_path('config', 'tasks'))
+    """The known tasks, and the name of the one to judge; a file of the user's own is one more.
+
+    Tasks of objects of any size come last: an instruction that fits one of the benchmark's is
+    judged with the benchmark's thresholds.
+    """
+    folders = (('config', 'tasks'), ('config', 'tasks', 'any_size'))
+    known = tuple(task for folder in folders for task in load_tasks(share_path(*folder)))
     if task is None or not task.endswith(_YAML):
         return known, task
     given = load_task(Path(task))

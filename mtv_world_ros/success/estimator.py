@@ -12,14 +12,14 @@ import numpy as np
 from mtv_world_ros.core.data_types import FloatArray, SuccessEstimate
 from mtv_world_ros.core.errors import CannotTell, ConfigError, nearest
 from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
-from mtv_world_ros.success.calibration import Calibration, weighed
+from mtv_world_ros.success.calibration import Calibration, DOUBTS, weighed
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
 from mtv_world_ros.success.fitted_to import Setting
 from mtv_world_ros.success.foreseen import foreseen_ends, foreseen_feature, ForeseenEnds
 from mtv_world_ros.success.relations import Margin
 from mtv_world_ros.success.rollout_memory import Footage, remember, RolloutMemory
-from mtv_world_ros.success.situation import grippers_open
-from mtv_world_ros.success.task import load_tasks, match_task, TaskSpec
+from mtv_world_ros.success.situation import grippers_open, OPEN_SHARE
+from mtv_world_ros.success.task import load_tasks, match_task, object_called, TaskSpec
 from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
@@ -68,6 +68,16 @@ def capped(probability: float, features: Mapping[str, float]) -> float:
     # a rollout may begin where the task is all but done: then the margin is small
     left = features.get('moved', nan) == 0.0 and features.get('margin', nan) <= -MAX_MARGIN
     return min(probability, UNDONE_PROBABILITY) if closed or left else probability
+
+
+#: distance of a tool from an object's centre beyond which it does not hold the object [m]
+AWAY_M = 0.1
+#: reason against an estimate while a gripper has not let go, by `TaskSpec.gripper`
+_STILL_CLOSED = {
+    'open': 'a gripper is still closed (a task with `gripper: released` allows it away from what '
+    'it moved, one with `gripper: any` everywhere)',
+    'released': 'a gripper is still closed at what it moved (`gripper: any` allows that)',
+}
 
 
 class JudgedChunk(NamedTuple):
@@ -159,7 +169,7 @@ class SuccessEstimator:
             if ends is None:
                 return JudgedChunk(_abstains(reason, views, subjects), memory)
             evidence = Evidence.none(reason)
-        return JudgedChunk(self._judge(task, evidence, views, ends, is_real), memory)
+        return JudgedChunk(self._judge(task, evidence, views, subjects, ends, is_real), memory)
 
     def foresee(
         self, foreseen: ForeseenMotions, instruction: str, memory: RolloutMemory | None = None
@@ -182,7 +192,9 @@ class SuccessEstimator:
         """The task and its objects; a given task takes the objects in their order."""
         matched = match_task(self.tasks, instruction)
         if matched is not None:
-            return matched
+            task, said = matched
+            called = {role: object_called(name, names) for role, name in said.items()}
+            return task, {role: called[role] or name for role, name in said.items()}
         if self.is_given and len(names) == len(self.tasks[0].roles):
             return self.tasks[0], dict(zip(self.tasks[0].roles, names, strict=True))
         known = '; '.join(task.instruction for task in self.tasks) or 'none'
@@ -193,16 +205,19 @@ class SuccessEstimator:
         task: TaskSpec,
         evidence: Evidence,
         views: Views,
+        subjects: Sequence[int],
         ends: ForeseenEnds | None,
         is_real: bool,
     ) -> SuccessEstimate:
         features, spread = dict(evidence.features), 1.96 * evidence.sigma
         features['foreseen'] = foreseen_feature(ends)
-        features['released'] = _released(task, views.footage.openings)
+        features['released'] = _released(task, views, subjects)
         basis = self._objection(task)
         weights = None
         if self.calibration is not None and not basis:
             weights = self.calibration.given(is_real, ends is not None)
+        if is_real and weights is None:  # what was really seen needs no grasp that explains it
+            features |= dict.fromkeys(DOUBTS, nan)
         probability = weights.probability if weights else stated_probability
         margins = [features['margin'] + shift for shift in (-spread, 0.0, spread)]
         if evidence.worst is None:  # between the worst and the best that pictures could show
@@ -225,11 +240,11 @@ class SuccessEstimator:
         if ends is not None:
             counts = f'{ends.done.sum()} of {len(ends.done)} foreseen motions succeed'
             reasons.append(f'{counts}, {ends.share:.0%} by weight')
-        if task.gripper == 'open' and views.footage.openings is None:
+        if task.gripper != 'any' and views.footage.openings is None:
             reasons.append('gripper not checked')
         elif features['released'] == 0.0:
             low = 0.0
-            reasons.append('a gripper is still closed (a task with `gripper: any` allows it)')
+            reasons.append(_STILL_CLOSED[task.gripper])
         elsewhere = self._elsewhere(views, ends is not None) if weights else ''
         reasons.append(basis or self._origin(elsewhere, is_real))
         return SuccessEstimate(
@@ -268,11 +283,20 @@ class SuccessEstimator:
         )
 
 
-def _released(task: TaskSpec, openings: FloatArray | None) -> float:
-    """Return 1 if the grippers are open as required, else 0; NaN = not known or not required."""
-    if openings is None or task.gripper != 'open':
+def _released(task: TaskSpec, views: Views, subjects: Sequence[int]) -> float:
+    """Return 1 if the grippers have let go as required, else 0.
+
+    NaN = not known or not required.
+    """
+    footage = views.footage
+    if footage.openings is None or task.gripper == 'any':
         return nan
-    return float(grippers_open(openings)[-1])
+    if task.gripper == 'open' or footage.tools is None:
+        return float(grippers_open(footage.openings)[-1])
+    holding = footage.tools[footage.openings[:, -1] <= OPEN_SHARE, -1]
+    points = views.memory.points[subjects, -1]
+    away = np.linalg.norm(holding[:, None] - points[None], axis=-1)
+    return float((away > AWAY_M).all())  # NaN = not seen, which may be held
 
 
 def _check_views(task: TaskSpec, footage: Footage) -> None:

@@ -8,7 +8,13 @@ from math import isfinite, nan
 
 import numpy as np
 
-from mtv_world_ros.cameras.mask_geometry import block_size, count_reversals, Location, widest_swing
+from mtv_world_ros.cameras.mask_geometry import (
+    block_size,
+    count_reversals,
+    Location,
+    upright_extents,
+    widest_swing,
+)
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import CannotTell
 from mtv_world_ros.success.relations import (
@@ -18,7 +24,7 @@ from mtv_world_ros.success.relations import (
     ServedOn,
     Within,
 )
-from mtv_world_ros.success.rollout_memory import ObservedGrasp
+from mtv_world_ros.success.rollout_memory import MOVED_M, ObservedGrasp
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.jaccard import mean_of_known
@@ -88,6 +94,22 @@ class ImaginedScene:
         edge = block_size(footage.cameras, tuple(footage.poses[:, -1]), areas, point)
         return np.full(3, edge)
 
+    def seen_size(self, role: str) -> tuple[float, float]:
+        """See `Situation`; by the masks of the rollout's first frame."""
+        if role in self.sizes:
+            wide, long, high = self.sizes[role]
+            return (wide + long) / 2, high
+        item, footage = self.item(role), self.views.footage
+        found = upright_extents(
+            footage.cameras,
+            list(footage.poses[:, 0]),
+            self.views.start_mask(item) & self.views.start_ok(item)[:, None, None],
+            self.start(role),
+        )
+        if not np.isfinite(found).all():
+            raise CannotTell(f"the size of '{self.bound[role]}' is not known")
+        return found
+
     def clearances(self, role: str) -> FloatArray:
         """See `Situation`; how far the centre is over its start, where the object stood."""
         heights = self.views.memory.points[self.item(role), :, 2] - self.start(role)[2]
@@ -107,8 +129,6 @@ class ImaginedScene:
 
 #: limit of margins [softness lengths]
 MAX_MARGIN = 3.0
-#: minimum distance of a moved object from its start [m]
-MOVED_M = 0.03
 #: maximum horizontal distance of a tool from the centre of an object that it grasped [m]
 GRASP_M = 0.02
 #: maximum distance of a tool from the mask of an object that it grasped at the rim [m]

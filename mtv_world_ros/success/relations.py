@@ -210,6 +210,35 @@ class ServedOn(Relation):
         return float((at.size(self.subject)[2] - at.size(self.target)[2]) / 2 + FLOOR_M)
 
 
+class RestsOn(Relation):
+    """The subject rests on the target, anywhere on it, whatever the sizes of both.
+
+    Sizes are those that the first frame shows, so that the same task is about a saucer and a
+    serving plate, a block on a block and a block in a bowl.
+
+    Attributes:
+        target: placeholder of the object below.
+        tolerance_m: distance in height from lying on the target's floor or on its top that is
+            still resting. What rests on something hides its upper part, so that masks show the
+            centre of the lower object up to a quarter of its height too low.
+    """
+
+    target: str
+    tolerance_m: Length = 0.03
+
+    def margins(self, at: Situation) -> list[Margin]:
+        """Return the distance from the target's edge, and from the heights at which it rests."""
+        a, b = at.centres(self.subject), at.centres(self.target)
+        width, high = at.seen_size(self.target)
+        own_height, rise = at.seen_size(self.subject)[1], (a - b)[:, 2]
+        on_floor, on_top = (own_height - high) / 2 + FLOOR_M, (own_height + high) / 2
+        return [
+            Margin('over it', width / 2 - plane_distance(a, b)),
+            Margin('not below it', rise - (min(on_floor, on_top) - self.tolerance_m)),
+            Margin('not above it', max(on_floor, on_top) + self.tolerance_m - rise),
+        ]
+
+
 class NestedOn(ServedOn):
     """The subject, a plate, lies in or on the target, another plate.
 
@@ -420,6 +449,7 @@ KINDS: dict[str, type[Relation]] = {
     'on_top_of': OnTop,
     'served_on': ServedOn,
     'nested_on': NestedOn,
+    'rests_on': RestsOn,
     'within': Within,
     'inside': Inside,
     'apart': Apart,

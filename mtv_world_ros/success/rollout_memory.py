@@ -23,6 +23,8 @@ CLOSES_BY = 0.15
 OPENS_BY = 0.1
 #: opening at the start below which a gripper may already hold an object [fraction of its range]
 HOLDING_BELOW = 0.8
+#: minimum distance of a moved object from where it was [m]
+MOVED_M = 0.03
 #: minimum visible area of an object that is not hidden [fraction of its largest area]
 UNHIDDEN_SHARE = 0.9
 
@@ -84,7 +86,8 @@ class ObservedGrasp(NamedTuple):
         closed_at: (3,) where the tool was [m].
         gaps_m: (O,) how far outside an object's last unhidden mask it was [m]; negative =
             inside, NaN = not known. The largest over the views.
-        points: (O, 3) where the objects were last seen unhidden [m].
+        points: (O, 3) where the objects were last seen unhidden, or now if that is clearly
+            elsewhere [m].
         released_at: (3,) where it let go [m]; None = it has not.
     """
 
@@ -216,14 +219,21 @@ def _with_gripper(
 
 def _grasped(memory: RolloutMemory, footage: Footage, frame: int, arm: int) -> RolloutMemory:
     assert footage.tools is not None
-    tool = footage.tools[arm, frame]
+    tool, now = footage.tools[arm, frame], memory.points[:, -1]
+    # an object that is clearly elsewhere was moved, however much of it is hidden since
+    has_moved = np.linalg.norm(now - memory.seen_points, axis=-1) > MOVED_M
+    known = footage.known(frame).all(0)
+    shown = np.where(
+        (has_moved & known)[None, :, None, None], footage.frame_masks(frame), memory.seen_masks
+    )
     gaps = np.array(
         [
             _gap(footage.cameras, footage.poses[:, frame], masks, tool)
-            for masks in memory.seen_masks.swapaxes(0, 1)
+            for masks in shown.swapaxes(0, 1)
         ]
     )
-    grasp = ObservedGrasp(arm, tool, gaps, memory.seen_points.copy())
+    points = np.where((has_moved & known)[:, None], now, memory.seen_points)
+    grasp = ObservedGrasp(arm, tool, gaps, points)
     return replace(memory, grasps=(*memory.grasps, grasp)[-MAX_GRASPS:])
 
 

@@ -44,6 +44,10 @@ class Situation(Protocol):
         """Return the full extents (3,) of the object in its own frame [m]."""
         ...
 
+    def seen_size(self, role: str) -> tuple[float, float]:
+        """Return the object's mean width and its height as it stands at the start [m]."""
+        ...
+
     def clearances(self, role: str) -> FloatArray:
         """Return the height (T,) of the object's lowest point over the table [m]."""
         ...
@@ -94,6 +98,11 @@ class TruePoses:
     def size(self, role: str) -> FloatArray:
         """See `Situation`."""
         return np.asarray(self.sizes[role])
+
+    def seen_size(self, role: str) -> tuple[float, float]:
+        """See `Situation`."""
+        wide, long, high = self.sizes[role]
+        return (wide + long) / 2, high
 
     def clearances(self, role: str) -> FloatArray:
         """See `Situation`; the object is taken as an upright cylinder."""

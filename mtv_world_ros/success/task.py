@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 import re
 from typing import Annotated, Any, Self
@@ -17,7 +17,7 @@ from mtv_world_ros.success.relations import EXPECTED, KINDS, Length, Lengths3, R
 from mtv_world_ros.success.situation import grippers_open, Situation
 from mtv_world_ros.vision.describers.describer import ends_phrase
 
-GRIPPERS = ('open', 'any')
+GRIPPERS = ('open', 'released', 'any')
 #: number of last samples in which a `final` task is done (0.5 s at 10 Hz)
 HELD_SAMPLES = 5
 #: maximum length of an object's name in an instruction; it bounds the matching time [characters]
@@ -27,6 +27,8 @@ SCENES_REPLACED = (
     "scenes are no longer read from a table: a task is one file, 'config/tasks/NAME.yaml' or your "
     "own, and its entry of the table is its key 'scene' (docs/tasks.md)"
 )
+#: words of an instruction that name nothing
+_ARTICLES = frozenset({'a', 'an', 'the'})
 
 
 def _relation(data: Any) -> Relation:
@@ -71,7 +73,10 @@ class TaskSpec(Schema):
         nouns: what a placeholder's object may be called, by its last word; not given = anything.
             Tells tasks of one template apart.
         rims: last words of the names of objects that are held by their rim, not across the middle.
-        gripper: `open`: every gripper has let go at the end; `any`: that does not matter.
+        phrasings: further templates with the same placeholders. A task that has some takes
+            instructions with and without articles.
+        gripper: `open`: every gripper has let go at the end; `released`: every gripper is open,
+            or away from the objects that it was to move; `any`: that does not matter.
         views: names of the views to look at; empty = all.
         softness_m: length that counts as one in the margins [m].
         scene: objects on the table and moves of the expert, for the simulator; None = the task can
@@ -86,6 +91,7 @@ class TaskSpec(Schema):
     sizes_m: Annotated[dict[str, _Extents], _by_role('lengths')] = {}
     nouns: Annotated[dict[str, _Nouns], _by_role('words')] = {}
     rims: _Words = ()
+    phrasings: _Words = ()
     gripper: str = 'open'
     views: _Words = ()
     softness_m: Length = 0.01
@@ -94,11 +100,12 @@ class TaskSpec(Schema):
     @model_validator(mode='after')
     def _is_about_the_instruction(self) -> Self:
         for role in (*self.roles, *self.nouns, *self.sizes_m):
-            if f'{{{role}}}' not in self.instruction:
-                raise ValueError(
-                    f"the relations, nouns or sizes are about '{role}', which the instruction "
-                    f"'{self.instruction}' does not hold as {{{role}}}"
-                )
+            for template in self.templates:
+                if f'{{{role}}}' not in template:
+                    raise ValueError(
+                        f"the relations, nouns or sizes are about '{role}', which the instruction "
+                        f"'{template}' does not hold as {{{role}}}"
+                    )
         if self.gripper not in GRIPPERS:
             raise ValueError(
                 f"gripper is '{self.gripper}'; it must be one of {', '.join(GRIPPERS)}"
@@ -110,6 +117,11 @@ class TaskSpec(Schema):
         """Placeholders that the relations are about."""
         found = [role for relation in self.relations for role in relation.roles]
         return tuple(dict.fromkeys(found))
+
+    @property
+    def templates(self) -> tuple[str, ...]:
+        """Templates of instructions: `instruction`, then `phrasings`."""
+        return (self.instruction, *self.phrasings)
 
     @property
     def movers(self) -> tuple[str, ...]:
@@ -132,15 +144,24 @@ class TaskSpec(Schema):
             for margin in relation.margins(at)
             if margin.is_required
         ]
-        if self.gripper == 'open':
+        if self.gripper != 'any':  # poses alone do not say how far away a gripper is
             held.append(grippers_open(openings))
         return np.all(held, axis=0)
 
     def bind(self, instruction: str) -> dict[str, str] | None:
-        """Return the placeholders' objects if the instruction fits the template, else None."""
+        """Return the placeholders' objects if the instruction fits a template, else None."""
+        said = ' '.join(instruction.lower().split()).rstrip('.! ')
+        templates = [template.lower() for template in self.templates]
+        if self.phrasings:
+            said, templates = _bare(said), [_bare(template) for template in templates]
+        found = (self._bound(said, template) for template in templates)
+        return next((bound for bound in found if bound is not None), None)
+
+    def _bound(self, said: str, template: str) -> dict[str, str] | None:
+        """Return the placeholders' objects if words in lower case fit a template, else None."""
         name = rf'(?P<\1>[\\w -]{{1,{_LONGEST_NAME}}}?)'
-        pattern = re.sub(r'\\\{(\w+)\\\}', name, re.escape(self.instruction.lower()))
-        found = re.fullmatch(pattern, ' '.join(instruction.lower().split()).rstrip('.! '))
+        pattern = re.sub(r'\\\{(\w+)\\\}', name, re.escape(template))
+        found = re.fullmatch(pattern, said)
         if found is None:
             return None
         bound = found.groupdict()
@@ -148,6 +169,25 @@ class TaskSpec(Schema):
             return None  # one placeholder took two objects
         fits = all(bound[role].split()[-1] in nouns for role, nouns in self.nouns.items())
         return bound if fits else None
+
+
+def _bare(text: str) -> str:
+    """Return a text without articles."""
+    return ' '.join(word for word in text.split() if word not in _ARTICLES)
+
+
+def object_called(name: str, names: Sequence[str]) -> str | None:
+    """Return the one of several objects that a name means; None = none, or more than one.
+
+    Args:
+        name: as an instruction says it, e.g. `towel`.
+        names: names of the objects, e.g. `green towel`.
+    """
+    if name in names:
+        return name
+    words = set(_bare(name.lower()).split())
+    fits = [known for known in names if words <= set(known.lower().split())]
+    return fits[0] if len(fits) == 1 and words else None
 
 
 def match_task(
