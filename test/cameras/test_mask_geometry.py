@@ -1,11 +1,11 @@
-"""Leans of long objects from their masks."""
+"""Leans and extents of objects from their masks."""
 
 import cv2
 import numpy as np
 import pytest
 
 from mtv_world_ros.cameras.camera import project
-from mtv_world_ros.cameras.mask_geometry import lean
+from mtv_world_ros.cameras.mask_geometry import lean, upright_extents
 from mtv_world_ros.core.data_types import CameraModel
 from mtv_world_ros.core.transforms import looking_along
 
@@ -69,3 +69,44 @@ def test_a_round_mask_tells_nothing():
     mask = np.zeros((96, 128), np.uint8)
     cv2.circle(mask, (60, 50), 9, 1, -1)
     assert np.abs(lean([camera], [pose], [mask.astype(bool)])).max() < 0.02
+
+
+def drawn_box(camera, pose, size, yaw):
+    """The mask of an upright box at `PLACE`, by its projected corners."""
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    pixels, _ = project(camera, pose, (signs * size) @ turn.T + PLACE)
+    mask = np.zeros((camera.height, camera.width), np.uint8)
+    hull = cv2.convexHull(np.round(16 * pixels).astype(np.int32))
+    cv2.fillConvexPoly(mask, hull, 1, shift=4)
+    return mask.astype(bool)
+
+
+@pytest.mark.parametrize(
+    ('size', 'width'),
+    [((0.2, 0.2, 0.02), 0.23), ((0.05, 0.05, 0.05), 0.06), ((0.06, 0.06, 0.1), 0.07)],
+)
+def test_extents_of_plates_blocks_and_bottles_are_those_that_were_drawn(size, width):
+    # the width of a box is the mean over its turns: 4 / pi of its side
+    places = np.array([LOW, SIDE, ABOVE])
+    cameras, poses = zip(*[make_camera(p, (0, 0)) for p in places], strict=True)
+    found = []
+    for yaw in (0.0, 0.4, 0.8, 1.2):
+        masks = np.stack(
+            [drawn_box(c, pose, size, yaw) for c, pose in zip(cameras, poses, strict=True)]
+        )
+        found.append(upright_extents(cameras, poses, masks, PLACE))
+    assert np.mean(found, axis=0)[0] == pytest.approx(width, rel=0.15)
+    assert np.mean(found, axis=0)[1] == pytest.approx(size[2], abs=0.015)
+
+
+def test_extents_count_the_largest_part_and_the_views_that_see_it():
+    camera, pose = make_camera(np.array(LOW), (0, 0))
+    mask = drawn_box(camera, pose, (0.06, 0.06, 0.06), 0.0)
+    alone = upright_extents([camera], [pose], mask[None], PLACE)
+    spotted = mask.copy()
+    spotted[:3, :3] = True
+    empty = np.zeros_like(mask)
+    both = upright_extents([camera, camera], [pose, pose], np.stack([spotted, empty]), PLACE)
+    assert both == pytest.approx(alone)
+    assert np.isnan(upright_extents([camera], [pose], empty[None], PLACE)).all()

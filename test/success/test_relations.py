@@ -14,6 +14,7 @@ from mtv_world_ros.success.relations import (
     Moved,
     NestedOn,
     OnTop,
+    RestsOn,
     ServedOn,
     Shaken,
     Shifted,
@@ -325,3 +326,25 @@ def test_final_wants_success_in_each_of_the_last_samples():
     assert ever_and_final(np.array([True, False]), held=1) == (True, False)
     assert ever_and_final(np.zeros(4, dtype=bool), held=1) == (False, False)
     assert ever_and_final(np.ones(2, dtype=bool), held=5) == (True, False)
+
+
+@pytest.mark.parametrize(
+    ('size', 'offset', 'succeeds'),
+    [
+        # a plate of 20 cm, 2 cm high: anywhere on it
+        ((0.2, 0.2, 0.02), (0.0, 0.0, 0.02), True),
+        ((0.2, 0.2, 0.02), (0.09, 0.0, 0.02), True),
+        ((0.2, 0.2, 0.02), (0.11, 0.0, 0.02), False),
+        ((0.2, 0.2, 0.02), (0.0, 0.0, 0.1), False),
+        # a saucer of 10 cm: the same place is beside it
+        ((0.1, 0.1, 0.02), (0.06, 0.0, 0.02), False),
+        # a block of 6 cm: on its top, not beside it and not above it
+        ((0.06, 0.06, 0.06), (0.0, 0.02, 0.055), True),
+        ((0.06, 0.06, 0.06), (0.0, 0.06, 0.0), False),
+        ((0.06, 0.06, 0.06), (0.0, 0.0, 0.1), False),
+    ],
+)
+def test_resting_on_something_depends_on_its_size(size, offset, succeeds):
+    rests = RestsOn(kind='rests_on', subject='a', target='b')
+    at = situation({'a': B + [offset], 'b': B}, sizes={'a': (0.05, 0.05, 0.05), 'b': size})
+    assert bool(holds(rests, at)[0]) is succeeds

@@ -151,3 +151,52 @@ def test_places_and_gaps_are_those_of_the_drawn_blocks():
 def test_reversals_are_counted_beyond_the_noise(angles, count):
     counts = count_reversals(np.array(angles, float), 0.15)
     assert (counts[-1] if len(counts) else 0) == count
+
+
+def put_on_another(openings_at_end, tool_at_end):
+    """The red block is put on the blue one; then the gripper and its tool are as given."""
+    shown = pick_and_place(ON_TOP)
+    openings, tools = np.array(shown.openings), np.array(shown.tools)
+    openings[:, -2:], tools[:, -1] = openings_at_end, tool_at_end
+    return replace(shown, openings=openings, tools=tools)
+
+
+@pytest.mark.parametrize(
+    ('opening', 'tool', 'released'),
+    [(1.0, ON_TOP, 1.0), (0.0, ON_TOP, 0.0), (0.0, HOME, 1.0), (0.5, np.add(ON_TOP, 0.05), 0.0)],
+)
+def test_a_shut_gripper_away_from_what_it_moved_has_let_go(opening, tool, released):
+    tasks = load_tasks(share_path('config', 'tasks', 'any_size'))
+    found = SuccessEstimator(tasks).estimate(put_on_another(opening, tool), STACK).estimate
+    assert found.features['released'] == released
+    assert (found.probability > 0.75) is bool(released)
+
+
+def test_a_task_that_wants_open_grippers_does_not_ask_where_they_are(estimator):
+    found = estimator.estimate(put_on_another(0.0, HOME), STACK).estimate
+    assert found.features['released'] == 0.0
+    assert 'gripper: released' in ' '.join(found.reasons)
+
+
+def test_real_frames_need_no_grasp_that_explains_them(estimator):
+    shown = pick_and_place(GOAL, (0.0, 0.04, 0.0))
+    seen = estimator.estimate(shown, LEFT, is_real=True).estimate
+    assert seen.probability > 0.75
+    assert estimator.estimate(shown, LEFT).estimate.probability < 0.3
+
+
+def test_a_grasp_counts_from_where_the_block_was_pushed_to():
+    # pushed by 6 cm with a third of it hidden, so that it never was seen unhidden there
+    pushed = (RED[0] - 0.06, RED[1], RED[2])
+    red = [RED, RED, pushed, pushed]
+    rollout, start = masks(red[1:], [BLUE] * 3), masks(red[:1], [BLUE])
+    hidden = np.array(rollout.masks)
+    for view in range(2):
+        for frame in (1, 2):
+            rows = np.flatnonzero(hidden[view, 0, frame].any(1))
+            hidden[view, 0, frame, rows[: len(rows) // 3]] = False
+    shown = footage(replace(rollout, masks=hidden), start)
+    shown = with_robot(shown, [HOME, HOME, pushed, pushed], [1.0, 1.0, 1.0, 0.0])
+    (grasp,) = remember(None, shown).grasps
+    assert np.linalg.norm((grasp.points[0] - pushed)[:2]) < 0.015
+    assert grasp.gaps_m[0] < 0.01

@@ -11,7 +11,7 @@ from mtv_world_ros.simulation.randomize import draw_scene, instruction_of
 from mtv_world_ros.simulation.tasks import Shake, task_named, tasks_named
 from mtv_world_ros.simulation.workcell import workcell_of
 from mtv_world_ros.success.situation import TruePoses
-from mtv_world_ros.success.task import load_task, load_tasks, match_task
+from mtv_world_ros.success.task import load_task, load_tasks, match_task, object_called
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from test.support.tables import table
 
@@ -142,7 +142,10 @@ def test_nouns_tell_tasks_of_one_template_apart(bundled, instruction, name):
     ('change', 'message'),
     [
         (('relations:', 'relashions:'), r"unknown key 'relashions' \(did you mean 'relations'"),
-        (('name:', 'gripper: shut\nname:'), 'gripper is .shut.; it must be one of open, any'),
+        (
+            ('name:', 'gripper: shut\nname:'),
+            'gripper is .shut.; it must be one of open, released, any',
+        ),
         (('name:', 'nouns: {z: [cup]}\nname:'), "about 'z'"),
         (('name:', 'nouns: [cup]\nname:'), "'nouns' is .* expected words by placeholder"),
         (('name:', 'views: low\nname:'), "'views' is 'low'; expected a list of words"),
@@ -180,3 +183,61 @@ def test_files_that_cannot_be_used_are_config_errors(tmp_path, text):
         (tmp_path / name).write_text(LEFT)
     with pytest.raises(ConfigError, match='more than one file'):
         load_tasks(tmp_path)
+
+
+@pytest.fixture(scope='module')
+def put_on():
+    (task,) = load_tasks(share_path('config', 'tasks', 'any_size'))
+    return task
+
+
+@pytest.mark.parametrize(
+    ('said', 'subject', 'target'),
+    [
+        ('pick the blue block and place it in plate', 'blue block', 'plate'),
+        ('Pick up a blue block and put it on the white plate.', 'blue block', 'white plate'),
+        ('stack blue block on red block', 'blue block', 'red block'),
+        ('put the cup into the box', 'cup', 'box'),
+    ],
+)
+def test_things_of_any_size_are_put_on_others_in_many_words(put_on, said, subject, target):
+    assert put_on.bind(said) == {'a': subject, 'b': target}
+
+
+@pytest.mark.parametrize(
+    'said', ['put the red block and the green block on the plate', 'fold the towel', 'put it on']
+)
+def test_other_instructions_are_not_about_putting_one_thing_on_another(put_on, said):
+    assert put_on.bind(said) is None
+
+
+def test_benchmark_decides_what_it_knows(bundled, put_on):
+    tasks = [*bundled.values(), put_on]
+    names = {
+        said: matched and matched[0].name
+        for said in ('stack the red block on the blue block', 'stack red block on blue block')
+        for matched in [match_task(tasks, said)]
+    }
+    assert list(names.values()) == ['stack_blocks_two', 'put_on']
+
+
+@pytest.mark.parametrize(
+    ('name', 'meant'),
+    [
+        ('green towel', 'green towel'),
+        ('towel', 'green towel'),
+        ('the towel', 'green towel'),
+        ('block', None),
+        ('blue block', 'blue block'),
+        ('cup', None),
+        ('the', None),
+    ],
+)
+def test_objects_are_called_by_the_words_that_tell_them_apart(name, meant):
+    assert object_called(name, ('green towel', 'blue block', 'red block')) == meant
+
+
+def test_phrasings_need_all_placeholders(tmp_path):
+    text = LEFT.replace('name:', 'phrasings: ["move {a} left"]\nname:')
+    with pytest.raises(ConfigError, match="'move .a. left' does not hold as .b."):
+        load_task(write(tmp_path, text))
