@@ -4,7 +4,7 @@ It takes TensorFlow's weights of 2015-12-05 as `pt_inception-2015-12-05-*.pth` (
 `weights-inception-2015-12-05-*.pth` (torch-fidelity) hold them: keys as in torchvision's Inception
 v3, 1,008 classes, no auxiliary classifier. As in TensorFlow's graph, and unlike torchvision's,
 average pools leave the padding out, the last block pools by the maximum, and images are resized as
-TensorFlow 1 does.
+TensorFlow 1 does. torch-fidelity has the same network, but loads its weights by unpickling.
 """
 
 from __future__ import annotations
