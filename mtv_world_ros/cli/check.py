@@ -23,10 +23,6 @@ if TYPE_CHECKING:
     from mtv_world_ros.inspection.inspection_report import Inspection
 
 
-#: exit status by verdict; 2 is argparse's
-_STATUS = {'ok': 0, 'not checked': 3, 'suspicious': 1, 'broken': 1}
-
-
 def add(commands: argparse._SubParsersAction) -> None:
     """Add the command."""
     parser = commands.add_parser(
@@ -84,7 +80,7 @@ def _episodes_in(path: Path) -> list[Path]:
 def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
     from tqdm import tqdm
 
-    from mtv_world_ros.core.files import write_whole
+    from mtv_world_ros.core.files import write_json, write_whole
     from mtv_world_ros.core.images import write_png
     from mtv_world_ros.inspection.folder import (
         broken_parts,
@@ -94,7 +90,7 @@ def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
         inspect_folder,
     )
     from mtv_world_ros.inspection.inspect import load_inspector
-    from mtv_world_ros.inspection.inspection_report import BROKEN
+    from mtv_world_ros.inspection.inspection_report import BROKEN, CHECKED, EXIT_STATUS, to_json
 
     file, source = robot_file(arguments, paths[0])
     inspector = load_inspector(file)
@@ -116,9 +112,16 @@ def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
         write_png(out / 'episodes.png', picture)
     write_whole(out / 'report.md', folder_markdown(found, 'episodes.png'))
     write_whole(out / BROKEN, json.dumps(broken_parts(found), indent=2))
+    values = {
+        'verdict': found.verdict,
+        'exit_status': EXIT_STATUS[found.verdict],
+        'wrong': [finding.text for finding in found.findings],
+        'episodes': to_json(found.episodes, found.failed),
+    }
+    write_json(out / CHECKED, values)
     print(folder_text(found))
     print(f"{found.verdict}: see '{out / 'report.md'}'")
-    return _STATUS[found.verdict]
+    return EXIT_STATUS[found.verdict]
 
 
 def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
@@ -127,7 +130,7 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     from tqdm import tqdm
 
     from mtv_world_ros.inspection.inspect import load_inspector
-    from mtv_world_ros.inspection.inspection_report import to_text
+    from mtv_world_ros.inspection.inspection_report import EXIT_STATUS, to_text
 
     file, source = robot_file(arguments, path)
     inspector = load_inspector(file)
@@ -141,18 +144,30 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     _write_inspection(inspector, episode, inspection, out)
     print(to_text(inspection))
     print(f"{inspection.verdict}: see '{out / 'report.md'}'")
-    return _STATUS[inspection.verdict]
+    return EXIT_STATUS[inspection.verdict]
 
 
 def _write_inspection(
     inspector: Inspector, episode: Episode, inspection: Inspection, out: Path
 ) -> None:
-    from mtv_world_ros.core.files import write_whole
+    from mtv_world_ros.core.files import write_json, write_whole
     from mtv_world_ros.core.images import write_png
-    from mtv_world_ros.inspection.inspection_report import to_markdown
+    from mtv_world_ros.inspection.inspection_report import (
+        CHECKED,
+        EXIT_STATUS,
+        to_json,
+        to_markdown,
+    )
 
     pictures = {}
     for view in episode.views:
         pictures[view] = f'{view}.png'
         write_png(out / pictures[view], inspector.picture(episode, view))
     write_whole(out / 'report.md', to_markdown(inspection, pictures))
+    values = {
+        'verdict': inspection.verdict,
+        'exit_status': EXIT_STATUS[inspection.verdict],
+        'wrong': [],
+        'episodes': to_json({episode.info.path.name: inspection}),
+    }
+    write_json(out / CHECKED, values)

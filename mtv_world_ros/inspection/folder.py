@@ -16,11 +16,14 @@ from mtv_world_ros.core.transforms import inverse
 from mtv_world_ros.data.episode import Episode, MASKS_BY
 from mtv_world_ros.inspection.inspect import Inspector
 from mtv_world_ros.inspection.inspection_report import (
+    aligned,
     broken,
     Finding,
     Inspection,
+    NUMBERS,
     Section,
     suspicious,
+    VERDICTS,
     worst,
 )
 from mtv_world_ros.inspection.places import background, CameraPlaces, find_places
@@ -241,21 +244,30 @@ def _with(inspection: Inspection, view: str, finding: Finding) -> Inspection:
 
 
 def table(found: FolderInspection) -> list[list[str]]:
-    """Rows: episode, verdict, place of each view's camera, findings; the first is the head."""
-    views = list(found.places)
-    rows = [['episode', 'verdict', *(f'place of {view}' for view in views), 'findings']]
+    """Rows: episode, view, verdict, numbers, place of the camera, faults; the first is the head.
+
+    A view is a row; what concerns all views of an episode is one more if something is wrong there.
+    """
+    rows = [
+        ['episode', 'view', 'verdict', *(head for head, _ in NUMBERS.values()), 'place', 'wrong']
+    ]
     for name, inspection in found.episodes.items():
-        texts = [
-            f'{section.name}: {finding.text}'
-            for section in inspection.sections
-            for finding in section.findings
-            if finding.verdict != 'not checked'
-        ]
-        places = [found.place(view, name) for view in views]
-        rows.append([name, inspection.verdict, *places, ' / '.join(texts)])
+        for section in inspection.sections:
+            if section is inspection.recording and section.verdict == 'ok':
+                continue
+            place = found.place(section.name, name)
+            cells = [name, section.name, section.verdict, *section.cells(), place]
+            rows.append([*cells, ' / '.join(section.wrong)])
     for name, why in found.failed.items():
-        rows.append([name, 'broken', *('-' for _ in views), why])
+        rows.append([name, '-', 'broken', *('-' for _ in NUMBERS), '-', why])
     return rows
+
+
+def _counts(found: FolderInspection) -> str:
+    """Return how many views have each verdict, in words."""
+    verdicts = [view.verdict for episode in found.episodes.values() for view in episode.views]
+    each = [f'{verdicts.count(word)} {word}' for word in VERDICTS if word in verdicts]
+    return f'{len(verdicts)} views: {", ".join(each)}'
 
 
 def _conclusions(found: FolderInspection) -> list[str]:
@@ -263,10 +275,10 @@ def _conclusions(found: FolderInspection) -> list[str]:
     unchecked: dict[str, list[str]] = {}
     for name, inspection in found.episodes.items():
         for section in inspection.sections:
-            for finding in section.findings:
-                if finding.verdict == 'not checked':
-                    unchecked.setdefault(f'{section.name}: {finding.text}', []).append(name)
+            for text in section.unchecked:
+                unchecked.setdefault(f'{section.name}: {text}', []).append(name)
     return [
+        _counts(found),
         *(f'{finding.verdict}: {finding.text}' for finding in found.findings),
         *(f'not checked in {" ".join(names)}: {text}' for text, names in unchecked.items()),
         *found.notes,
@@ -287,16 +299,7 @@ def broken_parts(found: FolderInspection) -> dict[str, dict[str, str]]:
 
 def folder_text(found: FolderInspection) -> str:
     """Return the table as text, with what concerns all episodes below."""
-    rows = table(found)
-    widths = [max(len(row[n]) for row in rows) for n in range(len(rows[0]) - 1)]
-    lines = [
-        '  '.join(
-            [*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[-1]]
-        )
-        for row in rows
-    ]
-    lines += _conclusions(found)
-    return '\n'.join(line.rstrip() for line in lines)
+    return '\n'.join([*aligned(table(found)), *_conclusions(found)])
 
 
 def folder_markdown(found: FolderInspection, picture: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -189,7 +189,7 @@ class Inspector:
             measured = {}, [not_checked(_MOVES)]
         else:
             measured, notes = self._measured(episode, view, joints, residual)
-        return _section(
+        section = _section(
             view,
             [
                 *visibility,
@@ -203,6 +203,7 @@ class Inspector:
             ],
             notes,
         )
+        return replace(section, numbers=_numbers(residual))
 
     def _measured(
         self, episode: Episode, view: str, joints: JointTrack, residual: MotionResidual | Finding
@@ -345,6 +346,18 @@ class Inspector:
             return None
         matched = [(s, match_joints(t, self.robot)) for s, t in episode.trajectories]
         return stitch(matched, origin_ns)
+
+
+def _numbers(residual: MotionResidual | Finding | None) -> dict[str, float]:
+    """Return the numbers of a view that were measured, by the keys of `NUMBERS`."""
+    if not isinstance(residual, MotionResidual) or residual.reason:
+        return {}
+    found = {
+        'residual_px': float(np.hypot(*residual.shift_px)),
+        'match': residual.match,
+        'delay_s': residual.lag_s,
+    }
+    return {key: value for key, value in found.items() if np.isfinite(value)}
 
 
 def _instead(text: str, there: float, here: float) -> str:

@@ -5,14 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 #: file of a folder's report: what is broken, by episode and view
 BROKEN = 'broken.json'
 #: from best to worst
-VERDICTS = ('ok', 'not checked', 'suspicious', 'broken')
+NOT_CHECKED = 'not checked'
+VERDICTS = ('ok', NOT_CHECKED, 'suspicious', 'broken')
+#: exit status of the command by verdict; 2 is argparse's
+EXIT_STATUS = {'ok': 0, NOT_CHECKED: 3, 'suspicious': 1, 'broken': 1}
+#: numbers of a view: head and format of their column in tables
+NUMBERS = {
+    'residual_px': ('residual [px]', '{:.1f}'),
+    'match': ('match', '{:.2f}'),
+    'delay_s': ('delay [s]', '{:+.1f}'),
+}
+#: file with the numbers and findings of every view
+CHECKED = 'check.json'
 _ADVICE = {
     'ok': 'Everything was checked, and nothing wrong was found.',
-    'not checked': 'Nothing wrong was found, but not everything could be checked.',
+    NOT_CHECKED: 'Nothing wrong was found, but not everything could be checked.',
     'suspicious': 'Look at the overlay pictures before you rely on this recording.',
     'broken': 'Predictions from this recording would be wrong.',
 }
@@ -32,7 +44,7 @@ class Finding:
 
 def not_checked(text: str) -> Finding:
     """Return a check that could not be made, and why."""
-    return Finding(verdict='not checked', text=text)
+    return Finding(verdict=NOT_CHECKED, text=text)
 
 
 def suspicious(text: str) -> Finding:
@@ -57,12 +69,14 @@ class Section:
     Attributes:
         name: of the view, or `recording`.
         measures: measured values as text, by name.
+        numbers: values of `NUMBERS` that were measured.
         findings: faults, and checks that were not possible with the reason.
         notes: other things to know.
     """
 
     name: str
     measures: Mapping[str, str] = field(default_factory=dict)
+    numbers: Mapping[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -70,6 +84,32 @@ class Section:
     def verdict(self) -> str:
         """The worst of the findings."""
         return worst([finding.verdict for finding in self.findings])
+
+    @property
+    def wrong(self) -> list[str]:
+        """Texts of the faults."""
+        return [finding.text for finding in self.findings if finding.verdict != NOT_CHECKED]
+
+    @property
+    def unchecked(self) -> list[str]:
+        """Texts of the checks that could not be made."""
+        return [finding.text for finding in self.findings if finding.verdict == NOT_CHECKED]
+
+    def cells(self) -> list[str]:
+        """Return the numbers as cells of a table, in the order of `NUMBERS`; `-` = not known."""
+        return [
+            form.format(self.numbers[key]) if key in self.numbers else '-'
+            for key, (_, form) in NUMBERS.items()
+        ]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what `check.json` has of it: faults apart from checks that could not be made."""
+        return {
+            'verdict': self.verdict,
+            **{key: self.numbers.get(key) for key in NUMBERS},
+            'wrong': self.wrong,
+            'not_checked': self.unchecked,
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,10 +146,13 @@ def to_markdown(inspection: Inspection, pictures: Mapping[str, str]) -> str:
         '',
         f'`{inspection.episode}`, robot `{inspection.robot}`. {_ADVICE[inspection.verdict]}',
         '',
-        '| | verdict | reason |',
-        '|---|---|---|',
+        f'| | verdict | {" | ".join(name for name, _ in NUMBERS.values())} | reason |',
+        f'|---|---|{"---|" * len(NUMBERS)}---|',
     ]
-    lines += [f'| {s.name} | {s.verdict} | {_reasons(s)} |' for s in inspection.sections]
+    lines += [
+        f'| {s.name} | {s.verdict} | {" | ".join(s.cells())} | {_reasons(s)} |'
+        for s in inspection.sections
+    ]
     for section in inspection.sections:
         lines += ['', f'## {section.name}', '']
         if section.name in pictures:
@@ -123,14 +166,47 @@ def to_markdown(inspection: Inspection, pictures: Mapping[str, str]) -> str:
 
 
 def to_text(inspection: Inspection) -> str:
-    """Return a line for each section, and one for each finding."""
-    lines = []
+    """Return a table, a row a view with its numbers, and a line for each finding and note."""
+    head = ['view', 'verdict', *(name for name, _ in NUMBERS.values())]
+    rows = [[s.name, s.verdict, *s.cells()] for s in inspection.sections]
+    lines = aligned([head, *rows])
     for section in inspection.sections:
-        residual = section.measures.get('residual')
-        lines.append(f'{section.name}: {section.verdict}' + (f' ({residual})' if residual else ''))
-        lines += [f'  {finding.verdict}: {finding.text}' for finding in section.findings]
-        lines += [f'  note: {note}' for note in section.notes]
+        lines += [f'{section.name}: {f.verdict}: {f.text}' for f in section.findings]
+        lines += [f'{section.name}: note: {note}' for note in section.notes]
     return '\n'.join(lines)
+
+
+def to_json(
+    inspections: Mapping[str, Inspection], failed: Mapping[str, str] = {}
+) -> dict[str, Any]:
+    """Return the content of `check.json`: verdicts, numbers, faults and what was not checked.
+
+    Args:
+        inspections: one of each episode, by name.
+        failed: why an episode could not be inspected, by name.
+    """
+    episodes: dict[str, Any] = {}
+    for name, inspection in inspections.items():
+        episodes[name] = {
+            'verdict': inspection.verdict,
+            'views': {section.name: section.as_json() for section in inspection.views},
+            'recording': inspection.recording.as_json(),
+        }
+    for name, why in failed.items():
+        episodes[name] = {'verdict': 'broken', 'views': {}, 'recording': {'wrong': [why]}}
+    return episodes
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the rows of a table as lines; the last column is not filled up."""
+    widths = [max(len(row[n]) for row in rows) for n in range(len(rows[0]) - 1)]
+    lines = [
+        '  '.join(
+            [*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[-1]]
+        )
+        for row in rows
+    ]
+    return [line.rstrip() for line in lines]
 
 
 def _reasons(section: Section) -> str:
