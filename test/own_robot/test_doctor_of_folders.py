@@ -237,7 +237,7 @@ def test_numbers_of_two_good_views_are_not_hidden_by_a_camera_that_is_not_known(
         ['a', 'wrist', 'not checked', '-', '-', '-'],
         ['b', '-', 'broken', '-', '-', '-'],
     ]
-    assert [row[-1] for row in table(found)] == ['', '', 'late', '', 'no bag']
+    assert [row[-1] for row in table(found)] == ['wrong', '', 'late', '', 'no bag']
     text = folder_text(found)
     assert '3 views: 1 ok, 1 not checked, 1 suspicious' in text.splitlines()
     values = to_json(found.episodes, found.failed)
