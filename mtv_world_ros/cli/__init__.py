@@ -27,6 +27,7 @@ from typing import Any  # noqa: E402
 from mtv_world_ros.cli.commands import (  # noqa: E402
     ADVANCED_OPTIONS,
     COMMANDS,
+    MODEL_OPTIONS,
     REMOVED,
     RENAMED,
     SECTIONS,
@@ -58,7 +59,7 @@ _READ_ONLY = '; choose another folder'
 _OUTPUTS = ('out', 'picture', 'save')
 #: groups of commands of two words -> their help
 _GROUPS = {
-    'import': 'recordings and weights of others become episodes and checkpoints',
+    'import': 'convert recordings and weights of others',
     'fit': 'fit parameters to recordings',
     'export': 'write episodes and results in other formats',
 }
@@ -97,19 +98,29 @@ def make_parser(*wanted: str) -> argparse.ArgumentParser:
         module = import_module(f'mtv_world_ros.cli.{COMMANDS[name].module}')
         place = groups.get(group, commands)
         getattr(module, COMMANDS[name].function)(place)
-        _separate_advanced(place.choices[last])
+        command = place.choices[last]
+        command.description = command.description or _sentence(COMMANDS[name].help)
+        _group_options(command)
     if not wanted:
         _add_others(commands)
     return parser
 
 
-def _separate_advanced(parser: argparse.ArgumentParser) -> None:
-    """Show the options that few users need last in a parser's help."""
-    common = parser._optionals._group_actions
-    rare = [action for action in common if ADVANCED_OPTIONS & {*action.option_strings}]
-    if rare:
-        parser._optionals._group_actions = [a for a in common if a not in rare]
-        parser.add_argument_group('advanced options')._group_actions.extend(rare)
+def _sentence(text: str) -> str:
+    return f'{text[:1].upper()}{text[1:]}.'
+
+
+def _group_options(parser: argparse.ArgumentParser) -> None:
+    """Show options of the model, and those that few users need, under their own headings."""
+    groups = {'advanced options': ADVANCED_OPTIONS}
+    if '--no-foresight' in parser._option_string_actions:  # it runs a model
+        groups = {'model options': MODEL_OPTIONS, **groups}
+    for heading, options in groups.items():
+        common = parser._optionals._group_actions
+        moved = [action for action in common if options & {*action.option_strings}]
+        if moved:
+            parser._optionals._group_actions = [a for a in common if a not in moved]
+            parser.add_argument_group(heading)._group_actions.extend(moved)
 
 
 def _add_others(commands: argparse._SubParsersAction) -> None:

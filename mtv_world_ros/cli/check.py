@@ -39,11 +39,15 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--seconds', type=float, default=10.0, help='with --live: how long to record'
     )
     parser.add_argument(
-        '--views', type=names, help='comma-separated; default: all; needed with --live'
+        '--views',
+        type=names,
+        help='names of the views, comma-separated; default: all; needed with --live',
     )
     add_options(parser, 'source')
-    parser.add_argument('--robot', help="YAML, or a bundled robot; default: the episode's")
-    parser.add_argument('--out', type=Path, help='default: out/doctor/<episode>')
+    parser.add_argument('--robot', help="robot YAML, or a bundled robot; default: the episode's")
+    parser.add_argument(
+        '--out', type=Path, help='folder of the report; default: out/doctor/<episode>'
+    )
     parser.set_defaults(handler=_doctor, default_out=Path('out/doctor'))
 
 

@@ -15,13 +15,13 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         'collect',
         help='make episodes of the simulated benchmark',
-        description='Makes the episodes of a data set that are not there yet, its card '
+        description='Make the episodes of a data set that are not there yet, its card '
         '(dataset.json, README.md) and a contact sheet.',
     )
     parser.add_argument(
         '--task',
         default='all',
-        help="names, or YAML files with a scene, comma-separated; or 'all'",
+        help="names of tasks, or YAML files with a scene, comma-separated; or 'all'",
     )
     parser.add_argument(
         '--robot',
@@ -29,7 +29,10 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='a robot with a workcell in the simulator: yam_bimanual, franka or ur5e_pair',
     )
     parser.add_argument(
-        '--episodes', type=int, required=True, help='per task; with --zero-shot in all'
+        '--episodes',
+        type=int,
+        required=True,
+        help='number of episodes per task; with --zero-shot in all',
     )
     parser.add_argument(
         '--zero-shot',
@@ -73,11 +76,11 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='first: render the first frame only, for foresight alone; fit contact needs all',
     )
     add_physics(parser)
-    parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--out', type=Path, required=True)
-    parser.add_argument('--workers', type=int, default=1)
-    parser.add_argument('--width', type=int, default=384, help='of the images [px]')
-    parser.add_argument('--height', type=int, default=288)
+    parser.add_argument('--seed', type=int, default=0, help='seed of the scenes')
+    parser.add_argument('--out', type=Path, required=True, help='folder of the data set')
+    parser.add_argument('--workers', type=int, default=1, help='number of processes')
+    parser.add_argument('--width', type=int, default=384, help='width of the images [px]')
+    parser.add_argument('--height', type=int, default=288, help='height of the images [px]')
     parser.add_argument(
         '--fps', type=float, default=10.0, help='frames a second, at most 50; 16 for Wan'
     )

@@ -40,17 +40,17 @@ COMMANDS = {
         'imagine', 'run a policy for whole episodes in the world model', 'Run', 'add_imagine'
     ),
     'foresee': CommandEntry(
-        'foresee', 'object motion under commands by physics alone, without a model', 'Run'
+        'foresee', 'simulate where objects go under commands, by physics without a model', 'Run'
     ),
     'train': CommandEntry('train', 'train a world model on a folder of episodes', 'Learn'),
     'fit contact': CommandEntry(
-        'fits.contact', 'how arms follow, friction, weight and grip, for the physics', 'Learn'
+        'fits.contact', 'fit arm response, friction, weight and grip of the physics', 'Learn'
     ),
     'fit success': CommandEntry(
-        'fits.success', "a checkpoint's success estimate, to recorded outcomes", 'Learn'
+        'fits.success', "fit a checkpoint's success estimate to recorded outcomes", 'Learn'
     ),
     'fit camera': CommandEntry(
-        'fits.camera', 'the pose of a camera, from recordings in which the arm moves', 'Learn'
+        'fits.camera', 'estimate camera poses from recordings in which the arm moves', 'Learn'
     ),
     'evaluate': CommandEntry('evaluate', 'score checkpoints on recorded episodes', 'Judge'),
     'rank': CommandEntry(
@@ -58,32 +58,32 @@ COMMANDS = {
     ),
     'collect': CommandEntry('collect', 'record episodes of the simulated benchmark', 'Prepare'),
     'robot': CommandEntry(
-        'robot', 'print a robot, draw it, and make its YAML from a URDF', 'Prepare'
+        'robot', 'print and draw a robot, and make its YAML from a URDF', 'Prepare'
     ),
     'check': CommandEntry(
-        'check', 'do calibration, joints, clocks and images of recordings fit together', 'Prepare'
+        'check', 'check calibration, joints, clocks and images of recordings', 'Prepare'
     ),
     'import bag': CommandEntry(
-        'imports.bag', "a robot's own rosbag2 recordings become episodes", 'Prepare'
+        'imports.bag', "convert a robot's own rosbag2 recordings into episodes", 'Prepare'
     ),
     'import lerobot': CommandEntry(
-        'imports.lerobot', 'a LeRobot data set (v2.0, v2.1, v3.0) becomes episodes', 'Prepare'
+        'imports.lerobot', 'convert a LeRobot data set (v2.0, v2.1, v3.0) into episodes', 'Prepare'
     ),
     'import videos': CommandEntry(
-        'imports.videos', 'video files with tables of joints or tool poses become episodes',
+        'imports.videos', 'convert videos with tables of joints or tool poses into episodes',
         'Prepare',
     ),
     'import wan': CommandEntry(
-        'imports.wan', 'public Wan 2.1 weights become a checkpoint', 'Prepare'
+        'imports.wan', 'convert public Wan 2.1 weights into a checkpoint', 'Prepare'
     ),
     'recover': CommandEntry(
-        'recover', 'whole bags of recordings that were killed or cut off', 'Prepare'
+        'recover', 'repair bags of recordings that were killed or cut off', 'Prepare'
     ),
     'export lerobot': CommandEntry(
-        'export_lerobot', 'episodes become a LeRobot data set (v3.0)', 'Prepare'
+        'export_lerobot', 'convert episodes into a LeRobot data set (v3.0)', 'Prepare'
     ),
     'export report': CommandEntry(
-        'evaluate', 'the HTML report of evaluations, written again', 'Prepare', 'add_report'
+        'evaluate', 'write the HTML report of evaluations again', 'Prepare', 'add_report'
     ),
 }  # fmt: skip
 
@@ -101,6 +101,19 @@ RENAMED = {
     'calibrate-camera': ('fit', 'camera'),
     'faults': ('rank', '--list-faults'),
 }
+
+#: options of commands that run a model; `--help` shows them under a heading of their own
+MODEL_OPTIONS = frozenset(
+    {
+        '--checkpoint',
+        '--device',
+        '--no-foresight',
+        '--robot',
+        '--seed',
+        '--seeds',
+        '--segmenter',
+    }
+)
 
 #: options that few users need; `--help` shows them last, under a heading of their own
 ADVANCED_OPTIONS = frozenset(

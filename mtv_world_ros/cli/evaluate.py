@@ -49,8 +49,15 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="folder, 'bundled' or 'bundled-paper'; NAME=FOLDER names its row in the tables",
     )
     parser.add_argument('dataset', type=Path, help='folder of episodes')
-    parser.add_argument('--out', type=Path, required=True, metavar='DIR')
-    parser.add_argument('--mode', choices=('observe', 'imagine'), default='observe')
+    parser.add_argument(
+        '--out', type=Path, required=True, metavar='DIR', help='folder of the results'
+    )
+    parser.add_argument(
+        '--mode',
+        choices=('observe', 'imagine'),
+        default='observe',
+        help='begin each chunk at a real frame (observe, default), or at the frame imagined last',
+    )
     parser.add_argument(
         '--split', help="split of dataset.json, or 'all'; default: test where there is one"
     )
@@ -60,7 +67,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar='NAME',
         help='only the episodes that were collected with this physics; default: all, counted',
     )
-    parser.add_argument('--workers', type=int, default=1, help='processes that score episodes')
+    parser.add_argument(
+        '--workers', type=int, default=1, help='number of processes that score episodes'
+    )
     parser.add_argument(
         '--actions',
         type=names,
@@ -82,11 +91,19 @@ def add(commands: argparse._SubParsersAction) -> None:
         'masks of the recorded frames',
     )
     parser.add_argument(
-        '--quality', type=names, default=(), metavar='LIST', help='of psnr,ssim,lpips'
+        '--quality',
+        type=names,
+        default=(),
+        metavar='LIST',
+        help='picture quality, any of psnr,ssim,lpips',
     )
-    parser.add_argument('--fid-weights', type=Path, help='Inception-v3 of 2015-12-05, state dict')
-    parser.add_argument('--fvd-weights', type=Path, help='I3D state dict')
-    parser.add_argument('--no-report', dest='report', action='store_false', help='no report.html')
+    parser.add_argument(
+        '--fid-weights', type=Path, help='for FID: state dict of Inception-v3 of 2015-12-05'
+    )
+    parser.add_argument('--fvd-weights', type=Path, help='for FVD: state dict of I3D')
+    parser.add_argument(
+        '--no-report', dest='report', action='store_false', help='write no report.html'
+    )
     add_options(parser, 'overwrite dtype model serving seeds describer segmenter source task')
     parser.set_defaults(handler=_evaluate)
 

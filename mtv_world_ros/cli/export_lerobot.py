@@ -22,10 +22,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         'episodes', type=Path, nargs='+', help='folder of episodes, or one episode'
     )
-    parser.add_argument('--out', type=Path, required=True)
+    parser.add_argument('--out', type=Path, required=True, help='folder of the data set')
     parser.add_argument('--fps', type=int, default=10, help='rows a second')
     parser.add_argument(
-        '--size', default='', metavar='WxH', help='of the images [px]; default: as recorded'
+        '--size', default='', metavar='WxH', help='size of the images [px]; default: as recorded'
     )
     parser.add_argument(
         '--images',

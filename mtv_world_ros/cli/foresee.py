@@ -22,17 +22,21 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'foresee',
-        help='say where objects go under the commands of an episode or a file, without a picture',
-        description='Foresees what the commands of an episode, or of a YAML file with objects and '
-        'joint positions, do to objects: in several futures, by contact alone. No checkpoint is '
-        'needed, any robot with a URDF will do; numbers of contact are those of fit contact, or '
-        'a guess, which is said.',
+        help='simulate where objects go under commands, by physics without a model',
+        description='Simulate what the commands of an episode, or of a YAML file with objects and '
+        'joint positions, do to objects, in several futures. No checkpoint is needed: any robot '
+        'with a URDF will do. Numbers of contact are those of fit contact, or a guess, which is '
+        'said.',
     )
     parser.add_argument('scene', type=Path, help='folder of an episode, or a YAML file')
-    parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
-    parser.add_argument('--contact', metavar='DIR', help="that fit contact wrote, or 'bundled'")
-    parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
-    parser.add_argument('--futures', type=int, default=16)
+    parser.add_argument('--robot', default='yam_bimanual', help='robot YAML, or a bundled robot')
+    parser.add_argument(
+        '--contact', metavar='DIR', help="folder that fit contact wrote, or 'bundled'"
+    )
+    parser.add_argument(
+        '--views', type=names, default='low,high', help='names of the views, comma-separated'
+    )
+    parser.add_argument('--futures', type=int, default=16, help='number of futures')
     parser.add_argument('--picture', type=Path, metavar='PNG', help='draw the first future')
     add_options(parser, 'overwrite')
     parser.set_defaults(handler=_foresee)

@@ -36,8 +36,10 @@ def add_replay(commands: argparse._SubParsersAction) -> None:
         '--clock, --lock-step, ...): see python -m mtv_world_ros.ros.bags.player --help.',
         allow_abbrev=False,
     )
-    parser.add_argument('episode', type=Path)
-    parser.add_argument('--offline', action='store_true', help='without ROS, as fast as possible')
+    parser.add_argument('episode', type=Path, help='folder of the episode')
+    parser.add_argument(
+        '--offline', action='store_true', help='imagine it without ROS, as fast as possible'
+    )
     parser.add_argument('--out', type=Path, help='folder for the predictions (with --offline)')
     add_options(parser, 'overwrite source checkpoint dtype model describer segmenter serving task')
     parser.set_defaults(
@@ -102,14 +104,27 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
         help='recorded episodes whose first frames to start from, or a folder of them',
     )
     parser.add_argument('--live', action='store_true', help='start from what the cameras show')
-    parser.add_argument('--count', type=int, default=0, help='default: each episode once')
-    parser.add_argument('--start', type=float, default=0.0, help='recorded time to start at [s]')
-    parser.add_argument('--max-chunks', type=int, default=0, help='0 = until the policy is done')
-    parser.add_argument('--max-seconds', type=float, default=3600.0, help='of an episode [s]')
-    parser.add_argument('--instruction', default='', help="default: the recorded episode's")
-    parser.add_argument('--out', type=Path, default=Path('out/imagine'))
     parser.add_argument(
-        '--no-video', dest='video', action='store_false', help='no comparison.mp4 of each episode'
+        '--count', type=int, default=0, help='number of episodes; default: each once'
+    )
+    parser.add_argument('--start', type=float, default=0.0, help='recorded time to start at [s]')
+    parser.add_argument(
+        '--max-chunks',
+        type=int,
+        default=0,
+        help='largest number of chunks an episode; 0 = no limit',
+    )
+    parser.add_argument(
+        '--max-seconds', type=float, default=3600.0, help='wall-clock limit of an episode [s]'
+    )
+    parser.add_argument(
+        '--instruction', default='', help="text for the robot; default: the recorded episode's"
+    )
+    parser.add_argument(
+        '--out', type=Path, default=Path('out/imagine'), help='default: out/imagine'
+    )
+    parser.add_argument(
+        '--no-video', dest='video', action='store_false', help='write no comparison.mp4'
     )
     add_watch(parser, 'every episode')
     add_options(parser, 'overwrite checkpoint model describer segmenter')

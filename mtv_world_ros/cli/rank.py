@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.robot.model import RobotModel
 
 _DESCRIPTION = """\
-Runs policies on the same episodes in the simulator and in imagination, and says how well the two
+Run policies on the same episodes in the simulator and in imagination, and say how well the two
 agree. DIR gets ranking.json, ranking.md, ranking.html, flips.png (six commands that change what
 happens, real and imagined) and three files for every rollout: the result, the last real frames
 over the last imagined ones, and where objects are. Running the same command again goes on where it
@@ -66,7 +66,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     policies.add_argument(
         '--policies',
         metavar='LIST|FILE',
-        help='scripted ones, comma-separated, or a YAML file of any policies, like '
+        help='scripted policies, comma-separated, or a YAML file of any policies, like '
         'config/rankings/example.yaml; default: ten scripted ones',
     )
     policies.add_argument(
@@ -77,17 +77,21 @@ def add(commands: argparse._SubParsersAction) -> None:
         'large; kinds of test are in no training and no calibration; drawn:SEED composes new ones',
     )
     parser.add_argument(
-        '--tasks', metavar='LIST', help='comma-separated; default: three, with --faults six'
+        '--tasks',
+        metavar='LIST',
+        help='names of tasks, comma-separated; default: three, with --faults six',
     )
-    parser.add_argument('--episodes', type=int, default=10, help='of each task')
-    parser.add_argument('--out', type=Path, required=True, metavar='DIR')
+    parser.add_argument('--episodes', type=int, default=10, help='number of scenes of each task')
+    parser.add_argument(
+        '--out', type=Path, required=True, metavar='DIR', help='folder of the results'
+    )
     parser.add_argument(
         '--compare',
         metavar='CHECKPOINT',
-        help='a second checkpoint beside the first; every rollout is simulated once. Its own '
+        help='a second checkpoint that is ranked, too; every rollout is simulated once. Its own '
         'ranking goes to DIR/compared',
     )
-    parser.add_argument('--workers', type=int, default=1, help='processes')
+    parser.add_argument('--workers', type=int, default=1, help='number of processes')
     parser.add_argument(
         '--ray',
         nargs='?',
@@ -102,7 +106,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar='M',
         help='the prediction-powered rates use the true outcomes of the first M of each task',
     )
-    parser.add_argument('--max-chunks', type=int, default=8, help='answers of a policy at most')
+    parser.add_argument(
+        '--max-chunks',
+        type=int,
+        default=8,
+        help='largest number of answers of a policy in an episode',
+    )
     parser.add_argument(
         '--hold',
         type=int,

@@ -55,33 +55,31 @@ def _count(text: str) -> int:
 #: options by the word that `add_options` knows them by
 _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     'model': {
-        '--robot': {'help': 'robot YAML; default: the one of the checkpoint'},
-        '--device': {'default': 'cpu'},
+        '--robot': {'help': 'robot YAML, or a bundled robot; default: that of the checkpoint'},
+        '--device': {'default': 'cpu', 'help': 'PyTorch device, e.g. cpu (default) or cuda'},
         '--threads': {
             'type': number_or_0,
             'default': 0,
-            'help': 'CPU threads; 0 = all but one, of two both',
+            'help': 'CPU threads; 0 = all but one, but both of two',
         },
         '--no-foresight': {
             'dest': 'foresight',
             'action': 'store_false',
-            'help': 'foresee no object motion: the imagined frames alone decide. A model that was '
-            "trained with the objects' first masks is shown them (the paper's method); one that "
-            "was trained with foreseen objects, as bundled, is shown none. The paper's method on "
-            'simulated scenes is --checkpoint bundled-paper',
+            'help': 'simulate no object motion: the imagined frames alone decide. For the '
+            "paper's method use it with --checkpoint bundled-paper",
         },
         '--no-camera-check': {
             'dest': 'camera_check',
             'action': 'store_false',
-            'help': "do not compare the first pictures with the arm's outline, nor correct the "
+            'help': "neither compare the first frames with the arm's outline nor correct the "
             'cameras',
         },
         '--steps': {
             'type': number_or_0,
             'default': 0,
-            'help': 'denoising steps; 0 = as the checkpoint says, else 4',
+            'help': 'denoising steps; 0 = as many as the checkpoint says',
         },
-        '--seed': {'type': int, 'default': 0},
+        '--seed': {'type': int, 'default': 0, 'help': 'seed of the noise (default: 0)'},
     },
     'serving': {
         '--serving': {
@@ -110,21 +108,22 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
         '--calibration': {
             'type': Path,
             'metavar': 'FILE',
-            'help': "of the cameras; default: calibration.yaml beside each bag, or the bag's TF",
+            'help': 'calibration of the cameras; default: calibration.yaml beside each bag, or the '
+            "bag's TF",
         },
     },
     'seeds': {
         '--seeds': {
             'type': _count,
             'default': 1,
-            'help': 'rollouts of each, for the success estimate',
+            'help': 'rollouts of each episode with different noise, for the success estimate',
         }
     },
     'segmenter': {
         '--segmenter': {
             'default': 'auto',
-            'help': 'auto, colour, sam2 or sam3; auto = sam2 where MTV_WORLD_WEIGHTS has it, '
-            'else colour; or the objects.safetensors of an import with --objects',
+            'help': 'finds objects: auto, colour, sam2, sam3, or the objects.safetensors of an '
+            'import with --objects; auto = sam2 where MTV_WORLD_WEIGHTS has it, else colour',
         }
     },
     'describer': {
@@ -136,12 +135,15 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
         }
     },
     'checkpoint': {
-        '--checkpoint': {'default': 'bundled', 'help': "folder, 'bundled' or 'bundled-paper'"}
+        '--checkpoint': {
+            'default': 'bundled',
+            'help': "folder of the model, 'bundled' (default) or 'bundled-paper'",
+        }
     },
     'overwrite': {
         '--overwrite': {'action': 'store_true', 'help': 'replace what an earlier run wrote'}
     },
-    'dtype': {'--dtype': {'default': 'auto', 'help': 'auto, float32 or bfloat16'}},
+    'dtype': {'--dtype': {'default': 'auto', 'help': 'number format: auto, float32 or bfloat16'}},
 }
 
 

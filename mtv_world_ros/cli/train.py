@@ -28,15 +28,19 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         'train',
         help='train a world model on a folder of episodes',
-        description='Several processes, GPUs or machines train together when a launcher starts '
-        'it, e.g. torchrun --nproc-per-node 2 -m mtv_world_ros.cli train DATASET --out DIR, or '
-        'accelerate launch --multi_gpu with the same -m. optimizer.batch_size is that of all of '
-        'all processes together: they see the same clips as one process would.',
+        epilog='Several processes, GPUs or machines train together when a launcher starts it, '
+        'e.g. torchrun --nproc-per-node 2 -m mtv_world_ros.cli train DATASET --out DIR, or '
+        'accelerate launch --multi_gpu with the same -m. optimizer.batch_size counts the clips '
+        'of all processes together: they see the same clips as one process would.',
     )
-    parser.add_argument('dataset', type=Path, nargs='?', help='left out with --dry-run')
-    parser.add_argument('--out', type=Path, help='resumes what is there')
-    parser.add_argument('--preset', default='small', help='name or YAML file')
-    parser.add_argument('--views', help='e.g. low,high or low; default: those of the preset')
+    parser.add_argument(
+        'dataset', type=Path, nargs='?', help='folder of episodes; left out with --dry-run'
+    )
+    parser.add_argument('--out', type=Path, help='folder of the run; one that is there is resumed')
+    parser.add_argument(
+        '--preset', default='small', help='training preset: a name, or a YAML file'
+    )
+    parser.add_argument('--views', help="names of the views, e.g. low,high; default: the preset's")
     parser.add_argument(
         '--object-mask', choices=('on', 'off'), help='object masks in the trajectory video'
     )
@@ -50,8 +54,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--latent-cache',
         type=Path,
         metavar='DIR',
-        help="what Wan's autoencoder and CLIP make of clips, computed once and kept; runs may "
-        'share it',
+        help="folder of outputs of Wan's autoencoder and CLIP, computed once; runs may share it",
     )
     add_options(parser, 'source')
     parser.add_argument(
@@ -60,7 +63,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         default=[],
         metavar='SECTION.KEY=VALUE',
         dest='overrides',
-        help='of the preset, e.g. optimizer.steps=2000',
+        help='change a value of the preset, e.g. optimizer.steps=2000',
     )
     parser.add_argument(
         '--episodes', type=int, metavar='N', help='use N episodes, spread evenly over the data set'
@@ -72,16 +75,15 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--cache',
         type=Path,
         metavar='DIR',
-        help='keeps the decoded recordings; several runs may share it',
+        help='folder of the decoded recordings; several runs may share it',
     )
-    parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--device', default='cpu')
+    parser.add_argument('--seed', type=int, default=0, help='seed of weights, noise and batches')
+    parser.add_argument('--device', default='cpu', help='PyTorch device, e.g. cpu or cuda')
     parser.add_argument(
         '--doctor',
         type=Path,
         metavar='DIR',
-        help='what mtv-world check wrote about these episodes; those are left out of which the '
-        'recording or a view that is trained on is broken',
+        help='folder that mtv-world check wrote about these episodes; broken ones are left out',
     )
     add_options(parser, 'describer segmenter dtype')
     parser.add_argument(
@@ -110,8 +112,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         type=float,
         default=0.0,
         metavar='N',
-        help='of a device, for the model-FLOP utilisation in the log; 0 = that of a product of '
-        'large matrices, measured at the start',
+        help='peak of a device, for the model-FLOP utilisation in the log; 0 = measured at the '
+        'start with a product of large matrices',
     )
     parser.add_argument(
         '--sample-every',
@@ -124,9 +126,15 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--held-out',
         type=Path,
         metavar='DIR',
-        help="data set they are of; default: DATASET. Its split 'val', else 'test'",
+        help="data set of the held-out episodes (its split 'val', else 'test'); default: DATASET",
     )
-    parser.add_argument('--held-out-episodes', type=int, default=4, metavar='N')
+    parser.add_argument(
+        '--held-out-episodes',
+        type=int,
+        default=4,
+        metavar='N',
+        help='number of held-out episodes',
+    )
     parser.set_defaults(handler=_train)
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.viewing.streams import Streams
 
 _DESCRIPTION = """\
-Shows real, drawn and imagined frames of every view on one timeline, masks outlined, joints, the
+Show real, drawn and imagined frames of every view on one timeline, masks outlined, joints, the
 success estimate and its reasons. PATH is an episode, predictions, an imagined episode, the folder
 of mtv-world demo, or, with a tab for each of its episodes, that of mtv-world imagine or evaluate,
 or of mtv-world rank (its worst rollouts); bags of the same time that are given together are shown
@@ -32,16 +32,18 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='show episodes, predictions, evaluations, rankings or a running node in Rerun',
         description=_DESCRIPTION,
     )
-    parser.add_argument('paths', type=Path, nargs='*', metavar='PATH')
     parser.add_argument(
-        '--live', action='store_true', help='show topics beside a running node, until Ctrl-C'
+        'paths', type=Path, nargs='*', metavar='PATH', help='what to show, see above'
+    )
+    parser.add_argument(
+        '--live', action='store_true', help='show the topics of running nodes, until Ctrl-C'
     )
     parser.add_argument(
         '--port',
         type=PageAddress.parse,
         default=PageAddress(),
         metavar='[ADDRESS:]PORT',
-        help='of the viewer for browsers on this machine; with an address, e.g. 0.0.0.0:9090, '
+        help='port of the page for browsers on this machine; with an address, e.g. 0.0.0.0:9090, '
         'others can see what is shown and write to it (default: %(default)s)',
     )
     parser.add_argument(
@@ -53,7 +55,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         type=int,
         default=8,
         metavar='N',
-        help='of an evaluation the first N, of a ranking the worst N',
+        help='number of episodes: the first N of an evaluation, the worst N of a ranking',
     )
     add_options(parser, 'overwrite')
     parser.set_defaults(handler=_view)

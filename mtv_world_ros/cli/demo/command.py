@@ -13,8 +13,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         'demo', help='replay the bundled episode through the ROS node and score its predictions'
     )
-    parser.add_argument('--episode', type=Path, help='default: the bundled one')
-    parser.add_argument('--out', type=Path, default=Path('out/demo'))
+    parser.add_argument('--episode', type=Path, help='episode folder; default: the bundled one')
+    parser.add_argument('--out', type=Path, default=Path('out/demo'), help='default: out/demo')
     add_options(parser, 'overwrite checkpoint model')
     parser.set_defaults(handler=_demo)
 

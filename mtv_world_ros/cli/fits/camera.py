@@ -43,7 +43,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         epilog='Intrinsics come from the recording; the pose there is the guess to start from. '
         'Of several recordings, moved cameras are told apart, and the focal length is estimated '
         'where it is not known. '
-        'This is the calibration of a camera: that of the success estimate is `calibrate`.',
+        'The success estimate is calibrated by mtv-world fit success.',
     )
     parser.add_argument(
         'episodes', type=Path, nargs='+', metavar='EPISODE', help='recordings, or folders of them'
@@ -53,7 +53,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         dest='views',
         type=names,
         required=True,
-        help='name; or several, comma-separated, that stand still',
+        help='name of the view; or several, comma-separated, of cameras that stand still',
     )
     parser.add_argument(
         '--same-focal',
@@ -95,8 +95,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument(
         '--mount-link',
-        help='link that carries it; `find` = the one of the arm whose motion fits; default: as '
-        'recorded',
+        help='link that carries the camera; `find` = the link of the arm whose motion fits; '
+        'default: as recorded',
     )
     parser.add_argument('--robot', help="YAML, or a bundled robot; default: the episode's")
     add_options(parser, 'source')
@@ -106,7 +106,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar='FROM,TO',
         help='only that part of the recording [s], e.g. before the hand takes something: 0,4',
     )
-    parser.add_argument('--seed', type=int, default=0, help='of the search')
+    parser.add_argument('--seed', type=int, default=0, help='seed of the search')
     parser.add_argument(
         '--out', type=Path, help='calibration file to write; default: out/camera/<view>.yaml'
     )

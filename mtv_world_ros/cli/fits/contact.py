@@ -14,14 +14,13 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'contact',
-        help='find how arms follow, friction, weight and grip: what foresight is told',
-        description='Finds how arms follow their commands and how late they do, how high the '
-        'table is, how fingers grip, what rubs and how heavy objects are: the numbers under which '
-        'solids, shaped as the first masks show them, keep nearest to where later masks show '
-        'them. Masks, commands and joint states are all it reads. Says each number with its '
-        'interval and how much it rests on. Numbers that OUT has are where it begins. Writes '
-        'OUT/object_motion/arm_response.json and contact.json, with which a checkpoint foresees '
-        "where objects go. OUT may be the checkpoint's folder.",
+        help='fit arm response, friction, weight and grip of the physics',
+        description='Fit the numbers of the physics to recorded episodes: delay and response of '
+        'the arms, height of the table, grip, friction, weight of objects. Simulated objects then '
+        'keep nearest to where later masks show them. Masks, commands and joint states are read, '
+        'no recorded poses. Each number is printed with its interval and the recordings that it '
+        'rests on. The search begins at the numbers that OUT holds, and writes '
+        'OUT/object_motion/arm_response.json and contact.json.',
     )
     parser.add_argument('dataset', type=Path, help='folder with episodes, searched recursively')
     parser.add_argument(
@@ -31,14 +30,20 @@ def add(commands: argparse._SubParsersAction) -> None:
         type=Path,
         required=True,
         metavar='OUT',
-        help='folder of a checkpoint, or any',
+        help='folder of a checkpoint, or any other folder',
     )
-    parser.add_argument('--robot', default='yam_bimanual', help='YAML file or bundled name')
-    parser.add_argument('--views', type=names, default='low,high', help='comma-separated')
-    parser.add_argument('--episodes', type=int, default=50, help='at most; 20 to 50 will do')
-    parser.add_argument('--motions', type=int, default=16, help='that are foreseen later')
+    parser.add_argument('--robot', default='yam_bimanual', help='robot YAML, or a bundled robot')
     parser.add_argument(
-        '--threads', type=number_or_0, default=0, help='that foresee; 0 = all but one'
+        '--views', type=names, default='low,high', help='names of the views, comma-separated'
+    )
+    parser.add_argument(
+        '--episodes', type=int, default=50, help='largest number of episodes; 20 to 50 will do'
+    )
+    parser.add_argument(
+        '--motions', type=int, default=16, help='number of futures that the checkpoint simulates'
+    )
+    parser.add_argument(
+        '--threads', type=number_or_0, default=0, help='CPU threads; 0 = all but one'
     )
     add_options(parser, 'overwrite')
     parser.set_defaults(handler=_fit)

@@ -43,12 +43,16 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('checkpoint', help="folder, 'bundled' or 'bundled-paper'")
     parser.add_argument('dataset', type=Path, help='folder of episodes with outcomes')
-    parser.add_argument('--out', type=Path, required=True, metavar='DIR')
+    parser.add_argument(
+        '--out', type=Path, required=True, metavar='DIR', help='folder of the results'
+    )
     parser.add_argument(
         '--split', help="split of dataset.json, or 'all'; default: test where there is one"
     )
-    parser.add_argument('--episodes', type=int, help='use only so many')
-    parser.add_argument('--workers', type=int, default=1, help='processes that imagine episodes')
+    parser.add_argument('--episodes', type=int, help='use only the first N episodes')
+    parser.add_argument(
+        '--workers', type=int, default=1, help='number of processes that imagine episodes'
+    )
     add_options(parser, 'seeds')
     parser.add_argument(
         '--l2', type=float, default=1.0, help='strength of the prior on the weights'

@@ -27,19 +27,26 @@ def add(commands: argparse._SubParsersAction) -> None:
         'image topics. OUT also gets robot/ and mapping.yaml, which --topics takes elsewhere. '
         'Call it again to continue: finished episodes are kept. Exit status: 1 if a bag failed.',
     )
-    parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='or folder of bags')
+    parser.add_argument(
+        'bags', type=Path, nargs='+', metavar='BAG', help='a bag, or a folder of bags'
+    )
     parser.add_argument('--topics', type=Path, metavar='FILE', help='mapping: which topic is what')
     parser.add_argument(
-        '--robot', help="YAML, or a bundled robot; default: the mapping's, or /robot_description"
+        '--robot',
+        help="robot YAML, or a bundled robot; default: the mapping's, or /robot_description",
     )
     parser.add_argument(
         '--action',
         metavar='TOPIC',
-        help="of the commands, or 'state': the measured positions that follow; default: the "
+        help="topic of the commands, or 'state': the measured positions that follow; default: the "
         "mapping's, or joint_trajectory",
     )
-    parser.add_argument('--calibration', type=Path, help="default: the bags' TF and CameraInfo")
-    parser.add_argument('--out', type=Path, required=True)
+    parser.add_argument(
+        '--calibration',
+        type=Path,
+        help="calibration of the cameras; default: the bags' TF and CameraInfo",
+    )
+    parser.add_argument('--out', type=Path, required=True, help='folder of the episodes')
     add_object_options(parser)
     parser.set_defaults(handler=_import_bag)
 

@@ -29,9 +29,9 @@ def _add_masks(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--segmenter',
         choices=('auto', 'colour', 'sam2', 'sam3'),
-        help="stores the objects' masks with the episodes; default: none, or those recorded",
+        help="store the objects' masks with the episodes; default: none, or those recorded",
     )
-    parser.add_argument('--device', default='cpu', help='of the segmenter')
+    parser.add_argument('--device', default='cpu', help='PyTorch device of the segmenter')
 
 
 def _add_boxes(parser: argparse.ArgumentParser) -> None:

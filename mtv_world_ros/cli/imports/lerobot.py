@@ -34,11 +34,11 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='which feature is what; default: made of --robot and --calibration, for columns that '
         "are named like the robot's joints [rad or m]",
     )
-    parser.add_argument('--robot', help='without --mapping: YAML, or a bundled robot')
+    parser.add_argument('--robot', help='robot YAML, or a bundled robot, without --mapping')
     parser.add_argument(
-        '--calibration', type=Path, help="without --mapping: of the cameras, by the views' names"
+        '--calibration', type=Path, help='calibration of the cameras by view, without --mapping'
     )
-    parser.add_argument('--out', type=Path, required=True)
+    parser.add_argument('--out', type=Path, required=True, help='folder of the episodes')
     parser.add_argument('--episodes', help="numbers, comma-separated, e.g. '0,4,7'; default: all")
     add_object_options(parser)
     parser.set_defaults(handler=_import_dataset)

@@ -25,14 +25,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         epilog='config/datasets/videos.yaml describes the mapping file. Call it again to '
         'continue: finished episodes are kept. Exit status: 1 if one failed.',
     )
-    parser.add_argument('folder', type=Path, help='of the files that the mapping names')
+    parser.add_argument('folder', type=Path, help='folder of the files that the mapping names')
     parser.add_argument(
         '--mapping', type=Path, required=True, help='which file is which view, which column what'
     )
     parser.add_argument(
-        '--calibration', type=Path, help='of the cameras; default: marked as not known'
+        '--calibration', type=Path, help='calibration of the cameras; default: marked as not known'
     )
-    parser.add_argument('--out', type=Path, required=True)
+    parser.add_argument('--out', type=Path, required=True, help='folder of the episodes')
     add_object_options(parser)
     parser.set_defaults(handler=_import_videos)
 

@@ -23,21 +23,25 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         'wan',
         help='convert public Wan 2.1 weights into a checkpoint',
-        description='Makes a checkpoint of Wan2.1-Fun-V1.1-Control: every tensor is loaded, new '
+        description='Make a checkpoint of Wan2.1-Fun-V1.1-Control: every tensor is loaded, new '
         'and zero, or an error.',
     )
     parser.add_argument(
         'path', type=Path, help="folder in VideoX-Fun's or diffusers' layout, or transformer file"
     )
     parser.add_argument('--out', type=Path, required=True, help='the new checkpoint folder')
-    parser.add_argument('--preset', default='wan-1.3b', help='name or YAML file')
+    parser.add_argument(
+        '--preset', default='wan-1.3b', help='training preset: a name, or a YAML file'
+    )
     parser.add_argument(
         '--prompt', default=PROMPT, help="the instruction; default: the paper's for all tasks"
     )
     parser.add_argument(
-        '--guidance-scale', type=float, help="1 = none; default: the preset's sampling"
+        '--guidance-scale', type=float, help="text guidance, 1 = none; default: the preset's"
     )
-    parser.add_argument('--negative-prompt', help="of guidance; default: the preset's sampling")
+    parser.add_argument(
+        '--negative-prompt', help="text that guidance leads away from; default: the preset's"
+    )
     for part in _ELSEWHERE:
         option = '--' + part.replace('_', '-')
         parser.add_argument(option, type=Path, help='file or folder; default: in PATH')
