@@ -108,8 +108,8 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
         '--calibration': {
             'type': Path,
             'metavar': 'FILE',
-            'help': 'calibration of the cameras; default: calibration.yaml beside each bag, or the '
-            "bag's TF",
+            'help': 'calibration of the cameras; default: calibration.yaml in the folder of each '
+            "bag, or the bag's TF",
         },
     },
     'seeds': {
