@@ -111,6 +111,7 @@ setup(
         'console_scripts': [
             'mtv-world = mtv_world_ros.cli:main',
             'world_model = mtv_world_ros.ros:run_world_model',
+            'policy_node = mtv_world_ros.ros:run_policy',
         ],
         # Policy kinds that the simulator makes.
         'mtv_world.policies': [f'scripted = {PACKAGE}.simulation.expert.policy_kind'],

@@ -11,8 +11,13 @@ import re
 from mtv_world_ros.core.config import Schema
 from mtv_world_ros.ros.parameters import is_read_only, Settings, shown_default, valid_values
 from mtv_world_ros.ros.policy.loop import PolicySettings
+from mtv_world_ros.ros.sensing.live_start import StartSettings
 
-NODES: dict[str, type[Schema]] = {'world_model': Settings, 'policy': PolicySettings}
+NODES: dict[str, type[Schema]] = {
+    'world_model': Settings,
+    'policy': PolicySettings,
+    'imagine': StartSettings,
+}
 PAGES = ('parameters.md', 'policies.md')
 _TABLE = re.compile(r'(<!-- parameters: (\w+) -->\n\n)(?:\|.*\n)*')
 

@@ -258,11 +258,11 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
     words = _current(words)
     parser = _parser_for(words)
     arguments, more = parser.parse_known_args(words)
-    arguments.player, arguments.command_line = more, words
+    arguments.ros, arguments.command_line = more, words
     leaf = parser
     for word in words[:2]:
         leaf = _choices(leaf).get(word, leaf)
-    if more and not getattr(arguments, 'takes_player_options', lambda _: False)(arguments):
+    if more and not getattr(arguments, 'takes_more', lambda _: False)(arguments):
         hints = [f'{word}{nearest(word, leaf._option_string_actions)}' for word in more]
         parser.error(f'unrecognized arguments: {" ".join(hints)}')
     _check_texts(leaf, arguments)

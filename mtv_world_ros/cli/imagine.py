@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,9 +22,11 @@ from mtv_world_ros.core.files import check_free
 
 if TYPE_CHECKING:
     from mtv_world_ros.rollout.episode_viewer import EpisodeViewer
+    from mtv_world_ros.rollout.imagined_episodes import EpisodeStart
+    from mtv_world_ros.rollout.pipeline import Pipeline
 
-#: ends of an episode that are no fault, as the node `policy` reports them
-GOOD_ENDS = ('done', 'max_chunks', 'stopped', 'max_seconds')
+#: ends of an episode that are no fault
+GOOD_ENDS = ('done', 'max_chunks', 'max_seconds')
 
 
 def add_replay(commands: argparse._SubParsersAction) -> None:
@@ -44,7 +46,7 @@ def add_replay(commands: argparse._SubParsersAction) -> None:
     add_options(parser, 'overwrite source checkpoint dtype model describer segmenter serving task')
     parser.set_defaults(
         handler=_replay,
-        takes_player_options=lambda chosen: not chosen.offline,
+        takes_more=lambda chosen: not chosen.offline,
     )
 
 
@@ -80,7 +82,7 @@ def _replay(arguments: argparse.Namespace) -> int:
 def _play(arguments: argparse.Namespace) -> int:
     import runpy
 
-    sys.argv = ['mtv-world replay', str(arguments.episode), *arguments.player]
+    sys.argv = ['mtv-world replay', str(arguments.episode), *arguments.ros]
     runpy.run_module('mtv_world_ros.ros.bags.player', run_name='__main__')
     return 0
 
@@ -88,7 +90,10 @@ def _play(arguments: argparse.Namespace) -> int:
 def add_imagine(commands: argparse._SubParsersAction) -> None:
     """Add the command `imagine`."""
     parser = commands.add_parser(
-        'imagine', help='run a policy for whole episodes in the world model'
+        'imagine',
+        help='run a policy for whole episodes in the world model',
+        epilog='With --live, --ros-args and what follows rename topics (-r FROM:=TO) and set '
+        'parameters (-p NAME:=VALUE): see docs/policies.md.',
     )
     parser.add_argument(
         '--policy',
@@ -128,7 +133,10 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
     )
     add_watch(parser, 'every episode')
     add_options(parser, 'overwrite checkpoint model describer segmenter')
-    parser.set_defaults(handler=_imagine)
+    parser.set_defaults(
+        handler=_imagine,
+        takes_more=lambda chosen: chosen.live and chosen.ros[0] == '--ros-args',
+    )
 
 
 def _imagine(arguments: argparse.Namespace) -> int:
@@ -136,7 +144,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.episode_reader import list_episodes
 
     (arguments.checkpoint,) = open_checkpoints(arguments.device, arguments.checkpoint)
-    watch = watch_arguments(arguments)
+    watch_arguments(arguments)
     for folder in arguments.episodes:
         if not folder.exists():
             raise EpisodeError(f"there is no episode '{folder}'")
@@ -146,9 +154,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
             'give --episodes with recorded episodes to start from, or --live to start from the '
             f'cameras; --episodes has {len(episodes)}'
         )
-    results = (
-        _from_cameras(arguments, watch) if arguments.live else _in_process(arguments, episodes)
-    )
+    results = _in_world_model(arguments, episodes)
     from mtv_world_ros.viewing.sheets import write_pictures
 
     for result in results:
@@ -158,19 +164,18 @@ def _imagine(arguments: argparse.Namespace) -> int:
     print('\n'.join(episode_table(results)))
     print(f'look at them: mtv-world view {arguments.out}')
     failed = [result for result in results if result['how'] not in GOOD_ENDS]
-    logs = f" (logs are in '{arguments.out / 'logs'}')" if arguments.live else ''
     for result in failed:
         why = str(result['text']).strip().splitlines() or ['no reason was given']
         sys.stderr.write(
-            f'mtv-world: episode {result["episode"]} failed: {result["how"]}: {why[-1]}{logs}\n'
+            f'mtv-world: episode {result["episode"]} failed: {result["how"]}: {why[-1]}\n'
         )
     return int(bool(failed))
 
 
-def _in_process(
+def _in_world_model(
     arguments: argparse.Namespace, episodes: Sequence[Path]
 ) -> Sequence[Mapping[str, object]]:
-    """Run the policy from recorded frames, in this process."""
+    """Run the policy from recorded frames, or from what the cameras show."""
     from mtv_world_ros.core.errors import MtvWorldError
     from mtv_world_ros.rollout.assembly import asked_describer
     from mtv_world_ros.rollout.imagined_episodes import (
@@ -181,26 +186,25 @@ def _in_process(
 
     # a wrong name is an error here, before anything is loaded or removed
     robot = arguments.checkpoint.load_robot(arguments.robot)
-    check_start(arguments.policy, robot, arguments.start, is_recorded=True)
+    check_start(arguments.policy, robot, arguments.start, is_recorded=not arguments.live)
     for bag in sorted(arguments.out.glob('episode_*')):
         check_free(bag, arguments.overwrite)
     describer = asked_describer(arguments.describer)
     pipeline = replace(pipeline_of(arguments), describer=describer)
-    viewer = _viewer(arguments)
     options = EpisodeOptions(
         policy=arguments.policy,
-        episodes=tuple(episodes),
-        count=arguments.count,
-        start_s=arguments.start,
+        count=arguments.count or len(episodes) or 1,
         max_chunks=arguments.max_chunks,
         max_seconds=arguments.max_seconds,
         instruction=arguments.instruction,
         seed=arguments.seed,
         num_inference_steps=arguments.steps,
     )
+    starts = _starts(arguments, episodes, pipeline)
+    viewer = _viewer(arguments)
     watched = {'on_start': viewer.begin, 'on_chunk': viewer.add} if viewer else {}
     results = imagine_episodes(
-        pipeline, options, arguments.out, overwrite=arguments.overwrite, **watched
+        pipeline, options, starts, arguments.out, overwrite=arguments.overwrite, **watched
     )
     if viewer:
         try:
@@ -208,6 +212,25 @@ def _in_process(
         except MtvWorldError as error:  # the episodes are there
             sys.stderr.write(f'mtv-world: {error}\n')
     return results
+
+
+def _starts(
+    arguments: argparse.Namespace, episodes: Sequence[Path], pipeline: Pipeline
+) -> Iterator[EpisodeStart]:
+    """Return the starts of the episodes: recorded frames, or what the cameras show."""
+    if not arguments.live:
+        from mtv_world_ros.rollout.imagined_episodes import recorded_starts
+
+        return recorded_starts(episodes, pipeline, arguments.start)
+    from mtv_world_ros.ros.sensing.live_start import live_starts
+
+    return live_starts(
+        pipeline.spec,
+        pipeline.robot,
+        arguments.checkpoint.cameras_file,
+        arguments.ros,
+        tell=partial(print, flush=True),
+    )
 
 
 def _viewer(arguments: argparse.Namespace) -> EpisodeViewer | None:
@@ -220,33 +243,6 @@ def _viewer(arguments: argparse.Namespace) -> EpisodeViewer | None:
     watch, stream = arguments.watch, rerun_log.recording('imagine')
     print(rerun_log.open_viewer(stream, None, watch.address, watch.file, False), flush=True)
     return EpisodeViewer(stream, watch.file)
-
-
-def _from_cameras(
-    arguments: argparse.Namespace, watch: Sequence[str] | None
-) -> Sequence[Mapping[str, object]]:
-    """Run the policy from what the cameras show, over ROS topics."""
-    from mtv_world_ros.ros.launching import imagine_episodes, ImagineOptions
-
-    options = ImagineOptions(
-        policy=arguments.policy,
-        count=arguments.count,
-        max_chunks=arguments.max_chunks,
-        max_seconds=arguments.max_seconds,
-        instruction=arguments.instruction,
-        seed=arguments.seed,
-        watch=None if watch is None else (*watch, '--by-episode'),
-        checkpoint=arguments.checkpoint.name,
-        robot=arguments.robot or '',
-        device=arguments.device,
-        num_threads=arguments.threads,
-        num_inference_steps=arguments.steps,
-        segmenter=arguments.segmenter,
-        describer=str(arguments.describer.absolute()) if arguments.describer else '',
-    )
-    return imagine_episodes(
-        options, arguments.out, overwrite=arguments.overwrite, tell=partial(print, flush=True)
-    )
 
 
 def episode_table(results: Sequence[Mapping[str, object]]) -> list[str]:

@@ -1,10 +1,11 @@
-"""Whole episodes of a policy in imagination, each as a bag, from recorded first frames."""
+"""Whole episodes of a policy in imagination, each as a bag, from real first frames."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain, cycle, islice
 import json
 from math import isfinite, nan
 from pathlib import Path
@@ -57,20 +58,16 @@ class EpisodeOptions:
     Attributes:
         policy: YAML file, name of one in `config/policies`, or a scripted policy such as
             `expert-miss-0.5`.
-        episodes: recorded episodes to start from, in turn.
-        count: number of episodes; 0 = one for each recorded one.
-        start_s: time of the recorded frame to start from [s].
+        count: number of episodes.
         max_chunks: number of answers after which an episode ends; 0 = the policy ends it.
         max_seconds: longest time of an episode on the wall [s].
-        instruction: text for the robot; empty = the recorded episode's.
+        instruction: text for the robot; empty = the start's.
         seed: episode k uses seed + 1000 k.
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
     """
 
     policy: str
-    episodes: tuple[Path, ...]
-    count: int = 0
-    start_s: float = 0.0
+    count: int = 1
     max_chunks: int = 0
     max_seconds: float = 3600.0
     instruction: str = ''
@@ -80,17 +77,21 @@ class EpisodeOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeStart:
-    """The recorded moment that an imagined episode starts from.
+    """The real moment that an imagined episode starts from.
 
     Attributes:
+        source: folder of the recorded episode, or `live`.
         observation: frames at the cameras' size, and joint positions.
-        instruction: text for the robot; empty = not recorded.
+        instruction: text for the robot; empty = not known.
         origin: task, scene and recording, for policies that use them in place of pictures.
+        robot: the robot as it describes itself; None = the pipeline's.
     """
 
+    source: str
     observation: Observation
     instruction: str
     origin: EpisodeOrigin
+    robot: RobotModel | None = None
 
 
 def recorded_start(path: Path, pipeline: Pipeline, start_s: float = 0.0) -> EpisodeStart:
@@ -110,6 +111,7 @@ def recorded_start(path: Path, pipeline: Pipeline, start_s: float = 0.0) -> Epis
     observation = observation_after(episode, views, robot, start_s)
     info = episode.info
     return EpisodeStart(
+        source=str(path),
         observation=observation,
         instruction=info.instruction,
         origin=EpisodeOrigin(
@@ -119,6 +121,13 @@ def recorded_start(path: Path, pipeline: Pipeline, start_s: float = 0.0) -> Epis
             recording_ns=observation.stamp_ns,
         ),
     )
+
+
+def recorded_starts(
+    paths: Sequence[Path], pipeline: Pipeline, start_s: float = 0.0
+) -> Iterator[EpisodeStart]:
+    """Return a moment of each recorded episode in turn, without end; see `recorded_start`."""
+    return (recorded_start(path, pipeline, start_s) for path in cycle(paths))
 
 
 def check_start(policy: str, robot: RobotModel, start_s: float, *, is_recorded: bool) -> None:
@@ -164,6 +173,7 @@ def clear_episodes(out: Path, *, overwrite: bool) -> None:
 def imagine_episodes(
     pipeline: Pipeline,
     options: EpisodeOptions,
+    starts: Iterator[EpisodeStart],
     out: Path,
     *,
     overwrite: bool = False,
@@ -174,9 +184,10 @@ def imagine_episodes(
 
     Args:
         pipeline: imagines and judges.
-        options: policy, episodes and limits.
+        options: policy, number of episodes and limits.
+        starts: where the episodes start; asked once for each.
         out: folder of the results.
-        overwrite: remove the episodes of an earlier run from it.
+        overwrite: remove the episodes of an earlier run from it, once the first start is there.
         on_start: called at the start of each episode.
         on_chunk: called with every chunk once it is ready.
 
@@ -186,20 +197,20 @@ def imagine_episodes(
     Raises:
         ConfigError: `out` holds episodes, and `overwrite` is not set; no such policy.
         EpisodeError: a recorded episode cannot be used, or the disk is full.
+        ObservationError: the cameras or the robot gave no observation.
     """
-    check_start(options.policy, pipeline.robot, options.start_s, is_recorded=True)
-    clear_episodes(out, overwrite=overwrite)
     make_policy = assemble_policy(options.policy, pipeline.robot)
-    count, results = options.count or len(options.episodes), list[dict[str, Any]]()
-    for number in tqdm(range(count), unit='ep', disable=None):
-        path = options.episodes[number % len(options.episodes)]
-        start = recorded_start(path, pipeline, options.start_s)
+    results = list[dict[str, Any]]()
+    first = next(starts)
+    clear_episodes(out, overwrite=overwrite)
+    chosen = islice(chain([first], starts), options.count)
+    for number, start in enumerate(tqdm(chosen, total=options.count, unit='ep', disable=None)):
         on_start(start)
         run = _EpisodeRun(pipeline, options, number, start, out / f'episode_{number:05d}')
         try:
             run.imagine(make_policy, on_chunk)
         finally:
-            results.append({**run.result(), 'start': str(path)})
+            results.append({**run.result(), 'start': start.source})
             write_whole(out / 'episodes.json', json.dumps(results, indent=2) + '\n')
     return results
 
@@ -209,7 +220,7 @@ class _EpisodeRun:
 
     Args:
         pipeline: imagines and judges.
-        options: policy, episodes and limits.
+        options: policy and limits.
         number: number of the episode.
         start: where it starts.
         bag: folder of its bag.
@@ -223,7 +234,8 @@ class _EpisodeRun:
         start: EpisodeStart,
         bag: Path,
     ) -> None:
-        self._pipeline, self._options, self._start, self._bag = pipeline, options, start, bag
+        self._pipeline = pipeline if start.robot is None else pipeline.with_robot(start.robot)
+        self._options, self._start, self._bag = options, start, bag
         self._number, self._seed = number, options.seed + SEED_STEP * number
         self._begun_s = time.monotonic()
         self._num_chunks, self._policy = 0, options.policy
@@ -302,7 +314,8 @@ class _EpisodeRun:
             if world.is_recording_broken:
                 raise
             self._how, self._text = 'rejected', str(error)
-        self._num_chunks = world.num_answers
+        finally:
+            self._num_chunks = world.num_answers
 
     def _is_late(self) -> bool:
         return time.monotonic() - self._begun_s > self._options.max_seconds

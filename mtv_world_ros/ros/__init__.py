@@ -14,3 +14,11 @@ def run_world_model() -> int:
     from mtv_world_ros.ros.world_model.node import main
 
     return main()
+
+
+def run_policy() -> int:
+    """Run the command `policy_node`; return its exit status."""
+    end_on_signals('policy_node')
+    from mtv_world_ros.ros.policy.node import main
+
+    return main()

@@ -24,8 +24,6 @@ _LOOK_PERIOD_S = 0.5
 #: messages kept while the viewer is busy; older ones are dropped
 _DEPTH = 10
 _ROOT = '/live'
-#: episodes that have a tab; earlier ones stay in the viewer's list
-_MAX_TABS = 8
 
 
 class LiveViewer(Node):
@@ -34,14 +32,10 @@ class LiveViewer(Node):
     Args:
         stream: recording of the viewer, which is served or saved already.
         name: of the node.
-        by_episode: a tab for each imagined episode; one begins with the picture of a view that it
-            starts from, which is published once.
     """
 
-    def __init__(self, stream: Any, name: str = 'viewer', *, by_episode: bool = False) -> None:
+    def __init__(self, stream: Any, name: str = 'viewer') -> None:
         super().__init__(name)
-        self._by_episode, self._root = by_episode, '/episode_0' if by_episode else _ROOT
-        self._tabs: dict[str, Streams] = {}
         self._stream = stream
         self._topics: dict[tuple[str, ...], str] = {}
         self._shown = Streams()
@@ -83,8 +77,6 @@ class LiveViewer(Node):
         # what has no stamp is about the last frame
         stamp_ns = read_stamp(data) if has_header(msgtype) else self._last_ns
         stamp_ns = stamp_ns or self._last_ns or self.get_clock().now().nanoseconds
-        if self._by_episode and self._begins_episode(topic, msgtype):
-            self._next_tab(stamp_ns)
         self._begin_ns = self._begin_ns or stamp_ns
         self._last_ns = stamp_ns
         taken = Streams()
@@ -99,19 +91,8 @@ class LiveViewer(Node):
         ):
             self._shown.images.update({key: [] for key in taken.images})
             self._shown.success.extend(taken.success)
-            self._tabs[self._root] = self._shown
-            tabs = dict(list(self._tabs.items())[-_MAX_TABS:])
-            self._stream.send_blueprint(rerun_log.layout(tabs, active=len(tabs) - 1))
-        rerun_log.log_streams(self._stream, taken, self._root, self._begin_ns)
-
-    def _begins_episode(self, topic: str, msgtype: str) -> bool:
-        """Return whether a message is the first image of a new episode."""
-        kind = shown_as(topic, msgtype) or ('',)
-        return kind[:2] == ('image', 'real') and kind[1:] in self._shown.images
-
-    def _next_tab(self, stamp_ns: int) -> None:
-        self._begin_ns, self._shown = stamp_ns, Streams()
-        self._root = f'/episode_{len(self._tabs)}'
+            self._stream.send_blueprint(rerun_log.layout({_ROOT: self._shown}))
+        rerun_log.log_streams(self._stream, taken, _ROOT, self._begin_ns)
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -121,13 +102,12 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--port', type=PageAddress.parse, default=PageAddress())
     parser.add_argument('--save', type=Path)
     parser.add_argument('--native', action='store_true')
-    parser.add_argument('--by-episode', action='store_true')
     options = parser.parse_args(remove_ros_args(arguments)[1:])
     stream = rerun_log.recording('live')
     note = rerun_log.open_viewer(stream, None, options.port, options.save, options.native)
     sys.stdout.write(f'{note}\nCtrl-C ends it\n')
     sys.stdout.flush()
-    status = run(lambda: LiveViewer(stream, by_episode=options.by_episode), arguments)
+    status = run(lambda: LiveViewer(stream), arguments)
     stream.flush()
     return status
 

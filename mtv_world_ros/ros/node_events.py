@@ -10,7 +10,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.parameters import LiveSettings, Settings
 
 if TYPE_CHECKING:
     from mtv_world_ros.ros.world_model.follow_joint_trajectory import Goal
@@ -19,15 +19,27 @@ if TYPE_CHECKING:
     from mtv_world_ros.ros.world_model.worker import Chunk, Ended
 
 
-class NodeEvents(Protocol):
-    """Events of a configured node; see `Rollouts`. All but `on_results` come from the executor."""
+class SensingEvents(Protocol):
+    """Events of a node that takes the robot's description and TF."""
 
-    def settings(self) -> Settings:
+    def settings(self) -> LiveSettings:
         """Return the present parameters."""
         ...
 
     def guarded(self, handle: Callable[..., None]) -> Callable[..., None]:
         """Return the handler as a callback that no message makes raise."""
+        ...
+
+    def on_robot(self, robot: RobotModel) -> None:
+        """Take the robot as it describes itself."""
+        ...
+
+
+class NodeEvents(SensingEvents, Protocol):
+    """Events of a configured node; see `Rollouts`. All but `on_results` come from the executor."""
+
+    def settings(self) -> Settings:
+        """Return the present parameters."""
         ...
 
     def on_image(self, view: str, message: Image | CompressedImage) -> None:
@@ -40,10 +52,6 @@ class NodeEvents(Protocol):
 
     def on_plan(self, plan: JointTrajectoryMsg | Goal, transport_s: float = 0.0) -> None:
         """Take a plan of the topic or of the action, and how long it was under way [s]."""
-        ...
-
-    def on_robot(self, robot: RobotModel) -> None:
-        """Take the robot as it describes itself."""
         ...
 
     def on_results(self) -> None:

@@ -53,8 +53,8 @@ _SECONDS = (0.001, 86400.0)
 _SET_SERVICES = ('set_parameters', 'set_parameters_atomically')
 
 
-class NodeSettings(Schema):
-    """Parameters of every node that observes."""
+class CheckpointSettings(Schema):
+    """Parameters of every node that loads a checkpoint."""
 
     checkpoint: str = at_start(
         'bundled', "Checkpoint folder; 'bundled' and 'bundled-paper' ship with the package."
@@ -65,6 +65,11 @@ class NodeSettings(Schema):
     compressed_input: bool = at_start(
         False, 'Subscribe to `<camera>/image_raw/compressed` (JPEG or PNG).'
     )
+
+
+class ObservationSettings(Schema):
+    """Limits of an observation, and the calibration of its cameras."""
+
     calibration_file: str = parameter(
         '',
         "YAML with every view's pose; empty = the one in the checkpoint. Read again when an "
@@ -79,7 +84,33 @@ class NodeSettings(Schema):
     )
 
 
-class Settings(NodeSettings):
+class NodeSettings(ObservationSettings, CheckpointSettings):
+    """Parameters of every node that observes."""
+
+
+class LiveSettings(ObservationSettings):
+    """Parameters of every node that takes the robot's description and TF."""
+
+    use_robot_description: bool = at_start(
+        True,
+        'Take lengths, offsets and limits of the robot from the topic `robot_description`; while '
+        'it describes another robot, trajectories are rejected.',
+    )
+    extrinsics: Literal['auto', 'tf', 'file'] = at_start(
+        'auto',
+        "Where the cameras' poses come from: /tf and /tf_static (needs tf2_msgs), or the "
+        'calibration file; auto = TF if it leads from the frame of the images to the robot and '
+        '`calibration_file` is empty.',
+    )
+    tf_prefix: str = at_start('', 'Prefix of the frame names in TF, e.g. `left_cell/`.')
+    max_tf_age_s: float = parameter(
+        1.0,
+        'Camera poses from /tf that are older than the image by more are no observation [s].',
+        _SECONDS,
+    )
+
+
+class Settings(LiveSettings, NodeSettings):
     """Parameters of the node `world_model`."""
 
     device: str = at_start('cpu', 'Device of the model: cpu, cuda, cuda:1.')
@@ -118,23 +149,6 @@ class Settings(NodeSettings):
     mode: Mode = at_start('observe', 'Mode at start; `~/imagine` changes it.')
     autostart: bool = at_start(
         True, 'Configures and activates itself; false = a lifecycle manager does that.'
-    )
-    use_robot_description: bool = at_start(
-        True,
-        'Take lengths, offsets and limits of the robot from the topic `robot_description`; while '
-        'it describes another robot, trajectories are rejected.',
-    )
-    extrinsics: Literal['auto', 'tf', 'file'] = at_start(
-        'auto',
-        "Where the cameras' poses come from: /tf and /tf_static (needs tf2_msgs), or the "
-        'calibration file; auto = TF if it leads from the frame of the images to the robot and '
-        '`calibration_file` is empty.',
-    )
-    tf_prefix: str = at_start('', 'Prefix of the frame names in TF, e.g. `left_cell/`.')
-    max_tf_age_s: float = parameter(
-        1.0,
-        'Camera poses from /tf that are older than the image by more are no observation [s].',
-        _SECONDS,
     )
     publish_tf: bool = at_start(
         True, 'Publish the frames of the views to /tf_static where TF lacks them.'

@@ -13,11 +13,12 @@ import tempfile
 from typing import TypeVar
 
 import rclpy
+from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from mtv_world_ros.core.errors import MtvWorldError
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.processes import (
     end_on_signals,
     escape_unprintable_output,
@@ -91,11 +92,11 @@ def run(
         return 0
     end_with_parent()
     starting = end_on_signals('mtv_world_ros')
-    _find_log_folder()
+    find_log_folder()
     try:
-        rclpy.init(args=None if args is None else list(args), signal_handler_options=signals)
-    except RuntimeError as error:  # rclpy's own classes for this are private
-        sys.stderr.write(f'ConfigError: {_why_refused(error)}\n')
+        init_ros(args, signals=signals)
+    except ConfigError as error:
+        sys.stderr.write(f'ConfigError: {error}\n')
         return 1
     node: AnyNode | None = None
     failure = ''
@@ -123,6 +124,29 @@ def run(
     return int(bool(failure))
 
 
+def init_ros(
+    args: Sequence[str] | None,
+    context: Context | None = None,
+    *,
+    signals: SignalHandlerOptions | None = None,
+) -> None:
+    """Initialise ROS from a command line.
+
+    Args:
+        args: command line with the program's name; default: the process' own.
+        context: is initialised; default: the process' own.
+        signals: signals that rclpy handles; default: all in the process' own context, else none.
+
+    Raises:
+        ConfigError: an argument or a parameter file is refused.
+    """
+    words = None if args is None else list(args)
+    try:
+        rclpy.init(args=words, context=context, signal_handler_options=signals)
+    except RuntimeError as error:  # rclpy's own classes for this are private
+        raise ConfigError(_why_refused(error)) from error
+
+
 def _why_refused(error: Exception) -> str:
     """Return why rclpy refused the command line or a parameter file, and what is valid."""
     detail = str(error).partition('failed to initialize rcl: ')[2] or str(error)
@@ -134,7 +158,7 @@ def _why_refused(error: Exception) -> str:
     return f'the arguments after --ros-args cannot be used: {detail}{hint}'
 
 
-def _find_log_folder() -> None:
+def find_log_folder() -> None:
     """Let ROS log into a temporary folder where it cannot write its own (a read-only home)."""
     home = os.environ.get('ROS_HOME') or Path.home() / '.ros'
     folder = Path(os.environ.get('ROS_LOG_DIR') or Path(home) / 'log')

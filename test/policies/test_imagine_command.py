@@ -3,6 +3,7 @@
 from dataclasses import replace
 import json
 import shutil
+import signal
 import subprocess
 import sys
 
@@ -16,6 +17,23 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.viewing.streams import read_streams
 
 DEMO = share_path('resource', 'demo_episode')
+HOLDING = """
+import numpy as np
+from mtv_world_ros import JointTrajectory
+from mtv_world_ros.robot.file import load_robot, robot_path
+
+
+class Holding:
+    name = 'holding'
+
+    def reset(self, *, seed):
+        self.names = load_robot(robot_path('yam_bimanual')).joint_names
+
+    def act(self, observation, instruction):
+        times = np.array([1.0, 4.0])
+        rows = np.repeat(observation.positions[None], 2, axis=0)
+        return JointTrajectory(joint_names=self.names, times=times, positions=rows)
+"""
 
 
 def run(out, policy, *more):
@@ -111,3 +129,44 @@ def test_an_episode_ends_after_its_longest_time_and_keeps_its_chunks(tmp_path):
     assert run(tmp_path, 'recorded', '--steps', '1', '--max-seconds', '0.001', '--no-video') == 0
     (episode,) = json.loads((tmp_path / 'episodes.json').read_text())
     assert episode['how'] == 'max_seconds' and (tmp_path / 'episode_00000').is_dir()
+
+
+@pytest.mark.slow
+def test_live_episodes_start_from_what_a_bag_shows(tmp_path, capsys, monkeypatch):
+    """The two commands of docs/policies.md."""
+    pytest.importorskip('rclpy', reason='rclpy is not installed (pip install .[ros])')
+    from test.support import ros_nodes
+
+    player = [sys.executable, '-m', 'mtv_world_ros.cli', 'replay', str(DEMO), '--no-wait']
+    playing = ros_nodes.NodeProcess([*player, '--loop'], tmp_path / 'player.log')
+    (tmp_path / 'holding_policy.py').write_text(HOLDING)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / 'holding.yaml').write_text('kind: python\nfactory: holding_policy:Holding\n')
+    words = ['--live', '--policy', str(tmp_path / 'holding.yaml'), '--count', '2']
+    words += ['--max-chunks', '1', '--steps', '1', '--out', str(tmp_path / 'out'), '--no-video']
+    words += ['--ros-args', '-p', f'calibration_file:={DEMO / "calibration.yaml"}']
+    try:
+        assert main(['imagine', *words]) == 0, playing.output()
+    finally:
+        playing.stop(signal.SIGINT)
+    said = capsys.readouterr().out
+    assert said.count('observed /low/image_raw/compressed, /high/image_raw/compressed') == 2
+    results = json.loads((tmp_path / 'out' / 'episodes.json').read_text())
+    assert [(r['start'], r['how'], r['num_chunks']) for r in results] == [
+        ('live', 'max_chunks', 1)
+    ] * 2
+    # the bag says what the robot is to do
+    streams = read_streams([tmp_path / 'out' / 'episode_00000'])
+    assert 'purple block' in ' '.join(text for _, text in streams.words)
+    assert ('real', 'low') in streams.images and ('imagined', 'high') in streams.images
+
+
+def test_ros_arguments_belong_to_live_episodes(capsys, tmp_path):
+    with pytest.raises(SystemExit):
+        run(tmp_path, 'expert', '--ros-args', '-r', 'low:=camera')
+    assert 'unrecognized arguments: --ros-args' in capsys.readouterr().err
+
+
+def test_a_policy_that_repeats_a_recording_needs_one(capsys, tmp_path):
+    assert main(['imagine', '--live', '--policy', 'recorded', '--out', str(tmp_path)]) == 1
+    assert 'give --episodes' in capsys.readouterr().err

@@ -12,7 +12,6 @@ import argparse
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 import json
 import os
 from pathlib import Path
@@ -171,35 +170,6 @@ def large_observation() -> Any:
     return replace(small, cameras=cameras, frames=np.zeros((2, 960, 1280, 3), np.uint8))
 
 
-# recorder of imagined episodes
-
-
-def episode_recorder(folder: Path, one: Signal) -> None:
-    """A bag is open, or about to be, when the recorder is hit."""
-    import rclpy
-    from rclpy.executors import SingleThreadedExecutor
-
-    from mtv_world_ros.ros.episodes.episode_runner import RecorderProcess
-    from mtv_world_ros.ros.peers import Peers
-
-    node = rclpy.create_node('attacker')
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    spin_once = partial(executor.spin_once, timeout_sec=0.05)
-    recorder = RecorderProcess(folder, Peers(node, spin_once))
-    try:
-        recorder.start(['/joint_states'])
-        recorder.begin()
-        while not one.late():
-            spin_once()
-            recorder.check()
-        raise AssertionError('the signal was not noticed')
-    finally:
-        recorder.stop()
-        executor.shutdown()
-        node.destroy_node()
-
-
 # processes of a recording through the node
 
 
@@ -245,7 +215,6 @@ KINDS: dict[str, tuple[str, float, Callable[[Path, Signal], None]]] = {
     'worker of rank, collect, evaluate': ('spawn_main', 3.0, worker),
     'worker of train': ('children.py', 3.0, clip_worker),
     'policy server': ('--serve', 3.0, policy_server),
-    'recorder of episodes': ('episode_recorder', 3.0, episode_recorder),
     'recorder of a demo': ('bags.recorder', 6.0, through_node),
     'player of a demo': ('bags.player', 6.0, through_node),
     'node of a demo': ('world_model.node', 6.0, through_node),

@@ -268,7 +268,7 @@ class Kills:
         """The fake policy, of the fake model's sizes."""
         values = (f'checkpoint:={self._out / "checkpoint"}',
                   f'calibration_file:={self._out / "calibration.yaml"}',
-                  'diagnostics_period_s:=0.2', *ros().FROZEN)  # fmt: skip
+                  'diagnostics_period_s:=0.2')  # fmt: skip
         return ['--ros-args', *(part for value in values for part in ('-p', value))]
 
     # world model

@@ -99,7 +99,7 @@ def test_services_are_guarded_once(context):
 @pytest.mark.parametrize('count', ['', 'x', '-1', '1e9', '\N{SUPERSCRIPT TWO}', '9' * 5000, '٣'])
 def test_a_count_of_diagnostics_that_is_no_number_says_nothing(context, count):
     with ended(Node('any')) as node:
-        peers = Peers(node, lambda: None)
+        peers = Peers(node)
         values = [KeyValue(key='subscribers./plan', value=count)]
         peers._on_diagnostics(DiagnosticArray(status=[DiagnosticStatus(name='n', values=values)]))
         assert peers.unconnected(['/plan']) == []

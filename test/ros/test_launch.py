@@ -1,6 +1,6 @@
 """The launch files, read by the real `ros2 launch`."""
 
-import json
+from importlib import metadata
 import os
 import signal
 import subprocess
@@ -8,7 +8,12 @@ import time
 
 import pytest
 
+pytest.importorskip('rclpy', reason='rclpy is not installed (pip install .[ros])')
+
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.policy.loop import PolicySettings
+from test.support.launch_stand_in import LaunchStandIn
 
 
 @pytest.mark.native_ros
@@ -16,7 +21,7 @@ from mtv_world_ros.core.files import share_path
     ('name', 'arguments'),
     [
         ('world_model.launch.py', ('params_file', 'mode', 'calibration_file', 'large_images')),
-        ('policy_in_the_loop.launch.py', ('policy', 'episodes', 'max_chunks', 'live')),
+        ('policy_in_the_loop.launch.py', ('policy', 'mode', 'max_chunks', 'checkpoint')),
         ('replay.launch.py', ('episode', 'calibration_file', 'rate', 'pace')),
     ],
 )
@@ -189,7 +194,7 @@ def test_replays_in_two_namespaces_at_once(launch):
     [
         ('replay.launch.py', 'checkpoint:=/nowhere', 'world_model'),
         ('replay.launch.py', 'episode:=/nowhere', 'nowhere'),
-        ('policy_in_the_loop.launch.py', 'episodes:=/nowhere', 'nowhere'),
+        ('policy_in_the_loop.launch.py', 'checkpoint:=/nowhere', 'world_model'),
     ],
 )
 def test_a_process_that_fails_is_the_status_of_the_launch(launch, name, argument, said):
@@ -200,11 +205,59 @@ def test_a_process_that_fails_is_the_status_of_the_launch(launch, name, argument
 
 
 @pytest.mark.native_ros
-def test_policy_lives_an_episode_and_the_launch_ends(launch, tmp_path):
-    episode = share_path('resource', 'demo_episode')
-    process = launch(
-        'policy_in_the_loop.launch.py', 'policy:=scripted', f'episodes:={episode}', 'count:=1',
-        'max_chunks:=1', f'out:={tmp_path / "out"}',
-    )  # fmt: skip
+def test_policy_and_world_model_start_and_end_on_ctrl_c(launch, ros2):
+    policy = share_path('config', 'policies', 'openpi.yaml')
+    process = launch('policy_in_the_loop.launch.py', f'policy:={policy}', 'mode:=observe')
+    read_until(process, 'ready: policy')
+    assert 'success=True' in ros2('service', 'call', '/policy/start', 'std_srvs/srv/Trigger')
+    process.send_signal(signal.SIGINT)
     check_end(process)
-    assert len(json.loads((tmp_path / 'out' / 'episodes.json').read_text())) == 1
+
+
+SCHEMAS = {'world_model': Settings, 'policy_node': PolicySettings}
+
+
+@pytest.mark.parametrize(
+    ('name', 'arguments', 'started'),
+    [
+        ('world_model.launch.py', {}, ['world_model']),
+        ('world_model.launch.py', {'mode': 'imagine', 'pace': 'burst'}, ['world_model']),
+        ('replay.launch.py', {'episode': '/bag'}, ['world_model', 'mtv-world']),
+        ('policy_in_the_loop.launch.py', {}, ['world_model', 'policy_node']),
+        (
+            'policy_in_the_loop.launch.py',
+            {'mode': 'observe', 'policy': 'a.yaml', 'max_chunks': '3', 'instruction': 'stack'},
+            ['world_model', 'policy_node'],
+        ),
+    ],
+)
+def test_launch_files_start_what_is_installed_with_parameters_that_exist(name, arguments, started):
+    """The files run on stand-ins of `launch`, which has no wheel."""
+    nodes = LaunchStandIn(share_path('launch')).nodes(name, arguments)
+    assert [node['executable'] for node in nodes] == started
+    installed = {e.name for e in metadata.entry_points(group='console_scripts')}
+    for node in nodes:
+        assert node['executable'] in installed
+        if node['executable'] in SCHEMAS:
+            schema, given = SCHEMAS[node['executable']], node['parameters']
+            known = {'use_sim_time', *schema.model_fields}
+            assert {*given} <= known
+            read = schema(**{key: v for key, v in given.items() if key != 'use_sim_time'})
+            for key in {*arguments} & {*given}:
+                assert str(getattr(read, key)) == arguments[key]
+
+
+def test_both_nodes_of_a_policy_agree():
+    nodes = LaunchStandIn(share_path('launch')).nodes(
+        'policy_in_the_loop.launch.py', {'mode': 'observe', 'calibration_file': '/c.yaml'}
+    )
+    world_model, policy = (node['parameters'] for node in nodes)
+    for key in ('mode', 'checkpoint', 'calibration_file', 'compressed_input', 'use_sim_time'):
+        assert world_model[key] == policy[key]
+
+
+def test_a_mode_that_does_not_exist_is_refused():
+    with pytest.raises(RuntimeError, match="mode is 'watch'; it must be one of imagine, observe"):
+        LaunchStandIn(share_path('launch')).nodes(
+            'policy_in_the_loop.launch.py', {'mode': 'watch'}
+        )

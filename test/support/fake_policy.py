@@ -1,13 +1,10 @@
 """A policy node whose policy goes wrong at its second answer, in the way that the task says."""
 
-import os
-import sys
 import time
 
 import numpy as np
 
 from mtv_world_ros.core.data_types import JointTrajectory
-from mtv_world_ros.ros.policy.node import main
 
 LATE_S = 2.5
 
@@ -48,7 +45,6 @@ FAULTS = {
     'late': lambda: time.sleep(LATE_S),
     'slow': lambda: time.sleep(1.0),
     'crashes': crash,
-    'dies': lambda: os._exit(3),
 }
 JOINTS = tuple(
     f'{arm}_{joint}'
@@ -59,7 +55,3 @@ JOINTS = tuple(
 
 def load(settings, robot):
     return lambda origin: FakePolicy(origin.task)
-
-
-if __name__ == '__main__':
-    sys.exit(main(load=load))

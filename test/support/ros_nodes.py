@@ -221,9 +221,13 @@ class Client:
 
     def set(self, **values):
         """Set parameters of the node; return the first refusal's reason, or ''."""
+        return self.set_on('/world_model', **values)
+
+    def set_on(self, node, **values):
+        """Set parameters of a node; return the first refusal's reason, or ''."""
         parameters = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
         request = SetParameters.Request(parameters=parameters)
-        results = self.call(SetParameters, '/world_model/set_parameters', request).results
+        results = self.call(SetParameters, f'{node}/set_parameters', request).results
         return next((r.reason for r in results if not r.successful), '')
 
     def get(self, name):
@@ -473,12 +477,6 @@ def start_policy(folder, *parameters, remaps=()):
     return NodeInProcess(lambda context: PolicyNode(load_fake_policy, context), words)
 
 
-def start_policy_process(folder, *parameters, remaps=()):
-    """Start the policy node in a process of its own, which some of its faults end."""
-    words = policy_options(folder, *parameters, remaps=remaps)
-    return NodeProcess([sys.executable, str(FAKE_POLICY), *words], folder / 'policy.log')
-
-
 INPUTS = {
     **{f'/{view}/image_raw': Image for view in VIEWS},
     **{f'/{view}/camera_info': CameraInfo for view in VIEWS},
@@ -487,14 +485,6 @@ INPUTS = {
 }
 
 
-#: parameters and names of nodes that start from what the episode runner shows them
-FROZEN = (
-    'camera_topics.low:=start/low',
-    'camera_topics.high:=start/high',
-    'max_image_age_s:=3600.0',
-    'max_joint_state_age_s:=3600.0',
-)
-JOINT_STATES = ('joint_states:=start/joint_states',)
 COMPRESSED = CompressedImage
 IMAGE = Image
 INFO = CameraInfo
@@ -503,3 +493,8 @@ PLAN = JointTrajectory
 STRING = String
 REPORT = DiagnosticArray
 TRIGGER = Trigger
+LATCHED_QOS = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)

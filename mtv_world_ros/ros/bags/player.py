@@ -171,7 +171,7 @@ class Player(Node):
         self._hint = self._describe_cameras(types)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
-        self._peers = Peers(self, lambda: self._executor.spin_once(timeout_sec=0.05))
+        self._peers = Peers(self)
         self._counts: Counter[str] = Counter()
         self._first_ns = 0
         self._timeline: Timeline | None = None

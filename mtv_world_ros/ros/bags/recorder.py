@@ -82,7 +82,9 @@ class Recorder(Node):
         self._executor.add_node(self)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._on_signal)
-        self._writer = self._open()
+        self._writer: BagWriter | None = BagWriter(
+            options.out, overwrite=options.overwrite, keep=True
+        )
 
     def record(self) -> None:
         """Record for the given duration, or until a signal and the messages sent before it.
@@ -133,10 +135,6 @@ class Recorder(Node):
         if self._num_lost:
             lost = ', '.join(f'{topic} {n}' for topic, n in sorted(self._num_lost.items()))
             self.get_logger().warning(f'lost before they got here: {lost}')
-
-    def _open(self) -> BagWriter | None:
-        """The bag that is open from the start."""
-        return BagWriter(self._options.out, overwrite=self._options.overwrite, keep=True)
 
     def _after_spin(self) -> None:
         """Flush the bag, and names silent topics."""

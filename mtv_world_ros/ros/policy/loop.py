@@ -331,8 +331,8 @@ class PolicyLoop:
             self._why_waiting = 'the rollout is done, but of its chunk there was no report'
             return
         num_frames = int(report['frames'])
-        # with a real robot the world model starts from frames newer than those answered
-        is_strict = self._settings.mode == 'imagine'
+        # real frames may be newer than those answered; predicted ones stand still meanwhile
+        is_strict = self._settings.mode == 'imagine' and self.num_chunks > 0
         start_ns = before.stamp_ns if is_strict else int(report['observation_stamp_ns'])
         stamps = chunk_stamps(start_ns, num_frames, self._spec.fps)
         missing = self._frames.missing(stamps)

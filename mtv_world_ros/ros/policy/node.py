@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 import sys
+import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -12,6 +13,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -39,6 +41,8 @@ from mtv_world_ros.ros.world_model.loading import check_calibration, reload_came
 
 Load = Callable[[PolicySettings, RobotModel], PolicyMaker]
 _TICK_S = 0.02
+#: time after which a reset without an answer is asked for again [s]
+_ASK_AGAIN_S = 4.0
 
 
 def load_named_policy(settings: PolicySettings, robot: RobotModel) -> PolicyMaker:
@@ -80,13 +84,14 @@ class PolicyNode(Node):
         self._answers = self.create_guard_condition(self._guarded(self._loop.on_answers))
         self._cameras = subscribe_observations(
             self,
-            self._spec.views,
-            compressed=settings.compressed_input,
+            parameters.declare_camera_topics(self, self._spec.views),
+            compressed=self._spec.views if settings.compressed_input else (),
             buffer=self._buffer,
             guarded=self._guarded,
         )
         self._subscribe_predictions(settings.world_model, frames)
         self._plans = self.create_publisher(JointTrajectoryMsg, 'joint_trajectory', 10)
+        self._reset = WorldModelReset(self, settings.world_model)
         self._instruction = self.create_publisher(String, 'instruction', LATCHED)
         self.create_service(Trigger, '~/start', self._on_start)
         self.create_service(Trigger, '~/stop', self._on_stop)
@@ -138,6 +143,7 @@ class PolicyNode(Node):
                 f'nobody is connected to {self._unconnected()}; is the world model running, and '
                 "does the parameter 'world_model' name it?",
             )
+        self._reset.check()
         return self._buffer.observe(self.get_clock().now().nanoseconds).observation
 
     # what reaches it
@@ -182,6 +188,8 @@ class PolicyNode(Node):
         self._buffer.clear()
         if settings.instruction:
             self._instruction.publish(String(data=settings.instruction))
+        if settings.mode == 'imagine':
+            self._reset.ask()
         origin = EpisodeOrigin(
             task=settings.task,
             scene_seed=settings.scene_seed,
@@ -232,6 +240,46 @@ class PolicyNode(Node):
 
     def _settings(self) -> PolicySettings:
         return parameters.read(self, PolicySettings)
+
+
+class WorldModelReset:
+    """Resets the world model, so that an imagined episode begins at real frames.
+
+    Args:
+        node: owner of the client.
+        world_model: name of the world model's node.
+    """
+
+    def __init__(self, node: Node, world_model: str) -> None:
+        self._client = node.create_client(Trigger, f'{world_model}/reset')
+        self._asked: list[Future] = []
+        self._asked_s = 0.0
+
+    def ask(self) -> None:
+        """Ask for a reset; `check` refuses until it is done."""
+        self._asked = [self._client.call_async(Trigger.Request())]
+        self._asked_s = time.monotonic()
+
+    def check(self) -> None:
+        """Refuse to go on until the reset that was asked for is done.
+
+        Raises:
+            Rejection: the world model has not answered yet, or refused.
+        """
+        if not self._asked:
+            return
+        answers = [future.result() for future in self._asked if future.done()]
+        if any(answer is not None and answer.success for answer in answers):
+            self._asked = []
+            return
+        if time.monotonic() > self._asked_s + _ASK_AGAIN_S:  # an answer may get lost
+            self._asked.append(self._client.call_async(Trigger.Request()))
+            self._asked_s = time.monotonic()
+        said = next((f': {a.message}' for a in answers if a is not None and a.message), '')
+        raise Rejection(
+            Reason.WORLD_MODEL_MISSING,
+            f"'{self._client.srv_name}' has not reset the world model yet{said}",
+        )
 
 
 def main(args: Sequence[str] | None = None, load: Load = load_named_policy) -> int:

@@ -24,8 +24,8 @@ from mtv_world_ros.robot.file import described_robot
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
-from mtv_world_ros.ros.node_events import NodeEvents
-from mtv_world_ros.ros.parameters import Settings
+from mtv_world_ros.ros.node_events import SensingEvents
+from mtv_world_ros.ros.parameters import LiveSettings
 from mtv_world_ros.ros.qos_profiles import LATCHED
 from mtv_world_ros.ros.sensing.observations import SensedScene
 
@@ -48,7 +48,7 @@ class RobotDescription:
         self,
         node: Node,
         expected: RobotModel,
-        events: NodeEvents,
+        events: SensingEvents,
     ) -> None:
         self._expected, self._events = expected, events
         self._log = node.get_logger()
@@ -115,6 +115,7 @@ class Extrinsics:
         node: owner of the subscriptions and the publisher.
         links: of the robot, those whose pose its joint states determine.
         events: has the present parameters.
+        publishes: whether frames that TF lacks are published.
 
     Raises:
         ConfigError: poses are to come from TF, and tf2_msgs is not installed.
@@ -124,7 +125,9 @@ class Extrinsics:
         self,
         node: Node,
         links: Collection[str],
-        events: NodeEvents,
+        events: SensingEvents,
+        *,
+        publishes: bool,
     ) -> None:
         self._node, self._links, self._settings = node, frozenset(links), events.settings
         self._tree = TransformTree(events.settings().tf_prefix)
@@ -137,7 +140,7 @@ class Extrinsics:
         if self._message is None:
             self._log_absence()
             return
-        if events.settings().publish_tf:
+        if publishes:
             self._publisher = node.create_publisher(self._message, '/tf_static', LATCHED)
         for topic, qos, latched in (
             ('/tf', QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT), False),
@@ -252,7 +255,7 @@ class Extrinsics:
             message.transforms = [t for t in message.transforms if t not in self._published]
         self._tree.add(message, latched=latched)
 
-    def _uses_tf(self, frame: str, settings: Settings) -> bool:
+    def _uses_tf(self, frame: str, settings: LiveSettings) -> bool:
         if settings.extrinsics != 'auto':
             return settings.extrinsics == 'tf'
         is_given = bool(settings.calibration_file)

@@ -23,7 +23,7 @@ from mtv_world_ros.data.transform_tree import Mount
 from mtv_world_ros.ros.messages import image_messages
 from mtv_world_ros.ros.messages.conversions import check_sample, NANO, to_ns, to_sample
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
-from mtv_world_ros.ros.parameters import NodeSettings
+from mtv_world_ros.ros.parameters import ObservationSettings
 from mtv_world_ros.ros.sensing.samples import NodeTime, Samples
 
 AnyImage = Image | CompressedImage
@@ -87,7 +87,7 @@ class ObservationBuffer:
         joint_names: Sequence[str],
         width: int,
         height: int,
-        limits: Callable[[], NodeSettings],
+        limits: Callable[[], ObservationSettings],
         on_image: Callable[[str, AnyImage], None] | None = None,
         pose: Callable[[str, str, int], Mount | None] | None = None,
         time: NodeTime | None = None,
@@ -315,7 +315,7 @@ class ObservationBuffer:
             return camera
         return replace(camera, mount_link=mount.link, T_mount_camera=mount.T_link_frame)
 
-    def _pick_images(self, now_ns: int, limits: NodeSettings) -> list[tuple[int, AnyImage]]:
+    def _pick_images(self, now_ns: int, limits: ObservationSettings) -> list[tuple[int, AnyImage]]:
         """Per view the image nearest to the newest moment that every view has seen.
 
         Where these are too far apart, because images were lost, the newest ones that are not.
@@ -355,7 +355,7 @@ class ObservationBuffer:
             )
         return picked
 
-    def _positions(self, stamp_ns: int, now_ns: int, limits: NodeSettings) -> FloatArray:
+    def _positions(self, stamp_ns: int, now_ns: int, limits: ObservationSettings) -> FloatArray:
         """(J,) positions nearest in time to the images."""
         missing = [name for name, samples in self._joints.items() if not samples]
         if missing:

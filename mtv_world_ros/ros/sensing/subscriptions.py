@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial, wraps
 from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor
@@ -59,7 +59,11 @@ class Inputs:
         events: NodeEvents,
     ) -> None:
         self._observations = subscribe_observations(
-            node, views, compressed=compressed, buffer=buffer, guarded=events.guarded
+            node,
+            parameters.declare_camera_topics(node, views),
+            compressed=views if compressed else (),
+            buffer=buffer,
+            guarded=events.guarded,
         )
         self._all = [*self._observations]
         instruction = events.guarded(events.on_instruction)
@@ -113,16 +117,25 @@ class Inputs:
 
 def subscribe_observations(
     node: Node,
-    views: Sequence[str],
+    topics: Mapping[str, str],
     *,
-    compressed: bool,
+    compressed: Collection[str],
     buffer: ObservationBuffer,
     guarded: Callable[[Handler], Handler],
 ) -> list[MatchedSubscription]:
-    """Subscribe to the cameras and joint states; see `Inputs`."""
-    kind, suffix = (CompressedImage, '/compressed') if compressed else (Image, '')
+    """Subscribe to the cameras and joint states.
+
+    Args:
+        node: owner of the subscriptions.
+        topics: camera topic of each view; `image_raw` and `camera_info` lie below.
+        compressed: views whose images come as JPEG or PNG.
+        buffer: gets images, camera infos and joint states.
+        guarded: returns a handler as a callback that no message makes raise.
+    """
     newest: list[tuple[Any, str, Handler, int]] = []
-    for view, topic in parameters.declare_camera_topics(node, views).items():
+    for view, topic in topics.items():
+        is_compressed = view in compressed
+        kind, suffix = (CompressedImage, '/compressed') if is_compressed else (Image, '')
         is_rectified = RECTIFIED in node.resolve_topic_name(f'{topic}/image_raw{suffix}')
         add_info = partial(buffer.add_camera_info, view, is_rectified=is_rectified)
         newest += [
@@ -144,6 +157,10 @@ class MatchedSubscription:
     topics where the newest message counts. `qos_overrides.<topic>.subscription.reliability`
     (match, reliable, best_effort) and `.depth` override the reliability and the depth.
 
+    Attributes:
+        topic: resolved name.
+        num_received: messages so far.
+
     Args:
         node: owner.
         kind: message type.
@@ -163,7 +180,15 @@ class MatchedSubscription:
         depth: int,
         default: str = 'match',
     ) -> None:
-        self._node, self._kind, self._callback = node, kind, callback
+        self._node, self._kind = node, kind
+        self.num_received = 0
+
+        @wraps(callback)  # rclpy looks at its signature
+        def count(*arguments: Any) -> None:
+            self.num_received += 1
+            callback(*arguments)
+
+        self._callback = count
         self.topic = node.resolve_topic_name(topic)
         prefix = f'qos_overrides.{self.topic}.subscription'
 

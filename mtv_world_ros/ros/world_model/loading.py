@@ -144,6 +144,15 @@ def load_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[CameraMo
         CalibrationError: the file is wrong or lacks a view, or there is none.
     """
     path = Path(settings.calibration_file or Checkpoint.open(settings.checkpoint).cameras_file)
+    return read_cameras(path, spec)
+
+
+def read_cameras(path: Path, spec: WorldModelSpec) -> tuple[CameraModel, ...]:
+    """Read the calibrated camera of every view, in the model's order.
+
+    Raises:
+        CalibrationError: the file is wrong or lacks a view.
+    """
     cameras = load_calibration(path)
     missing = [view for view in spec.views if view not in cameras]
     if missing:

@@ -235,7 +235,9 @@ class Rollouts:
         undo.callback(self._worker.close)
         self._adapter = AdapterSwitch(node, pipeline.world_model, self._worker.run_between)
         undo.callback(self._adapter.close)
-        self._extrinsics = Extrinsics(node, self._robot.posed_links, self)
+        self._extrinsics = Extrinsics(
+            node, self._robot.posed_links, self, publishes=settings().publish_tf
+        )
         self._description: RobotDescription | None = None
         if settings().use_robot_description:
             self._description = RobotDescription(node, self._robot, self)

@@ -1,8 +1,5 @@
 """The policy node in observe mode: real cameras, the world model beside it."""
 
-import json
-import sys
-
 import pytest
 
 from mtv_world_ros.ros.messages.conversions import values_of
@@ -54,39 +51,31 @@ def test_in_observe_mode_a_camera_that_stops_ends_the_episode_and_says_so(observ
 
 
 def test_an_imagined_episode_starts_from_what_the_cameras_show(tmp_path, ros):
-    """The cameras go on; the episode does not look at them again."""
+    """The cameras go on; the episode does not look at them again, and the next one starts anew."""
     ros.make_checkpoint(tmp_path / 'checkpoint')
-    options = {'remaps': ros.JOINT_STATES}
-    strict = ('pace:=burst', 'mode:=imagine', 'max_trajectory_age_s:=0.001')
-    world = ros.start_node(tmp_path, *strict, *ros.FROZEN, **options)
-    policy = ros.start_policy(tmp_path, *ros.FROZEN, **options)
-    out = tmp_path / 'out'
-    command = [
-        sys.executable,
-        '-m',
-        'mtv_world_ros.ros.episodes.episode_runner',
-        str(out),
-        '--live',
-    ]
-    command += ['--views', 'low', 'high', '--count', '2', '--max-chunks', '2', '--no-record']
-    runner = ros.NodeProcess(command, tmp_path / 'runner.log')
+    world = ros.start_node(tmp_path, 'pace:=burst', 'mode:=imagine')
+    policy = ros.start_policy(tmp_path, 'max_image_age_s:=1.5', 'max_chunks:=2')
     client = ros.Client()
     try:
-        cameras = {t: k for t, k in ros.INPUTS.items() if t != '/joint_trajectory'}
-        client.wait(lambda: client.node.count_subscribers('/low/image_raw'), 'the runner')
-        client.connect_inputs(cameras)
+        client.subscribe(ros.REPORT, '/policy/report', 100)
+        client.connect_inputs({t: k for t, k in ros.INPUTS.items() if t != '/joint_trajectory'})
 
-        def has_ended():
+        def ends():
+            reports = map(values_of, client.statuses('/policy/report'))
+            return [(v['how'], v['num_chunks']) for v in reports if v['state'] == 'ended']
+
+        def has_ended(number):
             client.send_scene()
-            client.spin_for(0.1)
-            return runner.process.poll() is not None
+            client.spin_for(0.05)
+            return len(ends()) == number
 
-        client.wait(has_ended, 'the end', timeout_s=60.0)
-        assert runner.process.returncode == 0, runner.output()
+        for number in (1, 2):
+            assert client.call(ros.TRIGGER, '/policy/start', ros.TRIGGER.Request()).success
+            client.wait(lambda number=number: has_ended(number), 'the end')
+        assert ends() == [('max_chunks', '2')] * 2
+        starts = [v['observation_stamp_ns'] for v in client.report_values('chunk')][::2]
+        assert int(starts[0]) < int(starts[1])
     finally:
         client.close()
-        for process in (runner, policy, world):
-            process.stop()
-    results = json.loads((out / 'episodes.json').read_text())
-    found = [(r['start'], r['how'], r['num_chunks']) for r in results]
-    assert found == [('live', 'max_chunks', '2')] * 2
+        for process in (policy, world):
+            assert process.stop() == 0

@@ -1,1 +1,0 @@
-"""Runs and records episodes of a policy in the world model."""
