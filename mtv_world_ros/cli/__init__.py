@@ -262,7 +262,7 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
     leaf = parser
     for word in words[:2]:
         leaf = _choices(leaf).get(word, leaf)
-    if more and not getattr(arguments, 'takes_more', lambda _: False)(arguments):
+    if more and not getattr(arguments, 'takes_more', lambda *_: False)(arguments, more):
         hints = [f'{word}{nearest(word, leaf._option_string_actions)}' for word in more]
         parser.error(f'unrecognized arguments: {" ".join(hints)}')
     _check_texts(leaf, arguments)

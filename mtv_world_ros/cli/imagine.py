@@ -46,7 +46,7 @@ def add_replay(commands: argparse._SubParsersAction) -> None:
     add_options(parser, 'overwrite source checkpoint dtype model describer segmenter serving task')
     parser.set_defaults(
         handler=_replay,
-        takes_more=lambda chosen: not chosen.offline,
+        takes_more=lambda chosen, _: not chosen.offline,
     )
 
 
@@ -135,7 +135,7 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
     add_options(parser, 'overwrite checkpoint model describer segmenter')
     parser.set_defaults(
         handler=_imagine,
-        takes_more=lambda chosen: chosen.live and chosen.ros[0] == '--ros-args',
+        takes_more=lambda chosen, more: chosen.live and more[0] == '--ros-args',
     )
 
 

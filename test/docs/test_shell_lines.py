@@ -224,9 +224,10 @@ def check_mtv_world(words: Sequence[str]) -> bool:
     except SystemExit as end:
         assert end.code == 0, said.getvalue()
         return True
-    if more and getattr(arguments, 'takes_player_options', lambda _: False)(arguments):
+    if more and getattr(arguments, 'takes_more', lambda *_: False)(arguments, more):
         source = PLAYER.read_text()
         more = [word for word in more if word.startswith('-') and f"'{word}'" not in source]
+        more = [] if '--ros-args' in more else more
     assert not more, f'unrecognized arguments: {more}'
     try:
         check_values(vars(arguments))
@@ -279,6 +280,16 @@ def check_world_model(words: Sequence[str]) -> bool:
     return False
 
 
+def check_policy_node(words: Sequence[str]) -> bool:
+    pytest.importorskip('rclpy')
+    from mtv_world_ros.ros.policy.loop import PolicySettings
+
+    names = [word.split(':=')[0] for word in words if ':=' in word]
+    unknown = [name for name in names if name not in PolicySettings.model_fields]
+    assert not unknown, f'no such parameter: {unknown}'
+    return False
+
+
 def check_ros2(words: Sequence[str]) -> bool:
     if words[0] == 'launch':
         file = ROOT / 'launch' / words[2]
@@ -295,6 +306,8 @@ def check_ros2(words: Sequence[str]) -> bool:
     elif words[0] == 'lifecycle':
         assert words[1:3] == ['set', '/world_model']
         assert words[3:] in (['configure'], ['activate'], ['deactivate'], ['cleanup'])
+    elif words[0] == 'service':
+        assert words[1:] == ['call', '/policy/start', 'std_srvs/srv/Trigger']
     else:
         assert words[:2] in (['bag', 'play'], ['bag', 'record'])
     return False
@@ -340,6 +353,7 @@ PROGRAMS: dict[str, Callable[[Sequence[str]], bool]] = {
     'export': lambda words: '=' in words[0],
     'make': check_make,
     'mtv-world': check_mtv_world,
+    'policy_node': check_policy_node,
     'python': check_python,
     'python3': lambda words: False,
     'ros2': check_ros2,
