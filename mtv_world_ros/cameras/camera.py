@@ -313,7 +313,7 @@ def _bent(coefficients: FloatArray, theta: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _largest_angle(coefficients: tuple[float, ...]) -> float:
-    """Angle up to which the distorted radius grows with it [rad]."""
+    """Return the angle up to which the distorted radius grows with it [rad]."""
     theta = np.linspace(0.0, np.pi / 2, 4001)
     grows = np.diff(np.polynomial.Polynomial(_odd(coefficients))(theta)) > 0
     return float(theta[-1] if grows.all() else theta[np.argmin(grows)])
@@ -344,7 +344,7 @@ def _padded(coefficients: FloatArray) -> FloatArray:
 
 
 def _apply(k: FloatArray, xy: np.ndarray) -> np.ndarray:
-    """Distorted from ideal coordinates (..., 2), real or complex."""
+    """Return the distorted coordinates of ideal ones (..., 2), real or complex."""
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     radial = _radial(k, r2)
@@ -365,7 +365,7 @@ def _radial(k: FloatArray, r2: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def _largest_r2(coefficients: tuple[float, ...]) -> float:
-    """Squared radius up to which the distorted radius grows with the true one."""
+    """Return the squared radius up to which the distorted radius grows with the true one."""
     r = np.linspace(0.0, _WIDEST, 4001)
     with np.errstate(all='ignore'):
         grows = np.diff(r * _radial(np.array(coefficients), r * r)) > 0
@@ -373,7 +373,7 @@ def _largest_r2(coefficients: tuple[float, ...]) -> float:
 
 
 def _tilt(xy: np.ndarray, tau_x: float, tau_y: float) -> np.ndarray:
-    """The tilted sensor of OpenCV's 14-coefficient model."""
+    """Return the tilt of the sensor in OpenCV's 14-coefficient model."""
     cx, sx, cy, sy = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
     rotation = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]]) @ np.array(
         [[1, 0, 0], [0, cx, sx], [0, -sx, cx]]

@@ -135,7 +135,7 @@ def upright_extents(
 
 
 def _largest_box(mask: BoolArray) -> tuple[int, int]:
-    """Width and height of the box around the largest connected part of a mask [px]."""
+    """Return the width and height of the box around the largest connected part of a mask [px]."""
     stats = np.asarray(cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)[2])
     largest = stats[1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))]
     return int(largest[cv2.CC_STAT_WIDTH]), int(largest[cv2.CC_STAT_HEIGHT])
@@ -161,7 +161,10 @@ def lean(
 
 
 def _plane(camera: CameraModel, T_base_camera: FloatArray, mask: BoolArray) -> FloatArray:
-    """Normal (3,) of the plane through the camera and the long axis; longer for long masks."""
+    """Return the normal (3,) of the plane through the camera and the long axis.
+
+    Longer for long masks.
+    """
     moments = cv2.moments(mask.view(np.uint8), binaryImage=True)
     centre = np.array([moments['m10'], moments['m01']]) / moments['m00']
     wide, slanted = moments['mu20'] - moments['mu02'], 2 * moments['mu11']
@@ -197,7 +200,7 @@ def moved_mask(
 
 
 def _depth(T_base_camera: FloatArray, point: FloatArray) -> float:
-    """Distance along the optical axis [m]."""
+    """Return the distance along the optical axis [m]."""
     return float(T_base_camera[:3, 2] @ (point - T_base_camera[:3, 3]))
 
 

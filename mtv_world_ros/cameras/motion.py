@@ -125,7 +125,7 @@ class Motion:
         return np.array([seen.any(axis=0).mean() for seen in shown])
 
     def _shows_tool(self, view: int) -> BoolArray:
-        """(A, N) whether the tool is in the image."""
+        """Return (A, N) whether the tool is in the image."""
         camera = self.cameras[view]
         seen = self._is_within(camera, view, 0.0)
         pinhole = replace(camera, distortion_model='none', distortion=np.zeros(0))

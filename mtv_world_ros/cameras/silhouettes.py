@@ -20,7 +20,7 @@ _NEAR_M = 0.04
 def draw_silhouettes(
     shapes: Sequence[LinkShape], camera: CameraModel, robot: RobotModel, positions: FloatArray
 ) -> NDArray[np.uint8]:
-    """(T, H, W) 1 where the robot is in the image, for positions (T, J)."""
+    """Return (T, H, W) 1 where the robot is in the image, for positions (T, J)."""
     poses = robot.forward_kinematics(positions)
     T_base_camera = camera_poses(camera, robot, positions)
     parts = [project_part(part, poses[part.link], camera, T_base_camera) for part in shapes]
@@ -30,7 +30,10 @@ def draw_silhouettes(
 def project_part(
     part: LinkShape, poses: FloatArray, camera: CameraModel, T_base_camera: FloatArray
 ) -> FloatArray:
-    """(T, N, 2) pixels of its points; what reaches behind the camera is cut off before it."""
+    """Return (T, N, 2) pixels of its points.
+
+    What reaches behind the camera is cut off before it.
+    """
     T = inverse(T_base_camera) @ poses
     points = np.einsum('tij,nj->tni', T[:, :3, :3], part.points) + T[:, None, :3, 3]
     depth = points[..., 2]

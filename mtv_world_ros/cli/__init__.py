@@ -309,7 +309,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _extra_of(package: str) -> str:
-    """The first extra of this package that asks for another one; empty = none does."""
+    """Return the first extra of this package that asks for another one; empty = none does."""
     for line in metadata.requires('mtv_world_ros') or ():
         found = re.match(rf'{re.escape(package)}\b(?!-).*extra == .(\w+)', line)
         if found and package:

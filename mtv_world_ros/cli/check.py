@@ -74,7 +74,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
 
 
 def _episodes_in(path: Path) -> list[Path]:
-    """Episodes of a folder that is none itself."""
+    """Return the episodes of a folder that is none itself."""
     from mtv_world_ros.data.episode_reader import list_episodes
 
     found = list_episodes(path) if path.is_dir() else []

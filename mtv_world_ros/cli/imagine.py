@@ -234,7 +234,7 @@ def _starts(
 
 
 def _viewer(arguments: argparse.Namespace) -> EpisodeViewer | None:
-    """The viewer of `--watch`; prints its address."""
+    """Return the viewer of `--watch`; prints its address."""
     if arguments.watch is None:
         return None
     from mtv_world_ros.rollout.episode_viewer import EpisodeViewer
@@ -260,7 +260,7 @@ def episode_table(results: Sequence[Mapping[str, object]]) -> list[str]:
 
 
 def _success_rate(verdicts: Sequence[str]) -> str:
-    """The share of successes among the verdicts, with Wilson's 95 % interval."""
+    """Return the share of successes among the verdicts, with Wilson's 95 % interval."""
     hits, count = verdicts.count('success'), sum(v in ('success', 'failure') for v in verdicts)
     without = len(verdicts) - count
     rest = f'; {without} without a verdict (open, or the estimate abstains)' if without else ''

@@ -209,7 +209,7 @@ def _rank(arguments: argparse.Namespace) -> int:
 
 
 def _viewer(arguments: argparse.Namespace) -> LiveRanking | None:
-    """The viewer of `--watch`; prints its address."""
+    """Return the viewer of `--watch`; prints its address."""
     if arguments.watch is None:
         return None
     from mtv_world_ros.reports.shown_rankings import LiveRanking
@@ -222,7 +222,7 @@ def _viewer(arguments: argparse.Namespace) -> LiveRanking | None:
 
 
 def _names(arguments: argparse.Namespace) -> list[str]:
-    """The checkpoints to rank with: one, or two with `--compare`."""
+    """Return the checkpoints to rank with: one, or two with `--compare`."""
     if arguments.true_episodes < 0:
         raise ConfigError(f'--true-episodes is {arguments.true_episodes}; it must be 0 or more')
     names = [arguments.checkpoint, *([arguments.compare] if arguments.compare else [])]
@@ -247,7 +247,7 @@ def _ranked(arguments: argparse.Namespace, checkpoint: Checkpoint, out: Path) ->
 
 
 def _listed(arguments: argparse.Namespace, robot: RobotModel) -> tuple[ListedPolicy, ...]:
-    """The policies of a file; none where `--policies` is a comma-separated list."""
+    """Return the policies of a file; none where `--policies` is a comma-separated list."""
     from mtv_world_ros.ranking.policy_list import check_single_clients, load_policy_list
 
     path = Path(arguments.policies or '')
@@ -307,7 +307,7 @@ def _jobs(
 
 
 def _settings(arguments: argparse.Namespace, checkpoint: Checkpoint) -> dict[str, str]:
-    """Settings that rollouts depend on: with other settings they are run again."""
+    """Return the settings that rollouts depend on: with other settings they are run again."""
     from mtv_world_ros.core.files import content_digest, share_path
     from mtv_world_ros.data.episode import NOMINAL
     from mtv_world_ros.evaluation.result_settings import fingerprint

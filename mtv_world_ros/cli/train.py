@@ -252,7 +252,7 @@ def _use_threads(arguments: argparse.Namespace) -> None:
 
 
 def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Overrides of the preset by options; --set has precedence."""
+    """Return the overrides of the preset by options; --set has precedence."""
     overrides: dict[str, Any] = {}
     if arguments.views is not None:
         views = [view.strip() for view in arguments.views.split(',') if view.strip()]

@@ -130,7 +130,7 @@ def _shown(arguments: argparse.Namespace) -> dict[str, Streams | ScoredRollout]:
 
 
 def _bag(path: Path) -> Path:
-    """The bag of a path: itself, or the predictions in the folder of `mtv-world demo`."""
+    """Return the bag of a path: itself, or the predictions in the folder of `mtv-world demo`."""
     from mtv_world_ros.data.episode_reader import list_episodes
 
     if (path / 'predictions').is_dir():

@@ -71,7 +71,7 @@ def _depths(
     camera: CameraModel,
     T_base_camera: FloatArray,
 ) -> FloatArray:
-    """(P, T) of the parts' centres [m]."""
+    """Return the depths (P, T) of the parts' centres [m]."""
     middles = [np.append(part.points.mean(axis=0), 1.0) for part in parts]
     centres = [poses[p.link][:, :3] @ middle for p, middle in zip(parts, middles, strict=True)]
     return project(camera, T_base_camera, np.stack(centres))[1]
@@ -83,7 +83,7 @@ def _seen_links(
     numbers: NDArray[np.int_],
     camera: CameraModel,
 ) -> NDArray[np.uint8]:
-    """(T, H, W) 1 + the number of the link that is seen in each pixel, 0 = none.
+    """Return (T, H, W) 1 + the number of the link that is seen in each pixel, 0 = none.
 
     Args:
         pixels: of each of P parts (T, N, 2), whose convex hull is its silhouette.
@@ -144,12 +144,12 @@ def _mean_colour(
 
 
 def _affine(points: FloatArray, others: FloatArray) -> FloatArray:
-    """(2, 3) the affine map that takes points (N, 2) to others best."""
+    """Return (2, 3) the affine map that takes points (N, 2) to others best."""
     whole = np.column_stack([points, np.ones(len(points))])
     return np.asarray(np.linalg.lstsq(whole, others, rcond=None)[0].T, np.float64)
 
 
 def _warped(image: ByteArray, affine: FloatArray, size: tuple[int, int], how: int) -> ByteArray:
-    """The image at the pixels to which an affine map takes those of (width, height)."""
+    """Return the image at the pixels to which an affine map takes those of (width, height)."""
     flags = how | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(image, affine, size, flags=flags), np.uint8)

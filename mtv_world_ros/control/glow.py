@@ -27,7 +27,7 @@ NO_BOX: Box = (0, 0, 0, 0)
 
 
 def is_empty(box: Box) -> bool:
-    """True if the box contains no pixel."""
+    """Return True if the box contains no pixel."""
     return box[0] >= box[1] or box[2] >= box[3]
 
 

@@ -285,7 +285,7 @@ def _draw_view(
 
 
 def _cover(image: ByteArray, pictures: ByteArray | None, frame: int) -> None:
-    """Lays one of (T, H, W, 4) pictures, weighed by their cover, over an (H, W, 3) image."""
+    """Lay one of (T, H, W, 4) pictures, weighed by their cover, over an (H, W, 3) image."""
     if pictures is None:
         return
     picture = pictures[frame]
@@ -299,7 +299,7 @@ def _draw_fingers(fingers: ArmLinks, image: ByteArray, arm: int, frame: int) -> 
 
 
 def _sigmas(camera: CameraModel, depths: FloatArray, config: TrajectoryVideoConfig) -> FloatArray:
-    """Standard deviation of the glow [px]: metric size over depth."""
+    """Return the standard deviation of the glow [px]: metric size over depth."""
     focal = (camera.K[0, 0] + camera.K[1, 1]) / 2
     pixels = config.point_radius_m * focal / np.maximum(depths, _NEAREST_SIZE_M)
     return np.maximum(pixels, config.min_radius_px)

@@ -47,7 +47,7 @@ class _UniqueKeys(_LOADER):
     """A loader that refuses a key that a mapping has twice: the first would be lost unsaid."""
 
     def get_single_node(self) -> yaml.Node | None:
-        """The root of the text, before merges are written out."""
+        """Return the root of the text, before merges are written out."""
         root = super().get_single_node()
         left, known = [root], set[int]()
         while left:
@@ -177,7 +177,7 @@ def read_bytes(path: Path | str, limit: str) -> bytes:
 
 @contextmanager
 def _open_regular(path: Path | str) -> Iterator[tuple[BinaryIO, int]]:
-    """The file and its size [bytes]; OSError if it is no regular one."""
+    """Yield the file and its size [bytes]; OSError if it is no regular one."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with open(descriptor, 'rb') as file:
         status = os.fstat(descriptor)
@@ -247,7 +247,7 @@ def parse_json(text: str | bytes, what: str) -> Any:
 
 
 def _whole_number(digits: str) -> int:
-    """An integer of no more digits than a float can hold."""
+    """Return an integer of no more digits than a float can hold."""
     if len(digits) > sys.float_info.max_10_exp:
         raise LimitError(f'a whole number has {len(digits)} digits')
     return int(digits)
@@ -312,7 +312,7 @@ def read_arrays(path: Path | str, limit: str = 'array_bytes') -> dict[str, np.nd
 
 
 def _array(data: bytes) -> np.ndarray:
-    """The array of an .npy file whose header states the size that it has."""
+    """Return the array of an .npy file whose header states the size that it has."""
     stream = BytesIO(data)
     version = np.lib.format.read_magic(stream)
     if version == (1, 0):

@@ -194,7 +194,7 @@ _VALID = {
 
 
 def _explain(failed: ValidationError, kind: type[Schema]) -> str:
-    """The first error: key, value and what would be valid."""
+    """Return the first error: key, value and what would be valid."""
     error = failed.errors(include_url=False)[0]
     if error['type'] == 'value_error':  # a validator's own text
         where = _path(error['loc']) or kind.section
@@ -207,7 +207,7 @@ def _explain(failed: ValidationError, kind: type[Schema]) -> str:
 
 
 def _quoted(error: ErrorDetails) -> str:
-    """E.g. `'gripper_open' is 'wide', must be a finite number`."""
+    """Return e.g. `'gripper_open' is 'wide', must be a finite number`."""
     name, value = f"'{error['loc'][-1]}'", error['input']
     if error['type'] == 'expected':
         context = error.get('ctx', {})
@@ -222,7 +222,7 @@ def _quoted(error: ErrorDetails) -> str:
 
 
 def _dotted(error: ErrorDetails, section: str) -> str:
-    """E.g. `optimizer.steps is 0; it must be at least 1`."""
+    """Return e.g. `optimizer.steps is 0; it must be at least 1`."""
     name, value = '.'.join(filter(None, (section, _path(error['loc'])))), error['input']
     if error['type'] == 'literal_error':
         known = _choices(error)
@@ -235,7 +235,7 @@ def _inside(error: ErrorDetails, text: str) -> str:
 
 
 def _path(loc: Sequence[int | str]) -> str:
-    """E.g. `tools[0].link`."""
+    """Return e.g. `tools[0].link`."""
     parts = (f'[{part}]' if isinstance(part, int) else f'.{part}' for part in loc)
     return ''.join(parts).removeprefix('.')
 

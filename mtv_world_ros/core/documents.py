@@ -142,5 +142,5 @@ def _counted(count: int, noun: str) -> str:
 
 
 def _data_uri(data: bytes, kind: str) -> str:
-    """Bytes of a media type as a `data:` address."""
+    """Return the bytes of a media type as a `data:` address."""
     return f'data:{kind};base64,{base64.b64encode(data).decode()}'

@@ -121,7 +121,7 @@ def check_free(path: Path, overwrite: bool, instead: str = '--out') -> None:
 
 
 def is_free(path: Path) -> bool:
-    """True if nothing is there but, at most, an empty folder."""
+    """Return True if nothing is there but, at most, an empty folder."""
     return not any(path.iterdir()) if path.is_dir() else not path.exists()
 
 
@@ -383,7 +383,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _is_abandoned(folder: Path) -> bool:
-    """True if no process of this machine writes the folder any more."""
+    """Return True if no process of this machine writes the folder any more."""
     try:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError:

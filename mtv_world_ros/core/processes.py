@@ -52,7 +52,7 @@ class Starting:
         self._name, self.is_over = name, False
 
     def __call__(self, signum: int, _: FrameType | None) -> None:
-        """Handles the signal."""
+        """Handle the signal."""
         if not self.is_over:
             text = f'{self._name}: stopped while starting ({signal.Signals(signum).name})\n'
             os.write(2, text.encode())
@@ -70,7 +70,7 @@ def end_on_signals(name: str) -> Starting:
 
 @contextmanager
 def ended_by_signals(name: str) -> Iterator[None]:
-    """Within it SIGINT and SIGTERM end the process, if this is its main thread."""
+    """Let SIGINT and SIGTERM end the process in the block, if this is its main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -86,7 +86,7 @@ def ended_by_signals(name: str) -> Iterator[None]:
 
 @contextmanager
 def stopped_by_sigterm() -> Iterator[None]:
-    """Within it SIGTERM raises `Stopped`, as SIGINT does KeyboardInterrupt, for a clean-up.
+    """Let SIGTERM raise `Stopped` in the block, as SIGINT raises KeyboardInterrupt.
 
     A clean-up longer than `_TIDY_S` is ended, and so is any at a second SIGTERM. An existing
     handler of SIGTERM stays.
@@ -130,7 +130,7 @@ def escape_unprintable_output() -> None:
 
 
 def private_domain() -> dict[str, str]:
-    """The environment with a ROS domain of its own, unless one is set."""
+    """Return the environment with a ROS domain of its own, unless one is set."""
     environment = dict(os.environ)
     environment.setdefault('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 100)))
     environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
@@ -138,7 +138,7 @@ def private_domain() -> dict[str, str]:
 
 
 def module_command(name: str, *arguments: str) -> list[str]:
-    """Command that runs a module of `mtv_world_ros.ros`."""
+    """Return the command that runs a module of `mtv_world_ros.ros`."""
     return [sys.executable, '-m', f'mtv_world_ros.ros.{name}', *arguments]
 
 

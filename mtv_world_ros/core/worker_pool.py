@@ -165,7 +165,7 @@ class WorkerPool(ProcessPoolExecutor):
 
 @contextmanager
 def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Environment variables as processes that start within it see them."""
+    """Yield the environment variables as processes that start within it see them."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
@@ -195,7 +195,7 @@ def _start_worker(make_run: Callable[[], Run], threads: int, parent: int) -> Non
 
 
 def _end_with(parent: int) -> None:
-    """A killed command must not go on writing: the same command may have been started again."""
+    """End with the parent: a killed command must not go on writing, it may be started again."""
     while os.getppid() == parent:
         time.sleep(_LOOK_S)
     os._exit(1)
@@ -367,7 +367,7 @@ def _is_ray_at_hand() -> bool:
 
 
 def _ray() -> Any:
-    """Ray, which is optional and large."""
+    """Import Ray, which is optional and large."""
     try:
         ray = importlib.import_module('ray')
         importlib.import_module('ray.util')

@@ -39,22 +39,22 @@ OUTCOMES = ('success', 'failure', 'unknown')
 
 
 def image_topic(view: str) -> str:
-    """Topic of the view's raw images; compressed ones have the suffix `/compressed`."""
+    """Return the topic of the view's raw images; compressed ones have the suffix `/compressed`."""
     return f'/{view}/image_raw'
 
 
 def camera_info_topic(view: str) -> str:
-    """Topic of the view's CameraInfo."""
+    """Return the topic of the view's CameraInfo."""
     return f'/{view}/camera_info'
 
 
 def mask_topic(view: str) -> str:
-    """Topic of the view's object masks (PNG: 0 = none, i + 1 = objects[i])."""
+    """Return the topic of the view's object masks (PNG: 0 = none, i + 1 = objects[i])."""
     return f'/{view}/mask/compressed'
 
 
 def optical_frame(view: str) -> str:
-    """frame_id of the view."""
+    """Return the frame_id of the view."""
     return f'{view}_optical_frame'
 
 
@@ -93,7 +93,7 @@ class EpisodeInfo:
 
 
 def dump_info(info: EpisodeInfo) -> dict[str, str]:
-    """Text of the episode's metadata record, by key.
+    """Return the text of the episode's metadata record, by key.
 
     Raises:
         EpisodeError: a key of `info.metadata` is one that the episode sets.

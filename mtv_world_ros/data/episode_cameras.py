@@ -172,7 +172,10 @@ def _read(path: Path, cameras: Mapping[str, CameraModel]) -> _Content:
 
 
 def _image_topic(view: str, topics: Collection[str]) -> str:
-    """Topic of a view's images, raw ones where both are there; empty = there is none."""
+    """Return the topic of a view's images, raw ones where both are there.
+
+    Empty = there is none.
+    """
     raw = image_topic(view)
     return next((topic for topic in (raw, f'{raw}/compressed') if topic in topics), '')
 

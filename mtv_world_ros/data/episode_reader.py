@@ -152,7 +152,10 @@ def read_info(path: Path | str) -> EpisodeInfo:
 
 
 def list_episodes(folder: Path | str) -> list[Path]:
-    """Episode folders anywhere in a folder, by path, links followed; hidden ones are left out."""
+    """Return the episode folders anywhere in a folder, by path, links followed.
+
+    Hidden ones are left out.
+    """
     found, seen = [], set()
     for place, folders, names in os.walk(folder, followlinks=True):
         real = os.path.realpath(place)
@@ -288,7 +291,10 @@ class _EpisodeReader:
             self.received[topic] = [(stamp, item) for stamp, kept, (_, item) in each if kept]
 
     def _other_stamps(self, topic: str, offset_s: float) -> NDArray[np.int64]:
-        """Stamps of a topic as they are; receive times on the clock of the others where 0."""
+        """Return the stamps of a topic as they are.
+
+        Receive times on the clock of the others where 0.
+        """
         stamps = np.array([stamp for stamp, _ in self.received[topic]], np.int64)
         is_far = not -CLOCKS.refused_behind_s < offset_s < CLOCKS.refused_ahead_s
         shift = round(offset_s * 1e9) if is_far else 0
@@ -413,7 +419,10 @@ class _EpisodeReader:
         return states
 
     def _own_states(self, topic: str, taken: Stamped) -> Stamped:
-        """Messages that name a joint of the robot; all, where none does or it is not known."""
+        """Return the messages that name a joint of the robot.
+
+        All, where none does or it is not known.
+        """
         joints = set(() if self.robot is None else self.robot.joint_names)
         own: Stamped = []
         others: dict[str, None] = {}
@@ -502,7 +511,7 @@ class _EpisodeReader:
         return self._whole_plans(topic, plans, states)
 
     def _plan_or_stop(self, message: Any) -> JointTrajectory | tuple[str, ...]:
-        """A plan, or the joints that an empty trajectory stops; empty = all."""
+        """Return a plan, or the joints that an empty trajectory stops; empty = all."""
         if not len(message.points):
             return self._renamed(message.joint_names)
         return self._plan(message)
@@ -579,7 +588,7 @@ class _EpisodeReader:
         return cameras
 
     def _moving(self, camera: CameraModel, track: Track) -> CameraModel:
-        """The camera of an episode, with the poses that /tf has of its frame in its mount."""
+        """Return camera of an episode, with the poses that /tf has of its frame in its mount."""
         frame = optical_frame(camera.view)
         moving, static = self._tf()
         if not read_tree(moving, static=static).moves_in(camera.mount_link, frame):
@@ -664,7 +673,7 @@ class _EpisodeReader:
         return self.mapping.topic(given) if given else self.topics.views[view].camera_info
 
     def _camera_infos(self, view: str) -> list[tuple[Any, Intrinsics]]:
-        """CameraInfos of a view that are calibrated, with their intrinsics.
+        """Return the CameraInfos of a view that are calibrated, with their intrinsics.
 
         Raises:
             CalibrationError: a number in one is NaN or infinite.
@@ -684,7 +693,7 @@ class _EpisodeReader:
     def _at_images(
         self, camera: CameraModel, size: tuple[int, int], *, is_given: bool
     ) -> CameraModel:
-        """The camera for images of a size, by CameraInfo where a file has not given others."""
+        """Return camera for images of a size, by CameraInfo where a file has not given others."""
         view, first, informed = camera.view, None, camera
         try:
             infos = self._camera_infos(view)
@@ -754,7 +763,7 @@ class _EpisodeReader:
 
 
 def _span(item: tuple[str, Any]) -> int | None:
-    """Length of a plan [ns]; None = the message is none."""
+    """Return the length of a plan [ns]; None = the message is none."""
     kind, message = item
     if kind != messages.JOINT_TRAJECTORY:
         return None
@@ -763,7 +772,7 @@ def _span(item: tuple[str, Any]) -> int | None:
 
 
 def _framed_pose(message: Any) -> tuple[str, FloatArray]:
-    """Frame and (4, 4) pose of a PoseStamped."""
+    """Return the frame and (4, 4) pose of a PoseStamped."""
     return message.header.frame_id, messages.parse_pose(message.pose)
 
 

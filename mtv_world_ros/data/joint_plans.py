@@ -69,7 +69,7 @@ def read_plan(message: Any) -> JointTrajectory:
 
 
 def _rows(names: Sequence[str], points: Iterable[Any], field: str) -> FloatArray:
-    """One field of all points, (T, J), checked."""
+    """Return one field of all points, (T, J), checked."""
     rows = [getattr(point, field) for point in points]
     for index, row in enumerate(rows):
         if len(row) != len(names):

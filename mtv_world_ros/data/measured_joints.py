@@ -206,7 +206,7 @@ def _short_runs(
 def _first_jump(
     times: FloatArray, positions: FloatArray, reach: JointReach
 ) -> tuple[int, int, int] | None:
-    """Row, the row before it and the joint of the first step that is out of reach."""
+    """Return the row, the row before it and the joint of the first step that is out of reach."""
     found: list[tuple[int, int, int]] = []
     for joint in np.flatnonzero(np.isfinite(reach.noise)):
         given = np.flatnonzero(np.isfinite(positions[:, joint]))
@@ -219,7 +219,10 @@ def _first_jump(
 
 
 def _sources(times: FloatArray, positions: FloatArray, reach: JointReach) -> NDArray[np.intp]:
-    """(N,) number of the source of each sample: the nearest of those that reach it; -1 = none."""
+    """Return (N,) number of the source of each sample: the nearest of those that reach it.
+
+    -1 = none.
+    """
     found = np.full(len(times), -1, np.intp)
     last = np.full((0, positions.shape[1]), np.nan)
     last_s = np.zeros_like(last)
@@ -390,7 +393,10 @@ def _table(
     robot: RobotModel | None,
     constants: Collection[str],
 ) -> tuple[tuple[str, ...], FloatArray]:
-    """Joint names, and positions (N, J); NaN where a message has none that can be used."""
+    """Return the joint names, and positions (N, J).
+
+    NaN where a message has none that can be used.
+    """
     kinds = {tuple(message.name): None for message in messages}
     known = {given: tuple(renamed(given)) for given in kinds}
     names = tuple(dict.fromkeys(name for each in known.values() for name in each))

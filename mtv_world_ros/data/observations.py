@@ -110,7 +110,7 @@ def _positions(episode: Episode, robot: RobotModel, index: int) -> FloatArray:
 
 
 def _last_before(stamps_ns: np.ndarray, stamp_ns: int) -> int:
-    """Index of the last stamp not after a moment, -1 if there is none."""
+    """Return the index of the last stamp not after a moment, -1 if there is none."""
     return int(np.searchsorted(stamps_ns, stamp_ns, side='right')) - 1
 
 

@@ -238,7 +238,10 @@ def _object_poses(
     stamps: np.ndarray,
     positions: FloatArray,
 ) -> FloatArray | None:
-    """(N, O, 4, 4) of the instants nearest to the frames; not turned where masks alone tell."""
+    """Return (N, O, 4, 4) of the instants nearest to the frames.
+
+    Not turned where masks alone tell.
+    """
     found = episode.object_poses
     if found is not None and len(found.stamps_ns):
         return found.T_base_object[nearest_rows(found.stamps_ns, stamps)]
@@ -290,7 +293,7 @@ def measured_positions(episode: Episode, robot: RobotModel, stamps: np.ndarray) 
 def frame_indices(
     recording: Recording, start: int, spec: WorldModelSpec, num_frames: int | None = None
 ) -> np.ndarray | None:
-    """Recorded frames that stand for the model's clock from frame `start` on.
+    """Return the recorded frames that stand for the model's clock from frame `start` on.
 
     Returns:
         (1 + T,) indices, or None where the recording ends or has a gap.

@@ -249,7 +249,7 @@ def _mend(
 
 
 def _with_missing(stream: StampedStream, stamps: Stamps, notes: list[str]) -> Stamps:
-    """Stamps, with those that are 0 made of receive times and the offsets around them."""
+    """Return stamps, with those that are 0 made of receive times and the offsets around them."""
     missing = stamps == 0
     if missing.any():
         known = np.flatnonzero(~missing)
@@ -333,7 +333,10 @@ def find_steps(
 
 
 def _speed(stamps: Stamps, received: Stamps) -> float:
-    """Stamped seconds a received second: that of simulated time; 1 where the latter are odd."""
+    """Return the stamped seconds a received second: that of simulated time.
+
+    1 where the latter are odd.
+    """
     lag = max(1, len(stamps) // 8)
     later = (received[lag:] - received[:-lag]).astype(np.float64)
     if not (later > 0).all():
@@ -369,7 +372,7 @@ def _level_before(
 def _scatter(
     offsets: FloatArray, seconds: FloatArray, begin: int, row: int, settings: ClockSettings
 ) -> float:
-    """Usual differences of delay before a step [s]."""
+    """Return the usual differences of delay before a step [s]."""
     first = int(np.searchsorted(seconds, seconds[row - 1] - settings.long_window_s))
     before = offsets[max(begin, min(first, row - settings.long_window_messages)) : row]
     low, high = np.quantile(before, (0.1, 0.9))
@@ -588,7 +591,7 @@ def _check_offsets(
 
 
 def _offset(stream: StampedStream, reference: StampedStream) -> float | None:
-    """Median offset against the reference [s]; None = they are not comparable."""
+    """Return the median offset against the reference [s]; None = they are not comparable."""
     low, high = reference.received_ns.min(), reference.received_ns.max()
     inside = (stream.received_ns >= low) & (stream.received_ns <= high)
     if not inside.any() or len(np.unique(stream.received_ns)) < min(len(stream.received_ns), 2):

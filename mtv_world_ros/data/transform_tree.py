@@ -230,7 +230,10 @@ class TransformTree:
         return lines
 
     def _circles(self) -> list[list[str]]:
-        """Frames that are above themselves, from parent to child; the first ends each."""
+        """Return the frames that are above themselves, from parent to child.
+
+        The first ends each.
+        """
         parents, seen, found = self._parents(), set[str](), []
         for frame in parents:
             chain: list[str] = []

@@ -348,7 +348,10 @@ class EpisodeScorer:
 def _mean_quality(
     stretches: Sequence[tuple[int, dict[str, dict[str, float]]]],
 ) -> dict[str, dict[str, float]]:
-    """Means over the stretches of an episode by view; frames weigh equally, NaN counts nothing."""
+    """Return the means over the stretches of an episode by view.
+
+    Frames weigh equally, NaN counts nothing.
+    """
     found: dict[str, dict[str, float]] = {}
     for view in stretches[0][1]:
         names = dict.fromkeys(name for _, numbers in stretches for name in numbers[view])

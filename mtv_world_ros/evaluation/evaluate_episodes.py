@@ -196,7 +196,7 @@ def _progress(results: Sequence[EpisodeResult]) -> str:
 def _distances(
     summary: EvaluationSummary, config: EvaluationConfig
 ) -> dict[tuple[str | None, str], dict[str, Estimate]]:
-    """FID and FVD by (zero-shot set, view), the set None for all episodes."""
+    """Return the FID and FVD by (zero-shot set, view), the set None for all episodes."""
     if config.fid_weights is None and config.fvd_weights is None:
         return {}
     return {
@@ -290,7 +290,10 @@ class _Run:
         }
 
     def _stored(self, job: EvaluationJob) -> EpisodeResult | None:
-        """The result of an earlier run; None if it is of other settings or another version."""
+        """Return the result of an earlier run.
+
+        None if it is of other settings or another version.
+        """
         features = self.config.fid_weights or self.config.fvd_weights
         if not self.name or (features and not feature_path(self.out, job.name).is_file()):
             return None

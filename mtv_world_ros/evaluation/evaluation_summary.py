@@ -217,7 +217,7 @@ class EvaluationSummary:
         }
 
     def _horizon(self, view: str | None, group: Group) -> dict[str, Any]:
-        """J of moving objects by predicted frame, with intervals."""
+        """Return J of moving objects by predicted frame, with intervals."""
         episodes = [result.rows for result in self.chosen(group)]
         found: dict[str, Any] = {}
         for name in FRAME_FIELDS:
@@ -241,6 +241,6 @@ class EvaluationSummary:
         return by_chunk(episodes, view, 'j_frames', self.spec.num_frames)
 
     def _seconds(self) -> dict[str, float]:
-        """Mean time of an episode by what it went into [s]."""
+        """Return the mean time of an episode by what it went into [s]."""
         stages = self.results[0].seconds
         return {name: float(np.mean([r.seconds[name] for r in self.results])) for name in stages}

@@ -206,7 +206,7 @@ def _tells(samples: Sequence[Sample]) -> bool:
 def _fits_without(
     samples: Sequence[Sample], groups: Sequence[set[str]], segmenter: str, l2: float
 ) -> list[dict[str, Any] | None]:
-    """For each sample the fit to those that share no group with it; None = of one outcome."""
+    """Return for each sample the fit to those of other groups; None = of one outcome."""
     fits: dict[frozenset[str], dict[str, Any] | None] = {}
     for left_out in set(map(frozenset, groups)):
         others = [
@@ -222,7 +222,7 @@ def _fits_without(
 def _judged_by(
     fits: Sequence[dict[str, Any] | None], samples: Sequence[Sample]
 ) -> tuple[Judgement, ...]:
-    """Each sample judged by a fit of its own."""
+    """Return each sample judged by a fit of its own."""
     return tuple(
         _judged(sample, nan if fit is None else _probability(fit, sample))
         for fit, sample in zip(fits, samples, strict=True)
@@ -264,7 +264,10 @@ def _weights(samples: Sequence[Sample], l2: float) -> dict[str, Any]:
 
 
 def _design(samples: Sequence[Sample]) -> tuple[FloatArray, BoolArray]:
-    """(N, F) features, NaN where one says nothing, and (N,) outcomes; abstentions are left out."""
+    """Return (N, F) features, NaN where one says nothing, and (N,) outcomes.
+
+    Abstentions are left out.
+    """
     pairs = [(f, sample.success) for sample in samples for f in sample.features if f]
     rows = [[weighed(features, name) for name in FEATURES] for features, _ in pairs]
     return np.array(rows, np.float64), np.array([success for _, success in pairs], np.bool_)
@@ -357,7 +360,7 @@ def fit_logistic(
 def _slope_within(
     theta: FloatArray, gradient: FloatArray, bounds: Sequence[tuple[float | None, float | None]]
 ) -> float:
-    """The largest slope along which `theta` could still go down without leaving its bounds."""
+    """Return largest slope along which `theta` could still go down without leaving its bounds."""
     low, high = np.array(bounds, np.float64).T  # None becomes NaN: no bound
     blocked = ((theta <= low) & (gradient > 0)) | ((theta >= high) & (gradient < 0))
     return float(np.abs(np.where(blocked, 0.0, gradient)).max())

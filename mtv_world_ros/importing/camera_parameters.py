@@ -107,7 +107,7 @@ class CameraSource(Schema):
         return f"view '{self.view}': camera"
 
     def features(self) -> list[str]:
-        """Features that the camera parameters are read from."""
+        """Return the features that the camera parameters are read from."""
         if self.camera is None or self.camera.file is not None:
             return []
         return [path for key in _PATHS if (path := getattr(self.camera, key)) is not None]

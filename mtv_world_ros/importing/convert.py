@@ -346,7 +346,7 @@ def _cameras(
     rows: dict[str, FloatArray],
     first: dict[str, ByteArray],
 ) -> tuple[list[CameraModel], dict[str, FloatArray], list[str]]:
-    """The cameras at the first row, the poses at all rows of those that move, what is odd."""
+    """Return cameras at the first row, the poses at all rows of those that move, what is odd."""
     cameras, tracks, notes = [], {}, []
     for view, source in mapping.views.items():
         height, width = first[view].shape[:2]

@@ -309,7 +309,7 @@ class _Writer:
         }
 
     def _write_tasks(self) -> None:
-        """The texts as the index of a pandas table, as LeRobot looks them up."""
+        """Write the texts as the index of a pandas table, as LeRobot looks them up."""
         table = {'task_index': list(self._tasks.values()), '__index_level_0__': list(self._tasks)}
         names = {'task_index': ('int64', 'int64'), '__index_level_0__': ('unicode', 'object')}
         pandas = {
@@ -390,7 +390,7 @@ def _cells(frames: ByteArray) -> list[dict[str, bytes | str]]:
 
 
 def _write_video(path: Path, frames: ByteArray, fps: int) -> None:
-    """Frames (T, H, W, 3), the first one at time 0."""
+    """Write frames (T, H, W, 3), the first one at time 0."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), 'w') as container:
         stream = container.add_stream(_CODEC, rate=fps, options=_CODEC_OPTIONS)
@@ -404,7 +404,10 @@ def _write_video(path: Path, frames: ByteArray, fps: int) -> None:
 
 
 def _statistics(values: np.ndarray, name: str) -> dict[str, Any]:
-    """Statistics for normalisation of (N, C) values; those of images are (C, 1, 1) in [0, 1]."""
+    """Return the statistics for normalisation of (N, C) values.
+
+    Those of images are (C, 1, 1) in [0, 1].
+    """
     values = values.astype(np.float64)
     found = {
         'min': values.min(0), 'max': values.max(0), 'mean': values.mean(0), 'std': values.std(0),

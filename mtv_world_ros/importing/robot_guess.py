@@ -315,7 +315,7 @@ class _Hand:
     def _turned_axes(
         self, opened: Sequence[FloatArray], middle: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """x, y, z of fingers that turn about an axis; None where they slide.
+        """Return the x, y, z of fingers that turn about an axis; None where they slide.
 
         A tip that turns moves on an arc: the line between the tips is taken in its place.
         """
@@ -375,7 +375,7 @@ class _Hand:
 def _slid_axes(
     shut: Sequence[FloatArray], opened: Sequence[FloatArray], middle: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """x, y, z of fingers that slide; None where they do not move."""
+    """Return the x, y, z of fingers that slide; None where they do not move."""
     y = opened[0].mean(axis=0) - shut[0].mean(axis=0)
     if np.linalg.norm(y) < 1e-6:
         return None
@@ -388,7 +388,10 @@ def _slid_axes(
 
 
 def _finger_points(model: pin.Model, urdf: Path, arm: _Arm) -> dict[int, FloatArray]:
-    """Points of the finger links' shapes in their joints' frames; empty where one has none."""
+    """Return the points of the finger links' shapes in their joints' frames.
+
+    Empty where one has none.
+    """
     root = parse_xml(read_text(urdf, 'urdf_bytes'))
     links = {link.get('name'): link for link in root.iter('link')}
     found = {}
@@ -406,7 +409,10 @@ def _finger_points(model: pin.Model, urdf: Path, arm: _Arm) -> dict[int, FloatAr
 
 
 def _tool_link(model: pin.Model, arm: _Arm) -> tuple[str, Any]:
-    """The link that carries the tool and its pose in the last joint; a named one if there is."""
+    """Return the link that carries the tool and its pose in the last joint.
+
+    A named one if there is.
+    """
     last = arm.chain[-1]
     carried = [
         f for f in model.frames if f.type == pin.FrameType.BODY and f.parentJoint == last

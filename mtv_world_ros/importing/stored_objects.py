@@ -83,7 +83,7 @@ class ObjectStage:
 def _starts(
     starts: Mapping[str, tuple[ByteArray, Mapping[str, BoolArray]]], names: Sequence[str]
 ) -> Iterator[tuple[str, tuple[BoolArray, ByteArray]]]:
-    """By view the masks (O, H, W) that were drawn in its first frame, and the frame."""
+    """Yield by view the masks (O, H, W) that were drawn in its first frame, and the frame."""
     for view, (frame, drawn) in starts.items():
         none = np.zeros(frame.shape[:2], np.bool_)
         yield view, (np.stack([drawn.get(name, none) for name in names]), frame)

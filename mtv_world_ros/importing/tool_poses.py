@@ -83,7 +83,7 @@ class ToolPoses(ToolTargets):
         return poses
 
     def _turn(self, row: FloatArray) -> FloatArray:
-        """(3, 3)."""
+        """Return (3, 3)."""
         if self.rotation_is == 'quaternion_xyzw':
             return rotation(row)
         if self.rotation_is == 'quaternion_wxyz':

@@ -84,7 +84,7 @@ class VideoMapping(Written):
         return {key for key in _LATER if getattr(self, key) == fields[key].default}
 
     def written(self) -> BagMapping:
-        """Task, outcome and quality of the episodes that are written."""
+        """Return the task, outcome and quality of the episodes that are written."""
         given = {name: getattr(self, name) for name in Written.model_fields}
         return BagMapping(**given, views={view: ViewSource(image=view) for view in self.views})
 

@@ -30,7 +30,7 @@ _MAX_RESPONSE_S = 0.5
 
 
 def check_rate(what: str, stamps_ns: Stamps) -> tuple[dict[str, str], list[Finding]]:
-    """Median rate and gaps of one stream."""
+    """Check the median rate and gaps of one stream."""
     if len(stamps_ns) < 2:
         return {}, [broken(f'{what}: {len(stamps_ns)} message, at least 2 are needed')]
     periods = np.diff(stamps_ns) * 1e-9
@@ -71,7 +71,7 @@ def check_skew(view: str, images: Mapping[str, Track]) -> tuple[dict[str, str], 
 def check_joint_states(
     stamps_ns: Stamps, joints: JointTrack
 ) -> tuple[dict[str, str], list[Finding]]:
-    """Joint states against a view's frames."""
+    """Check the joint states against a view's frames."""
     covered = float(joints.covers(stamps_ns).mean())
     away = nearest_distance_s(stamps_ns, joints.stamps_ns)
     measures = {
@@ -105,7 +105,7 @@ def check_commands(
     frames_ns: Stamps,
     joints: JointTrack,
 ) -> tuple[dict[str, str], list[Finding]]:
-    """Commands against frames, and how late the joints follow them.
+    """Check the commands against frames, and how late the joints follow them.
 
     Args:
         commands: all of the recording, in the robot's order; None where there are none.

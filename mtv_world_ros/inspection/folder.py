@@ -140,7 +140,7 @@ def _focal_findings(known: dict[str, dict[str, CameraModel]]) -> list[Finding]:
 
 
 def _segmenter_findings(segmenters: dict[str, list[str]]) -> list[Finding]:
-    """Masks by other segmenters, or other examples, are of other pixels."""
+    """Report masks by other segmenters or other examples: they are of other pixels."""
     if len(segmenters) < 2:
         return []
     groups = '; '.join(f"'{by}': {' '.join(names)}" for by, names in segmenters.items())
@@ -226,7 +226,7 @@ def _stale(
 
 
 def _shift(a: CameraModel, b: CameraModel) -> float:
-    """By how much what is a metre away shifts between two poses [share of the width]."""
+    """Return the shift of a point at 1 m between two poses [fraction of image width]."""
     if a.mount_link != b.mount_link:
         return np.inf
     between = inverse(a.T_mount_camera) @ b.T_mount_camera
@@ -244,7 +244,9 @@ def _with(inspection: Inspection, view: str, finding: Finding) -> Inspection:
 
 
 def table(found: FolderInspection) -> list[list[str]]:
-    """Rows: episode, view, verdict, numbers, place of the camera, faults; the first is the head.
+    """Return the rows: episode, view, verdict, numbers, place of the camera, faults.
+
+    The first is the head.
 
     A view is a row; what concerns all views of an episode is one more if something is wrong there.
     """

@@ -111,7 +111,7 @@ _MOST_FRAMES = 80
 
 
 def check_frozen(track: Track, joints: JointTrack) -> tuple[dict[str, str], list[Finding]]:
-    """Frames that stay the same while joints move."""
+    """Check for frames that stay the same while joints move."""
     covered = np.flatnonzero(joints.covers(track.stamps_ns))
     count = min(len(covered), _MOST_FRAMES)
     if count < 3:

@@ -477,7 +477,7 @@ def check_visibility(
 def check_limits(
     what: str, robot: RobotModel, positions: FloatArray
 ) -> tuple[dict[str, str], list[Finding]]:
-    """Positions (T, J) against the robot's limits, one finding a joint."""
+    """Check positions (T, J) against the robot's limits, one finding a joint."""
     beyond = np.maximum(robot.lower - positions, positions - robot.upper)
     share = (beyond > _LIMIT_TOLERANCE).mean(axis=0)
     findings = []

@@ -159,7 +159,7 @@ def measure_residual(
 def _delay(
     lags_s: Sequence[float], match: Callable[..., float], count: int, camera: CameraModel
 ) -> tuple[float, float]:
-    """The delay at which both halves of the recording together fit best, and its least gain."""
+    """Return delay at which both halves of the recording together fit best, and its least gain."""
     if len(lags_s) == 1:
         return lags_s[0], 0.0
     halves = [slice(0, count // 2), slice(count // 2, count)]
@@ -261,7 +261,7 @@ def _correlate(
     whole: NDArray[np.uint8],
     radius: int,
 ) -> tuple[FloatArray, int]:
-    """One link's normalised correlation over shifts, and the pairs in which it moves.
+    """Return one link's normalised correlation over shifts, and the pairs in which it moves.
 
     Only pixels that tell are compared: those that the link leaves or enters and the rest of the
     robot does not cover, which should change, and those without the robot in both frames, which
@@ -302,7 +302,7 @@ def _pairwise(silhouettes: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _products(
     differs: NDArray[np.uint8], telling: NDArray[np.uint8], change: FloatImage, radius: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Covariance of drawn and seen motion over shifts, and the variance of each, as sums.
+    """Return covariance of drawn and seen motion over shifts, and the variance of each, as sums.
 
     Over the telling pixels around the drawn motion that a shift leaves in the image: else a robot
     that is drawn too far inside would seem to be nearer than it is.
@@ -345,7 +345,7 @@ def _peak(surface: FloatArray) -> FloatArray:
 
 
 def _refined(line: FloatArray, at: int) -> float:
-    """Vertex of the parabola through the maximum and its neighbours."""
+    """Return the vertex of the parabola through the maximum and its neighbours."""
     if not 0 < at < len(line) - 1:
         return float(at)
     before, top, after = line[at - 1 : at + 2]

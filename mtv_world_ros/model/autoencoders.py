@@ -127,7 +127,7 @@ class TinyAutoencoder(nn.Module):
         return next(self.parameters()).device
 
     def num_latent_frames(self, num_frames: int) -> int:
-        """Latent frames that denoising a chunk of T frames takes: the start's and T / 4."""
+        """Return the number of latent frames of a chunk of T frames: the start's and T / 4."""
         return 1 + num_frames // self.frames_per_latent
 
     def encode(self, video: Tensor) -> Tensor:
@@ -213,7 +213,7 @@ class WanAutoencoder(nn.Module):
         return self.vae.config['scale_factor_spatial']
 
     def num_latent_frames(self, num_frames: int) -> int:
-        """Latent frames that denoising a chunk of T frames takes: the start's and T / 4."""
+        """Return the number of latent frames of a chunk of T frames: the start's and T / 4."""
         return 1 + num_frames // self.frames_per_latent
 
     @property
@@ -283,7 +283,7 @@ class SpaceToDepthAutoencoder(ModelMixin, ConfigMixin):
         return 3 * self.block_size**2
 
     def num_latent_frames(self, num_frames: int) -> int:
-        """Latent frames that denoising a chunk of T frames takes."""
+        """Return the number of latent frames of a chunk of T frames: the start's and T / 4."""
         return num_frames
 
     def encode(self, video: Tensor) -> Tensor:

@@ -267,7 +267,7 @@ def _factors(
 
 
 def _scale(module: str, rank: int, alpha: Tensor | None, settings: PeftSettings | None) -> float:
-    """Alpha / rank; 1 where neither tensors nor settings hold an alpha, as other tools do."""
+    """Return alpha / rank; 1 where neither tensors nor settings hold an alpha."""
     if alpha is None:
         return 1.0 if settings is None else settings.scale(module, rank)
     if settings is not None and settings.lora_alpha is not None:

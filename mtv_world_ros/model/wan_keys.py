@@ -37,7 +37,7 @@ class KeyMap:
 
 
 def transformer_keys(names: Iterable[str]) -> KeyMap:
-    """The transformer, of VideoX-Fun's or diffusers' names."""
+    """Return the keys of the transformer, of VideoX-Fun's or diffusers' names."""
     bare = _without_prefix(names)
     if 'head.head.weight' in bare:
         from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffusers
@@ -49,7 +49,7 @@ def transformer_keys(names: Iterable[str]) -> KeyMap:
 
 
 def autoencoder_keys(names: Iterable[str]) -> KeyMap:
-    """The autoencoder, of Wan's or diffusers' names."""
+    """Return the keys of the autoencoder, of Wan's or diffusers' names."""
     bare = _without_prefix(names)
     original = 'encoder.conv1.weight' in bare
     # imported here: it pulls in transformers, which a node of the small preset does not need
@@ -74,7 +74,7 @@ _UMT5 = {
 
 
 def text_encoder_keys(names: Iterable[str]) -> KeyMap:
-    """umT5's encoder, of Wan's or transformers' names."""
+    """Return the keys of umT5's encoder, of Wan's or transformers' names."""
     bare = _without_prefix(names)
     takes: dict[str, TakenTensor] = {}
     unused: dict[str, str] = {}
@@ -121,7 +121,7 @@ _CLIP_UNUSED = {
 
 
 def image_encoder_keys(names: Iterable[str]) -> KeyMap:
-    """CLIP's image side, of Wan's or transformers' names."""
+    """Return the keys of CLIP's image side, of Wan's or transformers' names."""
     takes: dict[str, TakenTensor] = {}
     unused: dict[str, str] = {}
     for name, source in _without_prefix(names).items():
@@ -150,7 +150,7 @@ def _clip_layer(name: str, source: str) -> dict[str, TakenTensor]:
 
 
 def _without_prefix(names: Iterable[str]) -> dict[str, str]:
-    """Bare name to name in the file; a prefix goes only where every name has it."""
+    """Return bare names -> names in the file; a prefix goes only where every name has it."""
     listed = list(names)
     for prefix in _PREFIXES:
         if listed and all(name.startswith(prefix) for name in listed):

@@ -311,7 +311,7 @@ class Arms:
         return drives, (note,) if unknown else ()
 
     def _mass(self) -> FloatArray:
-        """(J, J) mass matrix in the middle of the joints' ranges."""
+        """Return (J, J) mass matrix in the middle of the joints' ranges."""
         robot, model = self.robot, self._model
         ends = np.stack([robot.lower, robot.upper])
         middle = np.where(np.isfinite(ends).all(0), ends, 0.0).mean(0)
@@ -339,7 +339,7 @@ def set_drives(model: Any, drives: Drives, settings: ContactSettings) -> None:
 
 
 def finger_travels(robot: RobotModel) -> dict[str, float]:
-    """Gripper joint -> how far a finger goes as it moves by one [m / m or m / rad]."""
+    """Return the travel of a finger per unit of its gripper joint, by joint [m / m or m / rad]."""
     ends = np.zeros((2, len(robot.joint_names)))
     travels = {}
     for tool, name in enumerate(tool.gripper_joint for tool in robot.tools):

@@ -191,7 +191,7 @@ def kind_of(solid: Solid) -> str:
 
 
 def _empty_spec() -> Any:
-    """A table, and how the engine computes."""
+    """Return a table, and how the engine computes."""
     spec = mujoco.MjSpec()
     option = spec.option
     option.timestep, option.integrator = STEP_S, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -302,7 +302,7 @@ def _vessel(wide: float, high: float, rim: float, density: float) -> list[_Piece
 
 
 def _tray(wide: float, long: float, high: float, settings: ContactSettings) -> list[_Piece]:
-    """A box without a lid; it is heavy below."""
+    """Return a box without a lid; it is heavy below."""
     x, y, wall = wide / 2, long / 2, min(settings.wall_m, wide / 2, long / 2) / 2
     half = max(high - WALL_GAP_M, MIN_THICKNESS_M) / 2
     walls = (

@@ -147,7 +147,7 @@ class CoursePlanner:
         return course, then
 
     def _squeezed(self, commands: FloatArray) -> FloatArray:
-        """Commands (N, J) with grippers that are not open closed further."""
+        """Return the commands (N, J) with grippers that are not open closed further."""
         if not self._squeeze:
             return commands
         robot, closer = self._scene.arms.robot, commands.copy()
@@ -165,7 +165,9 @@ class CoursePlanner:
     def _finger_controls(
         self, led: FloatArray, state: FloatArray, fingers: np.ndarray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Ways and pushes (S, F) that take free fingers where their joint goes; (2, F) then.
+        """Return the ways and pushes (S, F) that take free fingers where their joint goes.
+
+        (2, F) then.
 
         What a gripper's joint does in free air was found for itself; what its fingers hang on,
         which is softer, counts where they touch something.
@@ -191,7 +193,7 @@ class CoursePlanner:
         return place, brake * speed + moved * pull / inertia, now
 
     def _masses(self) -> FloatArray:
-        """(D,) of what each degree of freedom moves alone, without its drive."""
+        """Return (D,) of what each degree of freedom moves alone, without its drive."""
         model, data = self._model, self._data
         mujoco.mj_forward(model, data)
         mass = np.zeros((model.nv, model.nv))

@@ -303,20 +303,23 @@ class Batch:
         run.take(moving, states)
 
     def _constraints(self, run: _Run, number: int) -> int:
-        """Number of constraints, of contacts most, where a future is; they make steps slow."""
+        """Return the number of constraints, of contacts most, where a future is.
+
+        They make steps slow.
+        """
         model, data = self._models[number], self._data[0]
         mujoco.mj_setState(model, data, run.physics[number], FULL)
         mujoco.mj_fwdPosition(model, data)
         return data.nefc
 
     def _controls(self, run: _Run, number: int, row: int) -> FloatArray:
-        """(S, D) numbers of the drives of a future in a row."""
+        """Return (S, D) numbers of the drives of a future in a row."""
         course, steps = run.courses[number], run.steps_of(row)
         targets = course.controls[steps] + course.pushes[steps] / self._gains[number]
         return targets + self.futures[number].zeros
 
     def _is_clear(self, run: _Run, number: int, row: int) -> bool:
-        """True if the arms pass by all solids in a row."""
+        """Return True if the arms pass by all solids in a row."""
         last = run.first_step(row + 1)
         steps = [*range(run.first_step(row), last, 2 * SUBSTEPS), last]
         where = run.courses[number].positions[steps] + self.futures[number].zeros
@@ -350,7 +353,7 @@ class _Run:
         return self.physics[number, 1 : 1 + self._scene.model.nq]
 
     def may_pass(self, number: int, row: int) -> bool:
-        """True if all solids are at rest and the arms move as in free air."""
+        """Return True if all solids are at rest and the arms move as in free air."""
         if self.still[number] < _SLEEP.num_still_rows:
             return False
         course, step, scene = self.courses[number], self.first_step(row), self._scene
@@ -406,7 +409,7 @@ class _Run:
         return BatchMotion(points=points, rotations=rotations, joints=joints, steps=self.computed)
 
     def _read(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Points (K, O, 3), rotations (K, O, 3, 3) and joints (K, J) now."""
+        """Return the points (K, O, 3), rotations (K, O, 3, 3) and joints (K, J) now."""
         scene, drives = self._scene, self._scene.arms.drives
         qpos = self.physics[:, 1 : 1 + scene.model.nq]
         at = scene.solid_qpos[:, None]
@@ -417,7 +420,7 @@ class _Run:
         return qpos[:, at + np.arange(3)], turns, joints
 
     def _speeds(self, physics: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(O, 3) speeds of ways and of turns of the solids."""
+        """Return (O, 3) speeds of ways and of turns of the solids."""
         scene = self._scene
         rows = physics[1 + scene.model.nq :][scene.solid_dofs[:, None] + np.arange(6)]
         return rows[:, :3], rows[:, 3:]
@@ -476,7 +479,7 @@ class _Nearby:
 
 
 def _matrices(quaternions: FloatArray) -> FloatArray:
-    """(..., 3, 3) of quaternions (..., 4), w first."""
+    """Return (..., 3, 3) of quaternions (..., 4), w first."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -147,7 +147,7 @@ class ObjectForesight:
     def _find(
         self, observation: Observation, names: tuple[str, ...], start_masks: ObjectMasks
     ) -> FoundObjects:
-        """The named objects where the rollout stands."""
+        """Return the named objects where the rollout stands."""
         # at its own size the real frame shows better where they are; where the names have
         # changed only an imagined frame shows where they are now
         source = self.source if self.found is None else observation
@@ -164,7 +164,7 @@ class ObjectForesight:
         observation: Observation,
         start_masks: ObjectMasks | None = None,
     ) -> FoundObjects:
-        """The named objects in the episode's first real frame, in which they count as whole."""
+        """Return named objects in the episode's first real frame, in which they count as whole."""
         if names not in self._whole:
             height, width = observation.frames.shape[1:3]
             frames = self.first.frames

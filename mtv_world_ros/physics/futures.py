@@ -104,7 +104,10 @@ def _disturbed(
     share: float,
     rng: np.random.Generator,
 ) -> Solid:
-    """A solid a little elsewhere, of a little other size; what stands on the table still does."""
+    """Return a solid a little elsewhere, of a little other size.
+
+    What stands on the table still does.
+    """
     noise, spread = share * rng.normal(size=5), settings.spread
     wide, long, high = solid.size * np.exp(spread.size * noise[[0, 0, 1]])
     x, y = solid.centre[:2] + spread.place_m * noise[2:4]

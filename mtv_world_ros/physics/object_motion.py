@@ -306,7 +306,10 @@ class FoundObjects:
 
 
 def _apart(motions: Sequence[ObjectMotion]) -> FloatArray:
-    """(K, K, O) how far poses are apart at the ends of motions [m]; those not known are not."""
+    """Return (K, K, O) how far poses are apart at the ends of motions [m].
+
+    Those not known are not.
+    """
     turns = np.stack([motion.rotations[-1].reshape(-1, 9) for motion in motions])
     ways = np.stack([motion.displacements[-1] for motion in motions])
     ends = np.concatenate([ways, _RADIUS_M * turns], axis=-1)
@@ -380,7 +383,7 @@ def _pans(reference_poses: FloatArray, poses: FloatArray) -> BoolArray:
 def _widths(
     cuts: ByteArray, motion: ObjectMotion, cameras: Sequence[CameraModel], poses: FloatArray
 ) -> FloatArray:
-    """(O,) sides of squares as large as the objects look in the views that show most [m].
+    """Return (O,) sides of squares as large as the objects look in the views that show most [m].
 
     But not wider than they look: a bottle is high.
     """
@@ -392,13 +395,13 @@ def _widths(
 
 
 def _holders(motion: ObjectMotion, widths: FloatArray) -> BoolArray:
-    """(T, O, O) which objects stand in or on which: within their width, and smaller."""
+    """Return (T, O, O) which objects stand in or on which: within their width, and smaller."""
     across = np.linalg.norm(motion.points[:, :, None, :2] - motion.points[:, None, :, :2], axis=-1)
     return np.asarray((across < widths / 2) & (_AS_WIDE * widths[:, None] < widths))
 
 
 def _from_behind(depths: FloatArray, holders: BoolArray) -> list[int]:
-    """Items in drawing order, far ones first; those of unknown depth last, on top."""
+    """Return the items in drawing order, far ones first; those of unknown depth last, on top."""
     far = np.nan_to_num(depths, nan=-np.inf)
     nearest = np.where(holders, far, np.inf).min(1, initial=np.inf)
     front, held = np.minimum(far, nearest), holders.sum(1)
@@ -406,7 +409,7 @@ def _from_behind(depths: FloatArray, holders: BoolArray) -> list[int]:
 
 
 def _lay(image: ByteArray, picture: ByteArray) -> None:
-    """Lays a picture, already weighed by its cover, over an (H, W, 4) image."""
+    """Lay a picture, already weighed by its cover, over an (H, W, 4) image."""
     rows, columns = np.nonzero(picture[..., 3])
     if not len(rows):
         return
@@ -426,6 +429,6 @@ def _warped(
 
 
 def _turns(rotations: FloatArray, poses: FloatArray) -> FloatArray:
-    """(T, O) angles [rad] about the optical axis, positive from the image's x to its y."""
+    """Return (T, O) angles [rad] about the optical axis, positive from the image's x to its y."""
     local = np.swapaxes(poses[:, None, :3, :3], -1, -2) @ rotations @ poses[:, None, :3, :3]
     return np.arctan2(local[..., 1, 0] - local[..., 0, 1], local[..., 0, 0] + local[..., 1, 1])

@@ -303,7 +303,7 @@ class TrackedSolids:
         return [number for number, solid in enumerate(self.solids) if solid is not None]
 
     def _floating(self, batch: Batch, positions: FloatArray) -> dict[int, str]:
-        """Objects that nothing holds, with the robot at joints (J,)."""
+        """Return the objects that nothing holds, with the robot at joints (J,)."""
         if batch.touches_arms(positions):
             return {}
         table, known = self.foresight.settings.table_m, self._known
@@ -351,17 +351,20 @@ def table_in(
 
 
 def _too_many(state: BatchState, count: int) -> bool:
-    """True if too few futures remain for a verdict."""
+    """Return True if too few futures remain for a verdict."""
     return len(state.lost) > (1 - _ENOUGH) * count
 
 
 def _upright(solid: Solid) -> FloatArray:
-    """(3, 3) of a solid as it was found."""
+    """Return (3, 3) of a solid as it was found."""
     return replace(solid, yaw=0.0).turn_to(solid)
 
 
 def _table_under(solids: Sequence[Solid | None]) -> float:
-    """Height of the table that the lowest solids stand on [m]; NaN = one alone does not tell."""
+    """Return the height of the table that the lowest solids stand on [m].
+
+    NaN = one alone does not tell.
+    """
     bottoms = np.array([solid.bottom for solid in solids if solid is not None])
     level = bottoms[bottoms < bottoms.min(initial=np.inf) + LEVEL_TOLERANCE_M]
     return float(level.mean()) if len(level) > 1 else float('nan')
@@ -408,6 +411,6 @@ def _overlap(one: Solid, other: Solid) -> bool:
 
 
 def _apart(one: Solid, other: Solid) -> float:
-    """Gap between the circles within two solids' outlines, seen from above [m]."""
+    """Return the gap between the circles within two solids' outlines, seen from above [m]."""
     way = float(np.linalg.norm(one.centre[:2] - other.centre[:2]))
     return way - (min(one.size[:2]) + min(other.size[:2])) / 2

@@ -269,7 +269,10 @@ def _at_size(
     cameras: Sequence[CameraModel],
     poses: Sequence[FloatArray],
 ) -> FloatArray:
-    """(3,) where a solid looks as large as the largest mask; NaN = it was not seen there whole."""
+    """Return (3,) where a solid looks as large as the largest mask.
+
+    NaN = it was not seen there whole.
+    """
     view = int(np.argmax(masks.sum((-2, -1))))
     camera, pose, mask = cameras[view], poses[view], masks[view]
     _, depth = project(camera, pose, solid.centre)
@@ -288,7 +291,10 @@ def _fills(
     cameras: Sequence[CameraModel],
     poses: Sequence[FloatArray],
 ) -> FloatArray:
-    """(V,) share of a solid's outline that its masks (V, H, W) fill; 0 = it is in no picture."""
+    """Return (V,) share of a solid's outline that its masks (V, H, W) fill.
+
+    0 = it is in no picture.
+    """
     wide, long, height = solid.size
     sizes = [wide] if solid.is_round else [solid.yaw, wide, long]
     x, y, z = solid.centre
@@ -304,7 +310,7 @@ def _fills(
 
 
 def _starts(solid: Solid, point: FloatArray) -> Iterator[tuple[FloatArray, float]]:
-    """Initial guesses: where it was, then where it is seen, with several yaw angles."""
+    """Yield the initial guesses: where it was, then where it is seen, with several yaw angles."""
     yield solid.centre, 0.0
     if np.isfinite(point).all():
         for turn in (0.0,) if solid.is_round else (0.0, *MOVED_YAW_GUESSES_RAD):
@@ -332,7 +338,7 @@ class _Outlines:
         return cls(tuple((cameras[view], poses[view]) for view in seen), reach)
 
     def residuals(self, corners: FloatArray) -> FloatArray:
-        """(..., N) how far the outline of points (..., M, 3) reaches beyond them [px]."""
+        """Return (..., N) how far the outline of points (..., M, 3) reaches beyond them [px]."""
         found = [_reach(project(camera, pose, corners)[0]) for camera, pose in self.views]
         return np.nan_to_num(np.concatenate(found, -1) - self.reach, nan=1e3)
 
@@ -340,7 +346,7 @@ class _Outlines:
 def _least_squares(
     residuals: Callable[[FloatArray], FloatArray], given: FloatArray, **how: Any
 ) -> Any:
-    """Least squares from initial parameters (N,); finite differences in one batch."""
+    """Return the least squares from initial parameters (N,); finite differences in one batch."""
 
     def slopes(numbers: FloatArray) -> FloatArray:
         steps = _DIFFERENCE * np.maximum(1.0, np.abs(numbers))
@@ -380,7 +386,7 @@ def _in_space(numbers: FloatArray, outline: FloatArray) -> FloatArray:
 
 
 def _corners(mask: BoolArray) -> FloatArray:
-    """(N, 2) of the hull of its parts but small ones, which belong to what looks alike."""
+    """Return (N, 2) of the hull of its parts but small ones, which belong to what looks alike."""
     _, parts, sizes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     areas = sizes[1:, cv2.CC_STAT_AREA]
     rows, columns = np.nonzero(

@@ -145,7 +145,7 @@ class LeRobotPolicy:
             channel.close()
 
     def _features(self) -> dict[str, dict[str, Any]]:
-        """The observation's features as LeRobot's data sets describe them."""
+        """Return the observation's features as LeRobot's data sets describe them."""
         names = list(self._config.state[0].names)
         features: dict[str, dict[str, Any]] = {
             'observation.state': {'dtype': 'float32', 'shape': (len(names),), 'names': names}
@@ -208,12 +208,12 @@ _WIRE_BYTES = 2
 
 
 def policy_setup(values: Mapping[str, Any]) -> bytes:
-    """Message `PolicySetup` of a `RemotePolicyConfig` with these fields."""
+    """Return the message `PolicySetup` of a `RemotePolicyConfig` with these fields."""
     return _tagged(1, _pickled('RemotePolicyConfig', values))
 
 
 def observation_parts(values: Mapping[str, Any]) -> Iterator[bytes]:
-    """Messages `Observation` of a `TimedObservation` with these fields, in parts."""
+    """Yield the messages `Observation` of a `TimedObservation` with these fields, in parts."""
     data = _pickled('TimedObservation', values)
     for begin in range(0, len(data), _PART_BYTES):
         part = data[begin : begin + _PART_BYTES]
@@ -263,7 +263,7 @@ def _varint(value: int) -> bytes:
 
 
 def _first_bytes(message: bytes) -> bytes:
-    """Field 1 of a message of byte fields; empty where it has none."""
+    """Return field 1 of a message of byte fields; empty where it has none."""
     at = 0
     while at < len(message):
         tag, at = _read_varint(message, at)

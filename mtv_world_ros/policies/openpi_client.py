@@ -64,7 +64,7 @@ class OpenPiConfig(ServerMapping):
         return OpenPiPolicy(self)
 
     def request(self, observation: Observation, instruction: str) -> dict[str, Any]:
-        """The request as nested mappings of arrays and text."""
+        """Return the request as nested mappings of arrays and text."""
         request: dict[str, Any] = {}
         for image in self.images:
             _put(request, image.key, image.image(observation))

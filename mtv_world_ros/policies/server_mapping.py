@@ -63,7 +63,7 @@ class ImageInput(Schema):
         return self
 
     def image(self, observation: Observation) -> ByteArray:
-        """The view as the server wants it.
+        """Return the view as the server wants it.
 
         Raises:
             ConfigError: there is no such view.
@@ -96,7 +96,7 @@ class StateInput(JointTable):
         return columns
 
     def values(self, observation: Observation) -> FloatArray:
-        """(C,) columns of the observed positions."""
+        """Return (C,) columns of the observed positions."""
         positions = dict(zip(self._joint_names, observation.positions.tolist(), strict=True))
         return to_columns(positions, self.names, self.columns)
 
@@ -153,7 +153,7 @@ class ActionOutput(JointTable):
         return is_velocity and abs(column.offset) > _ZERO
 
     def _position_joints(self, robot: RobotModel) -> set[str]:
-        """Joints whose values are positions with `action: velocity`."""
+        """Return the joints whose values are positions with `action: velocity`."""
         if self.positions is None:
             return {tool.gripper_joint for tool in robot.tools if tool.gripper_joint}
         if not self.is_velocity:

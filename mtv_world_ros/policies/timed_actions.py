@@ -124,7 +124,7 @@ class _Tensors:
 
 
 def _storage(data: bytes) -> FloatArray:
-    """A storage as `torch.save` wrote it in its older format."""
+    """Return a storage as `torch.save` wrote it in its older format."""
     if not isinstance(data, bytes):
         raise TypeError('a storage is bytes')
     stream = io.BytesIO(data)

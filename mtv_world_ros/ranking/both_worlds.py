@@ -176,7 +176,7 @@ def _masks(chunks: Sequence[ObservedChunk] | Sequence[Prediction]) -> BoolArray:
 def _estimates(
     chunks: Sequence[ObservedChunk] | Sequence[Prediction], fps: float
 ) -> dict[float, float]:
-    """Estimates by the time at which their chunk ends [s]."""
+    """Return the estimates by the time at which their chunk ends [s]."""
     ends = np.cumsum([chunk.masks.masks.shape[2] for chunk in chunks]) / fps
     return {
         round(float(end), 3): chunk.success.probability
@@ -185,7 +185,7 @@ def _estimates(
 
 
 def _least(overlaps: FloatArray, num: int) -> FloatArray:
-    """(T,) least overlap over the objects, NaN where none is known."""
+    """Return (T,) least overlap over the objects, NaN where none is known."""
     least = np.where(np.isfinite(overlaps), overlaps, np.inf).min(axis=0, initial=np.inf)
     return _padded(np.where(np.isfinite(least), least, nan), num, 0, nan)
 

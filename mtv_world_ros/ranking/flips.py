@@ -68,7 +68,7 @@ def objects_png(masks: BoolArray) -> bytes:
 
 
 def _read_objects(path: Path) -> BoolArray | None:
-    """(H, V * W) of `objects_png`; None = there is no such file."""
+    """Return (H, V * W) of `objects_png`; None = there is no such file."""
     picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     return None if picture is None else np.asarray(picture > 127)
 

@@ -243,7 +243,7 @@ class _Gripper:
 def _width(
     cameras: Sequence[CameraModel], poses: Sequence[FloatArray], masks: BoolArray, at: FloatArray
 ) -> float:
-    """Width of masks (V, H, W) of an object at (3,) [m], the median of the views."""
+    """Return the width of masks (V, H, W) of an object at (3,) [m], the median of the views."""
     found = []
     for camera, pose, mask in zip(cameras, poses, masks, strict=True):
         columns = np.flatnonzero(mask.any(0))

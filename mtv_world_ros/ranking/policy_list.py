@@ -148,7 +148,7 @@ def _listed(entry: PolicyEntry, path: Path, robot: RobotModel) -> ListedPolicy:
 
 
 def _values(policy: str | dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Values of the policy's file; paths are relative to the list's folder."""
+    """Return the values of the policy's file; paths are relative to the list's folder."""
     if isinstance(policy, dict):
         return dict(policy)
     if policy.startswith('expert'):
@@ -162,7 +162,7 @@ def _values(policy: str | dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _merged(values: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
-    """The values with changes, nested ones too."""
+    """Return the values with changes, nested ones too."""
     merged = dict(values)
     for key, value in change.items():
         before = merged.get(key)

@@ -281,7 +281,7 @@ def make_jobs(
 
 
 def _seed(task: str, index: int, seed: int, expert: Expert) -> int:
-    """The first seed whose scene exists and is in the expert's reach."""
+    """Return the first seed whose scene exists and is in the expert's reach."""
     reason = ''
     for attempt in range(_MAX_ATTEMPTS):
         found = episode_seed(seed, task, index, attempt)

@@ -160,7 +160,10 @@ class RolloutRunner:
     def _pictures_alone(
         self, job: Job, real: SimulatedRollout, objects: tuple[str, ...]
     ) -> SuccessEstimate | None:
-        """The estimate of an episode in which no motion is foreseen; None = none ever is."""
+        """Return the estimate of an episode in which no motion is foreseen.
+
+        None = none ever is.
+        """
         if self.pipeline.object_motion is None:
             return None
         pipeline, options = self.pipeline.without_foresight(), self._options(real, job, objects)
@@ -171,7 +174,7 @@ class RolloutRunner:
     def _judge_without_pictures(
         self, job: Job, real: SimulatedRollout, objects: tuple[str, ...]
     ) -> StoredEstimate:
-        """The verdict of the no-picture rule."""
+        """Return the verdict of the no-picture rule."""
         world, episode = real.world, self._begin(real, job, objects)
         commands = np.concatenate([world.start.positions[None], *world.commands])
         try:
@@ -181,13 +184,13 @@ class RolloutRunner:
         return StoredEstimate.stated(float(success), 'the no-picture rule')
 
     def _begin(self, real: SimulatedRollout, job: Job, objects: tuple[str, ...] = ()) -> Rollout:
-        """An episode that begins with the simulator's first observation."""
+        """Return an episode that begins with the simulator's first observation."""
         return self.pipeline.begin(real.world.start, self._options(real, job, objects))
 
     def _options(
         self, real: SimulatedRollout, job: Job, objects: tuple[str, ...]
     ) -> RolloutOptions:
-        """Options of the rollouts that begin with the simulator's first observation."""
+        """Return the options of the rollouts that begin with the simulator's first observation."""
         return RolloutOptions(
             instruction=real.instruction,
             objects=objects,

@@ -122,7 +122,7 @@ class _Store:
         self.found = {job: result for job, result in stored.items() if result is not None}
 
     def _stored(self, job: Job, overwrite: bool) -> Result | None:
-        """A result of an earlier run, if it is of the same job and settings."""
+        """Return a result of an earlier run, if it is of the same job and settings."""
         path = _path(self._out, job)
         try:
             values = read_json(path)

@@ -160,7 +160,7 @@ def reliability_page(found: Calibrated) -> str:
 
 
 def _values(found: Calibrated) -> dict[str, Any]:
-    """Every sample with its features and estimates, for those who fit something else."""
+    """Return every sample with its features and estimates, for those who fit something else."""
     return {
         'scores': found.calibration.scores,
         'samples': [

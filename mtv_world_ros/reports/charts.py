@@ -217,7 +217,7 @@ def scatter_chart(title: str, points: Sequence[Point], x_label: str, y_label: st
 
 
 def _square(axes: Axes, x_label: str, y_label: str) -> None:
-    """Both axes from 0 to 1, with the diagonal on which both are equal."""
+    """Draw both axes from 0 to 1, with the diagonal on which both are equal."""
     axes.set(xlim=(0, 1), ylim=(0, 1), xticks=_TICKS, yticks=_TICKS)
     axes.grid()
     axes.plot([0, 1], [0, 1], ':', color=_COLOURS['faint'], lw=1.2)
@@ -229,7 +229,7 @@ def _square(axes: Axes, x_label: str, y_label: str) -> None:
 def _axes(
     width: int, height: int, *, left: int, right: int, top: int, bottom: int
 ) -> Iterator[Axes]:
-    """Axes with margins in pixels, drawn in the page's style within the context."""
+    """Yield the axes with margins in pixels, drawn in the page's style within the context."""
     with rc_context(_STYLE):
         figure = Figure(figsize=(width / 72, height / 72))
         FigureCanvasSVG(figure)
@@ -244,7 +244,7 @@ def _axes(
 
 
 def _svg(axes: Axes, title: str, width: int, height: int, titles: Mapping[str, str]) -> Markup:
-    """The figure of the axes as an element that names what is at `titles`' ids."""
+    """Return the figure of the axes as an element that names what is at `titles`' ids."""
     stream = StringIO()
     figure = axes.get_figure(root=True)
     assert figure is not None

@@ -149,7 +149,7 @@ def _about(result: EpisodeResult) -> str:
 
 
 def _row(one: Marked, result: EpisodeResult, key: str) -> dict[str, Any]:
-    """J by view, the success estimate and its reasons."""
+    """Return J by view, the success estimate and its reasons."""
     means = {view: episode_means(result.rows, view)[key] for view in one.found.spec.views}
     known = isfinite(result.probability)
     doubted = [row for row in result.rows if row.name and row.status != 'ok']
@@ -165,7 +165,7 @@ def _row(one: Marked, result: EpisodeResult, key: str) -> dict[str, Any]:
 def _clip(
     episode: str, found: EvaluationSummary, is_picked: bool, budget: int
 ) -> tuple[RolloutClip | None, str]:
-    """An episode's video, or why there is none."""
+    """Return an episode's video, or why there is none."""
     try:
         rollout = found.rollout(episode)
     except EpisodeError as error:

@@ -70,7 +70,7 @@ def page(evaluations: Sequence[EvaluationSummary]) -> str:
 def _each(
     ones: Sequence[Marked], table: Callable[[EvaluationSummary], Table | None]
 ) -> list[tuple[Marked, Table]]:
-    """A table of each evaluation that has one."""
+    """Return a table of each evaluation that has one."""
     return [(one, found) for one in ones if (found := table(one.found)) is not None]
 
 
@@ -79,7 +79,7 @@ def _tables_of_numbers(found: EvaluationSummary) -> list[Table]:
 
 
 def _statuses(found: EvaluationSummary) -> Table:
-    """Counts by status, and how many rows have no score."""
+    """Return the counts by status, and how many rows have no score."""
     table = tables.status_table(found)
     views = found.metrics['views'].values()
     last = ['not scored, in all', *(numbers['num_not_scored'] for numbers in views)]
@@ -116,7 +116,7 @@ def _tiles(found: EvaluationSummary) -> list[tuple[str, str, str]]:
 
 
 def _paper_tables(ones: Sequence[Marked]) -> list[Table]:
-    """Method by view and method by task and view: the paper's tables 1 and 3."""
+    """Return the method by view and method by task and view: the paper's tables 1 and 3."""
     views = views_of(ones)
     rows = lines([one.found for one in ones], [one.title for one in ones])
     return [method_table(rows, views), *task_tables(rows, views)]
@@ -150,7 +150,7 @@ def _reliability(one: Marked) -> Markup | None:
 
 
 def _episodes(found: EvaluationSummary) -> Table:
-    """A line per episode, the worst first."""
+    """Return a line per episode, the worst first."""
     keys = ('j_moving', 'j_copy_moving', 'j_shuffled_moving', 'j_object_mean')
     head = ['Episode', 'Task', 'Outcome', 'J moving', 'held', 'shuffled', 'J objects', 'Success']
     by_key = {key: scores(found, key) for key in keys}

@@ -168,7 +168,7 @@ def _doubt(margin: Estimate, words: str) -> str:
 
 
 def _dots(evaluations: Sequence[Marked], view: str, keys: tuple[str, str, str]) -> Markup:
-    """All evaluations' dots of one kind below each other, so that they are compared."""
+    """Return all evaluations' dots of one kind below each other, so that they are compared."""
     words = {**dict(zip(keys, ('', 'held', 'shuffled'), strict=True)), **_MORE}
     shown = [
         (one, one.found.estimates(view)) for one in evaluations if view in one.found.spec.views
@@ -210,7 +210,10 @@ def horizon(evaluations: Sequence[Marked]) -> dict[str, Any] | None:
 
 
 def _lines(one: Marked, view: str, fps: float, count: int) -> list[ChartLine]:
-    """The curves of an evaluation in a view, on a clock; all have bands where it is alone."""
+    """Return the curves of an evaluation in a view, on a clock.
+
+    All have bands where it is alone.
+    """
     rows = [result.rows for result in one.found.results]
     clock = fps / one.found.spec.fps
     lines = []
@@ -231,7 +234,7 @@ def _lines(one: Marked, view: str, fps: float, count: int) -> list[ChartLine]:
 
 
 def _on_clock(values: Sequence[Any], clock: float) -> list[Any]:
-    """Every frame's value at the frames of a clock that is `clock` times as fast."""
+    """Return every frame's value at the frames of a clock that is `clock` times as fast."""
     count = max(int(len(values) * clock + 1e-6), 1)
     return [values[min(max(round((k + 1) / clock) - 1, 0), len(values) - 1)] for k in range(count)]
 

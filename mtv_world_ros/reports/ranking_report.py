@@ -62,7 +62,7 @@ def remarks(summary: Summary) -> list[str]:
 
 
 def _notes(summary: Summary) -> list[str]:
-    """Remarks on this ranking: its truth, agreement, calibration, and what is missing."""
+    """Return remarks on this ranking: its truth, agreement, calibration, and what is missing."""
     found = [_truth_remark(summary), _agreement_remark(summary), _unknown_remark(summary)]
     reasons = ' '.join(reason for result in summary.results for reason in result.imagined.reasons)
     if 'uncalibrated' in reasons:
@@ -257,7 +257,10 @@ def _cell(score: Score) -> str:
 
 
 def _number(value: float) -> str:
-    """Two decimals without the zero in front, 0 or 1 without any; a dash where there is none."""
+    """Return two decimals without the zero in front, 0 or 1 without any.
+
+    A dash where there is none.
+    """
     if not isfinite(value):
         return DASH
     return {'0.00': '0', '-0.00': '0', '1.00': '1'}.get(
@@ -464,7 +467,7 @@ def _tiles(summary: Summary) -> list[tuple[str, str, str]]:
 
 
 def _content(summary: Summary) -> dict[str, Any]:
-    """Values that the Markdown and the HTML page share."""
+    """Return the values that the Markdown and the HTML page share."""
     return {
         'title': TITLE,
         'remarks': remarks(summary),
@@ -483,7 +486,7 @@ def _chart(summary: Summary, judge: str, task: str | None) -> Markup:
 
 
 def _points(summary: Summary, judge: str, task: str | None) -> list[Point]:
-    """Policies, numbered from the best one in the simulator on."""
+    """Return the policies, numbered from the best one in the simulator on."""
     points = []
     for number, policy in enumerate(summary.policies):
         if not summary.chosen(policy, task):

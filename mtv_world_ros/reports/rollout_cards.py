@@ -145,7 +145,7 @@ def rollout_file(out: Path, result: Result, suffix: str) -> Path:
 
 
 def _address(out: Path, result: Result, suffix: str) -> str:
-    """Address of a rollout's file from the page; empty = there is none."""
+    """Return the address of a rollout's file from the page; empty = there is none."""
     path = rollout_file(out, result, suffix)
     return f'{FOLDER}/{quote(path.name)}' if path.is_file() else ''
 
@@ -177,7 +177,7 @@ def curves(course: WorldComparison) -> Markup:
 
 
 def _path(times: Sequence[float], values: Sequence[float], last: float, is_step: bool) -> str:
-    """Drawing commands of values in [0, 1]; a gap where one is not known.
+    """Return the drawing commands of values in [0, 1]; a gap where one is not known.
 
     A step holds its value from the moment before up to its own.
     """

@@ -96,7 +96,7 @@ class ArmSolver:
         raise TrajectoryError(f'tool pose at ({x:.3f}, {y:.3f}, {z:.3f}) m is out of reach')
 
     def _configuration(self, joints: FloatArray) -> FloatArray:
-        """Pinocchio's (nq,); joints that turn without end are given by cosine and sine."""
+        """Return Pinocchio's configuration (nq,); endless joints are given by cosine and sine."""
         q = self._neutral.copy()
         for (at, count), value in zip(self._q_at, joints, strict=True):
             q[at : at + count] = value if count == 1 else (np.cos(value), np.sin(value))
@@ -104,6 +104,6 @@ class ArmSolver:
 
 
 def _slack(jacobian: FloatArray, wanted: FloatArray) -> FloatArray:
-    """The part of a joint motion (n,) that leaves the tool where it is."""
+    """Return the part of a joint motion (n,) that leaves the tool where it is."""
     square = jacobian @ jacobian.T + _DAMPING * np.eye(6)
     return wanted - jacobian.T @ np.linalg.solve(square, jacobian @ wanted)

@@ -103,7 +103,7 @@ def _tool_differences(one: RobotModel, other: RobotModel) -> tuple[float, float]
 
 
 def _spread_positions(robot: RobotModel) -> FloatArray:
-    """(N, J) positions spread over the joints' range; endless joints over a turn."""
+    """Return (N, J) positions spread over the joints' range; endless joints over a turn."""
     lower = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
     upper = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
     shares = np.random.default_rng(0).random((_NUM_CONFIGURATIONS, len(lower)))
@@ -298,7 +298,7 @@ def load_robot(path: Path | str) -> RobotModel:
 
 
 def _movable(model: pin.Model, followers: set[str]) -> list[str]:
-    """Joints of one number that follow no other; floating and planar ones rest."""
+    """Return the joints of one number that follow no other; floating and planar ones rest."""
     return [
         name
         for name, joint in zip(model.names[1:], list(model.joints)[1:], strict=True)
@@ -510,7 +510,7 @@ def _build(urdf: str) -> pin.Model:
 
 
 def _resolved(mimics: Sequence[Mimic]) -> list[Mimic]:
-    """Followers of followers follow the joint that leads them all.
+    """Resolve chains: followers of followers follow the joint that leads them all.
 
     Raises:
         RobotError: joints follow each other in a circle.

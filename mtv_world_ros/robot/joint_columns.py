@@ -128,7 +128,7 @@ class JointTable(Schema):
         return self
 
     def _needed(self, robot: RobotModel) -> Sequence[str]:
-        """Joints that must have a column."""
+        """Return the joints that must have a column."""
         return () if self.allow_missing else robot.joint_names
 
     def _of(self, robot: RobotModel) -> tuple[JointColumn, ...]:

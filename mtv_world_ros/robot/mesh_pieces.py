@@ -326,7 +326,7 @@ def _is_convex(vertices: FloatArray) -> bool:
 
 
 def _best_cut(segments: FloatArray) -> tuple[float, list[FloatArray]]:
-    """By how much a cut makes hulls smaller [m^3], and the two parts (E, 2, 3)."""
+    """Return the reduction of the hulls' volume by a cut [m^3], and the two parts (E, 2, 3)."""
     whole = segments
     segments = segments[:: max(1, len(segments) // NUM_CUT_EDGES)]  # enough to choose a cut by
     points = segments.reshape(-1, 3)
@@ -372,7 +372,7 @@ def _hull_volume(segments: FloatArray) -> float:
 def _slice(
     vertices: FloatArray, edges: NDArray[np.int64], along: FloatArray, low: float, high: float
 ) -> FloatArray:
-    """Outermost points between two planes, with where the planes cut edges."""
+    """Return the outermost points between two planes, with where the planes cut edges."""
     inside = vertices[(along >= low) & (along <= high)]
     start, end = along[edges].T
     found = [inside]
@@ -386,7 +386,7 @@ def _slice(
 
 
 def even_directions(count: int) -> FloatArray:
-    """(count, 3) unit vectors spread evenly (a Fibonacci sphere)."""
+    """Return (count, 3) unit vectors spread evenly (a Fibonacci sphere)."""
     n = np.arange(count) + 0.5
     up, turn = 1 - 2 * n / count, n * np.pi * (1 + 5**0.5)
     across = np.sqrt(1 - up**2)

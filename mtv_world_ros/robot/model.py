@@ -243,11 +243,11 @@ class RobotModel:
         return follows
 
     def _tool_poses(self, links: Mapping[str, FloatArray]) -> FloatArray:
-        """(A, T, 4, 4) T_base_tool from the poses of the tools' links."""
+        """Return (A, T, 4, 4) T_base_tool from the poses of the tools' links."""
         return np.stack([links[tool.link] @ tool.T_link_tool for tool in self.tools])
 
     def _chains(self) -> list[list[int]]:
-        """Numbers of the joints that carry each tool, from the base on."""
+        """Return the numbers of the joints that carry each tool, from the base on."""
         model = self.pinocchio_model
         parents = [model.frames[self._frame(tool.link)].parentJoint for tool in self.tools]
         return [list(model.supports[parent])[1:] for parent in parents]
@@ -255,7 +255,7 @@ class RobotModel:
     def _placements(
         self, positions: FloatArray, links: Sequence[str], joints: Sequence[int] = ()
     ) -> tuple[dict[str, FloatArray], dict[int, FloatArray]]:
-        """T_base_link (T, 4, 4) by link and origins (T, 3) by joint, for positions (T, J)."""
+        """Return T_base_link (T, 4, 4) by link, origins (T, 3) by joint, for positions (T, J)."""
         model, data = self.pinocchio_model, self.pinocchio_model.createData()
         names = tuple(dict.fromkeys((*links, self.base_link)))
         frames = [self._frame(link) for link in names]
@@ -277,7 +277,7 @@ class RobotModel:
         )
 
     def configurations(self, positions: FloatArray) -> FloatArray:
-        """Pinocchio's (T, nq) for positions (T, J): mimics follow, endless joints as cos, sin."""
+        """Return Pinocchio's (T, nq) for positions (T, J); endless joints as cos, sin."""
         positions = np.asarray(positions, dtype=float)
         if positions.ndim != 2 or positions.shape[1] != len(self.joint_names):
             raise RobotError(
@@ -431,7 +431,7 @@ def check_can_move(joint: str, lower: float, upper: float, where: str) -> None:
 def check_positions(
     robot: RobotModel, positions: FloatArray, *, tolerance: float = LIMIT_TOLERANCE
 ) -> None:
-    """Checks positions (T, J) against the joint limits, with a tolerance [rad or m].
+    """Check positions (T, J) against the joint limits, with a tolerance [rad or m].
 
     Raises:
         TrajectoryError: names the first joint outside or not finite, its value and the limits.

@@ -88,7 +88,7 @@ def check_speeds(
 
 
 def _ratio(over: FloatArray, under: FloatArray) -> FloatArray:
-    """Their ratio, 0 where it is not a number."""
+    """Return the ratio of two numbers, 0 where it is not a number."""
     return np.divide(over, under, out=np.zeros_like(over), where=np.abs(under) > 1e-12)
 
 

@@ -73,7 +73,7 @@ def _check_size(trajectory: JointTrajectory) -> None:
 def _pick(
     values: FloatArray, given: tuple[str, ...], robot: RobotModel, default: FloatArray
 ) -> FloatArray:
-    """Columns (T, J) of the robot's joints; of those not given the default (J,)."""
+    """Return the columns (T, J) of the robot's joints; of those not given the default (J,)."""
     rows = np.tile(default, (len(values), 1))
     for column, name in enumerate(robot.joint_names):
         if name in given:

@@ -213,7 +213,7 @@ def gripper_links(robot: RobotModel, tool: Tool) -> set[str]:
 
 
 def _joint_frames(robot: RobotModel) -> dict[str, int]:
-    """The joint that carries each link."""
+    """Return the joint that carries each link."""
     return {
         f.name: f.parentJoint for f in robot.pinocchio_model.frames if f.type == pin.FrameType.BODY
     }
@@ -321,7 +321,7 @@ def _pieces(
     urdf: Path,
     cut: Callable[[FloatArray, NDArray[np.int64]], list[FloatArray]] | None,
 ) -> list[FloatArray]:
-    """Convex parts (N, 3) of a shape, of a mesh as it is cut."""
+    """Return the convex parts (N, 3) of a shape, of a mesh as it is cut."""
     if shape.tag != 'mesh':
         return [_points(shape, urdf)]
     scale = mesh_scale(shape)
@@ -406,7 +406,10 @@ def _moved(T: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def fill(parts: Sequence[FloatArray], camera: CameraModel) -> NDArray[np.uint8]:
-    """(T, H, W) the convex hulls of the parts' pixels; parts behind the camera are left out."""
+    """Return (T, H, W) the convex hulls of the parts' pixels.
+
+    Parts behind the camera are left out.
+    """
     images = np.zeros((len(parts[0]), camera.height, camera.width), np.uint8)
     size = np.array([camera.width, camera.height])
     for part in parts:

@@ -82,7 +82,7 @@ def streams_of(prediction: Prediction) -> Streams:
 
 
 def _labels(masks: ObjectMasks, view: int, frame: int) -> ByteArray:
-    """(H, W) numbers of the objects in a frame, 0 = none."""
+    """Return (H, W) numbers of the objects in a frame, 0 = none."""
     labels = np.zeros(masks.masks.shape[-2:], np.uint8)
     for number, mask in enumerate(masks.masks[view, :, frame], start=1):
         labels[mask] = number

@@ -49,7 +49,7 @@ class ObservedEpisode:
             return len(self._waiting) >= self._pipeline.spec.num_frames
 
     def see(self, observation: Observation) -> None:
-        """Queues a real observation.
+        """Queue a real observation.
 
         Raises:
             ObservationError: the views are not the model's.
@@ -66,7 +66,7 @@ class ObservedEpisode:
             self._seen, self._waiting = None, []
 
     def catch_up(self) -> None:
-        """Processes the queued observations."""
+        """Process the queued observations."""
         with self._lock:
             seen, waiting = self._seen, self._waiting
             self._waiting = []

@@ -479,7 +479,7 @@ class Pipeline:
         )
 
     def _majority(self, state: RolloutState, options: RolloutOptions) -> Majority:
-        """The rule that selects futures of majority outcome, for pictures and estimate."""
+        """Return the rule that selects futures of majority outcome, for pictures and estimate."""
 
         def majority(motions: ForeseenMotions) -> BoolArray | None:
             ends = self.estimator.foresee(motions, options.instruction, state.memory)
@@ -488,7 +488,7 @@ class Pipeline:
         return majority
 
     def _objects_in(self, observation: Observation) -> ObjectForesight:
-        """The objects of an episode that begins at an observation."""
+        """Return the objects of an episode that begins at an observation."""
         return ObjectForesight(
             model=self.object_motion if self.control.shows_objects else None,
             segmenter=self.segmenter,
@@ -514,7 +514,9 @@ def _check_inputs(name: str, control: Control, transformer: Mapping[str, Any]) -
 
 
 def _tasks(task: str | None) -> tuple[tuple[TaskSpec, ...], str | None]:
-    """The known tasks, and the name of the one to judge; a file of the user's own is one more.
+    """Return the known tasks, and the name of the one to judge.
+
+    A file of the user's own is one more.
 
     Tasks of objects of any size come last: an instruction that fits one of the benchmark's is
     judged with the benchmark's thresholds.

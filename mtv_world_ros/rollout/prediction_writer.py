@@ -164,7 +164,7 @@ def chunk_values(chunk: Prediction) -> dict[str, object]:
 
 
 def _array(values: np.ndarray, labels: Sequence[str]) -> Any:
-    """Row-major std_msgs/Float32MultiArray, one label a dimension."""
+    """Return the row-major std_msgs/Float32MultiArray, one label a dimension."""
     dimensions = [
         messages.make(
             'std_msgs/msg/MultiArrayDimension',

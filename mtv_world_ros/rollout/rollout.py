@@ -199,12 +199,12 @@ class Rollout:
         return replace(self, _states=(replace(state, memory=before.memory),))
 
     def _plan(self, trajectory: JointTrajectory | Plan) -> Plan:
-        """The plan from where the episode stands."""
+        """Return the plan from where the episode stands."""
         start = self.observation
         if isinstance(trajectory, Plan):
             return trajectory.after(start)
         return Plan.of(trajectory, self.pipeline.robot, start, self.options.limits)
 
     def _named(self) -> RolloutOptions:
-        """The options with the names of the objects."""
+        """Return the options with the names of the objects."""
         return replace(self.options, objects=self.names)

@@ -9,7 +9,7 @@ if sys.argv[:1] == ['-m']:  # `python -m` is about to run a node, whose imports 
 
 
 def run_world_model() -> int:
-    """The command `world_model`."""
+    """Run the node `world_model`."""
     end_on_signals('world_model')
     from mtv_world_ros.ros.world_model.node import main
 

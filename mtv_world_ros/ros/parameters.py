@@ -239,7 +239,7 @@ def help_text(name: str, kind: type[Schema]) -> str:
 
 
 def declare(node: Node, kind: type[Schema]) -> None:
-    """Declares the fields on the node; later changes are held to their ranges and choices.
+    """Declare the fields on the node; later changes are held to their ranges and choices.
 
     Raises:
         ConfigError: a value given at start-up is refused.
@@ -312,7 +312,7 @@ def declare_one(
     *,
     empty: Any = None,
 ) -> Any:
-    """Declares one parameter and returns its value.
+    """Declare one parameter and returns its value.
 
     Args:
         node: owner.
@@ -358,7 +358,7 @@ def refuse_unknown(node: Node) -> None:
 
 
 def declare_camera_topics(node: Node, views: Sequence[str]) -> dict[str, str]:
-    """Declares `camera_topics.<view>` and returns each view's camera topic, by default its name.
+    """Declare `camera_topics.<view>` and returns each view's camera topic, by default its name.
 
     Raises:
         ConfigError: a value given at start-up is refused.

@@ -25,7 +25,7 @@ class Peers:
         node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 100)
 
     def state(self, name: str) -> Mapping[str, str]:
-        """Values of a node's newest diagnostics."""
+        """Return the values of a node's newest diagnostics."""
         return self._newest.get(self._status_name(name), {})
 
     def unconnected(self, topics: Iterable[str]) -> list[str]:
@@ -42,7 +42,7 @@ class Peers:
         return [topic for topic in topics if has_none(topic)]
 
     def _status_name(self, name: str) -> str:
-        """A node's name, absolute or in this node's namespace, as diagnostics have it."""
+        """Return a node's name, absolute or in this node's namespace, as diagnostics have it."""
         return self._node.resolve_service_name(name).lstrip('/')
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -51,5 +51,8 @@ class Peers:
 
 
 def _is_zero(count: str) -> bool:
-    """True if a count of another node's diagnostics is 0; what is no number says nothing."""
+    """Return True if a count of another node's diagnostics is 0.
+
+    What is no number says nothing.
+    """
     return count.isascii() and count.isdecimal() and len(count) < 10 and int(count) == 0

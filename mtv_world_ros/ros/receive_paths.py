@@ -156,7 +156,7 @@ def _renames(scope: str, source: str, node: str) -> bool:
 
 
 def _remap_rules(arguments: Sequence[str]) -> list[tuple[str, str, str]]:
-    """Remapping rules of a command line: node name, or '' for all, from, to."""
+    """Return the remapping rules of a command line: node name, or '' for all, from, to."""
     rules: list[tuple[str, str, str]] = []
     is_ros, is_rule = False, False
     for word in arguments:
@@ -175,7 +175,7 @@ def _remap_rules(arguments: Sequence[str]) -> list[tuple[str, str, str]]:
 
 
 def _base_profile(given: str | None) -> Path | None:
-    """The package's profile to extend; None = the user has one of their own."""
+    """Return the package's profile to extend; None = the user has one of their own."""
     own = [share_path('config', name) for name in _OWN_PROFILES]
     if not given:
         return own[0]
@@ -211,7 +211,7 @@ def _write(base: Path, groups: Sequence[Sequence[str]], folder: Path) -> str:
 
 
 def _reader(topic: str, port: int) -> ElementTree.Element:
-    """The profile of a topic's reader: a UDP port on all interfaces of this machine."""
+    """Return the profile of a topic's reader: a UDP port on all interfaces of this machine."""
     reader = ElementTree.Element(_tag('data_reader'), profile_name=topic)
     _add(reader, 'unicastLocatorList', 'locator', 'udpv4', 'port').text = str(port)
     return reader
@@ -242,7 +242,7 @@ def _tag(name: str) -> str:
 
 
 def _buffer_bytes() -> int:
-    """The receive buffer to ask for: what is wanted, or what the kernel allows."""
+    """Return the receive buffer to ask for: what is wanted, or what the kernel allows."""
     try:
         allowed = int(_BUFFER_LIMIT.read_text())
     except (OSError, ValueError):

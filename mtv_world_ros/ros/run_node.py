@@ -52,7 +52,7 @@ def guard_node(node: Node) -> None:
 
 
 def spin_forever(node: Node) -> None:
-    """Handles callbacks one after the other until ROS shuts down."""
+    """Handle callbacks one after the other until ROS shuts down."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     executor.spin()

@@ -153,7 +153,7 @@ class _UrdfBodies:
             )
 
     def _collides(self, joint: int) -> str:
-        """Class of a body's geoms; what stands still touches objects alone."""
+        """Return the class of a body's geoms; what stands still touches objects alone."""
         if joint == 0:
             return 'contype="0" conaffinity="1"'
         robot, first = self._robot, self._model.supports[joint][1]
@@ -164,12 +164,12 @@ class _UrdfBodies:
         return f'class="{tool.arm}_{"pad" if self._model.names[joint] in grippers else "arm"}"'
 
     def _first_joint(self, link: str) -> int:
-        """Number of the joint nearest to the base among those that carry a link."""
+        """Return the number of the joint nearest to the base among those that carry a link."""
         chain = list(self._model.supports[self._placed(link, np.eye(4))[0]])
         return chain[1] if len(chain) > 1 else 0
 
     def _placed(self, link: str, pose: FloatArray) -> tuple[int, FloatArray]:
-        """The joint that carries a link, and a pose in the link as one in its body."""
+        """Return the joint that carries a link, and a pose in the link as one in its body."""
         frame = self._model.frames[self._frame(link)]
         return int(frame.parentJoint), frame.placement.homogeneous @ np.asarray(pose)
 
@@ -190,7 +190,7 @@ def _at(pose: FloatArray) -> str:
 
 
 def _axis(model: pin.Model, joint: pin.JointModel) -> str:
-    """The joint's own axis, found by moving it."""
+    """Return the joint's own axis, found by moving it."""
     data = joint.createData()
     joint.calc(data, pin.neutral(model), np.ones(model.nv))
     velocity = data.v

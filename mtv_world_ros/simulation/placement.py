@@ -24,7 +24,7 @@ def _plane(a: Sequence[float], b: Sequence[float]) -> float:
 
 
 def _gap(a: SceneObject, b: SceneObject) -> float:
-    """Gap between the circles around two objects' longer halves [m]."""
+    """Return the gap between the circles around two objects' longer halves [m]."""
     return _plane(a.position, b.position) - (max(a.size[:2]) + max(b.size[:2])) / 2
 
 

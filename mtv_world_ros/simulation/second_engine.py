@@ -62,7 +62,7 @@ def second_engine(
 
 
 def _solid(item: SceneObject) -> Solid:
-    """A box or an upright cylinder in place of an object, as long, wide and high."""
+    """Return a box or an upright cylinder in place of an object, as long, wide and high."""
     x, y, _ = item.size
     return Solid(
         centre=np.array(item.position),

@@ -112,7 +112,7 @@ class SimulatedWorld:
         return ever_and_final(self._sim.task.succeeds(self._sim.situation()))
 
     def _advance(self, targets: FloatArray, number: int, is_frame: bool) -> SimObservation | None:
-        """One control period; what is seen after it, if a picture is due."""
+        """Return one control period; what is seen after it, if a picture is due."""
         begun = time.perf_counter()
         self._sim.advance(targets)
         if (number + 1) % round(_LOOK_S / CONTROL_PERIOD_S) == 0 and not is_frame:

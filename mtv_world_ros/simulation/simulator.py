@@ -291,7 +291,7 @@ class SimEpisode:
         return self._instance_of[colours[..., 0] | colours[..., 1].astype(np.uint16) << 8]
 
     def _instances(self, scene: Any) -> ByteArray:
-        """Instance id by the number of a drawn geom, from 1; nothing drawn is 0."""
+        """Return the instance id by the number of a drawn geom, from 1; nothing drawn is 0."""
         owners = {
             self._model.body(item.role).id: i for i, item in enumerate(self.scene.objects, 1)
         }

@@ -42,7 +42,7 @@ _FINGER_BASES = {'left': (-0.037, 0.0392, 0.0605), 'right': (0.037, -0.0392, 0.0
 
 
 def _finger_xml(arm: str, side: str, closed: float) -> str:
-    """One finger; its pad's inner face meets the tool axis at the joint value `closed`."""
+    """Return one finger; its pad's inner face meets the tool axis at the joint value `closed`."""
     x, y, z = _FINGER_BASES[side]
     sign = 1.0 if side == 'left' else -1.0
     closes_upwards = closed > sum(_FINGER_RANGE) / 2

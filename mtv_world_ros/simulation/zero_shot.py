@@ -96,7 +96,7 @@ def with_moved_cameras(
 
 
 def _movable(task: Task) -> tuple[ObjectRole, ...]:
-    """Roles that are always present and can be grasped, so not trays and baskets."""
+    """Return the roles that are always present and can be grasped, so not trays and baskets."""
     return tuple(
         role
         for role in task.roles
@@ -105,7 +105,7 @@ def _movable(task: Task) -> tuple[ObjectRole, ...]:
 
 
 def _exchangeable(task: Task) -> tuple[str, ...]:
-    """Roles that any graspable object can have.
+    """Return the roles that any graspable object can have.
 
     Not what carries something, is shaken or is a plate, nor what has to be of a certain size.
     """

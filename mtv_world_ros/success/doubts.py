@@ -177,7 +177,7 @@ class Grounds:
 
 
 def _foreseen_alone(estimate: SuccessEstimate) -> SuccessEstimate:
-    """An estimate by foreseen motions; its interval holds whatever pictures could show."""
+    """Return an estimate by foreseen motions; its interval holds whatever pictures could show."""
     known = {name: estimate.features.get(name, nan) for name in ('foreseen', 'released')}
     low, middle, high = (
         capped(stated_probability({**known, 'margin': margin}), known)

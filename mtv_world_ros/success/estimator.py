@@ -189,7 +189,7 @@ class SuccessEstimator:
         return foreseen_ends(foreseen, task, bound, starts)
 
     def _task(self, instruction: str, names: tuple[str, ...]) -> tuple[TaskSpec, dict[str, str]]:
-        """The task and its objects; a given task takes the objects in their order."""
+        """Return the task and its objects; a given task takes the objects in their order."""
         matched = match_task(self.tasks, instruction)
         if matched is not None:
             task, said = matched
@@ -317,7 +317,7 @@ def _abstains(reason: CannotTell, views: Views, subjects: Sequence[int]) -> Succ
 
 
 def _jaccard(views: Views, goals: Mapping[int, FloatArray], subjects: Sequence[int]) -> FloatArray:
-    """(V, O): the subjects' J with their goal masks, every other's with its first mask."""
+    """Return (V, O): the subjects' J with their goal masks, every other's with its first mask."""
     num_views = len(views.footage.cameras)
     scores = [views.start_jaccard(item) for item in range(len(views.names))]
     for item in subjects:
@@ -326,7 +326,7 @@ def _jaccard(views: Views, goals: Mapping[int, FloatArray], subjects: Sequence[i
 
 
 def _margin_text(margin: Margin, spread: float, task: TaskSpec) -> str:
-    """The condition nearest to failing, in words; `spread` in units of its softness."""
+    """Return the condition nearest to failing, in words; `spread` in units of its softness."""
     held = 'held' if margin.end >= 0 else 'missed'
     if margin.unit != 'm':
         return f"'{margin.condition}' {held} by {abs(margin.end):.2g} {margin.unit}"

@@ -225,7 +225,7 @@ def _score(margin: Margin, task: TaskSpec) -> float:
 
 
 def _goals(scene: ImaginedScene, task: TaskSpec) -> tuple[dict[int, FloatArray], float]:
-    """J of every subject with its goal mask, and their mean gain over the start, in -1..1.
+    """Return J of every subject with its goal mask, and their mean gain over the start, in -1..1.
 
     The start counts as at most `MAX_START_JACCARD`: what was in its goal from the first frame on
     has nothing to gain, and is judged by its J.
@@ -245,7 +245,10 @@ def _goals(scene: ImaginedScene, task: TaskSpec) -> tuple[dict[int, FloatArray],
 
 
 def _goal_masks(scene: ImaginedScene, relation: Relation) -> BoolArray | None:
-    """Goal masks (V, H, W): the subject where it should be; None if that is not one place."""
+    """Return the goal masks (V, H, W): the subject where it should be.
+
+    None if that is not one place.
+    """
     goal = relation.goal(scene)
     if goal is None:
         return None
@@ -256,7 +259,10 @@ def _goal_masks(scene: ImaginedScene, relation: Relation) -> BoolArray | None:
 
 
 def _contained(scene: ImaginedScene, task: TaskSpec) -> float:
-    """Overlap of each subject with its container or plate, in -1..1; the smallest one."""
+    """Return the overlap of each subject with its container or plate, in -1..1.
+
+    The smallest one.
+    """
     shares = [
         scene.views.containment(scene.item(relation.subject), scene.item(relation.target))
         for relation in task.relations
@@ -288,7 +294,7 @@ def _grasps(scene: ImaginedScene, task: TaskSpec) -> tuple[float, float]:
 
 
 def _moved(scene: ImaginedScene, task: TaskSpec) -> float:
-    """0 if an object that the task moves is known to have stayed at its start, else 1."""
+    """Return 0 if an object that the task moves is known to have stayed at its start, else 1."""
     for role in task.movers:
         trail = scene.views.memory.points[scene.item(role)]
         known = np.isfinite(trail).all(1)

@@ -20,7 +20,7 @@ _CAMERA_SLACK = np.repeat([0.03, 0.05, 0.05], (3, 6, 1))
 
 
 def _placement(camera: CameraModel) -> FloatArray:
-    """(10,) position [m], optical axis, x axis, focal length [image widths]."""
+    """Return (10,) position [m], optical axis, x axis, focal length [image widths]."""
     pose = camera.T_mount_camera
     return np.array([*pose[:3, 3], *pose[:3, 2], *pose[:3, 0], camera.K[0, 0] / camera.width])
 

@@ -96,7 +96,7 @@ def _is_done(
 
 
 def _size(measured: FloatArray, usual: Sequence[float] | None) -> tuple[float, float, float]:
-    """Extents of an object as masks show them, or else as usual [m]."""
+    """Return the extents of an object as masks show them, or else as usual [m]."""
     known = measured if usual is None or np.isfinite(measured).all() else usual
     x, y, z = map(float, known)
     return (x, y, z)

@@ -206,7 +206,7 @@ class ServedOn(Relation):
         ]
 
     def _rise(self, at: Situation) -> float:
-        """Height of the subject's centre over the target's [m]."""
+        """Return the height of the subject's centre over the target's [m]."""
         return float((at.size(self.subject)[2] - at.size(self.target)[2]) / 2 + FLOOR_M)
 
 
@@ -322,7 +322,7 @@ class Inside(Relation):
 def _height_margins(
     at: Situation, subject: str, target: str, rise_m: tuple[float, float] | None
 ) -> list[Margin]:
-    """By how much the subject is at the height of what lies in a container."""
+    """Return the height margins of what lies in a container."""
     if rise_m is not None:
         rise = (at.centres(subject) - at.centres(target))[:, 2]
         low, high = rise_m
@@ -438,7 +438,7 @@ class Shaken(Relation):
         ]  # fmt: skip
 
     def _reversed(self, at: Situation, swing: float, is_lifted: BoolArray) -> BoolArray:
-        """(T,) whether there were enough reversals, each by more than a swing."""
+        """Return (T,) whether there were enough reversals, each by more than a swing."""
         turns = np.diff(at.reversals(self.subject, swing), prepend=0.0)
         return np.asarray(np.cumsum(turns * is_lifted) >= self.num_reversals)
 

@@ -176,7 +176,7 @@ def _begin(footage: Footage) -> RolloutMemory:
 
 
 def _followed(memory: RolloutMemory, footage: Footage, frame: int) -> RolloutMemory:
-    """The memory after one more frame."""
+    """Return the memory after one more frame."""
     if footage.openings is not None and footage.tools is not None and memory.levels is not None:
         for arm, opening in enumerate(footage.openings[:, frame]):
             memory = _with_gripper(memory, footage, frame, arm, float(opening))
@@ -202,7 +202,7 @@ def _followed(memory: RolloutMemory, footage: Footage, frame: int) -> RolloutMem
 def _with_gripper(
     memory: RolloutMemory, footage: Footage, frame: int, arm: int, opening: float
 ) -> RolloutMemory:
-    """The memory after a gripper's opening in one more frame."""
+    """Return the memory after a gripper's opening in one more frame."""
     assert memory.levels is not None and memory.closed is not None and footage.tools is not None
     levels, closed = memory.levels.copy(), memory.closed.copy()
     level = levels[arm]
@@ -262,7 +262,7 @@ def _gap(
 
 
 def _outside_px(mask: BoolArray, pixel: FloatArray) -> float:
-    """Distance of a pixel from the mask's edge [px], negative inside."""
+    """Return the distance of a pixel from the mask's edge [px], negative inside."""
     x, y = pixel
     height, width = mask.shape
     inside = 0 <= round(x) < width and 0 <= round(y) < height and mask[round(y), round(x)]
@@ -273,7 +273,7 @@ def _outside_px(mask: BoolArray, pixel: FloatArray) -> float:
 
 
 def _points(footage: Footage, frame: int) -> FloatArray:
-    """(O, 3) centres, NaN where fewer than two views know one."""
+    """Return (O, 3) centres, NaN where fewer than two views know one."""
     pixels = np.where(
         footage.known(frame)[..., None], centroids(footage.frame_masks(frame)), np.nan
     )
@@ -281,7 +281,7 @@ def _points(footage: Footage, frame: int) -> FloatArray:
 
 
 def _leans(footage: Footage, frame: int) -> FloatArray:
-    """(O, 2) leans of the long axes, NaN where no view knows one."""
+    """Return (O, 2) leans of the long axes, NaN where no view knows one."""
     masks, known = footage.frame_masks(frame), footage.known(frame)
     leans = np.full((known.shape[1], 2), np.nan)
     for item in map(int, np.flatnonzero(known.any(0))):

@@ -55,7 +55,7 @@ class Views:
         return self.names.index(name)
 
     def _is_used(self) -> BoolArray:
-        """(V,) whether a view is looked at."""
+        """Return (V,) whether a view is looked at."""
         views = [camera.view for camera in self.footage.cameras]
         return np.array([not self.used or view in self.used for view in views])
 
@@ -196,7 +196,7 @@ class Views:
         return bool(hidden.any() and not elsewhere.any())
 
     def _sigma(self, item: int) -> float:
-        """Standard error of where it was last seen [m]."""
+        """Return the standard error of where it was last seen [m]."""
         found = locate(
             self.footage.cameras,
             tuple(self.footage.poses[:, -1]),
@@ -206,6 +206,6 @@ class Views:
 
 
 def _median_known(pixels: FloatArray) -> FloatArray:
-    """(2,) median of the rows that are known, NaN if none is."""
+    """Return (2,) median of the rows that are known, NaN if none is."""
     known = pixels[np.isfinite(pixels[:, 0])]
     return np.median(known, axis=0) if len(known) else np.full(2, np.nan)

@@ -111,7 +111,7 @@ def _check_transformer(
 
 
 def _check_card(config: TrainingConfig, card: CheckpointCard, folder: Path) -> None:
-    """An adapter is served with its base's card, so it has to be trained with it."""
+    """Check the base's card: an adapter is served with it, so it has to be trained with it."""
     mine = config.card({}).plain()
     rendering = TrajectoryVideoConfig(**card.rendering).model_dump()
     theirs = {**card.plain(), 'rendering': rendering}

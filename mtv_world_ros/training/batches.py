@@ -213,7 +213,7 @@ class BatchSource:
     def _past(
         self, recording: Recording, start: int, lead_in: LeadIn | None, rng: np.random.Generator
     ) -> Past | None:
-        """Anchor and history of the clip, in models that take them."""
+        """Return the anchor and history of the clip, in models that take them."""
         if not self._history.on:  # nothing is drawn: runs without history keep their clips
             return None
         if lead_in is None:
@@ -253,7 +253,7 @@ def _spaced(recording: Recording, starts: np.ndarray, stride_s: float) -> np.nda
 
 
 def _stacked(ids: Sequence[ByteArray | None]) -> Tensor | None:
-    """Ids of a batch, zero in clips that have none; None if no clip has any."""
+    """Return the ids of a batch, zero in clips that have none; None if no clip has any."""
     known = next((part for part in ids if part is not None), None)
     if known is None:
         return None

@@ -219,7 +219,9 @@ class ControlMaker:
     def _objects(
         self, clip: Clip, clip_motion: Motion, names: tuple[str, ...]
     ) -> ByteArray | None:
-        """(V, 1 + T, H, W, 4) objects that go where they went; None = they are held as masks.
+        """Return (V, 1 + T, H, W, 4) objects that go where they went.
+
+        None = they are held as masks.
 
         They are those of the episode's first frame, as in a rollout of chained chunks.
         """

@@ -209,7 +209,7 @@ def _control_inputs(
 
 
 def _latent_size(config: TrainingConfig) -> tuple[int, int, int, int]:
-    """F, latent frames of the history, h, w."""
+    """Return F, latent frames of the history, h, w."""
     with torch.device('meta'):
         autoencoder = build_autoencoder(config.autoencoder)
     video = config.video

@@ -124,7 +124,7 @@ def _with_past(
 
 
 def _weights(weights: Tensor, autoencoder: Autoencoder, clean: Tensor) -> Tensor:
-    """Pixels' weights (B, V, T, H, W) in the shape of the latents."""
+    """Return the pixels' weights (B, V, T, H, W) in the shape of the latents."""
     if isinstance(autoencoder, SpaceToDepthAutoencoder):
         return latent_weights(weights, autoencoder.block_size)
     return pooled_weights(weights, clean.shape)

@@ -89,7 +89,7 @@ class SelfRollout:
         return self._chunk(lead_in, lead_in.num_chunks, start, past)
 
     def _chunk(self, lead_in: LeadIn, index: int, start: ByteArray, past: History) -> ClipBatch:
-        """One chunk from a given start frame, as a batch of one clip."""
+        """Return one chunk from a given start frame, as a batch of one clip."""
         clip = lead_in.chunk(index)
         inputs = self._controls.make(clip, lead_in.names, start, foresees=lead_in.foresees)
         return ClipBatch(

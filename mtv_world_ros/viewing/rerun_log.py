@@ -114,7 +114,7 @@ def escaped(path: str) -> str:
 
 
 def _style_curves(stream: Any, rollout: StoredRollout, root: str) -> None:
-    """Colours the curves of J like the objects' outlines, darker in each further view."""
+    """Colour the curves of J like the objects' outlines, darker in each further view."""
     import rerun
 
     for o, name in enumerate(rollout.objects):
@@ -133,7 +133,7 @@ def _mark_points(stream: Any, path: str) -> None:
 
 
 def _log_view(stream: Any, rollout: StoredRollout, v: int, index: int, root: str) -> None:
-    """Frames of all kinds in a view, masks outlined."""
+    """Log frames of all kinds in a view, masks outlined."""
     import rerun
 
     shown = {'real': rollout.true_masks, 'imagined': rollout.masks}
@@ -148,7 +148,7 @@ def _log_view(stream: Any, rollout: StoredRollout, v: int, index: int, root: str
 
 
 def _outlines(labels: ByteArray) -> Any:
-    """Edges of the objects of a label image."""
+    """Return the edges of the objects of a label image."""
     import rerun
 
     strips, colours = [], []

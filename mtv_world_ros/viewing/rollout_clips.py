@@ -82,7 +82,7 @@ def make_clip(
 
 
 def _sheet(rollout: StoredRollout) -> bytes:
-    """Some frames as a WebP."""
+    """Return some frames as a WebP."""
     small = outlined(rollout, _SHEET_TILE_PX)
     sheet = contact_sheet(small, num_columns=6, tile_width=_SHEET_TILE_PX)
     done, data = cv2.imencode('.webp', sheet[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 80])

@@ -99,7 +99,7 @@ def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
 
 
 def _reader(folder: Path) -> Any:
-    """The registered module that reads such a folder; None = there is none."""
+    """Return the registered module that reads such a folder; None = there is none."""
     if not folder.is_dir():
         return None
     # a ranking's folder is one first

@@ -102,7 +102,7 @@ def compared(streams: Streams) -> Comparison:
 def _at(
     streams: Streams, kind: str, view: str, stamps: np.ndarray, size: Sequence[int], reach: float
 ) -> ByteArray:
-    """(T, H, W, 3) frames nearest to the stamps."""
+    """Return (T, H, W, 3) frames nearest to the stamps."""
     blank = np.full((*size, 3), _BLANK, np.uint8)
     found = streams.images.get((kind, view), [])
     if not found:

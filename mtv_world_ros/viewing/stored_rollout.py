@@ -116,7 +116,7 @@ def _unpacked(held: dict[str, Any]) -> StoredRollout:
 
 
 def _bounded(rollout: StoredRollout) -> StoredRollout:
-    """The first frames, shrunk where they are large."""
+    """Return the first frames, shrunk where they are large."""
     kept: dict[str, Any] = {field.name: getattr(rollout, field.name) for field in fields(rollout)}
     height, width = rollout.real.shape[2:4]
     factor = min(1.0, MAX_SIDE / max(height, width))

@@ -118,7 +118,7 @@ def contact_sheet(
 def _view_band(
     comparison: Comparison, view: int, columns: np.ndarray, tile_width: int
 ) -> ByteArray:
-    """The rows of one view: real, trajectory, imagined, and the captions if there are any."""
+    """Return rows of one view: real, trajectory, imagined, and the captions if there are any."""
     height, width = _tile_size(comparison.real.shape[2:4], tile_width)
     captions = _HEAD_PX - 8 if comparison.captions else 0
     total = len(comparison.kinds) * (height + _GAP_PX) + captions + 2 * _GAP_PX

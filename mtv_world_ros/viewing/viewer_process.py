@@ -231,7 +231,7 @@ def _listens(host: str, port: int) -> bool:
 
 
 def _reached(host: str) -> str:
-    """Address under which this process reaches what listens on `host`."""
+    """Return the address under which this process reaches what listens on `host`."""
     address = ipaddress.ip_address(host)
     if not address.is_unspecified:
         return host

@@ -244,7 +244,7 @@ def _search(
     parts: Sequence[LinkShape],
     positions: FloatArray,
 ) -> _Found | str:
-    """The pose at which outline and picture agree, or why there is none."""
+    """Return the pose at which outline and picture agree, or why there is none."""
     if camera.width > _CHECK.image_width_px:
         camera = scaled(
             camera,
@@ -293,7 +293,7 @@ def _edges(frame: ByteArray, camera: CameraModel) -> _Edges:
 def _links(
     robot: RobotModel, parts: Sequence[LinkShape], positions: FloatArray
 ) -> list[FloatArray]:
-    """Corners (N, 3) of each part in the base frame [m]."""
+    """Return the corners (N, 3) of each part in the base frame [m]."""
     poses = robot.forward_kinematics(positions[None])
     return [
         part.points @ poses[part.link][0, :3, :3].T + poses[part.link][0, :3, 3] for part in parts
@@ -303,7 +303,10 @@ def _links(
 def _outline(
     camera: CameraModel, links: Sequence[FloatArray], T_base_camera: FloatArray
 ) -> _Outline:
-    """The outline of the robot from a pose (4, 4); without what the image's border cuts off."""
+    """Return the outline of the robot from a pose (4, 4).
+
+    Without what the image's border cuts off.
+    """
     corners, depths = project(camera, T_base_camera, np.concatenate(links))
     ends = np.cumsum([len(link) for link in links])[:-1]
     image = fill([part[None] for part in np.split(corners, ends)], camera)[0]
@@ -328,7 +331,7 @@ def _outline(
 
 
 def _strength(edges: _Edges, at: FloatArray, normals: FloatArray) -> FloatArray:
-    """(N, K) strength of edges at pixels (N, K, 2) across normals (N, 2)."""
+    """Return (N, K) strength of edges at pixels (N, K, 2) across normals (N, 2)."""
     maps = at.astype(np.float32)
     xx, xy, yy = (
         cv2.remap(one, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderValue=0)
@@ -339,7 +342,7 @@ def _strength(edges: _Edges, at: FloatArray, normals: FloatArray) -> FloatArray:
 
 
 def _shift(edges: _Edges, outline: _Outline, width: int) -> tuple[FloatArray, float]:
-    """The shift (2,) [px] at which edges meet an outline, and how clearly it stands out."""
+    """Return the shift (2,) [px] at which edges meet an outline, and how clearly it stands out."""
     step = max(1.0, width / _CHECK.coarse_width_px)
     blurred = _Edges(*(cv2.GaussianBlur(one, (0, 0), step) for one in edges))
     reach = (
@@ -357,7 +360,7 @@ def _shift(edges: _Edges, outline: _Outline, width: int) -> tuple[FloatArray, fl
 
 
 def _met(edges: _Edges, outline: _Outline) -> float:
-    """Share of an outline's points at which the picture has an edge."""
+    """Return the share of an outline's points at which the picture has an edge."""
     near = np.array([-1.0, 0.0, 1.0])[None, :, None] * outline.normals[:, None]
     strength = _strength(edges, outline.pixels[:, None] + near, outline.normals)
     return (
@@ -366,7 +369,7 @@ def _met(edges: _Edges, outline: _Outline) -> float:
 
 
 def _turned_by(camera: CameraModel, shift: FloatArray) -> FloatArray:
-    """(4, 4) the turn of a camera that shifts its picture by (2,) [px]."""
+    """Return (4, 4) the turn of a camera that shifts its picture by (2,) [px]."""
     T = np.eye(4)
     turn = np.array([shift[1] / camera.K[1, 1], -shift[0] / camera.K[0, 0], 0.0])
     T[:3, :3] = cv2.Rodrigues(turn)[0]
@@ -400,7 +403,7 @@ def _stepped(
     T: FloatArray,
     window: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """The pose after a step towards edges within a window [px], and its covariance (6, 6)."""
+    """Return pose after a step towards edges within a window [px], and its covariance (6, 6)."""
     reach = np.arange(-np.ceil(2 * window), np.ceil(2 * window) + 1) / 2
     at = outline.pixels[:, None] + reach[None, :, None] * outline.normals[:, None]
     strength = _strength(edges, at, outline.normals)

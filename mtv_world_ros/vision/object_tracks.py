@@ -45,7 +45,7 @@ def track_points(
 
 
 def _steady(points: FloatArray) -> FloatArray:
-    """(N, 3) without gaps and jitter, of points that may be NaN."""
+    """Return (N, 3) without gaps and jitter, of points that may be NaN."""
     seen = np.flatnonzero(np.isfinite(points).all(-1))
     result = np.full_like(points, np.nan)
     if not len(seen):

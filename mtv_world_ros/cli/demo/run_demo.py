@@ -59,7 +59,7 @@ def run_demo(episode: Path, out: Path, options: DemoOptions) -> str:
 def _score(
     recording: Recording, chunks: Sequence[RecordedChunk], views: tuple[str, ...]
 ) -> tuple[Comparison, list[ScoreRow]]:
-    """The frames that are both recorded and imagined, and their J."""
+    """Return the frames that are both recorded and imagined, and their J."""
     segmenter = choose_segmenter('colour')
     rows: list[ScoreRow] = []
     shown: list[tuple[np.ndarray, ...]] = []
@@ -87,7 +87,7 @@ def _score(
 
 
 def _frames_at(recording: Recording, stamps_ns: np.ndarray) -> np.ndarray:
-    """Recorded frames at the stamps, up to the recording's end."""
+    """Return the recorded frames at the stamps, up to the recording's end."""
     seconds = (stamps_ns - recording.stamp_ns) * 1e-9
     inside = seconds <= recording.times[-1] + 0.05
     return np.abs(recording.times[None] - seconds[inside, None]).argmin(axis=1)
@@ -140,7 +140,7 @@ def _report(
 def _whole_chunks(
     recording: Recording, chunks: Sequence[RecordedChunk]
 ) -> Sequence[RecordedChunk]:
-    """Chunks that start before the recording ends."""
+    """Return the chunks that start before the recording ends."""
     end_ns = recording.stamp_ns + round(float(recording.times[-1]) * 1e9)
     return [c for c in chunks if int(c.report['observation_stamp_ns']) < end_ns] or chunks
 

@@ -224,7 +224,10 @@ def estimate_camera(
 
 
 def _part(states: JointStates, start: float, end: float, path: str) -> JointStates:
-    """Joint states between two times of the recording; frames outside are not used then."""
+    """Return the joint states between two times of the recording.
+
+    Frames outside are not used then.
+    """
     from dataclasses import replace
 
     import numpy as np

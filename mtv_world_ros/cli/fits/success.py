@@ -102,7 +102,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 def _fitted_to(
     arguments: argparse.Namespace, checkpoint: Checkpoint, selection: Selection
 ) -> FittedTo:
-    """Robot, foresight and cameras of the episodes; of those only that can be read."""
+    """Return the robot, foresight and cameras of the episodes; of those only that can be read."""
     from mtv_world_ros.data.episode_reader import read_episode
     from mtv_world_ros.success.fitted_to import FittedTo, Setting
 
@@ -195,7 +195,7 @@ def _imagine(
 def _horizon(
     runs: Sequence[Sequence[EpisodeResult]], summary: EvaluationSummary, made: dict[str, str]
 ) -> HorizonCurve | None:
-    """J of the objects that move against the horizon; None = nothing moves."""
+    """Return J of the objects that move against the horizon; None = nothing moves."""
     from mtv_world_ros.evaluation.metrics.horizon import curve
     from mtv_world_ros.success.calibration import HorizonCurve
 

@@ -103,7 +103,10 @@ def _import_bag(arguments: argparse.Namespace) -> int:
 
 
 def _robot_of_bags(arguments: argparse.Namespace, mapping: BagMapping, bag: Path) -> Path:
-    """The robot's YAML; that of the first bag's `/robot_description` is written into OUT."""
+    """Return the robot's YAML.
+
+    That of the first bag's `/robot_description` is written into OUT.
+    """
     from mtv_world_ros.importing.bags import described_robot
     from mtv_world_ros.robot.file import robot_path
 

@@ -93,7 +93,7 @@ def _given(value: Any, default: Any) -> Any:
 
 
 def _line(report: PartReport) -> str:
-    """Summary of the tensors of a part, as text lines."""
+    """Return the summary of the tensors of a part, as text lines."""
     size = f'{report.loaded} tensors, {report.parameters / 1e6:.1f} M parameters'
     lines = [f'{report.part}: {size} ({", ".join(report.dtypes)}) from {report.source}']
     lines += [f'  new, zero: {name}' for name in report.new]

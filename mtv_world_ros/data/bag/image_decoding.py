@@ -225,7 +225,7 @@ def _decode(layout: str, data: NDArray[np.uint8], mode: int) -> NDArray[Any]:
 
 
 def _check_jpeg(layout: str, data: NDArray[np.uint8]) -> ByteArray:
-    """(H, W, 3) RGB; a decoder's warning that data are missing counts as damage."""
+    """Return (H, W, 3) RGB; a decoder's warning that data are missing counts as damage."""
     content = data.tobytes()
     try:
         return simplejpeg.decode_jpeg(content, 'RGB')
@@ -260,7 +260,10 @@ def _check_size(layout: str, data: NDArray[np.uint8]) -> None:
 
 
 def _png_size(content: bytes) -> tuple[int, int]:
-    """Width and height [px]; IndexError where a part of the file does not match its checksum."""
+    """Return the width and height [px].
+
+    IndexError where a part of the file does not match its checksum.
+    """
     position, kind = 8, b''
     while kind != b'IEND':
         length, kind = struct.unpack_from('>I4s', content, position)

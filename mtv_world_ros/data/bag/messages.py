@@ -86,12 +86,12 @@ def type_hash(msgtype: str) -> str:
 
 
 def serialize(msgtype: str, message: object) -> bytes:
-    """CDR bytes, encapsulation header included."""
+    """Return the CDR bytes, encapsulation header included."""
     return bytes(typestore().serialize_cdr(message, check_type(msgtype)))
 
 
 def deserialize(msgtype: str, data: bytes) -> Any:
-    """Typed message of CDR bytes; surplus bytes at the end are ignored.
+    """Return the typed message of CDR bytes; surplus bytes at the end are ignored.
 
     Some writers record up to a few bytes more than the message has (rclpy's
     `serialize_message` does where trailing float64 sequences are empty).
@@ -119,7 +119,7 @@ def make(msgtype: str, **fields: Any) -> Any:
 
 
 def make_header(stamp_ns: int, frame_id: str) -> Any:
-    """std_msgs/Header.
+    """Return the std_msgs/Header.
 
     Raises:
         EpisodeError: the stamp does not fit builtin_interfaces/Time.
@@ -140,7 +140,7 @@ def _make_time(stamp_ns: int, kind: str) -> Any:
 
 
 def make_image(stamp_ns: int, frame_id: str, pixels: NDArray[np.uint8]) -> Any:
-    """sensor_msgs/Image of (H, W, 3) uint8 RGB as rgb8, or of (H, W) uint8 as mono8."""
+    """Return the sensor_msgs/Image of (H, W, 3) uint8 RGB as rgb8, or of (H, W) uint8 as mono8."""
     height, width = pixels.shape[:2]
     return make(
         IMAGE,
@@ -155,13 +155,13 @@ def make_image(stamp_ns: int, frame_id: str, pixels: NDArray[np.uint8]) -> Any:
 
 
 def make_compressed(stamp_ns: int, frame_id: str, data: bytes, layout: str = JPEG) -> Any:
-    """sensor_msgs/CompressedImage of a JPEG or PNG file; `layout` is its `format`."""
+    """Return the sensor_msgs/CompressedImage of a JPEG or PNG file; `layout` is its `format`."""
     header, content = make_header(stamp_ns, frame_id), np.frombuffer(data, np.uint8)
     return make(COMPRESSED_IMAGE, header=header, format=layout, data=content)
 
 
 def make_camera_info(stamp_ns: int, camera: CameraModel, frame_id: str) -> Any:
-    """sensor_msgs/CameraInfo of a camera; R is the identity, P = [K 0]."""
+    """Return the sensor_msgs/CameraInfo of a camera; R is the identity, P = [K 0]."""
     coefficients = camera.distortion if len(camera.distortion) else np.zeros(5)
     return make(
         CAMERA_INFO,
@@ -189,7 +189,7 @@ def make_camera_info(stamp_ns: int, camera: CameraModel, frame_id: str) -> Any:
 def make_joint_state(
     stamp_ns: int, names: Sequence[str], positions: ArrayLike, velocities: ArrayLike | None = None
 ) -> Any:
-    """sensor_msgs/JointState; positions, velocities (J,) [rad or m, rad/s or m/s]."""
+    """Return the sensor_msgs/JointState; positions, velocities (J,) [rad or m, rad/s or m/s]."""
     given = {'position': positions, 'velocity': () if velocities is None else velocities}
     arrays = {key: np.array(value, np.float64) for key, value in given.items()}
     for key, array in arrays.items():
@@ -200,7 +200,7 @@ def make_joint_state(
 
 
 def make_pose_array(stamp_ns: int, frame_id: str, poses: ArrayLike) -> Any:
-    """geometry_msgs/PoseArray of poses (O, 4, 4) in a frame."""
+    """Return the geometry_msgs/PoseArray of poses (O, 4, 4) in a frame."""
     items = []
     for pose in np.asarray(poses, np.float64).reshape(-1, 4, 4):
         x, y, z, w = quaternion(pose[:3, :3])
@@ -223,7 +223,7 @@ def parse_pose_array(message: Any) -> NDArray[np.float64]:
 
 
 def parse_pose(item: Any) -> NDArray[np.float64]:
-    """Pose (4, 4) of a geometry_msgs/Pose.
+    """Return the pose (4, 4) of a geometry_msgs/Pose.
 
     Raises:
         ValueError: its quaternion is zero.
@@ -236,7 +236,7 @@ def parse_pose(item: Any) -> NDArray[np.float64]:
 
 
 def make_tf(stamp_ns: int, parent: str, child: str, T_parent_child: ArrayLike) -> Any:
-    """tf2_msgs/TFMessage with one transform."""
+    """Return the tf2_msgs/TFMessage with one transform."""
     T = np.asarray(T_parent_child, np.float64)
     x, y, z, w = quaternion(T[:3, :3]).tolist()
     place = dict(zip('xyz', T[:3, 3].tolist(), strict=True))
@@ -254,7 +254,7 @@ def make_tf(stamp_ns: int, parent: str, child: str, T_parent_child: ArrayLike) -
 
 
 def make_joint_trajectory(stamp_ns: int, trajectory: JointTrajectory) -> Any:
-    """trajectory_msgs/JointTrajectory that starts at `stamp_ns`."""
+    """Return the trajectory_msgs/JointTrajectory that starts at `stamp_ns`."""
     empty = np.empty(0)
     rates = trajectory.velocities
     points = [

@@ -70,7 +70,7 @@ def bag_information(
     last_ns: int,
     custom_data: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Content of `rosbag2_bagfile_information` for a bag of one MCAP file."""
+    """Return the content of `rosbag2_bagfile_information` for a bag of one MCAP file."""
     count = sum(topic.message_count for topic in topics)
     span = {
         'starting_time': {'nanoseconds_since_epoch': first_ns},

@@ -89,7 +89,7 @@ class BagReader:
         self._files = self._find_files()
 
     def topics(self) -> dict[str, str]:
-        """Message type of every topic that has messages, in order of first appearance."""
+        """Return message type of every topic that has messages, in order of first appearance."""
         return {message.topic: message.msgtype for message in self.messages()}
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
@@ -373,7 +373,7 @@ def _unpacked(message: BagMessage) -> BagMessage:
 
 
 def _split(records: bytes) -> Iterator[tuple[int, bytes]]:
-    """Whole records in a decompressed chunk."""
+    """Yield the whole records in a decompressed chunk."""
     position = 0
     while position + _RECORD.size <= len(records):
         opcode, length = _RECORD.unpack_from(records, position)

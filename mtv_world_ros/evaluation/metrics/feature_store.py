@@ -53,7 +53,7 @@ def _check(real: FloatArray, predicted: FloatArray) -> None:
 
 
 def _moments(features: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean (D,) and A (at most min(N, D) rows) with A^T A the sample covariance."""
+    """Return the mean (D,) and A (at most min(N, D) rows) with A^T A the sample covariance."""
     features = np.asarray(features, np.float64)
     mean = features.mean(0)
     root = (features - mean) / np.sqrt(len(features) - 1)

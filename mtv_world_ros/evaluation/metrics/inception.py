@@ -222,7 +222,7 @@ class InceptionV3(nn.Module):
 
 
 def _resized(images: Tensor) -> Tensor:
-    """Bilinear, corner to corner of the first pixels: pixel i lies at i * size / 299."""
+    """Resize bilinearly, corner to corner of the first pixels: pixel i lies at i * size / 299."""
     rows, columns = (_weights(count, images) for count in images.shape[2:])
     return rows @ images @ columns.T
 

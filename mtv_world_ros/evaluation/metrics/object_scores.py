@@ -110,7 +110,7 @@ def _boundary_f(pred: BoolArray, true: BoolArray, disk: np.ndarray) -> float:
 
 
 def _boundary(mask: BoolArray) -> BoolArray:
-    """The pixels that differ from the one to the right, below, or both (DAVIS, `seg2bmap`)."""
+    """Return pixels that differ from the one to the right, below, or both (DAVIS, `seg2bmap`)."""
     right, below, corner = mask.copy(), mask.copy(), mask.copy()
     right[:, :-1], below[:-1], corner[:-1, :-1] = mask[:, 1:], mask[1:], mask[1:, 1:]
     found = (mask ^ right) | (mask ^ below) | (mask ^ corner)

@@ -155,7 +155,7 @@ def _prior_of_groupings(num: int) -> FloatArray:
 def _choose(
     likelihood: FloatArray, num: int, rng: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
-    """Grouping and point of the grid of each draw, by their (Q, N) posterior."""
+    """Return the grouping and point of the grid of each draw, by their (Q, N) posterior."""
     share = np.exp(likelihood - likelihood.max()).cumsum()
     at = (np.arange(num) + rng.random(num)) / num * share[-1]
     found = np.minimum(np.searchsorted(share, at), len(share) - 1)

@@ -110,7 +110,7 @@ def summarise(episodes: Sequence[dict[str, float]]) -> dict[str, Estimate]:
 
 
 def _estimate(values: FloatArray, weights: FloatArray, limits: Interval) -> Estimate:
-    """The ratio of the sums of (E,) values and weights, over the episodes that have both."""
+    """Return ratio of the sums of (E,) values and weights, over the episodes that have both."""
     known = np.isfinite(values) & np.isfinite(weights)
     sums, counts = (np.where(known, found, 0.0)[:, None] for found in (values, weights))
     mean, ends = mean_interval(sums, counts, low=limits[0], high=limits[1])

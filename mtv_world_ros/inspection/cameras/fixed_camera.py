@@ -264,7 +264,7 @@ class FixedCamera:
         return Changes(camera=small, pairs=self.pairs, seen=seen, blur=blur, deviation=deviation)
 
     def fit(self, T: FloatArray, changes: Changes) -> float:
-        """Correlation of drawn and seen changes, -1 .. 1."""
+        """Return the correlation of drawn and seen changes, -1 .. 1."""
         drawn = self._drawn(T, changes).ravel().astype(np.float64)
         drawn -= drawn.mean()
         along = np.dot(drawn, changes.seen.ravel().astype(np.float64))
@@ -334,7 +334,7 @@ class FixedCamera:
     def _linearized(
         self, T: FloatArray, changes: Changes
     ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
-        """Errors (N,), their weights (N,), and their change by each of `UNITS` (6, N)."""
+        """Return errors (N,), their weights (N,), and their change by each of `UNITS` (6, N)."""
         errors = self.errors(T, changes).ravel()
         slopes = np.stack(
             [(self.errors(moved(T, row, self.centre), changes)
@@ -371,7 +371,10 @@ class FixedCamera:
     def _refined(
         self, T: FloatArray, changes: Changes, steps: FloatArray, evaluations: int = 220
     ) -> FloatArray:
-        """The pose nearby that fits best; `steps` (6, 6) are the first ones, in rows [rad, m]."""
+        """Return the pose nearby that fits best.
+
+        `steps` (6, 6) are the first ones, in rows [rad, m].
+        """
         result = minimize(
             lambda p: -self.fit(moved(T, p @ steps, self.centre), changes),
             np.zeros(6),

@@ -277,7 +277,10 @@ class JointCamera:
         return self._spread(first, T, np.append(best.x[6:], middle[2]), places)
 
     def _turn(self, a: int, b: int, places: CameraPlaces, focal: FloatArray) -> FloatArray:
-        """(3, 3) that takes rays of recording a to those of b; by a third one where none match."""
+        """Return (3, 3) that takes rays of recording a to those of b.
+
+        By a third one where none match.
+        """
         if places.place[a] == places.place[b]:
             return np.eye(3)
         width = self._recordings[0].camera.width
@@ -458,7 +461,7 @@ class JointCamera:
         return np.stack([*turns, *bends]) / 2
 
     def _steps(self, state: JointState, changes: Mapping[int, Changes]) -> dict[int, _Step]:
-        """Normal equations by place."""
+        """Return the normal equations by place."""
         found: dict[int, _Step] = {}
         for number in changes:
             place = self._places[number]

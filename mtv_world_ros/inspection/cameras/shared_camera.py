@@ -59,7 +59,9 @@ _OUTLIER_MIN_ERROR = 0.01
 
 
 def expected_within(apart_px: FloatArray) -> float:
-    """Distance from where it is within which 95 % of tool points are drawn [px]; NaN = not known.
+    """Return the distance from where it is within which 95 % of tool points are drawn [px].
+
+    NaN = not known.
 
     Args:
         apart_px: (N,) of points that were not fitted to, taken for normal in x and y.
@@ -249,7 +251,7 @@ class _Together:
             )
 
     def _with_places(self) -> Iterator[tuple[_View, int]]:
-        """Each view with the number of its first place."""
+        """Return each view with the number of its first place."""
         return zip(self._each, self._places, strict=False)
 
     def found(self, guess: bool, seed: int) -> list[JointState]:
@@ -368,7 +370,7 @@ def _strays(
 
 
 def _apart(point: SeenPoint, camera: CameraModel) -> float:
-    """Distance of a tool point, as it is drawn, from where it was seen [px]."""
+    """Return the distance of a tool point, as it is drawn, from where it was seen [px]."""
     pixels, _ = project(camera, camera.T_mount_camera[None], point.position[None])
     return float(np.linalg.norm(pixels[0] - point.pixel))
 

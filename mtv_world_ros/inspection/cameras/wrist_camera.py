@@ -236,7 +236,7 @@ class WristCamera:
         return T, float(np.median(np.linalg.norm(self._errors(T), axis=-1)))
 
     def _standard_errors(self, T: FloatArray, scale_px: float) -> tuple[float, float]:
-        """By leaving out a block of neighbouring stretches at a time [mm, degrees]."""
+        """Return standard errors [mm, degrees] by leaving out neighbouring stretches in turn."""
         step = 1e-2
         slopes = np.stack(
             [
@@ -289,7 +289,10 @@ def find_mount(tracks: SceneTracks, camera: CameraModel, robot: RobotModel) -> C
 
 
 def _rotation_between(turns: FloatArray) -> FloatArray | None:
-    """(3, 3) that takes the second vectors of (N, 2, 3) to the first; None where not unique."""
+    """Return (3, 3) that takes the second vectors of (N, 2, 3) to the first.
+
+    None where not unique.
+    """
     u, s, vt = np.linalg.svd(np.einsum('ni,nj->ij', turns[:, 0], turns[:, 1]))
     if s[1] < 0.02 * s[0]:
         return None

@@ -306,7 +306,9 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         text: Tensor,
         image: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """(B, K, D) embeddings and (B, K, 6, D) modulations of K noise levels; text; images.
+        """Return (B, K, D) embeddings and (B, K, 6, D) modulations of K noise levels; text.
+
+        Images.
 
         K is 2 with a history, whose level comes last, else 1.
         """

@@ -342,7 +342,7 @@ def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> Contact
 
 
 def _unhidden(episode: Episode, views: Sequence[str], num_rows: int) -> BoolArray:
-    """(1 + T, O) whether all views show about as much of an object as at first."""
+    """Return (1 + T, O) whether all views show about as much of an object as at first."""
     assert episode.masks is not None
     count = len(episode.info.objects)
     areas = []
@@ -514,7 +514,7 @@ def _populations(
     report: Callable[[str], None],
     progress: Callable[[Sequence[int]], Iterable[int]],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Draws (N, P) as logarithms, their log likelihoods (N, E), and weights (N,)."""
+    """Draw (N, P) as logarithms, their log likelihoods (N, E), and weights (N,)."""
     low, high = np.log(np.array(list(RANGES.values())).T)
     uniform = -float(np.log(high - low).sum())
     middle = np.log([1.0 if n in _FACTORS else getattr(first, n) for n in RANGES])
@@ -555,7 +555,7 @@ def _populations(
 
 
 def _weights(likelihoods: FloatArray, others: FloatArray) -> tuple[FloatArray, float]:
-    """Weights (N,) of draws, which sum to 1, and the share of the likelihood that counts.
+    """Return weights (N,) of draws, which sum to 1, and the share of the likelihood that counts.
 
     Foresight is rough whatever the settings, which a likelihood of many recordings does not know:
     few draws would decide. So as much of it counts as leaves enough draws (tempering).
@@ -573,13 +573,13 @@ def _weights(likelihoods: FloatArray, others: FloatArray) -> tuple[FloatArray, f
 
 
 def _covariance(draws: FloatArray, weights: FloatArray) -> FloatArray:
-    """(P, P) of draws (N, P) with weights (N,)."""
+    """Return (P, P) of draws (N, P) with weights (N,)."""
     off = draws - weights @ draws
     return (weights * off.T) @ off
 
 
 def _conditional(draws: FloatArray, weights: FloatArray) -> FloatArray:
-    """(P,) standard deviations of numbers if the others are known, of draws (N, P)."""
+    """Return (P,) standard deviations of numbers if the others are known, of draws (N, P)."""
     covariance = _covariance(draws, weights)
     floor = 1e-9 * np.eye(len(covariance))
     return np.asarray(np.diag(np.linalg.inv(covariance + floor)) ** -0.5, np.float64)
@@ -591,7 +591,7 @@ def _effective_draws(weights: FloatArray) -> float:
 
 
 def _settings(first: ContactSettings, logs: FloatArray) -> ContactSettings:
-    """Settings of a draw (P,)."""
+    """Return the settings of a draw (P,)."""
     numbers = dict(zip(RANGES, np.exp(logs).tolist(), strict=True))
     values = {name: numbers[name] * scale for name, scale in _scales(first).items()}
     heavier, stiffer = values['density'] / first.density, numbers['finger_stiffness']
@@ -720,7 +720,7 @@ def find_delay(recordings: Sequence[ContactRecording], arms: Arms) -> FittedNumb
 
 
 def _delay_errors(recording: ContactRecording, arms: Arms) -> FloatArray:
-    """Error of the joints by delay; NaN = they do not move."""
+    """Return the error of the joints by delay; NaN = they do not move."""
     expected = recording.positions
     if arms.response is not None:
         free = replace(arms.response, floor=None)
@@ -750,7 +750,7 @@ def find_cameras(recordings: Sequence[ContactRecording]) -> FittedNumber:
 
 
 def _ray_gaps(frame: FirstFrame) -> list[float]:
-    """By how far the views' rays to each object pass each other [m]; NaN = it does not tell.
+    """Return the gaps between the views' rays to each object [m]; NaN = not known.
 
     What the middle of a mask is uncertain by is left out, so that it is 0 where cameras are right.
     """
@@ -792,7 +792,7 @@ def _resampled(
     counted: str,
     middle: Callable[..., Any],
 ) -> FittedNumber:
-    """The `middle` of (E, ...) known rows, with an interval from resampled ones.
+    """Return the `middle` of (E, ...) known rows, with an interval from resampled ones.
 
     `of` rows were looked at; `counted` is what they are.
     """

@@ -122,7 +122,7 @@ def recorded_positions(
 
 
 def _masks_at(episode: Episode, views: Sequence[str], stamp_ns: float) -> BoolArray:
-    """(V, O, H, W) nearest to a stamp."""
+    """Return (V, O, H, W) nearest to a stamp."""
     assert episode.masks is not None
     ids = []
     for view in views:

@@ -88,11 +88,11 @@ class Timeline:
         return cls(bag_ns, steady_ns, rate, time.time_ns() - steady_ns)
 
     def due(self, bag_ns: int) -> int:
-        """Monotonic time at which a bag time is due [ns]."""
+        """Return the monotonic time at which a bag time is due [ns]."""
         return self.steady_ns + round((bag_ns - self.bag_ns) / self.rate)
 
     def bag_time(self, steady_ns: int) -> int:
-        """Bag time of a monotonic time [ns]."""
+        """Return the bag time of a monotonic time [ns]."""
         return self.bag_ns + round((steady_ns - self.steady_ns) * self.rate)
 
     def stamp(self, bag_ns: int) -> int:
@@ -202,7 +202,10 @@ class Player(Node):
             raise TrajectoryError('\n'.join(filter(None, (failed, self._hint))))
 
     def _chosen(self, types: dict[str, str]) -> list[str]:
-        """Topics to play; those whose type is not installed are left out, unless named."""
+        """Return the topics to play.
+
+        Those whose type is not installed are left out, unless named.
+        """
         options = self._options
         unknown = [topic for topic in options.topics if topic not in types]
         if unknown:
@@ -283,7 +286,7 @@ class Player(Node):
         self._wait_until_settled(end_s)
 
     def _unsubscribed(self, topics: list[str]) -> list[str]:
-        """Topics without a subscriber, by the ROS graph and by other nodes' diagnostics."""
+        """Return topics without a subscriber, by the ROS graph and by other nodes' diagnostics."""
         unsubscribed = [topic for topic in topics if not self.count_subscribers(topic)]
         if self._options.lock_step and not unsubscribed:
             node = self.resolve_topic_name(self._options.report_topic).rpartition('/')[0]
@@ -324,7 +327,7 @@ class Player(Node):
                 self._wait_for_answer(timeline, message.stamp_ns, stamp_ns)
 
     def _messages(self) -> Iterator[BagMessage]:
-        """Messages from start to end, and latched ones before the start."""
+        """Yield the messages from start to end, and latched ones before the start."""
         first_ns: int | None = None
         for message in in_order(self._reader.messages(tuple(self._outputs))):
             if first_ns is None:
@@ -364,7 +367,7 @@ class Player(Node):
                 publisher.wait_for_all_acked(Duration(seconds=4))
 
     def _wait_for_frames(self) -> None:
-        """In lock-step, advances the clock until the frames of the last answer are published."""
+        """Advance the clock, in lock-step, until the frames of the last answer are published."""
         end_s = time.monotonic() + self._options.answer_timeout
         timeline = self._timeline if self._options.lock_step else None
         while self._unpublished and timeline is not None and time.monotonic() < end_s:

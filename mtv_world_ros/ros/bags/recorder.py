@@ -245,7 +245,7 @@ class Recorder(Node):
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """The command line."""
+    """Return the command line."""
     parser = argparse.ArgumentParser(prog='recorder', description=__doc__)
     add = parser.add_argument
     add('out', type=Path, help='folder to make; it appears when the record is complete')

@@ -32,7 +32,7 @@ MIN_STAMPED_BYTES = _OFFSET + 8
 
 @cache
 def message_class(msgtype: str) -> Any:
-    """Class of a type such as `sensor_msgs/msg/Image`.
+    """Return the class of a type such as `sensor_msgs/msg/Image`.
 
     Raises:
         EpisodeError: its package is not installed.
@@ -58,7 +58,7 @@ def read_stamp(data: bytes) -> int:
 
 
 def with_stamp(data: bytes, stamp_ns: int) -> bytes:
-    """The serialised message with another stamp."""
+    """Return the serialised message with another stamp."""
     changed = bytearray(data)
     struct.pack_into(_layout(data), changed, _OFFSET, *divmod(stamp_ns, NANO))
     return bytes(changed)
@@ -72,7 +72,7 @@ NANO = 1_000_000_000
 
 
 def to_ns(stamp: Time | Duration) -> int:
-    """Nanoseconds of a stamp or a duration."""
+    """Return the nanoseconds of a stamp or a duration."""
     return stamp.sec * NANO + stamp.nanosec
 
 
@@ -83,7 +83,7 @@ def to_stamp(stamp_ns: int) -> Time:
 
 
 def make_header(stamp_ns: int, frame_id: str = '') -> Header:
-    """A header with this stamp and frame."""
+    """Return a header with this stamp and frame."""
     return Header(stamp=to_stamp(stamp_ns), frame_id=frame_id)
 
 
@@ -98,7 +98,10 @@ def to_trajectory(message: JointTrajectoryMsg) -> JointTrajectory:
 
 
 def to_trajectory_message(trajectory: JointTrajectory, header: Header) -> JointTrajectoryMsg:
-    """Message of a trajectory whose times count from the header's stamp; inverse of the above."""
+    """Return the message of a trajectory whose times count from the header's stamp.
+
+    Inverse of the above.
+    """
     points = []
     for row, seconds in enumerate(trajectory.times):
         point = JointTrajectoryPoint(positions=array('d', trajectory.positions[row].tolist()))
@@ -155,12 +158,12 @@ def to_positions(message: JointState) -> dict[str, float]:
 
 
 def to_joint_state(names: Sequence[str], positions: FloatArray, header: Header) -> JointState:
-    """JointState of (J,) positions [rad or m]."""
+    """Return the JointState of (J,) positions [rad or m]."""
     return JointState(header=header, name=list(names), position=array('d', positions.tolist()))
 
 
 def to_multi_array(values: FloatArray, labels: Sequence[str]) -> Float32MultiArray:
-    """Row-major array, one label a dimension."""
+    """Return the row-major array, one label a dimension."""
     dimensions = [
         MultiArrayDimension(
             label=label, size=values.shape[axis], stride=int(np.prod(values.shape[axis:]))
@@ -172,7 +175,7 @@ def to_multi_array(values: FloatArray, labels: Sequence[str]) -> Float32MultiArr
 
 
 def to_text(value: object) -> str:
-    """A value as diagnostics show it: numbers short, lists joined by commas."""
+    """Return a value as diagnostics show it: numbers short, lists joined by commas."""
     if isinstance(value, float):
         return f'{value:.6g}'
     if isinstance(value, (list, tuple)):
@@ -183,7 +186,7 @@ def to_text(value: object) -> str:
 def to_status(
     name: str, hardware_id: str, level: bytes, message: str, values: Mapping[str, object]
 ) -> DiagnosticStatus:
-    """A diagnostic status with every value as text."""
+    """Return a diagnostic status with every value as text."""
     return DiagnosticStatus(
         level=level,
         name=name,
@@ -194,5 +197,5 @@ def to_status(
 
 
 def values_of(status: DiagnosticStatus) -> dict[str, str]:
-    """The key-value pairs of a status."""
+    """Return the key-value pairs of a status."""
     return {pair.key: pair.value for pair in status.values}

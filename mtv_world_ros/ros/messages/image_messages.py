@@ -45,14 +45,14 @@ def to_rgb(message: Image | CompressedImage) -> ByteArray:
 
 
 def _bytes(pixels: ByteArray) -> array[int]:
-    """The fastest type for `data` in rclpy: assigning an ndarray is a thousand times slower."""
+    """Return fastest type for `data` in rclpy: assigning an ndarray is a thousand times slower."""
     data = array('B')
     data.frombytes(np.ascontiguousarray(pixels).data)
     return data
 
 
 def to_image(pixels: ByteArray, header: Header) -> Image:
-    """Image of (H, W, 3) uint8 RGB as rgb8, or of (H, W) uint8 as mono8."""
+    """Return the image of (H, W, 3) uint8 RGB as rgb8, or of (H, W) uint8 as mono8."""
     channels = 3 if pixels.ndim == 3 else 1
     return Image(
         header=header,
@@ -66,7 +66,7 @@ def to_image(pixels: ByteArray, header: Header) -> Image:
 
 
 def to_compressed(rgb: ByteArray, header: Header, quality: int) -> CompressedImage:
-    """JPEG of (H, W, 3) uint8 RGB, with the `format` that image_transport writes."""
+    """Return the JPEG of (H, W, 3) uint8 RGB, with the `format` that image_transport writes."""
     bgr = np.ascontiguousarray(rgb[..., ::-1])
     _, data = cv2.imencode('.jpg', bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return CompressedImage(

@@ -61,7 +61,7 @@ class PolicySettings(NodeSettings):
 
 
 def chunk_stamps(start_ns: int, num_frames: int, fps: float) -> list[int]:
-    """Stamps of a chunk's frames [ns], from the stamp it starts at."""
+    """Return the stamps of a chunk's frames [ns], from the stamp it starts at."""
     return [start_ns + round((k + 1) / fps * NANO) for k in range(num_frames)]
 
 
@@ -92,7 +92,7 @@ class PredictedFrames:
             stored.clear()
 
     def missing(self, stamps: Sequence[int]) -> list[str]:
-        """Names of the frames at these stamps that were not received."""
+        """Return the names of the frames at these stamps that were not received."""
         streams = {**self._images, 'joint_states': self._joints}
         return [
             f'{name} at {stamp} ns'
@@ -102,12 +102,12 @@ class PredictedFrames:
         ]
 
     def unexpected(self, stamps: Sequence[int]) -> list[int]:
-        """Stamps of received images that are not among these."""
+        """Return the stamps of received images that are not among these."""
         found = {stamp for stored in self._images.values() for stamp in stored}
         return sorted(found - set(stamps))
 
     def observation(self, stamp_ns: int, before: Observation) -> Observation:
-        """The frames at a stamp as an observation, with the cameras of an earlier one.
+        """Return the frames at a stamp as an observation, with the cameras of an earlier one.
 
         Raises:
             Rejection: an image or the joint state cannot be read.
@@ -237,7 +237,7 @@ class PolicyLoop:
         self._out.report('ended', {**self._values(), **self._estimate, 'how': how, 'text': text})
 
     def on_answers(self) -> None:
-        """Handles the policy's answers."""
+        """Handle the policy's answers."""
         for answer in self._actor.take():
             if answer.ticket != self._ticket:
                 self._out.fault('late_answer', 'an answer came after its episode had ended')
@@ -249,7 +249,7 @@ class PolicyLoop:
                 self._execute(answer)
 
     def on_report(self, values: Mapping[str, str]) -> None:
-        """Handles a report of the world model about a rollout."""
+        """Handle a report of the world model about a rollout."""
         state, stamp = values.get('state', ''), values.get('trajectory_stamp_ns', '')
         if self.phase == 'idle':
             return
@@ -319,7 +319,10 @@ class PolicyLoop:
         self._out.send(first_part(answer.trajectory, start, seconds), stamp_ns)
 
     def _start_of(self, trajectory: JointTrajectory, observation: Observation) -> FloatArray:
-        """Measured positions of the trajectory's joints; its first row for joints of others."""
+        """Return the measured positions of the trajectory's joints.
+
+        Its first row for joints of others.
+        """
         seen = dict(zip(self._joint_names, observation.positions, strict=True))
         named = zip(trajectory.joint_names, trajectory.positions[0], strict=True)
         return np.array([seen.get(name, first) for name, first in named])

@@ -168,7 +168,7 @@ class PolicyNode(Node):
         ]
 
     def _unconnected(self) -> list[str]:
-        """Topics that the world model is not connected to: messages on them are lost."""
+        """Return topics that the world model is not connected to: messages on them are lost."""
         unconnected = [s.topic_name for s in self._predictions if not s.get_publisher_count()]
         return unconnected + (
             [] if self._plans.get_subscription_count() else [self._plans.topic_name]

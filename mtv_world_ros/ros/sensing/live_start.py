@@ -220,7 +220,7 @@ class LiveObserver(Node):
         return '; '.join(parts)
 
     def _start(self) -> EpisodeStart:
-        """The newest observation.
+        """Return the newest observation.
 
         Raises:
             Rejection: something is missing, stale, out of sync or changed.
@@ -280,7 +280,7 @@ class LiveObserver(Node):
         self._instruction = message.data
 
     def _now_ns(self) -> int:
-        """The node's time [ns].
+        """Return the node's time [ns].
 
         Raises:
             Rejection: it comes from /clock, and nothing came there.
@@ -293,12 +293,12 @@ class LiveObserver(Node):
         return now_ns
 
     def _image_names(self, view: str) -> tuple[str, str]:
-        """Names of a view's raw and compressed images."""
+        """Return the names of a view's raw and compressed images."""
         raw, compressed = f'{self._topics[view]}/image_raw', '/compressed'
         return self.resolve_topic_name(raw), self.resolve_topic_name(raw + compressed)
 
     def _image_topics(self, view: str) -> list[str]:
-        """Topics that a view's images come from; both where nobody publishes any."""
+        """Return the topics that a view's images come from; both where nobody publishes any."""
         raw, compressed = self._image_names(view)
         if view in self._compressed:
             return [compressed]

@@ -141,7 +141,7 @@ class ObservationBuffer:
             self._on_image(view, message)
 
     def _now_ns(self) -> int:
-        """The node's time [ns]; 0 = there is none."""
+        """Return the node's time [ns]; 0 = there is none."""
         return self._time.now_ns() if self._time is not None else 0
 
     def add_camera_info(
@@ -221,7 +221,10 @@ class ObservationBuffer:
         self._frames.clear()
 
     def ages(self, now_ns: int) -> Mapping[str, float]:
-        """Age [s] of the newest image of each view and of the oldest joint; NaN = none yet."""
+        """Return the age [s] of the newest image of each view and of the oldest joint.
+
+        NaN = none yet.
+        """
         ages = {
             f'image_age_s.{view}': _age(images, now_ns) for view, images in self._images.items()
         }
@@ -306,7 +309,7 @@ class ObservationBuffer:
                 )
 
     def _posed(self, camera: CameraModel, image: AnyImage) -> CameraModel:
-        """The camera with its pose at the image's time."""
+        """Return the camera with its pose at the image's time."""
         if self._pose is None:
             return camera
         frame = self._intrinsics.info(camera.view, image.header.frame_id).header.frame_id
@@ -316,7 +319,7 @@ class ObservationBuffer:
         return replace(camera, mount_link=mount.link, T_mount_camera=mount.T_link_frame)
 
     def _pick_images(self, now_ns: int, limits: ObservationSettings) -> list[tuple[int, AnyImage]]:
-        """Per view the image nearest to the newest moment that every view has seen.
+        """Return per view the image nearest to the newest moment that every view has seen.
 
         Where these are too far apart, because images were lost, the newest ones that are not.
         """
@@ -356,7 +359,7 @@ class ObservationBuffer:
         return picked
 
     def _positions(self, stamp_ns: int, now_ns: int, limits: ObservationSettings) -> FloatArray:
-        """(J,) positions nearest in time to the images."""
+        """Return (J,) positions nearest in time to the images."""
         missing = [name for name, samples in self._joints.items() if not samples]
         if missing:
             why = next((w for name in missing if (w := self._joints[name].refusal)), '')
@@ -378,7 +381,7 @@ def _refusal(samples: Samples[Any], what: str, stamp_ns: int, now_ns: int, limit
 
 
 def _because(refusal: str) -> str:
-    """The reason why newer samples were refused, to be appended to a text."""
+    """Return the reason why newer samples were refused, to be appended to a text."""
     return f'; the last one was refused: {refusal}' if refusal else ''
 
 
@@ -389,7 +392,7 @@ def _skew_s(images: Sequence[tuple[int, AnyImage]]) -> float:
 
 
 def _common_size(frames: Sequence[ByteArray], least: tuple[int, int]) -> tuple[int, int]:
-    """Width and height of the largest frame, shrunk to at most `_MOST_PIXELS`."""
+    """Return the width and height of the largest frame, shrunk to at most `_MOST_PIXELS`."""
     height, width = max((frame.shape[:2] for frame in frames), key=prod)
     shrink = min(1.0, sqrt(max(_MOST_PIXELS, prod(least)) / (width * height)))
     return max(round(shrink * width), 1), max(round(shrink * height), 1)
@@ -473,7 +476,7 @@ class Intrinsics:
             del self._changed[view]
 
     def camera(self, view: str, *, width: int, height: int) -> CameraModel:
-        """The view's camera, for images of this size.
+        """Return the view's camera, for images of this size.
 
         Raises:
             Rejection: its info is missing, changed, or for another size.
@@ -508,7 +511,7 @@ class Intrinsics:
         return [f"no camera_info of view '{view}'"]
 
     def info(self, view: str, frame_id: str) -> CameraInfo:
-        """The view's info, with the image's frame where the image names one."""
+        """Return the view's info, with the image's frame where the image names one."""
         info = self._shown[view]
         if frame_id in ('', info.header.frame_id):
             return info
@@ -611,7 +614,7 @@ def _are_equal(before: Iterable[CameraModel], now: Iterable[CameraModel]) -> boo
 
 
 def _differences(first: CameraInfo, later: CameraInfo) -> str:
-    """Differences between two infos of one camera, as text; empty = none."""
+    """Return the differences between two infos of one camera, as text; empty = none."""
     changes = []
     for field in _COMPARED:
         before, now = getattr(first, field), getattr(later, field)

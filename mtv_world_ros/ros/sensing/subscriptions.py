@@ -97,7 +97,7 @@ class Inputs:
         return self._watch.mismatches
 
     def unpublished(self) -> list[str]:
-        """Topics of observations that nobody publishes."""
+        """Return the topics of observations that nobody publishes."""
         return [s.topic for s in self._observations if not s.num_publishers]
 
     @property

@@ -175,7 +175,7 @@ class FollowJointTrajectory:
             self._events.give_up(request.rollout, goal.violation[1])
 
     def _outcome(self, goal: Goal, ended: Ended) -> tuple[str, str, str]:
-        """The goal's last event, the name of its code, and why in words."""
+        """Return the goal's last event, the name of its code, and why in words."""
         verdict = _verdict(ended)
         if goal.violation:
             code, text = goal.violation
@@ -244,7 +244,7 @@ def _code(reason: Reason | None) -> str:
 
 
 def _verdict(ended: Ended) -> str:
-    """State of the plan of a goal."""
+    """Return the state of the plan of a goal."""
     if ended.last is None:
         return 'nothing was imagined'
     prediction = ended.last.prediction

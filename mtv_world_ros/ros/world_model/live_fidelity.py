@@ -222,7 +222,7 @@ class LiveFidelity:
             frames.add(stamp_ns, small)
 
     def _due(self) -> Expected | None:
-        """A chunk whose last frame every view has passed."""
+        """Return a chunk whose last frame every view has passed."""
         newest = [frames.newest[0] if frames else -1 for frames in self._frames.values()]
         for expected in self._expected:
             if not expected.stamps or min(newest) >= expected.stamps[-1]:
@@ -273,7 +273,7 @@ class LiveFidelity:
         return seen.episode
 
     def _matched(self, stamps: Sequence[int]) -> tuple[list[int], ByteArray]:
-        """Imagined frames that every view has a real one for, and those (V, N, H, W, 3)."""
+        """Return imagined frames that every view has a real one for, and those (V, N, H, W, 3)."""
         indices, rows = [], []
         for index, stamp in enumerate(stamps):
             row = []

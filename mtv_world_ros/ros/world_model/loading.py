@@ -76,7 +76,7 @@ class AdapterSwitch:
         node.add_post_set_parameters_callback(self._take)
 
     def close(self) -> None:
-        """Listens to the parameter no more."""
+        """Listen to the parameter no more."""
         self._node.remove_on_set_parameters_callback(self._check)
         self._node.remove_post_set_parameters_callback(self._take)
 

@@ -53,7 +53,7 @@ class WorldModelNode(LifecycleNode):
         )
 
     def settings(self) -> Settings:
-        """The present parameters."""
+        """Return the present parameters."""
         return self._settings
 
     def start(self) -> None:
@@ -116,7 +116,7 @@ class WorldModelNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """A transition raised: frees the model; the node can be configured again."""
+        """Free the model after a transition raised; the node can be configured again."""
         self._release()
         return TransitionCallbackReturn.SUCCESS
 

@@ -149,7 +149,7 @@ class PredictionPublisher:
         )
 
     def subscriber_counts(self) -> dict[str, int]:
-        """Subscribers that each topic is connected to, as `subscribers.<topic>`."""
+        """Return the subscribers that each topic is connected to, as `subscribers.<topic>`."""
         outputs = [self._joints, self._success, self._jaccard]
         for offered in self._streams:
             outputs += [publisher for one in offered.values() for publisher in one.publishers]
@@ -180,7 +180,7 @@ class PredictionPublisher:
             frames.drop_others(None)
 
     def _offer(self, view: str, depth: int) -> dict[str, ImageStream]:
-        """The streams of a view that the parameters ask for, by name."""
+        """Return the streams of a view that the parameters ask for, by name."""
         settings = self._settings()
         names = ['predicted']
         names += ['trajectory'] if settings.publish_trajectory_video else []
@@ -333,7 +333,7 @@ def stamp_of(chunk: Chunk, index: int, stamp_mode: str) -> int:
 
 
 def _pixels(chunk: Chunk, stream: str, view: int, index: int) -> ByteArray:
-    """A frame of a stream, (H, W, 3) RGB or (H, W) labels."""
+    """Return a frame of a stream, (H, W, 3) RGB or (H, W) labels."""
     prediction = chunk.prediction
     if stream == 'mask':  # 0 = no object, i + 1 = object i; the later one where two overlap
         labels = np.zeros(prediction.masks.masks.shape[-2:], np.uint8)

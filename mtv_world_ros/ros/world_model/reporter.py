@@ -240,7 +240,7 @@ class Tally:
         return (level, ' | '.join(texts)) if texts else (DiagnosticStatus.OK, 'ready')
 
     def values(self, now_s: float) -> dict[str, object]:
-        """Keys and values: counts, `rejected.<reason>`, the last rejection, latencies."""
+        """Return keys and values: counts, `rejected.<reason>`, the last rejection, latencies."""
         values: dict[str, object] = dict(self.counts)
         values['rejected'] = sum(self._rejected.values())
         values |= {f'rejected.{reason}': n for reason, n in sorted(self._rejected.items())}
@@ -257,7 +257,7 @@ class Tally:
 
 
 def _chunk_values(chunk: Chunk, settings: Settings) -> dict[str, object]:
-    """Keys and values of a predicted chunk; stamps in ns, durations in s."""
+    """Return the keys and values of a predicted chunk; stamps in ns, durations in s."""
     prediction, request = chunk.prediction, chunk.request
     num_frames = len(prediction.video.times)
     frame_s = float(prediction.video.times[0] - prediction.trajectory_video.times[0])
@@ -281,7 +281,7 @@ def _chunk_values(chunk: Chunk, settings: Settings) -> dict[str, object]:
 
 
 def _sent_values(chunk: Chunk, sent: Sent) -> dict[str, object]:
-    """Keys and values of a chunk whose frames are out, or whose rest was dropped."""
+    """Return the keys and values of a chunk whose frames are out, or whose rest was dropped."""
     values = _chunk_identity(chunk)
     values |= {
         'frames_published': sent.num_frames,
@@ -359,7 +359,7 @@ def _success_values(success: SuccessEstimate) -> dict[str, object]:
 
 
 def _fidelity_values(scored: ScoredChunk) -> dict[str, object]:
-    """Keys and values of a chunk whose real frames came."""
+    """Return the keys and values of a chunk whose real frames came."""
     prediction = scored.chunk.prediction
     values: dict[str, object] = {
         **_request_values(scored.chunk.request),

@@ -326,7 +326,7 @@ class Rollouts:
         return silent or self._buffer.problems(self._node.get_clock().now().nanoseconds)
 
     def state(self) -> Mapping[str, object]:
-        """Keys and values for `/diagnostics`."""
+        """Return the keys and values for `/diagnostics`."""
         return {
             'mode': 'imagine' if self._maker.imagine else 'observe',
             'checkpoint': self.settings().checkpoint,
@@ -372,7 +372,7 @@ class Rollouts:
         self._maker.instruction = message.data
 
     def on_plan(self, plan: JointTrajectoryMsg | Goal, transport_s: float = 0.0) -> None:
-        """Queues a plan, so that images that came with it are stored before it is checked."""
+        """Queue a plan, so that images that came with it are stored before it is checked."""
         self._arrived.append(_Arrived(time.monotonic(), plan, transport_s))
         self._arrivals.trigger()
 
@@ -495,7 +495,7 @@ class Rollouts:
 
 
 def _entities(node: Node) -> dict[str, list[object]]:
-    """Everything the node has, by kind."""
+    """Return everything that the node has, by kind."""
     names = {kind: 'guards' if kind == 'guard_condition' else f'{kind}s' for kind in _ENTITIES}
     return {kind: list(getattr(node, name)) for kind, name in names.items()}
 

@@ -175,7 +175,7 @@ class RolloutWorker:
             return True
 
     def _new_thread(self) -> Thread:
-        """A daemon: one that is stuck does not keep the process from ending."""
+        """Return a daemon thread: one that is stuck does not keep the process from ending."""
         return Thread(target=self._run, name='rollouts', daemon=True)
 
     @property
@@ -361,7 +361,7 @@ class RolloutWorker:
     def _ended(
         self, request: Request, state: str, reason: Reason | None = None, text: str = ''
     ) -> Ended:
-        """The end of the running request, with what is known of it."""
+        """Return the end of the running request, with what is known of it."""
         known = self._known
         last = known[-1] if known else None
         return Ended(
@@ -396,7 +396,7 @@ class RolloutWorker:
                 self._put(chunk)
 
     def _options(self, request: Request) -> RolloutOptions:
-        """The options that the request asks for."""
+        """Return the options that the request asks for."""
         settings = request.settings
         return RolloutOptions(
             instruction=request.instruction,

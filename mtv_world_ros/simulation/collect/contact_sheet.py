@@ -58,7 +58,10 @@ def titled(text: str, picture: ByteArray) -> ByteArray:
 
 
 def _row(out: Path, pair: Sequence[CardEntry | None], num_frames: int, width: int) -> ByteArray:
-    """A success and a failure of one task side by side; a missing one leaves its place empty."""
+    """Return a success and a failure of one task side by side.
+
+    A missing one leaves its place empty.
+    """
     strips = [entry and film_strip(out / entry.name, num_frames, width) for entry in pair]
     shape = next(strip.shape for strip in strips if strip is not None)
     blocks = [
@@ -75,7 +78,7 @@ def _row(out: Path, pair: Sequence[CardEntry | None], num_frames: int, width: in
 def _pairs(
     entries: Iterable[CardEntry], count: int
 ) -> list[tuple[CardEntry | None, CardEntry | None]]:
-    """The first `count` successes and failures of every task and kind."""
+    """Return the first `count` successes and failures of every task and kind."""
     groups: dict[tuple[str, str], dict[str, list[CardEntry]]] = {}
     for entry in sorted(entries, key=lambda entry: entry.name):
         group = groups.setdefault((entry.zero_shot or '', entry.task), {o: [] for o in OUTCOMES})

@@ -99,7 +99,7 @@ def _named(names: Sequence[str]) -> str:
 
 
 def _zero_shot_numbers(groups: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, int]]:
-    """One command where the kinds took turns, else one for each kind."""
+    """Return one command where the kinds took turns, else one for each kind."""
     kinds = sorted(groups, key=lambda kind: -groups[kind]['episodes'])
     numbers = [groups[kind]['episodes'] for kind in kinds]
     if max(numbers) - min(numbers) <= 1:
@@ -137,7 +137,7 @@ def _cameras(cameras: Mapping[str, CameraModel]) -> Table:
 
 
 def _objects(entries: Iterable[CardEntry]) -> Table:
-    """Nouns and colours of all objects, by how often they occur."""
+    """Return the nouns and colours of all objects, by how often they occur."""
     nouns: Counter[str] = Counter()
     colours: dict[str, set[str]] = {}
     for entry in entries:

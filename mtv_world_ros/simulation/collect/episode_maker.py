@@ -116,7 +116,7 @@ class EpisodeMaker:
         )
 
     def _attempt(self, job: CollectJob, seed: int) -> tuple[SimEpisode, Take | None]:
-        """The episode of a seed; no take where its scene or plan is impossible."""
+        """Return the episode of a seed; no take where its scene or plan is impossible."""
         config = self._config
         task, randomization = variant(
             job.zero_shot, job.task, seed, config.randomization, config.zero_shot
@@ -137,7 +137,7 @@ class EpisodeMaker:
         return SimEpisode(self._robot, home, randomization, physics=physics)
 
     def _policy(self, job: CollectJob, seed: int) -> PolicyVariant | None:
-        """The scripted policy in place of the expert; None = the expert."""
+        """Return the scripted policy in place of the expert; None = the expert."""
         if self._config.kinds:
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
             return draw_variant(self._config.kinds, rng)

@@ -157,7 +157,7 @@ def carry_out(
     first: SimObservation,
     config: RecordConfig,
 ) -> Take:
-    """Runs commands open loop, as a controller would that is given the action chunks.
+    """Run commands open loop, as a controller would that is given the action chunks.
 
     Args:
         sim: has just been reset, or given a scene.

@@ -437,14 +437,14 @@ def _rotors(arms: Any, armature: FloatArray, fingers: Sequence[int]) -> FloatArr
 
 
 def _moving_nodes(arms: Any) -> list[Any]:
-    """Shapes of bodies that joints move."""
+    """Return the shapes of bodies that joints move."""
     bodies = map(arms.getBodyNode, range(arms.getNumBodyNodes()))
     moving = [body for body in bodies if body.getNumDependentGenCoords()]
     return [body.getShapeNode(k) for body in moving for k in range(body.getNumShapeNodes())]
 
 
 def _group(detector: Any, nodes: Iterable[Any]) -> Any:
-    """Shapes that are asked together what they touch."""
+    """Return the shapes that are asked together what they touch."""
     group = detector.createCollisionGroup()
     for node in nodes:
         group.addShapeFrame(node)
@@ -467,14 +467,14 @@ def _same_arm(arms: Any) -> list[tuple[Any, Any]]:
 
 
 def _cone() -> Any:
-    """A solver of contacts whose friction is the same in all directions."""
+    """Return a solver of contacts whose friction is the same in all directions."""
     options = dart.constraint.NsgsFrictionSolver.Options()
     options.maxSweeps, options.tolerance = _FRICTION_ITERATIONS, _FRICTION_TOLERANCE
     return dart.constraint.NsgsFrictionSolver(options)
 
 
 def _boxed(shape: Any) -> Any:
-    """A box in place of a cylinder or capsule; other shapes as they are."""
+    """Return a box in place of a cylinder or capsule; other shapes as they are."""
     caps = {'CylinderShape': 0.0, 'CapsuleShape': _CAPS_LENGTH}.get(shape.getType())
     if caps is None:
         return shape
@@ -520,7 +520,7 @@ def _add_pads(tree: ElementTree.Element, robot: RobotModel, grips: set[str]) -> 
 
 
 def _pad(arms: Any, name: str, settings: ContactSettings) -> Any:
-    """The joint of a pad, which does not give way yet."""
+    """Return the joint of a pad, which does not give way yet."""
     joint, stiffness = arms.getJoint(name), settings.pad_stiffness or 0.0
     joint.setLimitEnforcement(False)
     joint.setSpringStiffness(0, stiffness)
@@ -530,7 +530,7 @@ def _pad(arms: Any, name: str, settings: ContactSettings) -> Any:
 
 
 def _skeleton(robot: RobotModel, path: Path, tree: ElementTree.Element) -> tuple[Any, set[str]]:
-    """The robot's bodies, and the links that have an inertia in its description, of a file."""
+    """Return robot's bodies, and the links that have an inertia in its description, of a file."""
     loader = dart.utils.DartLoader()
     options = loader.getOptions()
     options.mDefaultRootJointType = dart.utils.DartLoaderRootJointType.FIXED
@@ -616,7 +616,7 @@ def _table(settings: ContactSettings) -> Any:
 
 
 def _body(number: int, solid: Solid, settings: ContactSettings, given: float) -> Any:
-    """A solid of a mass [kg], as it stands."""
+    """Return a solid of a mass [kg], as it stands."""
     skeleton = dart.dynamics.Skeleton(f'object {number}')
     joint, body = skeleton.createFreeJointAndBodyNodePair()
     parts = _parts(solid, settings)
@@ -667,7 +667,7 @@ def _parts(solid: Solid, settings: ContactSettings) -> list[_Part]:
 
 
 def _prism(wide: float, high: float, middle: float, mass: float) -> list[_Part]:
-    """Boxes through one axis, which are round together; at a height of their middle.
+    """Return the boxes through one axis, which are round together; at a height of their middle.
 
     They stand on one box within the round, which makes few contacts.
     """
@@ -699,7 +699,7 @@ def _vessel(wide: float, high: float, rim: float, density: float) -> list[_Part]
 
 
 def _tray(wide: float, long: float, high: float, settings: ContactSettings) -> list[_Part]:
-    """A box without a lid; it is heavy below."""
+    """Return a box without a lid; it is heavy below."""
     x, y, half, wall = wide / 2, long / 2, (high - _LIFT_M) / 2, settings.wall_m / 2
     walls = (
         ((wall, y, half), (x - wall, 0.0)),

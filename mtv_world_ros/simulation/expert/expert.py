@@ -364,7 +364,7 @@ class Expert:
     def _place(
         self, pick: Pick, move: PickPlace, now: dict[str, SceneObject], goal: Place
     ) -> tuple[FloatArray, float]:
-        """Tool position and yaw at which the subject is let go."""
+        """Return the tool position and yaw at which the subject is let go."""
         subject, turned, rest = now[move.subject], pick.yaw, np.asarray(goal)
         if move.rest != 'table':
             reference = now[move.reference]
@@ -386,7 +386,7 @@ class Expert:
     def _pace(
         self, arm: str, usual: list[WayPoint], rng: np.random.Generator, *, alone: bool
     ) -> tuple[float, float]:
-        """The drawn motion time, and what the usual way points take before scaling [s]."""
+        """Return the drawn motion time, and what the usual way points take before scaling [s]."""
         wanted = rng.uniform(*(self._config.motion_s if alone else self._config.motions_s))
         return wanted, sum(self._timed(usual, self.workcell.home_tools[arm]))
 
@@ -404,7 +404,7 @@ class Expert:
         return waits, rows_of_visits
 
     def _late(self, seconds: float, pace: tuple[float, float]) -> int:
-        """Rows until an unscaled time [s]; 0 if it is negative."""
+        """Return the rows until an unscaled time [s]; 0 if it is negative."""
         return max(round(seconds * pace[0] / pace[1] * self._config.rate_hz), 0)
 
     def _rests(self, arm: str) -> WayPoint:
@@ -428,7 +428,7 @@ class Expert:
                 share = max(share - _SHORTENING_STEP, 0.0)
 
     def _follow(self, arm: str, stops: list[WayPoint], pace: tuple[float, float]) -> FloatArray:
-        """Minimum-jerk blends between way points, at a pace."""
+        """Return the minimum-jerk blends between way points, at a pace."""
         config = self._config
         home = self._rests(arm)
         seconds, (wanted, unscaled) = self._timed(stops, home.position), pace

@@ -87,7 +87,7 @@ class ScriptedPolicy:
         return self._plan
 
     def reset(self, *, seed: int) -> None:
-        """Plans the next episode.
+        """Plan the next episode.
 
         Args:
             seed: of the plan's tempo and heights, and of the faults.
@@ -160,7 +160,7 @@ class ScriptedPolicy:
     def _intentions(
         self, rng: np.random.Generator, *, is_wrong: bool
     ) -> Iterator[tuple[Task, Scene]]:
-        """Tasks and scenes that it may plan for, in order of preference."""
+        """Yield the tasks and scenes that it may plan for, in order of preference."""
         if not is_wrong:
             size = self.variant.size('goal_object_moved_after')
             yield self._with_goal_object_moved(size, rng) if size else (self.task, self.scene)
@@ -199,7 +199,7 @@ class ScriptedPolicy:
         )
 
     def _wrong_moves(self, move: Move, rng: np.random.Generator) -> list[Move]:
-        """The move with another object: put where the right one belongs, else put back."""
+        """Return the move with another object: put where the right one belongs, else put back."""
         others = [
             item.role
             for item in self.scene.objects
@@ -215,7 +215,7 @@ class ScriptedPolicy:
         return [move.replace(subject=other, reference=reference), back]
 
     def _seen(self, scene: Scene, rng: np.random.Generator) -> Scene:
-        """The scene with the policy's errors of object and goal positions."""
+        """Return the scene with the policy's errors of object and goal positions."""
         subjects = {move.subject for move in self.task.moves}
 
         def moved(place: Place, deviation: float) -> Place:
@@ -283,7 +283,7 @@ def policy_of_recording(
 
 
 def _velocities(plan: JointTrajectory, times: FloatArray) -> FloatArray:
-    """(N, J) commanded velocities at the times; none after the end."""
+    """Return (N, J) commanded velocities at the times; none after the end."""
     assert plan.velocities is not None
     columns = [np.interp(times, plan.times, column, right=0.0) for column in plan.velocities.T]
     return np.stack(columns, axis=1)

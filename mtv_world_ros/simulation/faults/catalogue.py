@@ -103,7 +103,10 @@ class FaultKind(Schema):
 
 
 def _read() -> dict[str, FaultKind]:
-    """All kinds; `defaults` of a file hold for its entries where these do not say otherwise."""
+    """Return all kinds.
+
+    `defaults` of a file hold for its entries where these do not say otherwise.
+    """
     kinds: dict[str, FaultKind] = {}
     for name in _FILES:
         path = share_path('config', 'faults', f'{name}.yaml')

@@ -92,7 +92,7 @@ def _read(at: FloatArray, positions: FloatArray) -> FloatArray:
 
 
 def _blended(before: FloatArray, rest: FloatArray, num: int) -> FloatArray:
-    """(N, J) `rest`, to which a row before (J,) passes within `num` rows."""
+    """Return (N, J) `rest`, to which a row before (J,) passes within `num` rows."""
     whole, num = rest.copy(), min(num, len(rest))
     blend = (np.arange(1, num + 1) / num)[:, None] if num else np.zeros((0, 1))
     whole[:num] = (1 - blend) * before + blend * whole[:num]
@@ -116,7 +116,7 @@ def lead(c: Commands, size: float, rng: Rng) -> FloatArray:
 
 
 def _followed(c: Commands, rule: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
-    """(T, J) of joints whose next position follows from their last one and the command."""
+    """Return (T, J) of joints whose next position follows from their last one and the command."""
     whole = c.positions.copy()
     for row in range(1, len(whole)):
         whole[row] = rule(whole[row - 1], c.positions[row])

@@ -78,7 +78,7 @@ def drawn_values(name: str) -> dict[str, Any]:
 
 
 def _edit(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
-    """A step that changes way points, and its description."""
+    """Return a step that changes way points, and its description."""
     parts = _parts()
     way = str(rng.choice(parts['directions']))
     far = _round(rng.uniform(0.2, 0.8) if way == 'other' else rng.uniform(0.015, 0.06))
@@ -110,7 +110,7 @@ def _edit(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
 
 
 def _scaled(step: Any, far: float) -> Any:
-    """A step whose lengths [0, k] are [0, k * far]."""
+    """Return a step whose lengths [0, k] are [0, k * far]."""
     match step:
         case dict():
             return {key: _scaled(value, far) for key, value in step.items()}
@@ -122,7 +122,7 @@ def _scaled(step: Any, far: float) -> Any:
 
 
 def _command(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
-    """A step that changes commands, and its description."""
+    """Return a step that changes commands, and its description."""
     commands = _parts()['commands']
     drawn = commands[int(rng.integers(len(commands)))]
     name, options = drawn['step'], drawn.get('options', {})

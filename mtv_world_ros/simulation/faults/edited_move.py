@@ -117,7 +117,10 @@ class EditedMove:
         return total
 
     def _direction(self, name: str, stop: WayPoint) -> FloatArray:
-        """A direction or way (3,) by name; `drawn_1` and `drawn_2` are two draws of `drawn`."""
+        """Return a direction or way (3,) by name.
+
+        `drawn_1` and `drawn_2` are two draws of `drawn`.
+        """
         of = name.rstrip('_123')
         if of in WAYS_OF_STOPS:
             return WAYS_OF_STOPS[of](self, stop)
@@ -170,21 +173,24 @@ def _anew(move: EditedMove) -> float:
 
 
 def _towards(move: EditedMove, begin: str, end: str, other: OfMove) -> FloatArray:
-    """Unit vector in the plane between way points; `other` if they are within the size."""
+    """Return the unit vector in the plane between way points.
+
+    `other` if they are within the size.
+    """
     way = _between(move, begin, end) * FLAT
     distance = float(np.linalg.norm(way))
     return way / distance if distance > move.size else other(move)
 
 
 def _to_other(move: EditedMove) -> FloatArray:
-    """Way in the plane from the grasp to the nearest other object; zero without one."""
+    """Return the way in the plane from the grasp to the nearest other object; zero without one."""
     ways = [(place - move.stop('close').position) * FLAT for place in move.draws.objects]
     others = [way for way in ways if np.linalg.norm(way) > _OWN_M]
     return min(others, key=np.linalg.norm, default=np.zeros(3))
 
 
 def _shortened(way: FloatArray, size: float) -> FloatArray:
-    """Unit vector of a way, or less where that is shorter than the size."""
+    """Return the unit vector of a way, or less where that is shorter than the size."""
     return way / max(float(np.linalg.norm(way)), size)
 
 
@@ -199,7 +205,7 @@ def _to_floor(move: EditedMove) -> FloatArray:
 
 
 def _other_arm(move: EditedMove) -> FloatArray:
-    """Unit vector in the plane from the arm's rest to the other arm's."""
+    """Return the unit vector in the plane from the arm's rest to the other arm's."""
     other = move.draws.other_home
     return np.zeros(3) if other is None else unit((other - move.stops[-1].position) * FLAT)
 
@@ -210,13 +216,13 @@ def unit(way: FloatArray) -> FloatArray:
 
 
 def _wandering(move: EditedMove, stop: WayPoint) -> FloatArray:
-    """Error of a way point, times the size, not below the lowest way point."""
+    """Return the error of a way point, times the size, not below the lowest way point."""
     x, y, z = move.size * move.draws.errors[move.number_of(stop)]
     return np.array([x, y, max(stop.position[2] + z, move.floor) - stop.position[2]])
 
 
 def _lowered(move: EditedMove, stop: WayPoint) -> FloatArray:
-    """Down by the size, not below the grasp."""
+    """Return the displacement down by the size, not below the grasp."""
     floor, z = move.stop('close').position[2] + _MIN_CARRY_HEIGHT_M, stop.position[2]
     return (max(z - move.size, min(z, floor)) - z) * UP
 
@@ -230,7 +236,7 @@ def _to_fence(move: EditedMove, stop: WayPoint) -> FloatArray:
 
 
 def _about_home(move: EditedMove, stop: WayPoint) -> FloatArray:
-    """Displacement if all is turned about the arm's rest, by the size."""
+    """Return the displacement if all is turned about the arm's rest, by the size."""
     angle = move.draws.sign * move.size / 2
     turn = rotation((0.0, 0.0, np.sin(angle), np.cos(angle)))
     way = stop.position - move.stops[-1].position
@@ -242,7 +248,7 @@ def _to_grid(move: EditedMove, stop: WayPoint) -> FloatArray:
 
 
 def _same(move: EditedMove, name: str) -> FloatArray:
-    """A direction that another one is derived from: both use the same draw."""
+    """Return a direction that another one is derived from: both use the same draw."""
     return move.way({name: 1}, move.stops[0])
 
 
@@ -297,7 +303,7 @@ def _others(move: EditedMove, own: FloatArray) -> list[FloatArray]:
 
 
 def _next_to_goal(move: EditedMove) -> FloatArray:
-    """Position of the object next to the goal, else the goal."""
+    """Return the position of the object next to the goal, else the goal."""
     return _object_by_goal(move, move.stop('open').position)
 
 
@@ -320,7 +326,7 @@ def _on_next_to_goal(move: EditedMove) -> FloatArray:
 
 
 def _next_to_own(move: EditedMove) -> FloatArray:
-    """Position of the object next to the grasped one, else the grasp."""
+    """Return the position of the object next to the grasped one, else the grasp."""
     own, home = move.stop('close').position, move.stops[-1].position
     others = [place for place in _others(move, own) if _distance(place, home) < _MAX_REACH_M]
     grasp = move.stop('grasp').position
@@ -334,7 +340,7 @@ def _on_own(move: EditedMove) -> FloatArray:
 
 
 def _nearest_to_goal(move: EditedMove) -> FloatArray:
-    """Position of the object nearest to the goal, else the grasped one's."""
+    """Return the position of the object nearest to the goal, else the grasped one's."""
     own, goal = move.stop('close').position, move.stop('open').position
     return min(_others(move, own), key=lambda place: _distance(place, goal), default=own)
 

@@ -146,7 +146,7 @@ def _between(move: EditedMove, times: Sequence[float]) -> float:
 
 
 def _roamed(count: int, draws: Draws) -> list[FloatArray]:
-    """Places (3,) near objects [m], drawn."""
+    """Return the places (3,) near objects [m], drawn."""
     places, rng = list[FloatArray](), draws.play
     for _ in range(count):
         x, y, z = draws.objects[int(rng.integers(len(draws.objects)))]

@@ -258,7 +258,10 @@ def objects_from_instruction(instruction: str) -> tuple[str, ...]:
 
 
 def _phrase(tokens: list[str]) -> list[str]:
-    """Words from a leading colour word up to the end of its noun phrase; empty if none leads."""
+    """Return the words from a leading colour word up to the end of its noun phrase.
+
+    Empty if none leads.
+    """
     if tokens[0] not in PALETTE and tokens[0] not in OTHER_COLOURS:
         return []
     phrase = tokens[:1]

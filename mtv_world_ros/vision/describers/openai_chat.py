@@ -102,7 +102,7 @@ class OpenAIChat:
         raise AssertionError('without a format there is none to refuse')
 
     def _complete(self, messages: list[Any], wanted: dict[str, Any] | None) -> bytes:
-        """The body of a completion, after as many attempts as the budget allows."""
+        """Return the body of a completion, after as many attempts as the budget allows."""
         import openai
 
         try:
@@ -122,7 +122,7 @@ class OpenAIChat:
             ) from error
 
     def _post(self, messages: list[Any], wanted: dict[str, Any] | None) -> bytes:
-        """One request. Reads piece by piece: some servers keep a slow answer alive with blanks."""
+        """Send one request; read piece by piece, as some servers keep a slow answer alive."""
         import httpx2
 
         deadline = time.monotonic() + self.config.timeout_s
@@ -182,7 +182,7 @@ class OpenAIChat:
         )
 
     def _failed(self, status: int, text: str) -> DescriptionError:
-        """The error for an HTTP status that is final."""
+        """Return the error for an HTTP status that is final."""
         reply = f'{self.identity} answers with status {status}: {excerpt(text)}'
         budget = f"'retry_budget_s' ({self.config.retry_budget_s:g} s)"
         if status == 429:
@@ -232,7 +232,7 @@ def _client(config: OpenAIConfig, key: str) -> Any:
 
 
 def _messages(frame: ByteArray, turns: Sequence[str]) -> list[Mapping[str, Any]]:
-    """The turns as messages; the frame goes with the first, as PNG, so nothing is lost."""
+    """Return the turns as messages; the frame goes with the first, as PNG, so nothing is lost."""
     is_encoded, png = cv2.imencode('.png', np.ascontiguousarray(frame[..., ::-1]))
     assert is_encoded
     url = f'data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}'
@@ -300,7 +300,7 @@ def retry_after(headers: Mapping[str, str]) -> float | None:
 
 
 def _seconds_until(date: str) -> float:
-    """NaN for what is no date."""
+    """Return the seconds until a date; NaN for what is no date."""
     try:
         moment = parsedate_to_datetime(date)
     except ValueError:

@@ -102,7 +102,7 @@ def read_answer(text: str) -> tuple[DescribedObject, ...]:
 
 
 def _json_in(text: str) -> dict[str, Any]:
-    """The first JSON object in a text."""
+    """Return the first JSON object in a text."""
     start = text.find('{')
     if start < 0:
         raise DescriptionError('it holds no JSON object')

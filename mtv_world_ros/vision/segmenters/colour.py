@@ -123,7 +123,10 @@ class ColourSegmenter:
         firsts: BoolArray | None,
         out: BoolArray,
     ) -> list[ObjectTrack]:
-        """Tracks of the named objects in (T, H, W, 3) frames of one view; `out` may take them."""
+        """Return the tracks of the named objects in (T, H, W, 3) frames of one view.
+
+        `out` may take them.
+        """
         images = self._look(frames, names)
         tracks: list[ObjectTrack] = []
         for index, name in enumerate(names):
@@ -153,7 +156,7 @@ class ColourSegmenter:
         firsts: BoolArray | None,
         images: _Images,
     ) -> ObjectTrack:
-        """The track of an object with its part of another colour, where its noun has one."""
+        """Return track of an object with its part of another colour, where its noun has one."""
         word = part_of(name, colour_of(name))
         if word is None or not tracks[index].masks.any():
             return tracks[index]
@@ -242,7 +245,7 @@ def _edge(colour: Floats, background: Floats, core: float) -> float:
 
 
 def _median(pixels: ByteArray) -> Floats:
-    """(3,) the median of (..., 3) uint8 by channel, which numpy takes longer to sort."""
+    """Return (3,) the median of (..., 3) uint8 by channel, which numpy takes longer to sort."""
     image = np.ascontiguousarray(pixels).reshape(1, -1, 3)
     middle = [(image.shape[1] - 1) // 2, image.shape[1] // 2]
     counts = [cv2.calcHist([image], [channel], None, [256], [0, 256]) for channel in range(3)]
@@ -253,13 +256,13 @@ def _median(pixels: ByteArray) -> Floats:
 
 
 def _others(tracks: Sequence[ObjectTrack], rivals: Sequence[int], index: int) -> BoolArray | None:
-    """Pixels that objects of the same colour word, found before, already hold."""
+    """Return the pixels that objects of the same colour word, found before, already hold."""
     held = [tracks[i].masks for i in rivals if i < index]
     return np.any(held, axis=0) if held else None
 
 
 def _lab(rgb: ByteArray) -> Floats:
-    """(..., 3) CIELAB of (N, M, 3) uint8 RGB, L in 0-100, a and b around 0."""
+    """Return (..., 3) CIELAB of (N, M, 3) uint8 RGB, L in 0-100, a and b around 0."""
     return _centred(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), np.uint8))
 
 
@@ -276,7 +279,7 @@ def _saturation(lab: Floats) -> Floats:
 
 
 def _hue_table(colours: Floats) -> ByteArray:
-    """(256, 256) index of the palette word nearest in hue for each 8-bit a, b; N = none."""
+    """Return (256, 256) index of the palette word nearest in hue for each 8-bit a, b; N = none."""
     a, b = np.meshgrid(np.arange(256) - 128, np.arange(256) - 128, indexing='ij')
     hues = np.degrees(np.arctan2(colours[:, 2], colours[:, 1]))
     error = np.degrees(np.arctan2(b, a))[..., None] - hues

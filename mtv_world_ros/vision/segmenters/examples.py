@@ -109,7 +109,7 @@ class Example:
         return Example(name=name, frame=crop, mask=mask, size=np.array([width, height]))
 
     def patch(self, width: int, height: int) -> tuple[ByteArray, BoolArray]:
-        """The object alone and its mask, for frames of another size."""
+        """Return the object alone and its mask, for frames of another size."""
         rows, columns = np.nonzero(self.mask)
         around = np.s_[
             max(0, rows.min() - 2) : rows.max() + 3, max(0, columns.min() - 2) : columns.max() + 3
@@ -181,7 +181,7 @@ class ObjectExamples:
         return digest.hexdigest()
 
     def of_name(self, name: str) -> list[Example]:
-        """The examples of one object."""
+        """Return the examples of one object."""
         return [example for example in self.examples if example.name == name]
 
     def save(self, path: Path) -> None:
@@ -225,14 +225,14 @@ class ObjectExamples:
 
 
 def _bins(rgb: ByteArray) -> NDArray[np.intp]:
-    """(...,) bin of each (..., 3) uint8 RGB."""
+    """Return (...,) bin of each (..., 3) uint8 RGB."""
     lab = np.asarray(cv2.cvtColor(rgb.reshape(1, -1, 3), cv2.COLOR_RGB2LAB), np.intp)[0]
     lightness, a, b = (lab // [256 // count for count in _BINS]).T
     return ((lightness * _BINS[1] + a) * _BINS[2] + b).reshape(rgb.shape[:-1])
 
 
 def _histogram(rgb: ByteArray) -> Floats:
-    """(bins,) shares of the colours of (N, 3) uint8 RGB."""
+    """Return (bins,) shares of the colours of (N, 3) uint8 RGB."""
     from scipy.ndimage import gaussian_filter
 
     counts = np.bincount(_bins(rgb), minlength=int(np.prod(_BINS))).astype(float)
@@ -267,7 +267,7 @@ class _Look:
         self.stands_out = bool(np.median(own) >= _MIN_COLOUR_JACCARD)
 
     def _where(self, others: Floats, share: float) -> BoolArray:
-        """Colours more likely the object's, which has this share of the pixels."""
+        """Return the colours more likely the object's, which has this share of the pixels."""
         likely = self.colours * share > others * (1 - share)
         return likely & (self.colours > _MIN_COLOUR_SHARE)
 
@@ -277,7 +277,7 @@ _WITHIN = TrackingConfig(max_area_share=1.0)
 
 
 def _opened(pixels: BoolArray) -> BoolArray:
-    """(H, W) without what is one pixel thin, and gaps of as much filled."""
+    """Return (H, W) without what is one pixel thin, and gaps of as much filled."""
     square = np.ones((2, 2), np.uint8)
     # MORPH_OPEN has one anchor for both steps, and so moves what it opens by a pixel
     opened = cv2.dilate(
@@ -400,7 +400,7 @@ class _Follower:
         return mask & ~taken, 'ok' if best else 'absent'
 
     def _grown(self, frame: ByteArray, taken: BoolArray, seed: BoolArray) -> BoolArray:
-        """(H, W) a mask with the sides in the shade, which have no colour of its own.
+        """Return (H, W) a mask with the sides in the shade, which have no colour of its own.
 
         First those colours about it are added that are the object's where it is known to be, then
         it is cut out of a box around both, as examples are.
@@ -453,7 +453,7 @@ def cut_out(frame: ByteArray, box: Box) -> BoolArray:
 
 
 def _box_around(mask: BoolArray) -> Box:
-    """The box of a mask (H, W), a little wider on all sides, within the frame."""
+    """Return the box of a mask (H, W), a little wider on all sides, within the frame."""
     left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
     rows, columns = mask.shape
     margin = max(_MIN_MARGIN_PX, round(_MARGIN * columns))
@@ -470,7 +470,7 @@ def _lab(frame: ByteArray) -> NDArray[np.int16]:
 
 
 def _around(mask: BoolArray, gap: int) -> BoolArray:
-    """(H, W) where an object may be that was last seen in a mask, `gap` + 1 frames ago."""
+    """Return (H, W) where an object may be that was last seen in a mask, `gap` + 1 frames ago."""
     left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
     reach = round(_MAX_MOTION * hypot(*mask.shape) * (1 + gap))
     window = np.zeros_like(mask)

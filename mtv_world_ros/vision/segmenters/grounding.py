@@ -239,7 +239,7 @@ def box_iou(boxes: FloatArray, box: FloatArray) -> FloatArray:
 
 
 def _prompt(names: tuple[str, ...]) -> tuple[str, list[tuple[int, int]]]:
-    """The detector's text, `red block. blue cup.`, and where in it each name stands."""
+    """Return the detector's text, `red block. blue cup.`, and where in it each name stands."""
     text, spans = '', []
     for name in names:
         phrase = ' '.join(name.lower().replace('.', ' ').split())
@@ -249,17 +249,17 @@ def _prompt(names: tuple[str, ...]) -> tuple[str, list[tuple[int, int]]]:
 
 
 def _tokens_of(spans: list[tuple[int, int]], offsets: np.ndarray) -> list[BoolArray]:
-    """For each name, which of the (N, 2) token offsets lie in it."""
+    """Return for each name which of the (N, 2) token offsets lie in it."""
     begins, ends = offsets.T
     return [(begins >= first) & (ends <= last) & (begins < ends) for first, last in spans]
 
 
 def _mean_score(likely: FloatArray, chosen: BoolArray) -> FloatArray:
-    """(Q,) mean over the chosen tokens; 0 for a name without any."""
+    """Return (Q,) mean over the chosen tokens; 0 for a name without any."""
     return likely[:, : len(chosen)][:, chosen].mean(1) if chosen.any() else np.zeros(len(likely))
 
 
 def _corners(boxes: FloatArray) -> FloatArray:
-    """Centre x, y, width, height to left, top, right, bottom, cut at the image's edge."""
+    """Return centre x, y, width, height to left, top, right, bottom, cut at the image's edge."""
     half = boxes[:, 2:] / 2
     return np.clip(np.hstack([boxes[:, :2] - half, boxes[:, :2] + half]), 0, 1)

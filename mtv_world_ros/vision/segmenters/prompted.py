@@ -102,7 +102,10 @@ def drop_old(session: Any, index: int, kept: int) -> None:
 
 
 def _square_mask(mask: BoolArray, model: SamVideo) -> Tensor:
-    """(1, 1, S, S) the prompt, at the model's own size; a small object keeps a pixel at least."""
+    """Return (1, 1, S, S) the prompt, at the model's own size.
+
+    A small object keeps a pixel at least.
+    """
     import torch
 
     size = int(model.tracker.image_size)
@@ -227,7 +230,7 @@ def memory_errors(name: str, device: str) -> Iterator[None]:
 
 
 def _status(doubt: str, first: BoolArray, masks: BoolArray, config: TrackingConfig) -> str:
-    """The finder's doubt, else the tracker's."""
+    """Return the finder's doubt, else the tracker's."""
     if doubt != 'ok':
         return doubt
     return judge(masks, first, config) if first.any() else 'absent'

@@ -192,7 +192,7 @@ class Sam3Video:
         return FirstMasks(masks=first, status=chosen.status)
 
     def _see(self, frame: ByteArray) -> Any:
-        """Features of a frame from the image encoder that detector and tracker share."""
+        """Return features of a frame from the image encoder that detector and tracker share."""
         size = int(self.tracker.image_size)
         pixels = prepare(frame, (size, size), self._normalisation, self.device)
         return self._model.detector_model.get_vision_features(pixel_values=pixels)
@@ -216,7 +216,7 @@ class Sam3Video:
 
 
 def _upscaled(logits: FloatArray, height: int, width: int) -> BoolArray:
-    """(N, H, W) masks of (N, h, w) logits."""
+    """Return (N, H, W) masks of (N, h, w) logits."""
     import torch
 
     likely = torch.tensor(logits)[:, None].sigmoid()

@@ -47,7 +47,7 @@ class TrackingConfig:
     max_slivers: float = 0.2
 
     def min_area(self, shape: tuple[int, ...]) -> int:
-        """Smallest area of a piece [px] in frames of (..., H, W)."""
+        """Return the smallest area of a piece [px] in frames of (..., H, W)."""
         return max(2, ceil(self.min_area_share * shape[-2] * shape[-1]))
 
 
@@ -161,7 +161,9 @@ class _Patch(NamedTuple):
 
 
 def _patch(frame: BoolArray) -> _Patch:
-    """The patch of what is set in a frame (H, W); begins at even pixels, empty if nothing is.
+    """Return the patch of what is set in a frame (H, W).
+
+    Begins at even pixels, empty if nothing is.
 
     Connected components are found in blocks of 2 by 2: those of the patch are numbered as those
     of the frame.
@@ -239,7 +241,7 @@ def _nearest(
 
 
 def _join(main: int, pieces: Labels, stats: Labels, config: TrackingConfig) -> list[int]:
-    """Labels of the main piece and of the pieces whose boxes lie next to it."""
+    """Return the labels of the main piece and of the pieces whose boxes lie next to it."""
     left, top, width, height = stats[:, :4].T
     reach = config.join_gap * max(width[main], height[main])
     across = np.maximum(left - left[main] - width[main], left[main] - left - width)
@@ -255,7 +257,7 @@ def _has_body(mask: BoolArray) -> bool:
 
 
 def _check(patch: _Patch, state: _State, config: TrackingConfig) -> None:
-    """Doubts jumps in place or area, then remembers the mask, which is not empty."""
+    """Doubt jumps in place or area, then remember the mask, which is not empty."""
     centre, area = state.centre, state.area
     gap = state.gap
     _remember(patch, state)
