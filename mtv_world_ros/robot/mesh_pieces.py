@@ -256,7 +256,9 @@ def slices(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
     axis = np.linalg.svd(middle[:: max(1, len(middle) // 2000)], full_matrices=False)[2][0]
     along = vertices @ axis
     cuts = np.linspace(along.min(), along.max(), NUM_SLICES + 1)
-    slices = [_slice(vertices, edges, along, *ends) for ends in zip(cuts, cuts[1:], strict=False)]
+    between = [_slice(vertices, edges, along, *ends) for ends in zip(cuts, cuts[1:], strict=False)]
+    # a mesh of several bodies, as letters of a logo, has slices between them that hold nothing
+    slices = [outermost(points, NUM_SLICE_DIRECTIONS) for points in between if len(points)]
     try:
         volumes = [float(ConvexHull(points).volume) for points in (whole, *slices)]
     except (QhullError, ValueError):  # flat
@@ -372,7 +374,7 @@ def _hull_volume(segments: FloatArray) -> float:
 def _slice(
     vertices: FloatArray, edges: NDArray[np.int64], along: FloatArray, low: float, high: float
 ) -> FloatArray:
-    """Return the outermost points between two planes, with where the planes cut edges."""
+    """Return the points (N, 3) between two planes, with where the planes cut edges."""
     inside = vertices[(along >= low) & (along <= high)]
     start, end = along[edges].T
     found = [inside]
@@ -381,8 +383,7 @@ def _slice(
         share = ((cut - start[crossed]) / (end - start)[crossed])[:, None]
         a, b = vertices[edges[crossed, 0]], vertices[edges[crossed, 1]]
         found.append(a + share * (b - a))
-    points = np.concatenate(found)
-    return outermost(points, NUM_SLICE_DIRECTIONS)
+    return np.concatenate(found)
 
 
 def even_directions(count: int) -> FloatArray:
