@@ -13,7 +13,6 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, get_args, get_origin, Literal, NamedTuple, Union
 
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticUndefined
 import yaml
 
 from mtv_world_ros.cameras.calibration_file import CalibratedView
@@ -315,13 +314,14 @@ def _plural(text: str) -> str:
 
 
 def _default(field: FieldInfo) -> str:
-    if field.is_required() or field.default is PydanticUndefined:
+    if field.is_required():
         return 'required'
-    if isinstance(field.default, Schema):
+    default = field.get_default(call_default_factory=True)
+    if isinstance(default, Schema):
         return 'its defaults'
-    if field.default in ('', (), {}):
+    if default in ('', (), {}):
         return 'empty'
-    value = list(field.default) if isinstance(field.default, tuple) else field.default
+    value = list(default) if isinstance(default, tuple) else default
     return f'`{yaml.safe_dump(value, default_flow_style=True).splitlines()[0]}`'
 
 

@@ -7,6 +7,7 @@ N samples, J joints.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
@@ -44,6 +45,16 @@ class ReachSettings:
     still: float = 1e-3
     #: maximum number of publishers that are distinguished
     num_publishers: int = 32
+    #: a fast step belongs to a motion if a step beside it has the same sign and this fraction of
+    #: its speed
+    smooth_ratio: float = 0.2
+    #: fraction of a joint's steps up to which fast ones are taken as motion; of a wrong unit more
+    #: are
+    fast_ratio: float = 0.3
+    #: time between two steps of a joint that are beside each other [s]
+    beside_s: float = 0.2
+    #: longest time for which a sample repeats the joint's last measurement [s]
+    repeated_s: float = 0.25
 
 
 REACH = ReachSettings()
@@ -121,6 +132,28 @@ class JointReach:
         turned = np.abs((moved + np.pi) % (2 * np.pi) - np.pi)
         return np.asarray(np.where(self.is_endless[chosen], turned, moved), np.float64)
 
+    def with_speeds(self, speeds: FloatArray) -> JointReach:
+        """Return a copy in which joints have at least these speeds (J,) [rad/s or m/s]."""
+        other = copy(self)
+        other.speed = np.maximum(self.speed, speeds)
+        return other
+
+    def with_repeats(self, times: FloatArray, positions: FloatArray) -> JointReach:
+        """Return a copy for samples (N, J) that repeat the last measurement of a slower joint.
+
+        Such a joint moves for several samples and shows it in one.
+        """
+        other, period = copy(self), np.median(np.diff(times)) if len(times) > 1 else 0.0
+        other.noise = self.noise.copy()
+        for joint in np.flatnonzero(np.isfinite(self.noise)):
+            given = np.isfinite(positions[:, joint])
+            values, seconds = positions[given, joint], times[given]
+            gaps = np.diff(seconds[1:][np.diff(values) != 0])
+            if len(gaps):  # rests make some of them longer
+                held_s = min(float(np.quantile(gaps, 0.25)), self.settings.repeated_s)
+                other.noise[joint] += self.speed[joint] * max(held_s - period, 0.0)
+        return other
+
 
 class Unreachable(NamedTuple):
     """Samples that the joints cannot have reached.
@@ -128,10 +161,17 @@ class Unreachable(NamedTuple):
     Attributes:
         rows: (N,) True for an unreachable sample.
         text: joint, size, time and number of the unreachable samples; empty if there is none.
+        fast: joints that move faster than their speed limit; empty if there is none.
     """
 
     rows: BoolArray
     text: str
+    fast: str = ''
+
+    @property
+    def texts(self) -> list[str]:
+        """The notes that are not empty."""
+        return [text for text in (self.fast, self.text) if text]
 
 
 def find_unreachable(
@@ -145,7 +185,8 @@ def find_unreachable(
 
     Samples are sorted into sources within which every step is possible. Short and rare stretches
     are glitches. Of sources that take turns, the one that moves is the robot. A jump after which
-    the joint stays is named, and all samples are kept.
+    the joint stays is named, and all samples are kept. So is a joint that moves steadily, but
+    faster than its speed limit: the limit of the robot's description is too low.
 
     Args:
         topic: for texts.
@@ -158,9 +199,12 @@ def find_unreachable(
         EpisodeError: it cannot be told which samples are the robot's.
     """
     times = (stamps_ns - stamps_ns[0]) * 1e-9 if len(stamps_ns) else np.zeros(0)
+    speeds = _steady_speeds(times, positions, reach)
+    fast = _fast_text(topic, speeds, reach)
+    reach = reach.with_speeds(speeds).with_repeats(times, positions)
     first = _first_jump(times, positions, reach)
     if first is None:
-        return Unreachable(np.zeros(len(times), bool), '')
+        return Unreachable(np.zeros(len(times), bool), '', fast)
     row, before, joint = first
     step = (
         f"joint '{reach.names[joint]}' jumps from {positions[before, joint]:.4g} to "
@@ -171,16 +215,20 @@ def find_unreachable(
     settings = reach.settings
     if np.bincount(sources[sources >= 0]).max() <= settings.scattered_ratio * len(times):
         text = f"'{topic}': {step}; nearly every step does (degrees instead of radians?)"
-        return Unreachable(np.zeros(len(times), bool), text)
+        return Unreachable(np.zeros(len(times), bool), text, fast)
     is_short = _short_runs(times, sources, settings)
     if is_short.mean() <= settings.glitch_ratio:
         lasting = set(sources[~is_short].tolist())
         what = 'glitches of a sensor, or a second publisher'
         if len(lasting) > 1:
-            what = 'an encoder whose zero changed, or a time in which nothing was recorded'
+            what = (
+                'an encoder whose zero changed, a time in which nothing was recorded, or a joint '
+                "that is faster than its speed limit: 'speed_limits' of the robot's YAML"
+            )
         kept = ~is_short
     else:
-        kept = sources == _robot_source(topic, times, positions, sources, step, settings)
+        begin = f"'{topic}': {step}"
+        kept = sources == _robot_source(begin, items, times, positions, sources, settings)
         what = 'a second publisher that stands still'
     count = int((~kept).sum())
     handled = (
@@ -189,7 +237,52 @@ def find_unreachable(
         if count
         else f'all {items} are kept; cut the recording there where its images do not fit'
     )
-    return Unreachable(~kept, f"'{topic}': {step} ({what}); {handled}")
+    return Unreachable(~kept, f"'{topic}': {step} ({what}); {handled}", fast)
+
+
+def _steady_speeds(times: FloatArray, positions: FloatArray, reach: JointReach) -> FloatArray:
+    """Return (J,) the speeds of joints that move steadily beyond their reach; 0 = they do not.
+
+    A glitch or another publisher goes forth and back, and a changed zero is a single step. The
+    steps of a motion have others of their sign beside them. Repeated positions are left out:
+    tables may have more rows than the joint has measurements.
+    """
+    settings, found = reach.settings, np.zeros(positions.shape[1])
+    fastest = settings.speed_factor * settings.default_speed
+    for joint in np.flatnonzero(np.isfinite(reach.noise)):
+        values, given = positions[:, joint], np.isfinite(positions[:, joint])
+        given[1:] &= values[1:] != values[:-1]
+        at, values = times[given], values[given]
+        steps, seconds = np.diff(values), np.maximum(np.diff(at), 1e-9)
+        if reach.is_endless[joint]:
+            steps = (steps + np.pi) % (2 * np.pi) - np.pi
+        is_fast = np.abs(steps) > reach.noise[joint] + reach.speed[joint] * seconds
+        if not is_fast.any() or is_fast.sum() > settings.fast_ratio * len(times):
+            continue
+        speeds = steps / seconds
+        beside = np.where(seconds <= settings.beside_s, speeds, 0.0)
+        beside = np.stack([np.append(0.0, beside[:-1]), np.append(beside[1:], 0.0)])
+        ahead = (beside * np.sign(speeds)).max(axis=0)
+        is_steady = ahead >= settings.smooth_ratio * np.abs(speeds)
+        top = float(np.abs(speeds[is_fast]).max())
+        if is_steady[is_fast].all() and top <= fastest:
+            found[joint] = top
+    return found
+
+
+def _fast_text(topic: str, speeds: FloatArray, reach: JointReach) -> str:
+    """Return the note on joints that move faster than their limit, and the remedy."""
+    joints = np.flatnonzero(speeds)
+    if not len(joints):
+        return ''
+    worst = int(joints[np.argmax(speeds[joints] / reach.speed[joints])])
+    limit = reach.speed[worst] / reach.settings.speed_factor
+    limits = ', '.join(f'{reach.names[n]}: {np.ceil(speeds[n] * 10) / 10:g}' for n in joints)
+    return (
+        f"'{topic}': joint '{reach.names[worst]}' moves at up to {speeds[worst]:.3g} a second, "
+        f"its speed limit is {limit:.3g}: taken as motion; correct the robot's YAML: "
+        f"'speed_limits: {{{limits}}}'"
+    )
 
 
 def _short_runs(
@@ -245,11 +338,11 @@ def _sources(times: FloatArray, positions: FloatArray, reach: JointReach) -> NDA
 
 
 def _robot_source(
-    topic: str,
+    begin: str,
+    items: str,
     times: FloatArray,
     positions: FloatArray,
     sources: NDArray[np.intp],
-    step: str,
     settings: ReachSettings,
 ) -> int:
     """Return the source that is the robot: of those that last, the only one that moves.
@@ -262,10 +355,18 @@ def _robot_source(
     moving = [int(n) for n in lasting if _moves(positions[sources == n], settings)]
     if len(moving) != 1:
         each = ' and '.join(str(count) for count in sorted(counts, reverse=True)[:4])
+        remedy = (
+            "two publishers? Leave one out: give the topic of the robot's own as 'joint_states' "
+            'in the mapping (--topics), or record again'
+        )
+        if items != 'messages':
+            remedy = (
+                'two recordings in one? Leave rows out, or, where the joint is that fast, give '
+                "the robot's YAML 'speed_limits'"
+            )
         raise EpisodeError(
-            f"'{topic}': {step}; {each} of {len(times)} messages belong together, and it cannot "
-            'be told which are the robot: two publishers? Leave one out: give the topic of the '
-            "robot's own as 'joint_states' in the mapping (--topics), or record again"
+            f'{begin}; {each} of {len(times)} {items} belong together, and it cannot be told '
+            f'which are the robot: {remedy}'
         )
     return moving[0]
 
@@ -306,7 +407,7 @@ def mend_rows(
         missing.setdefault(text, []).append(name)
     notes += [_stands_in(what, joints, text) for text, joints in missing.items()]
     found = find_unreachable(what, stamps, mended, JointReach(robot), 'rows')
-    notes += [found.text] if found.text else []
+    notes += found.texts
     mended[found.rows] = np.nan
     for joint in np.flatnonzero(np.isnan(mended).any(axis=0)):
         known = np.flatnonzero(np.isfinite(mended[:, joint]))
@@ -371,9 +472,8 @@ def merge_joint_states(
     if robot is not None and set(names) >= set(robot.joint_names):
         columns = [names.index(name) for name in robot.joint_names]
         found = find_unreachable(topic, stamps, table[:, columns], JointReach(robot))
-        if found.text:
-            warnings.append(found.text)
-            stamps, table = stamps[~found.rows], table[~found.rows]
+        warnings += found.texts
+        stamps, table = stamps[~found.rows], table[~found.rows]
     tools = () if robot is None else robot.tools
     grippers = tuple(tool.gripper_joint for tool in tools if tool.gripper_joint)
     _warn_of_repeats(topic, stamps, np.isfinite(table), warnings)

@@ -23,7 +23,13 @@ from mtv_world_ros.data.episode import Episode, MASKS_BY, UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.stream_clocks import ClockBreakError, WHOLE, Window
-from mtv_world_ros.importing.convert import import_each, ImportSummary, jumps, MAPPING_KEY
+from mtv_world_ros.importing.convert import (
+    import_each,
+    ImportSummary,
+    jumps,
+    MAPPING_KEY,
+    unknown_camera_note,
+)
 from mtv_world_ros.importing.mapping import digest_of
 from mtv_world_ros.importing.robot_guess import guess_robot
 from mtv_world_ros.importing.stored_objects import AS_RECORDED, MaskWriter, ObjectStage
@@ -329,11 +335,8 @@ def write_imported(
     stamps, positions = _measured(episode, robot, mapping)
     commands = _commands(episode, robot, mapping)
     warnings = [*episode.warnings, *jumps([t for _, t in commands], robot)]
-    warnings += [
-        f"view '{view}': {what} not known: mtv-world fit camera {out.parent} --view {view} "
-        '--click points.html'
-        for view, what in episode.unknown.items()
-    ]
+    unknown = episode.unknown.items()
+    warnings += [unknown_camera_note(out.parent, view, what) for view, what in unknown]
     instruction = mapping.instruction or episode.info.instruction
     names = stage.names(
         out.name,

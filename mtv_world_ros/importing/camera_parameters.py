@@ -81,7 +81,7 @@ def _is_there(name: Any, info: ValidationInfo[dict[str, Any]]) -> Path | None:
 
 
 class CameraSource(Schema):
-    """Source of a view: image feature and calibration."""
+    """Source of a view: image feature and calibration; without one its camera is not known."""
 
     view: str = Field(default='', description='its name; set by the mapping')
     feature: str = Field(description='feature of the images')
@@ -94,12 +94,17 @@ class CameraSource(Schema):
 
     @model_validator(mode='after')
     def _has_one_source(self) -> Self:
-        if (self.calibration is None) == (self.camera is None):
+        if self.calibration is not None and self.camera is not None:
             raise ValueError(
                 "give either 'calibration' (a calibration YAML) or 'camera' (keys of the "
-                "dataset's own camera parameters)"
+                "dataset's own camera parameters), or none of both where the camera is not known"
             )
         return self
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the mapping states the camera."""
+        return self.calibration is not None or self.camera is not None
 
     @property
     def where(self) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mtv_world_ros.cameras.camera import camera_poses
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, MtvWorldError, TrajectoryError
-from mtv_world_ros.data.episode import Episode, EpisodeInfo, Track
+from mtv_world_ros.data.episode import Episode, EpisodeInfo, Track, UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.measured_joints import mend_rows
@@ -127,7 +127,7 @@ class _Frames:
         return len(self._times)
 
     def __getitem__(self, index: Any) -> ByteArray:
-        frames = self._dataset.frames(self._entry, self._feature, self._times[: index + 1])
+        frames = self._dataset.frames(self._entry, self._feature, self._times)
         frame = next(islice(frames, index, None), None)
         if frame is None:
             raise EpisodeError(f"'{self._feature}' has no frame {index}")
@@ -230,6 +230,7 @@ def convert_episode(
     }
     first = {view: _next_frame(frames, view, 0) for view, frames in videos.items()}
     cameras, tracks, notes = _cameras(dataset, entry, mapping, rows, first)
+    unknown = [view for view, source in mapping.views.items() if not source.is_known]
     texts = _instructions(dataset, rows, mapping)
     with ExitStack() as stack:
         writer = EpisodeWriter(
@@ -237,7 +238,7 @@ def convert_episode(
             task=mapping.task,
             instruction=texts[0],
             robot=mapping.robot.name,
-            cameras=cameras,
+            cameras=list(cameras.values()),
             objects=stage.names(
                 out.name, texts[0], lambda: next(iter(first.values())), given=mapping.objects
             ),
@@ -245,6 +246,7 @@ def convert_episode(
                 'source': dataset.root.resolve().name,
                 'source_episode': str(entry.index),
                 MAPPING_KEY: key or mapping.key,
+                **({UNKNOWN_CAMERAS: ', '.join(unknown)} if unknown else {}),
             },
             jpeg_quality=mapping.jpeg_quality,
         )
@@ -257,12 +259,13 @@ def convert_episode(
             if k == 0 or texts[k] != texts[k - 1]:
                 writer.write_instruction(stamp_ns, texts[k])
             writer.write_joint_states(stamp_ns, mapping.robot.joint_names, measured[k])
-            for camera in cameras:
-                view = camera.view
+            for view in mapping.views:
                 frame = first[view] if k == 0 else _next_frame(videos[view], view, k)
-                writer.write_camera_info(view, stamp_ns, camera)
+                if view in cameras:
+                    writer.write_camera_info(view, stamp_ns, cameras[view])
                 if view in tracks:
-                    writer.write_camera_pose(view, stamp_ns, camera.mount_link, tracks[view][k])
+                    mount = cameras[view].mount_link
+                    writer.write_camera_pose(view, stamp_ns, mount, tracks[view][k])
                 writer.write_image(view, stamp_ns, frame)
                 masks.add(view, stamp_ns, frame)
             if k in commands:  # after what it starts from, so that the episode can be played
@@ -270,6 +273,7 @@ def convert_episode(
         masks.finish()
     shown = {view: dataset.video_note(entry, row.feature) for view, row in mapping.views.items()}
     turned = [f"view '{view}': {note}" for view, note in shown.items() if note]
+    turned += [unknown_camera_note(out.parent, view, 'pose and intrinsics') for view in unknown]
     return *paused, *mended, *odd, *notes, *turned, *jumps(commands.values(), mapping.robot)
 
 
@@ -282,7 +286,8 @@ def _stream_features(mapping: DatasetMapping) -> tuple[str, ...]:
 def _read_rows(
     dataset: LeRobotDataset, entry: EpisodeEntry, mapping: DatasetMapping
 ) -> dict[str, FloatArray]:
-    names = ['timestamp', 'task_index', *_stream_features(mapping)]
+    names = ['timestamp', *_stream_features(mapping)]
+    names += [] if mapping.instruction else ['task_index']
     names += [mapping.outcome_feature] if mapping.outcome_feature else []
     for source in mapping.views.values():
         dataset.feature(source.feature, ('video', 'image'))
@@ -314,7 +319,7 @@ def _commanded(
     if stream is None:
         return measured, ()
     values, names = _table(dataset, rows, stream)
-    positions, odd = stream.commanded(values, names, measured, mapping.robot)
+    positions, odd = stream.commanded(values, names, measured, mapping.robot, mapping.state)
     _check(positions, stream, mapping, 'action')
     return positions, odd
 
@@ -345,10 +350,11 @@ def _cameras(
     mapping: DatasetMapping,
     rows: dict[str, FloatArray],
     first: dict[str, ByteArray],
-) -> tuple[list[CameraModel], dict[str, FloatArray], list[str]]:
-    """Return cameras at the first row, the poses at all rows of those that move, what is odd."""
-    cameras, tracks, notes = [], {}, []
-    for view, source in mapping.views.items():
+) -> tuple[dict[str, CameraModel], dict[str, FloatArray], list[str]]:
+    """Return the known cameras at the first row, poses at all rows of those that move, notes."""
+    cameras, tracks, notes = {}, {}, []
+    known = {view: source for view, source in mapping.views.items() if source.is_known}
+    for view, source in known.items():
         height, width = first[view].shape[:2]
         found = camera_track(source, dataset.root, entry.index, rows, (width, height))
         camera = found.camera
@@ -357,7 +363,7 @@ def _cameras(
         notes += [found.note] if found.note else []
         resting = np.zeros((1, len(mapping.robot.joint_names)))
         camera_poses(camera, mapping.robot, resting)  # names a mount_link that is not there
-        cameras.append(camera)
+        cameras[view] = camera
     return cameras, tracks, notes
 
 
@@ -365,9 +371,9 @@ def _instructions(
     dataset: LeRobotDataset, rows: dict[str, FloatArray], mapping: DatasetMapping
 ) -> list[str]:
     """Return the instruction at each row."""
-    numbers = rows['task_index'].ravel().astype(int)
     if mapping.instruction:
-        return [mapping.instruction] * len(numbers)
+        return [mapping.instruction] * len(rows['timestamp'])
+    numbers = rows['task_index'].ravel().astype(int)
     unknown = sorted(set(numbers.tolist()) - set(dataset.tasks))
     if unknown:
         raise EpisodeError(f'it names task {unknown[0]}, which meta/tasks does not have')
@@ -397,6 +403,14 @@ def _commands(
         )
         found.append((first, trajectory))
     return found
+
+
+def unknown_camera_note(folder: Path, view: str, what: str) -> str:
+    """Return what is not known of a view's camera, and the command that estimates it."""
+    return (
+        f"view '{view}': {what} not known: mtv-world fit camera {folder} --view {view} "
+        '--click points.html'
+    )
 
 
 #: speed of a command that counts as a jump [joint speed limits]

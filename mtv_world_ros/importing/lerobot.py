@@ -7,7 +7,7 @@ Layout as in huggingface/lerobot (`src/lerobot/datasets/utils.py`, `io_utils.py`
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -28,13 +28,15 @@ from mtv_world_ros.core.bounded_input import (
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest, ObservationError
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
-from mtv_world_ros.importing.video_frames import frames_at, video_note, video_offset
+from mtv_world_ros.importing.video_frames import frames_at, times_in_video, video_note
 
 VERSIONS = ('v2.0', 'v2.1', 'v3.0')
 _PICTURES = ('video', 'image')
 #: bytes 24 and 25 of a PNG: 16 bits, grey
 _PNG_DEPTH = bytes([16, 0])
 _INFO = Path('meta/info.json')
+#: columns that LeRobot adds to every table
+_OWN_COLUMNS = ('timestamp', 'frame_index', 'episode_index', 'index', 'task_index')
 #: maximum time between a video frame and its row [periods]
 _TIME_TOLERANCE = 0.25
 #: rows a second that no recording exceeds [Hz]
@@ -60,12 +62,14 @@ class EpisodeEntry:
         length: number of rows.
         data_file: parquet file with its rows, maybe among others'.
         videos: by feature.
+        tasks: texts.
     """
 
     index: int
     length: int
     data_file: Path
     videos: Mapping[str, VideoPart]
+    tasks: tuple[str, ...] = ()
 
 
 class LeRobotDataset:
@@ -88,7 +92,7 @@ class LeRobotDataset:
         pyarrow_modules()
         self.root = root
         self._video_notes: dict[Path, str] = {}
-        self._offsets: dict[tuple[int, str], float] = {}
+        self._matches: dict[tuple[int, str], str] = {}
         info = self._info()
         self.version = str(info.get('codebase_version', ''))
         if self.version not in VERSIONS:
@@ -136,13 +140,16 @@ class LeRobotDataset:
         """
         found = self.feature(name, _PICTURES)
         if _is_depth_map(found):
-            cameras = {n: f for n, f in self.features.items() if f.get('dtype') in _PICTURES}
-            colours = [n for n, f in cameras.items() if not _is_depth_map(f)]
             raise ConfigError(
                 f"'{self.root}': feature '{name}' is a depth map (is_depth_map), no picture of "
-                f'the scene; those are {", ".join(colours) or "none"}'
+                f'the scene; those are {", ".join(self.colour_features()) or "none"}'
             )
         return found
+
+    def colour_features(self) -> tuple[str, ...]:
+        """Return the names of videos and images that are no depth maps."""
+        cameras = {n: f for n, f in self.features.items() if f.get('dtype') in _PICTURES}
+        return tuple(name for name, f in cameras.items() if not _is_depth_map(f))
 
     def column_names(self, feature: str) -> list[str]:
         """Return the names of a feature's columns, empty where it has none.
@@ -195,12 +202,7 @@ class LeRobotDataset:
         file = entry.videos[feature].file
         if file not in self._video_notes:
             self._video_notes[file] = video_note(file)
-        notes = [self._video_notes[file]]
-        if offset_s := self._offsets.get((entry.index, feature)):
-            notes.append(
-                f'its frames are {1000 * offset_s:+.1f} ms from the times of the rows, all alike; '
-                'they were shifted onto the rows'
-            )
+        notes = (self._video_notes[file], self._matches.get((entry.index, feature), ''))
         return '; '.join(filter(None, notes))
 
     def rows(self, entry: EpisodeEntry, features: Sequence[str]) -> dict[str, FloatArray]:
@@ -211,13 +213,19 @@ class LeRobotDataset:
             ConfigError: a feature is not there.
         """
         for name in features:
-            self.feature(name)
+            if name not in _OWN_COLUMNS:  # converters leave these out of meta/info.json
+                self.feature(name)
         wanted = list(dict.fromkeys([*features, 'frame_index', 'episode_index']))
-        table = self._table(entry, wanted)
+        there = self._columns(entry)
+        absent = {name for name in wanted if name in _OWN_COLUMNS and name not in there}
+        table = self._table(entry, [name for name in wanted if name not in absent])
         try:
             arrays = {
-                name: np.array(table.column(name).to_pylist(), dtype=float) for name in wanted
+                name: np.array(table.column(name).to_pylist(), dtype=float)
+                for name in wanted
+                if name not in absent
             }
+            arrays |= self._stand_ins(entry, absent)
         except (TypeError, ValueError) as error:
             raise EpisodeError(
                 f"'{entry.data_file}': a feature among {list(features)} does not hold numbers "
@@ -225,6 +233,34 @@ class LeRobotDataset:
             ) from error
         order = np.argsort(arrays['frame_index'].ravel(), kind='stable')
         return {name: arrays[name][order] for name in features}
+
+    def _columns(self, entry: EpisodeEntry) -> set[str]:
+        """Return the names of a table's columns; empty where the table cannot be read."""
+        pyarrow, parquet = pyarrow_modules()
+        try:
+            return set(parquet.read_schema(entry.data_file).names)
+        except (OSError, pyarrow.ArrowException):
+            return set()  # the reader of the rows says why
+
+    def _stand_ins(self, entry: EpisodeEntry, absent: Collection[str]) -> dict[str, FloatArray]:
+        """Return the values of LeRobot's own columns that a table does not have.
+
+        Raises:
+            EpisodeError: the episode has several tasks, and no column says which row has which.
+        """
+        frames = np.arange(entry.length, dtype=float)
+        found = {'frame_index': frames, 'index': frames, 'timestamp': frames / self.fps}
+        if 'task_index' in absent:
+            numbers = [n for n, text in self.tasks.items() if text in entry.tasks]
+            numbers = numbers or (list(self.tasks) if len(self.tasks) == 1 else [])
+            if len(numbers) != 1:
+                raise EpisodeError(
+                    f"'{entry.data_file}' has no column 'task_index', and episode {entry.index} "
+                    f'has {len(numbers)} of the {len(self.tasks)} tasks of the metadata; give '
+                    "'instruction' in the mapping"
+                )
+            found['task_index'] = np.full(entry.length, numbers[0], float)
+        return {name: values for name, values in found.items() if name in absent}
 
     def frames(
         self, entry: EpisodeEntry, feature: str, timestamps: FloatArray
@@ -241,12 +277,13 @@ class LeRobotDataset:
         tolerance = _TIME_TOLERANCE / self.fps
         times = timestamps + part.start_s
         try:
-            offset_s = video_offset(part.file, times, tolerance, is_alone=self.version != 'v3.0')
-            if offset_s:
-                self._offsets[entry.index, feature] = offset_s
-            yield from frames_at(part.file, times + offset_s, tolerance)
+            is_alone = self._num_episodes[part.file] == 1
+            found, how = times_in_video(part.file, times, tolerance, is_alone=is_alone)
+            self._matches[entry.index, feature] = how
+            yield from frames_at(part.file, found, tolerance)
         except EpisodeError as error:
-            raise EpisodeError(f'{error}{self._stale_video(feature)}') from error
+            hint = self._stale_video(feature) or self._video_elsewhere(part.file)
+            raise EpisodeError(f'{error}{hint}') from error
 
     def _info(self) -> Mapping[str, Any]:
         file = self.root / _INFO
@@ -266,10 +303,12 @@ class LeRobotDataset:
     def _episodes_v2(self) -> Iterator[EpisodeEntry]:
         for row in self._lines('meta/episodes.jsonl'):
             index = int(row['episode_index'])
-            place = {'episode_index': index, 'episode_chunk': index // self._chunk}
+            chunk = index // self._chunk  # converters also call it as v3.0 does
+            place = {'episode_index': index, 'episode_chunk': chunk, 'chunk_index': chunk}
             yield EpisodeEntry(
                 index=index,
                 length=int(row['length']),
+                tasks=_texts(row.get('tasks')),
                 data_file=self._file(self._data_path, place),
                 videos={
                     key: VideoPart(
@@ -295,6 +334,7 @@ class LeRobotDataset:
                 yield EpisodeEntry(
                     index=int(row['episode_index']),
                     length=int(row['length']),
+                    tasks=_texts(row.get('tasks')),
                     data_file=self._file(self._data_path, _place(row, 'data')),
                     videos=videos,
                 )
@@ -335,9 +375,8 @@ class LeRobotDataset:
             raise EpisodeError(
                 f"'{entry.data_file}' is not there{self._stale(entry) or ', but in the metadata'}"
             )
-        table = _read_table(
-            entry.data_file, columns=columns, filters=[('episode_index', '==', entry.index)]
-        )
+        only = [('episode_index', '==', entry.index)] if 'episode_index' in columns else None
+        table = _read_table(entry.data_file, columns=columns, filters=only)
         if table.num_rows != entry.length:
             raise EpisodeError(
                 f"'{entry.data_file}' has {table.num_rows} rows of episode {entry.index}, the "
@@ -357,6 +396,23 @@ class LeRobotDataset:
             'v3.0); write it again, or merge or convert the dataset anew with LeRobot'
         )
 
+    def _video_elsewhere(self, file: Path) -> str:
+        """Return a text on a file that is called like a missing video; empty if none is."""
+        if file.is_file():
+            return ''
+        end = file.relative_to(self.root).parts[1:]
+        alike = [
+            found
+            for found in sorted(self.root.rglob(file.name))
+            if found.relative_to(self.root).parts[-len(end) :] == end
+        ]
+        if not alike:
+            return ''
+        return (
+            f"; '{alike[0].relative_to(self.root)}' is: correct 'video_path' in '{_INFO}', which "
+            f"is '{self._video_path}'"
+        )
+
     def _stale_video(self, feature: str) -> str:
         """Return a text on the video files that no episode refers to; empty if there is none."""
         named = {entry.videos[feature].file for entry in self.episodes.values()}
@@ -371,6 +427,11 @@ class LeRobotDataset:
             "'from_timestamp' of meta/episodes in v3.0); write it again, or merge or convert the "
             'dataset anew with LeRobot'
         )
+
+    @cached_property
+    def _num_episodes(self) -> Counter[Path]:
+        """Number of episodes with frames in a video file."""
+        return Counter(part.file for e in self.episodes.values() for part in e.videos.values())
 
     @cached_property
     def _files_by_episode(self) -> dict[int, list[Path]]:
@@ -462,6 +523,11 @@ class LeRobotDataset:
             raise EpisodeError(
                 f"'{entry.data_file}': an image of '{feature}' is damaged: {error}"
             ) from error
+
+
+def _texts(value: Any) -> tuple[str, ...]:
+    """Return the texts of a list; empty if it is none."""
+    return tuple(map(str, value)) if isinstance(value, list) else ()
 
 
 def _are_numbers(values: list[Any]) -> bool:

@@ -30,7 +30,7 @@ from mtv_world_ros.importing.camera_parameters import CameraSource
 from mtv_world_ros.importing.lerobot import LeRobotDataset
 from mtv_world_ros.importing.tool_poses import ToolPoses
 from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.robot.joint_columns import JointEntries, JointTable, to_positions
+from mtv_world_ros.robot.joint_columns import JointColumn, JointEntries, JointTable, to_positions
 from mtv_world_ros.robot.model import RobotModel
 
 #: names of features, or of what several features begin with, in data sets of LeRobot's layout
@@ -97,8 +97,26 @@ class ActionStream(Stream):
                 )
         return [joint for joint in robot.joint_names if joint not in led]
 
+    def columns_among(self, names: Sequence[str], state: Stream | None) -> tuple[JointColumn, ...]:
+        """Return one column a joint; those of the state where the mapping gives none.
+
+        Args:
+            names: of the columns; those that are named like the robot's joints go first.
+            state: stream of the measured joints; None = the own columns alone.
+        """
+        own = self.columns
+        is_open = not (self.joints or self.tools or self.differences)
+        if state is None or not is_open or 'unit' in self.model_fields_set:
+            return own
+        return own if {column.column for column in own} <= set(names) else state.columns
+
     def commanded(
-        self, values: FloatArray, names: Sequence[str], measured: FloatArray, robot: RobotModel
+        self,
+        values: FloatArray,
+        names: Sequence[str],
+        measured: FloatArray,
+        robot: RobotModel,
+        state: Stream | None = None,
     ) -> tuple[FloatArray, tuple[str, ...]]:
         """Return (T, J) positions of a feature's values (T, C), and what was odd.
 
@@ -107,14 +125,16 @@ class ActionStream(Stream):
             names: of the columns; empty where the dataset does not name them.
             measured: (T, J) positions of the same rows.
             robot: gives the order of joints, and the tools.
+            state: stream of the measured joints, for commands without `joints`.
 
         Raises:
             ConfigError: a column is not there.
             EpisodeError: most poses of a tool are out of reach.
         """
         positions = measured.copy()
-        at = [robot.joint_names.index(column.joint) for column in self.columns]
-        positions[:, at] = to_positions(values, names, self.columns, self.label)
+        columns = self.columns_among(names, state)
+        at = [robot.joint_names.index(column.joint) for column in columns]
+        positions[:, at] = to_positions(values, names, columns, self.label)
         added = [robot.joint_names.index(joint) for joint in self.differences]
         positions[:, added] += measured[:, added]
         odd = [
@@ -209,40 +229,50 @@ def load_mapping(path: Path) -> DatasetMapping:
 
 
 def guess_mapping(
-    dataset: LeRobotDataset, robot: str, calibration: Path
+    dataset: LeRobotDataset, robot: str, calibration: Path | None
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return the values of a mapping for columns that are named like the robot's joints.
 
-    Views are the image features that the calibration has, by the last part of their names; the
-    names of the other image features are returned as the second value.
+    Views are the colour features that the calibration has, by the last part of their names; the
+    names of the other image features are returned as the second value. Without a calibration all
+    colour features are views, whose cameras are not known.
 
     Raises:
-        ConfigError: the calibration has none of the views.
+        ConfigError: the calibration has none of the views, or there is no colour feature.
         CalibrationError: the calibration cannot be used.
     """
-    known = load_calibration(calibration)
-    features = [n for n, f in dataset.features.items() if f.get('dtype') in ('video', 'image')]
-    found = {name.rpartition('.')[2]: name for name in features}
-    if not found.keys() & known.keys():
+    pictures = [n for n, f in dataset.features.items() if f.get('dtype') in ('video', 'image')]
+    found = _view_names(dataset.colour_features())
+    known = found.keys() if calibration is None else load_calibration(calibration).keys()
+    views = {view: {'feature': name} for view, name in found.items() if view in known}
+    if not views:
+        cameras = '' if calibration is None else f"'{calibration}' has views {', '.join(known)}, "
         raise ConfigError(
-            f"'{calibration}' has views {', '.join(known)}, and '{dataset.root}' has "
-            f'{", ".join(found) or "none"}; call them alike, or write a mapping (--mapping)'
+            f"{cameras and f'{cameras}and '}'{dataset.root}' has {', '.join(found) or 'none'}; "
+            'call them alike, or write a mapping (--mapping)'
         )
-    file = str(calibration.resolve())
+    if calibration is not None:
+        views = {k: {**v, 'calibration': str(calibration.resolve())} for k, v in views.items()}
     joints = load_robot(_robot_path(robot, Path())).joint_names
     action = _guess_features(dataset, joints, _ACTIONS)
     is_path = Path(robot).suffix in ('.yaml', '.yml')
     values = {
         'robot': str(Path(robot).resolve()) if is_path else robot,
-        'views': {
-            view: {'feature': name, 'calibration': file}
-            for view, name in found.items()
-            if view in known
-        },
+        'views': views,
         'state': {'feature': _guess_features(dataset, joints, _STATES) or _STATES[0]},
         'action': {'feature': action} if action else 'state',
     }
-    return values, tuple(name for view, name in found.items() if view not in known)
+    taken = {view['feature'] for view in views.values()}
+    return values, tuple(name for name in pictures if name not in taken)
+
+
+def _view_names(features: Sequence[str]) -> dict[str, str]:
+    """Return image features by the shortest ends of their names that differ, as names of views."""
+    for parts in range(1, max((name.count('.') for name in features), default=0) + 2):
+        names = ['_'.join(name.split('.')[-parts:]) for name in features]
+        if len(set(names)) == len(names):
+            break
+    return dict(zip(names, features, strict=True)) if features else {}
 
 
 def _guess_features(

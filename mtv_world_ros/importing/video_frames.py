@@ -419,6 +419,10 @@ def _as_many(
 def _doubt(pair: _Rates, shown: FloatArray, row_times: FloatArray) -> str:
     if pair.share_a_span:
         return ''
+    return _as_many_text(shown, row_times)
+
+
+def _as_many_text(shown: FloatArray, row_times: FloatArray) -> str:
     return (
         f'{len(shown)} frames last {shown[-1]:.2f} s by the video and {row_times[-1]:.2f} s by '
         'the rows: frame k is taken to belong to row k, as there are as many'
@@ -445,6 +449,41 @@ def _by_time(shown: FloatArray, row_times: FloatArray) -> FrameMatch:
     if left_out:
         note += f'; {left_out} frames after the last row are left out'
     return FrameMatch(numbers=numbers, times=shown[numbers], note=note)
+
+
+def times_in_video(
+    path: Path, times: FloatArray, tolerance_s: float, *, is_alone: bool
+) -> tuple[FloatArray, str]:
+    """Return the times (T,) in a video of the frames of rows [s], and how they were matched.
+
+    The text is empty where each row has a frame at its time, or where no match is found.
+
+    Args:
+        path: video file.
+        times: increasing times of the rows in the file [s].
+        tolerance_s: a frame may be this far from its row [s].
+        is_alone: whether the file holds these rows and no others. As many frames as rows then
+            belong to each other: frame k to row k, where the video has a rate in place of times.
+
+    Raises:
+        EpisodeError: see `open_video`.
+    """
+    offset_s = video_offset(path, times, tolerance_s, is_alone=is_alone)
+    if offset_s:
+        return times + offset_s, (
+            f'its frames are {1000 * offset_s:+.1f} ms from the times of the rows, all alike; '
+            'they were shifted onto the rows'
+        )
+    if not is_alone or len(times) < 2:
+        return times, ''
+    with open_video(path) as video:
+        found = video.packet_times(-np.inf, np.inf)
+    if len(found) != len(times) or np.abs(found - times).max() <= tolerance_s:
+        return times, ''
+    steps = np.diff(found)
+    if np.abs(steps - np.median(steps)).max() > _JITTER * np.median(steps):
+        return times, ''
+    return found, _as_many_text(found - found[0], times - times[0])
 
 
 def video_offset(path: Path, times: FloatArray, tolerance_s: float, *, is_alone: bool) -> float:

@@ -74,6 +74,7 @@ def described_robot(expected: RobotModel, urdf: str) -> tuple[RobotModel, float]
             tools=expected.tools,
             base_link=expected.base_link,
             mimics=mimics,
+            speed_limits=expected.speed_limits,
             file=expected.file,
         )
     except RobotError as error:
@@ -250,6 +251,10 @@ class RobotFile(Schema):
         default=None, description='order of position vectors; null = all that move by themselves'
     )
     mimic: ListOf[MimicEntry] = Field(default=(), description="added to the URDF's own")
+    speed_limits: dict[str, Annotated[float, Field(gt=0, le=1000)]] = Field(
+        default_factory=dict,
+        description='largest speed by joint, in place of that of the description [rad/s or m/s]',
+    )
     tools: ListOf[ToolEntry] = Field(description='one an arm')
 
     @model_validator(mode='after')
@@ -293,6 +298,7 @@ def load_robot(path: Path | str) -> RobotModel:
         ],
         base_link=base,
         mimics=mimics,
+        speed_limits=file.speed_limits,
         file=path,
     )
 

@@ -97,6 +97,7 @@ class RobotModel:
         tools: one per arm.
         base_link: link in which all poses are given.
         mimics: joints that follow commanded ones.
+        speed_limits: largest speeds by joint, in place of those of the model [rad/s or m/s].
         file: the YAML that it was read from; None = made in code.
 
     Attributes:
@@ -107,6 +108,7 @@ class RobotModel:
             may also write as 0.
         tools: one per arm, in the order of all A axes.
         mimics: joints that follow commanded ones.
+        speed_limits: speeds that were given in place of those of the model.
         pinocchio_model: the model, with every joint of the description.
 
     Raises:
@@ -122,6 +124,7 @@ class RobotModel:
         tools: Sequence[Tool],
         base_link: str,
         mimics: Sequence[Mimic] = (),
+        speed_limits: Mapping[str, float] | None = None,
         file: Path | None = None,
     ) -> None:
         self.name = name
@@ -138,6 +141,7 @@ class RobotModel:
         self._setters = [
             _Setter.of(self._joint(joint), column) for column, joint in enumerate(self.joint_names)
         ]
+        self.speed_limits = dict(speed_limits or {})
         self.lower, self.upper, self.velocity_limits = self._limits()
         self._check_names(mimics)
         self._setters += [
@@ -313,6 +317,13 @@ class RobotModel:
             check_can_move(name, low, high, f"robot '{self.name}'")
         speeds = np.array([model.velocityLimit[joint.velocity] for joint in joints])
         speeds = np.where(speeds > 0, speeds, np.inf)
+        for name, speed in self.speed_limits.items():
+            if name not in self.joint_names:
+                raise RobotError(
+                    f"'speed_limits' of robot '{self.name}' names '{name}', which is not among "
+                    f'its joints {list(self.joint_names)}{nearest(name, self.joint_names)}'
+                )
+            speeds[self.joint_names.index(name)] = speed
         for array in (lower, upper, speeds):
             array.flags.writeable = False
         return lower, upper, speeds

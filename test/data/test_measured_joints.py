@@ -264,3 +264,67 @@ def test_a_spike_in_the_rows_of_a_table_is_left_out_and_named(franka):
     assert '1 of 100 rows are out of reach of the others and were made of those' in note
     with pytest.raises(EpisodeError, match='it has no position at all'):
         mend_rows('observation.state', stamps * 1e-9, np.full_like(rows, math.nan), franka)
+
+
+def moved_to(robot: RobotModel, joint: int, values: np.ndarray) -> list[tuple[int, object]]:
+    """Return messages of a motion in which one joint has other positions."""
+    stamps, rows = motion(len(values) / RATE)
+    rows[:, joint] = values
+    return recorded(robot, stamps, rows)
+
+
+def test_a_joint_that_is_faster_than_its_stated_limit_moves_and_the_remedy_is_named(franka):
+    """Limits of descriptions are placeholders at times: .5 rad/s for fingers that do 6."""
+    times = np.arange(200) / RATE
+    values = HOME[3] + 1.3 * np.sin(2 * np.pi * 1.4 * np.clip(times - 1, 0, 1))
+    states, warnings = merged(franka, moved_to(franka, 3, values))
+    top = np.abs(np.diff(values)).max() * RATE
+    assert 11.4 < top < 11.5
+    np.testing.assert_array_equal(states.positions[:, 3], values)
+    (text,) = warnings
+    assert f"joint 'panda_joint4' moves at up to {top:.3g} a second, its speed limit is" in text
+    assert "'speed_limits: {panda_joint4: 11.5}'" in text
+
+
+def test_a_spike_of_several_samples_is_no_motion(franka):
+    stamps, rows = motion()
+    given = rows.copy()
+    given[100:104, 0] += [0.4, 0.9, 0.9, 0.4]  # rises and falls in steps of one sign each
+    given[150, 0] += 1.0
+    states, warnings = merged(franka, recorded(franka, stamps, given))
+    assert any('glitches of a sensor' in text for text in warnings)
+    assert len(states.stamps_ns) < len(stamps)
+
+
+def test_a_joint_that_is_measured_less_often_than_there_are_rows_makes_no_jumps(franka):
+    """A hand that answers at 10 Hz in a table of 50 rows a second shows five steps in one."""
+    times = np.arange(200) / RATE
+    speed = 2.5 * franka.velocity_limits[3]
+    way = HOME[3] + speed / 6 * np.sin(6 * times)
+    held = np.repeat(way[::5], 5)
+    assert np.abs(np.diff(held)).max() > 0.05 + 3 * franka.velocity_limits[3] / RATE
+    states, warnings = merged(franka, moved_to(franka, 3, held))
+    assert warnings == []
+    np.testing.assert_array_equal(states.positions[:, 3], held)
+
+
+def test_a_spike_of_a_joint_that_rests_is_still_one(franka):
+    """Rests repeat a position, too; a spike after them takes no time."""
+    values = np.full(200, HOME[3])
+    values[60:80] += np.linspace(0, 0.2, 20)
+    values[80:] += 0.2
+    values[150] += 0.7
+    states, (text,) = merged(franka, moved_to(franka, 3, values))
+    assert '1 of 200 messages are out of reach' in text
+    assert len(states.stamps_ns) == 199
+
+
+def test_rows_that_contradict_each_other_are_refused_in_words_of_tables(franka):
+    _, rows = motion()
+    both = np.empty((2 * len(rows), rows.shape[1]))
+    both[::2], both[1::2] = rows, -0.5 * rows + HOME
+    times = np.arange(len(both)) * 0.5 / RATE
+    with pytest.raises(EpisodeError) as caught:
+        mend_rows('observation.state', times, both, franka)
+    assert '200 and 200 of 400 rows belong together' in str(caught.value)
+    assert "'speed_limits'" in str(caught.value) and '--topics' not in str(caught.value)

@@ -212,6 +212,9 @@ def test_joints_in_another_unit_fail_with_advice(datasets, make_mapping, tmp_pat
     assert 'are unit, sign, offset' in summary.failed[0]
 
 
+CAMERA = '{file: a.json, intrinsics: K, extrinsics: T, mount_link: base}'
+
+
 @pytest.mark.parametrize(
     ('old', 'new', 'message'),
     [
@@ -227,8 +230,8 @@ def test_joints_in_another_unit_fail_with_advice(datasets, make_mapping, tmp_pat
         ('closed: 100, open: 0}\na', 'closed: 100}\na', "do not go together"),
         ('closed: 100, open: 0}\na', 'closed: 1, open: 1}\na', 'both ends of the range are 1'),
         ('calibration: calibration.yaml', 'calibration: cal.yaml', "cal.yaml' does not exist"),
-        (', calibration: calibration.yaml', '', "give either 'calibration'"),
-        ('calibration: calibration.yaml', 'calibration: null', "give either 'calibration'"),
+        ('calibration: calibration.yaml',
+         f'calibration: calibration.yaml, camera: {CAMERA}', "give either 'calibration'"),
         ('calibration: calibration.yaml', 'calibration: 5', 'must be the name of a file'),
         ('robot: robot.yaml', 'robot: robot.yml', 'robot.yml'),
         ('robot: robot.yaml', 'robot: [1]', 'must be the name of a bundled robot'),

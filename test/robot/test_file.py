@@ -8,7 +8,7 @@ from mtv_world_ros.cli.robot import describe
 from mtv_world_ros.core.data_types import JointTrajectory
 from mtv_world_ros.core.errors import ConfigError, RobotError, TrajectoryError
 from mtv_world_ros.importing.convert import jumps
-from mtv_world_ros.robot.file import described_robot, load_robot
+from mtv_world_ros.robot.file import described_robot, load_robot, save_robot
 from mtv_world_ros.robot.plan_limits import check_speeds
 
 PLANAR = """<robot name="two">
@@ -145,6 +145,19 @@ def test_a_speed_limit_of_zero_is_none_everywhere(tmp_path):
         check_speeds(robot, fast, np.zeros(2))
     (said,) = jumps([fast], robot)
     assert said.startswith("commands of joint 'elbow' jump 1 times (over 2 times 10 a second")
+
+
+def test_speed_limits_of_the_robot_file_stand_in_for_those_of_the_description(tmp_path):
+    robot = load_robot(write(tmp_path, planar(speed_limits={'elbow': 7.5})))
+    np.testing.assert_array_equal(robot.velocity_limits, [np.inf, 7.5])
+    live, _ = described_robot(robot, PLANAR)  # as from /robot_description
+    assert live.velocity_limits[1] == 7.5
+    saved = save_robot(robot.file, tmp_path / 'copy')
+    assert load_robot(saved.file).velocity_limits[1] == 7.5
+    with pytest.raises(RobotError, match="names 'elbo', which is .*did you mean 'elbow'"):
+        load_robot(write(tmp_path, planar(speed_limits={'elbo': 7.5})))
+    with pytest.raises(ConfigError, match='speed_limits'):
+        load_robot(write(tmp_path, planar(speed_limits={'elbow': 0})))
 
 
 def test_joints_take_the_order_of_the_file(tmp_path):

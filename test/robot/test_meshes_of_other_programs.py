@@ -247,3 +247,21 @@ def test_a_mesh_that_only_has_a_known_file_name_is_not_taken(tmp_path, name):
     shape = load_shape(robot(folder, upper=mesh(name)))
     taken = name == '../../arm.stl'  # it is there
     assert shape.is_known == taken and not shape.replaced
+
+
+def test_a_mesh_of_bodies_with_gaps_between_them_keeps_each(tmp_path):
+    """Letters of a logo: slices between them hold nothing."""
+    one = stl(np.array([0.02, 0.02, 0.02]))
+    ends = [np.array([0, 0, z]) for z in (-0.2, 0.2)]
+    triangles = b''
+    for offset in ends:
+        for face in FACES:
+            points = corners(np.array([0.02, 0.02, 0.02]))[list(face)] + offset
+            triangles += struct.pack('<12fH', 0, 0, 0, *points.ravel(), 0)
+    (tmp_path / 'logo.stl').write_bytes(one[:80] + struct.pack('<I', 24) + triangles)
+    shape = load_shape(robot(tmp_path, upper=mesh('logo.stl')))
+    parts = [part for part in shape.parts if part.link == 'upper']
+    assert len(parts) == 2
+    heights = sorted(float(part.points[:, 2].mean()) for part in parts)
+    np.testing.assert_allclose(heights, [-0.2, 0.2], atol=1e-6)
+    np.testing.assert_allclose(extent(shape.parts), [0.02, 0.02, 0.42], atol=1e-6)

@@ -142,6 +142,9 @@ def import_status(summary: ImportSummary[Any], name: Callable[[Any], str]) -> in
     for note in summary.robot_notes:
         print(f'robot: {note}', file=sys.stderr)
     print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
+    failed: dict[str, list[str]] = {}  # by reason
     for one, reason in summary.failed.items():
-        print(f'{name(one)}: {reason}', file=sys.stderr)
+        failed.setdefault(reason, []).append(name(one))
+    for reason, names in failed.items():
+        print(f'{", ".join(names)}: {reason}', file=sys.stderr)
     return 1 if summary.failed else 0

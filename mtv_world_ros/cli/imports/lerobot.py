@@ -31,12 +31,14 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--mapping',
         type=Path,
-        help='which feature is what; default: made of --robot and --calibration, for columns that '
-        "are named like the robot's joints [rad or m]",
+        help='which feature is what; default: made of --robot, for columns that are named like '
+        "the robot's joints [rad or m]",
     )
     parser.add_argument('--robot', help='robot YAML, or a bundled robot, without --mapping')
     parser.add_argument(
-        '--calibration', type=Path, help='calibration of the cameras by view, without --mapping'
+        '--calibration',
+        type=Path,
+        help='calibration of the cameras by view, without --mapping; default: not known',
     )
     parser.add_argument('--out', type=Path, required=True, help='folder of the episodes')
     parser.add_argument('--episodes', help="numbers, comma-separated, e.g. '0,4,7'; default: all")
@@ -48,6 +50,7 @@ def _import_dataset(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from mtv_world_ros.core.files import ROBOT_YAML
+    from mtv_world_ros.importing.bags import summary_line
     from mtv_world_ros.importing.convert import episode_name, import_dataset, read_frames
     from mtv_world_ros.importing.lerobot import LeRobotDataset
     from mtv_world_ros.importing.mapping import load_mapping
@@ -69,6 +72,9 @@ def _import_dataset(arguments: argparse.Namespace) -> int:
         stage=object_stage(arguments, found, read),
         progress=lambda numbers: tqdm(numbers, unit='ep', disable=None),
     )
+    for number in summary.made:
+        looked = bool(arguments.segmenter or arguments.objects)
+        print(summary_line(arguments.out / episode_name(number), objects=looked))
     status = import_status(summary, 'episode {}'.format)
     if summary.made or summary.kept:
         print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
@@ -83,10 +89,10 @@ def _guessed_mapping(arguments: argparse.Namespace) -> Path:
     from mtv_world_ros.importing.lerobot import LeRobotDataset
     from mtv_world_ros.importing.mapping import guess_mapping
 
-    if arguments.robot is None or arguments.calibration is None:
+    if arguments.robot is None:
         raise ConfigError(
-            'give --mapping (config/datasets/example.yaml has all keys), or --robot and '
-            "--calibration where the columns are named like the robot's joints"
+            'give --mapping (config/datasets/example.yaml has all keys), or --robot where the '
+            "columns are named like the robot's joints"
         )
     values, left_out = guess_mapping(
         LeRobotDataset(arguments.dataset), arguments.robot, arguments.calibration
@@ -95,7 +101,8 @@ def _guessed_mapping(arguments: argparse.Namespace) -> Path:
     write_whole(file, yaml.safe_dump(values, sort_keys=False))
     print(f'mapping: {file}')
     if left_out:
-        print(f"left out, not in '{arguments.calibration}': {', '.join(left_out)}")
+        where = f", not in '{arguments.calibration}'" if arguments.calibration else ', no colours'
+        print(f'left out{where}: {", ".join(left_out)}')
     return file
 
 
