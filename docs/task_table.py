@@ -18,10 +18,10 @@ def table() -> str:
     """Return the table of the files in `config/tasks`, in the order of their names."""
     folder = share_path('config', 'tasks')
     lines = ['| task | instruction | in the simulator |', '|---|---|---|']
-    for path in [*sorted(folder.glob('*.yaml')), *sorted(folder.glob('zero_shot/*.yaml'))]:
+    for path in [*sorted(folder.glob('*.yaml')), *sorted(folder.glob('*/*.yaml'))]:
         task = load_task(path)
         use = 'yes' if task.scene is not None else 'no: judged only'
-        use = 'zero-shot sets only' if path.parent != folder else use
+        use = 'zero-shot sets only' if path.parent.name == 'zero_shot' else use
         link = f'../config/tasks/{path.relative_to(folder)}'
         lines.append(f'| [`{task.name}`]({link}) | {task.instruction} | {use} |')
     return '\n'.join([*lines, ''])

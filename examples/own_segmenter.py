@@ -1,9 +1,11 @@
 """Uses a segmenter of your own: how the masks of objects are found.
 
     python examples/own_segmenter.py [EPISODE]
+    PYTHONPATH=examples mtv-world evaluate bundled EPISODES --segmenter own_segmenter:HueSegmenter
 
 Anything with `name` and `segment` will do. This one finds objects by the colour in their name,
-far more simply than the bundled one, and says nothing about its doubts.
+far more simply than the bundled one, and says nothing about its doubts. Commands and the node
+take the class by its name, `module:Class`.
 """
 
 from __future__ import annotations
@@ -47,14 +49,20 @@ class HueSegmenter:
         return ObjectMasks(names=names, masks=found, status=status)
 
 
-parser = argparse.ArgumentParser()
-parser.add_argument(
-    'episode', type=Path, nargs='?', default=share_path('resource', 'demo_episode')
-)
-options = parser.parse_args()
+def main() -> None:
+    """Judge an episode with the bundled segmenter and with this one."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument(
+        'episode', type=Path, nargs='?', default=share_path('resource', 'demo_episode')
+    )
+    options = parser.parse_args()
 
-pipeline = Pipeline.load('bundled')
-recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
-for segmenter in (pipeline.segmenter, HueSegmenter()):
-    success = judge(replace(pipeline, segmenter=segmenter), recording)
-    print(f'{segmenter.name:<8} success {success.probability:.2f}; {success.reasons[0]}')
+    pipeline = Pipeline.load('bundled')
+    recording = load_recording(options.episode, pipeline.spec, pipeline.robot)
+    for segmenter in (pipeline.segmenter, HueSegmenter()):
+        success = judge(replace(pipeline, segmenter=segmenter), recording)
+        print(f'{segmenter.name:<8} success {success.probability:.2f}; {success.reasons[0]}')
+
+
+if __name__ == '__main__':
+    main()

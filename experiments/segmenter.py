@@ -26,7 +26,7 @@ from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.vision.jaccard import jaccard
-from mtv_world_ros.vision.segmenters.choose import choose_segmenter, SEGMENTERS
+from mtv_world_ros.vision.segmenters.choose import check_segmenter_name, choose_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, Segmenter
 
 WINDOW = 17
@@ -159,7 +159,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('dataset', type=Path)
-    parser.add_argument('--segmenter', choices=SEGMENTERS, default='colour')
+    parser.add_argument('--segmenter', type=check_segmenter_name, default='colour')
     parser.add_argument('--device', default='cpu')
     parser.add_argument('--episodes', type=int, help='use only the first so many')
     parser.add_argument('--seed', type=int, default=9000, help='that the episodes were made with')

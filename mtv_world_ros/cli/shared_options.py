@@ -122,8 +122,9 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     'segmenter': {
         '--segmenter': {
             'default': 'auto',
-            'help': 'finds objects: auto, colour, sam2, sam3, or the objects.safetensors of an '
-            'import with --objects; auto = sam2 where MTV_WORLD_WEIGHTS has it, else colour',
+            'help': 'finds objects: auto, colour, sam2, sam3, module:Class of your own, or the '
+            'objects.safetensors of an import with --objects; auto = sam2 where MTV_WORLD_WEIGHTS '
+            'has it, else colour',
         }
     },
     'describer': {

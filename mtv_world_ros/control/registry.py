@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
-from importlib.util import find_spec
 import json
 from pathlib import Path
-import sys
-from typing import Any
 
 from mtv_world_ros.control.control import Control, ControlOptions
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.entry_points import CONTROLS as GROUP
-from mtv_world_ros.core.entry_points import registered
-from mtv_world_ros.core.errors import CheckpointError, ConfigError, MtvWorldError, nearest
+from mtv_world_ros.core.errors import CheckpointError, ConfigError, MtvWorldError
+from mtv_world_ros.core.registry import Registry
 
 TRAJECTORY_VIDEO = 'trajectory_video'
 #: the paper's method, first, and its three baselines
@@ -26,13 +22,20 @@ CONTROLS: Mapping[str, str] = {
 }
 #: what `fitted` found, in the folder of a checkpoint or a training
 CONTROL_FILE = 'control.json'
-#: packages that a control imports, and the extra that installs them
-_EXTRAS = {'tokenizers': 'fast_tokens'}
+_REGISTRY = Registry(
+    kind='control',
+    bundled=CONTROLS,
+    group=GROUP,
+    setting='video.control',
+    required=('create', 'make', 'layout'),
+    protocol='mtv_world_ros.control.control.Control',
+    extras={'tokenizers': 'fast_tokens'},
+)
 
 
 def control_names() -> list[str]:
     """Return the names that are registered: the package's, then those of entry points."""
-    return [*CONTROLS, *sorted(set(registered(GROUP)) - set(CONTROLS))]
+    return _REGISTRY.names()
 
 
 def check_control_name(name: str) -> str:
@@ -41,14 +44,7 @@ def check_control_name(name: str) -> str:
     Raises:
         ConfigError: it is neither.
     """
-    if ':' not in name and name not in control_names():
-        known = control_names()
-        raise ConfigError(
-            f"control '{name}' is not registered{nearest(name, known)}; registered are "
-            f'{", ".join(known)}. Set video.control to one of them, to the name of an entry '
-            f"point of the group '{GROUP}', or to module:Class"
-        )
-    return name
+    return _REGISTRY.check(name)
 
 
 def control_class(name: str) -> type[Control]:
@@ -60,41 +56,7 @@ def control_class(name: str) -> type[Control]:
     Raises:
         ConfigError: no such control, or it cannot be imported.
     """
-    check_control_name(name)
-    if ':' in name:
-        target = name
-    elif name in CONTROLS:
-        target = CONTROLS[name]
-    else:
-        target = registered(GROUP)[name].value
-    module, _, attribute = target.partition(':')
-    try:
-        found: Any = import_module(module)
-        for part in attribute.split('.'):
-            found = getattr(found, part)
-    except Exception as error:  # a third-party module may raise anything
-        raise ConfigError(
-            f"control '{name}' cannot be imported: {error or type(error).__name__}{_remedy(error)}"
-        ) from error
-    missing = [part for part in ('create', 'make', 'layout') if not hasattr(found, part)]
-    if missing:
-        raise ConfigError(
-            f"control '{name}': '{target}' lacks {', '.join(missing)}; see "
-            'mtv_world_ros.control.control.Control for what a control has'
-        )
-    return found
-
-
-def _remedy(error: Exception) -> str:
-    package = getattr(error, 'name', None) if isinstance(error, ModuleNotFoundError) else None
-    if package in _EXTRAS:
-        return f"; install it with: pip install 'mtv_world_ros[{_EXTRAS[package]}]'"
-    if package is not None and find_spec(package.partition('.')[0]) is None:
-        return (
-            f"; install the package that has '{package}', or add its folder to PYTHONPATH (now "
-            f'{len(sys.path)} folders)'
-        )
-    return ''
+    return _REGISTRY.load(name)
 
 
 def create_control(name: str, options: ControlOptions) -> Control:

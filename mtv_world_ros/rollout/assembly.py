@@ -7,11 +7,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.core.entry_points import DESCRIBERS as GROUP
 from mtv_world_ros.core.entry_points import policy_kind
-from mtv_world_ros.core.errors import (
-    PolicyError,
-)
+from mtv_world_ros.core.errors import PolicyError
 from mtv_world_ros.core.files import bundled
+from mtv_world_ros.core.registry import Registry
 from mtv_world_ros.policies.policy import (
     EpisodeOrigin,
     load_policy_config,
@@ -27,6 +27,15 @@ from mtv_world_ros.vision.describers.describer import Describer, InstructionDesc
 if TYPE_CHECKING:
     from mtv_world_ros.vision.describers.describer_config import DescriberConfig
 
+#: describers in Python code of the user's
+DESCRIBERS = Registry(
+    kind='describer',
+    bundled={},
+    group=GROUP,
+    setting="the key 'python' of a describer file",
+    protocol='mtv_world_ros.vision.describers.describer.Describer',
+    made_required=('describe',),
+)
 #: makes a policy for an episode's origin; most do not look at it
 PolicyMaker = Callable[[EpisodeOrigin], Policy]
 
@@ -112,6 +121,8 @@ def assemble_describer(config: DescriberConfig | str | Path | None = None) -> De
         config = load_describer_config(Path(config))
     if config.kind == 'list':
         return load_object_list(Path(config.list))
+    if config.kind == 'python':
+        return DESCRIBERS.create(config.python)
     if config.kind != 'openai' or not config.openai:
         return InstructionDescriber()
     from mtv_world_ros.vision.describers.openai_chat import OpenAIChat

@@ -127,8 +127,8 @@ class Settings(LiveSettings, NodeSettings):
     )
     segmenter: str = at_start(
         'auto',
-        'What finds the objects: auto, colour, sam2, sam3 or a file of examples; auto = sam2 if '
-        'MTV_WORLD_WEIGHTS has its weights, else colour.',
+        'What finds the objects: auto, colour, sam2, sam3, module:Class of your own or a file of '
+        'examples; auto = sam2 if MTV_WORLD_WEIGHTS has its weights, else colour.',
     )
     describer: str = at_start(
         '',

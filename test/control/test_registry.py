@@ -27,6 +27,7 @@ from mtv_world_ros.control.registry import (
     CONTROLS,
     create_control,
 )
+from mtv_world_ros.core import registry as core_registry
 from mtv_world_ros.core.data_types import JointTrajectory
 from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.core.files import share_path
@@ -147,7 +148,7 @@ def test_inputs_that_the_layout_does_not_declare_are_refused(inputs, said):
 
 def test_an_entry_point_registers_a_control(outside, monkeypatch, robot):
     entry = EntryPoint('tool_pixels', 'somebodys_control:ToolPixels', registry.GROUP)
-    monkeypatch.setattr(registry, 'registered', lambda group: {entry.name: entry})
+    monkeypatch.setattr(core_registry, 'registered', lambda group: {entry.name: entry})
     assert control_names()[-1] == 'tool_pixels'
     assert control_class('tool_pixels').__name__ == 'ToolPixels'
     assert create_control('tool_pixels', options(robot)).layout.names == ('frame',)

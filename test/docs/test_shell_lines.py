@@ -245,8 +245,7 @@ def check_values(given: dict[str, Any]) -> None:
     from mtv_world_ros.simulation.tasks import tasks_named
     from mtv_world_ros.simulation.zero_shot import kinds_named
     from mtv_world_ros.training.training_config import load_training_config
-    from mtv_world_ros.vision.segmenters.choose import SEGMENTERS
-    from mtv_world_ros.vision.segmenters.examples import SUFFIX
+    from mtv_world_ros.vision.segmenters.choose import check_segmenter_name
 
     def each(names: str | Sequence[str]) -> list[str]:
         return names.split(',') if isinstance(names, str) else list(names)
@@ -265,8 +264,7 @@ def check_values(given: dict[str, Any]) -> None:
             tasks_named(given[key])
     kinds_named(given.get('zero_shot') or '')
     ServingOptions.parse(given.get('serving') or '')
-    segmenter = given.get('segmenter')
-    assert segmenter in (None, *SEGMENTERS) or segmenter.endswith(SUFFIX)
+    check_segmenter_name(given.get('segmenter') or 'auto')
     if given.get('robot') and not given['robot'].startswith('my_'):  # those are the reader's own
         robot_path(given['robot'])
 

@@ -28,8 +28,9 @@ def _add_masks(parser: argparse.ArgumentParser) -> None:
     add_options(parser, 'describer')
     parser.add_argument(
         '--segmenter',
-        choices=('auto', 'colour', 'sam2', 'sam3'),
-        help="store the objects' masks with the episodes; default: none, or those recorded",
+        metavar='NAME',
+        help="store the objects' masks with the episodes: auto, colour, sam2, sam3 or "
+        'module:Class of your own; default: none, or those recorded',
     )
     parser.add_argument('--device', default='cpu', help='PyTorch device of the segmenter')
 

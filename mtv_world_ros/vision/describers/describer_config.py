@@ -94,7 +94,7 @@ def _plain(instruction: str) -> str:
     return ' '.join(instruction.lower().split()).rstrip('.! ')
 
 
-KINDS = ('instruction', 'list', 'openai')
+KINDS = ('instruction', 'list', 'openai', 'python')
 
 
 def _known(kind: Any) -> str:
@@ -113,12 +113,17 @@ class DescriberConfig(Schema):
     kind: Annotated[str, BeforeValidator(_known)] = Field(
         default='instruction',
         description='`instruction` (the words of the instruction, no model), `list` (a YAML '
-        'file) or `openai` (a server, also one on this machine)',
+        'file), `openai` (a server, also one on this machine) or `python` (a class of your own)',
     )
     list: str = Field(
         default='', description='the YAML file of `list`; in a file, relative to that file'
     )
     openai: OpenAIConfig | None = Field(default=None, description='the server of `openai`')
+    python: str = Field(
+        default='',
+        description='the class of `python`: the name of an entry point of '
+        '`mtv_world.describers`, or `module:Class`; it is called without arguments',
+    )
     cache: str = Field(
         default='',
         description="folder in which models' answers are kept; empty = they are not; in a file, "

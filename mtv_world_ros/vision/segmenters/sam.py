@@ -23,6 +23,7 @@ from mtv_world_ros.vision.segmenters.weights import (
     load_tokenizer,
     load_vision_model,
     preprocessor_config,
+    SegmenterOptions,
 )
 
 #: labels of SAM 2 for the two corners of a box among the points of a prompt
@@ -118,6 +119,18 @@ def sam2_segmenter(
         video=video,
         tracking=tracking or TrackingConfig(),
     )
+
+
+class Sam2:
+    """MM-Grounding-DINO and SAM 2, from the folder of weights."""
+
+    models = ('mm-grounding-dino', 'sam2_video')
+
+    @classmethod
+    def create(cls, options: SegmenterOptions) -> PromptedSegmenter:
+        """Load both models; see `sam2_segmenter` for the errors."""
+        detector, tracker = options.folders(*cls.models)
+        return sam2_segmenter(detector, tracker, device=options.device)
 
 
 #: maximum number of tokens of a name in SAM 3's text encoder
@@ -243,3 +256,15 @@ def sam3_segmenter(
     return PromptedSegmenter(
         name='sam3', finder=video, video=video, tracking=tracking or TrackingConfig()
     )
+
+
+class Sam3:
+    """SAM 3, from the folder of weights."""
+
+    models = ('sam3_video',)
+
+    @classmethod
+    def create(cls, options: SegmenterOptions) -> PromptedSegmenter:
+        """Load the model; see `sam3_segmenter` for the errors."""
+        (folder,) = options.folders(*cls.models)
+        return sam3_segmenter(folder, device=options.device)

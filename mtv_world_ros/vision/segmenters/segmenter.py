@@ -13,7 +13,11 @@ from mtv_world_ros.core.errors import ObservationError
 
 
 class Segmenter(Protocol):
-    """Finds named objects in videos."""
+    """Finds named objects in videos.
+
+    A class that is chosen by name has a class method `create(options)`, which takes
+    `weights.SegmenterOptions`, or is called without arguments.
+    """
 
     @property
     def name(self) -> str:

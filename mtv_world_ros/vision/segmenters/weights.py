@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,51 @@ VISION_MODELS = {
     'sam2_video': ('Sam2VideoModel', 'facebook/sam2.1-hiera-tiny'),
     'sam3_video': ('Sam3VideoModel', 'facebook/sam3'),
 }
+
+
+#: the environment variable that names the folder of public weights
+WEIGHTS_VARIABLE = 'MTV_WORLD_WEIGHTS'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SegmenterOptions:
+    """What a segmenter is created for.
+
+    Attributes:
+        name: name by which it was chosen.
+        weights: folder of public weights, at any depth up to two; None = there is none.
+        device: of the models: `cpu`, `cuda`, ...
+    """
+
+    name: str
+    weights: Path | None = None
+    device: str = 'cpu'
+
+    def has_models(self, *kinds: str) -> bool:
+        """Return whether the folder of weights has these models, keys of `VISION_MODELS`.
+
+        Raises:
+            ConfigError: `weights` is no folder.
+        """
+        return self.weights is not None and set(kinds) <= set(find_weights(self.weights))
+
+    def folders(self, *kinds: str) -> tuple[Path, ...]:
+        """Return the folders of these models.
+
+        Raises:
+            ConfigError: there is no folder of weights, or a model is not in it.
+        """
+        if self.weights is None:
+            raise ConfigError(
+                f"segmenter is '{self.name}', whose weights are looked for in the folder that "
+                f'{WEIGHTS_VARIABLE} names; it is not set'
+            )
+        found = find_weights(self.weights)
+        missing = [kind for kind in kinds if kind not in found]
+        if missing:
+            names = ', '.join(f'{kind} ({VISION_MODELS[kind][1]})' for kind in missing)
+            raise ConfigError(f"segmenter is '{self.name}', but '{self.weights}' holds no {names}")
+        return tuple(found[kind] for kind in kinds)
 
 
 def find_weights(root: Path) -> dict[str, Path]:

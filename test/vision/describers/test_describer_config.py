@@ -37,11 +37,27 @@ def test_without_a_configuration_the_instruction_names_the_objects():
     assert isinstance(assemble_describer(), InstructionDescriber)
 
 
+def test_a_class_of_ones_own_describes(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / 'my_describer.py').write_text(
+        'class Mine:\n    def describe(self, first_frame, instruction):\n        return ()\n'
+    )
+    file = write(tmp_path / 'describer.yaml', 'kind: python\npython: my_describer:Mine\n')
+    assert type(assemble_describer(file)).__name__ == 'Mine'
+    for name, said in (
+        ('my_describer:Mien', "has no attribute 'Mien'"),
+        ('json:JSONDecoder', 'is a JSONDecoder, which lacks describe'),
+        ('mine', "describer 'mine' is not registered; registered are none. Set the key 'python'"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            assemble_describer(write(file, f'kind: python\npython: {name}\n'))
+
+
 def test_the_file_that_is_shipped_is_valid_with_each_of_its_variants():
     shipped = share_path('config', 'describer.yaml')
     assert load_describer_config(shipped).kind == 'instruction'
     paragraphs = shipped.read_text().split('\n\n')[1:]
-    for kind, paragraph in zip(('list', 'openai'), paragraphs, strict=False):
+    for kind, paragraph in zip(('list', 'openai', 'python'), paragraphs, strict=False):
         lines = [line.removeprefix('# ') for line in paragraph.splitlines()]
         config = DescriberConfig(**yaml.safe_load('\n'.join(lines)))
         assert config.kind == kind
@@ -97,6 +113,7 @@ def test_a_wrong_object_list_says_what_and_where(tmp_path, text, words):
         ('kind: opnai', "kind 'opnai' is none (did you mean 'openai'?)"),
         ('kind: openai', "needs the key 'openai'"),
         ('kind: list', "needs the key 'list'"),
+        ('kind: python', "needs the key 'python'"),
         ('kind: [openai]', "'kind' is ['openai']; expected a text"),
         ('cach: x', "unknown key 'cach' (did you mean 'cache'?)"),
         ('kind: openai\nopenai: {base_url: x}', "openai: key 'model' is missing"),
