@@ -137,8 +137,8 @@ def with_camera_info(
 
     Args:
         camera: the calibrated view.
-        width: of the images that the CameraInfo is for [px].
-        height: of the images [px].
+        width: width of the images that the CameraInfo is for [px].
+        height: height of the images [px].
         K: (3, 3) [px].
         distortion_model: as in CameraInfo; ignored if all coefficients are zero, unless it is
             `equidistant`.

@@ -25,8 +25,8 @@ class Intrinsics:
     """Intrinsics that a CameraInfo gives of a view's images.
 
     Attributes:
-        width: of the full resolution [px]; 0 = not given, then it is that of the images.
-        height: of the full resolution [px]; 0 = not given.
+        width: width of the full resolution [px]; 0 = not given, then it is that of the images.
+        height: height of the full resolution [px]; 0 = not given.
         matrix: the nine entries of K, or of rectified images those of P's left part [px].
         distortion_model: as in the message.
         distortion: coefficients.

@@ -24,7 +24,7 @@ class Location:
     """A triangulated centroid.
 
     Attributes:
-        point: (3,) in the base frame [m].
+        point: (3,) point in the base frame [m].
         residual_px: distance of the views' rays where they pass each other, in pixels.
         sigma_m: position error that the centroid's error, or the larger residual, causes [m].
     """
@@ -112,9 +112,9 @@ def upright_extents(
     vertical. The depth along the line of sight is taken to be the mean width of the views.
 
     Args:
-        cameras: of the V views.
+        cameras: cameras of the V views.
         T_base_camera: pose of each camera, (4, 4) [m].
-        masks: of the object in each view, (V, H, W); empty = not seen.
+        masks: masks of the object in each view, (V, H, W); empty = not seen.
         point: (3,) its centre [m].
     """
     shown = []
@@ -150,9 +150,9 @@ def lean(
     that fits the planes of all views; a round mask determines none.
 
     Args:
-        cameras: of the V views.
+        cameras: cameras of the V views.
         T_base_camera: pose of each camera, (4, 4) [m].
-        masks: of the object in each view, (H, W), not empty.
+        masks: masks of the object in each view, (H, W), not empty.
     """
     planes = np.array([_plane(*view) for view in zip(cameras, T_base_camera, masks, strict=True)])
     level, up = planes[:, :2], planes[:, 2]
@@ -213,7 +213,7 @@ def count_reversals(angles: FloatArray, swing: float) -> FloatArray:
     """Return the cumulative number (T,) of reversals of an angle, each by more than `swing`.
 
     Args:
-        angles: (T,) without jumps of whole turns [rad].
+        angles: (T,) angles without jumps of whole turns [rad].
         swing: smaller turns are noise [rad].
     """
     counts, count, heading = np.zeros(len(angles)), 0, 0

@@ -159,7 +159,7 @@ def add_watch(parser: argparse.ArgumentParser, what: str) -> None:
     """Add `--watch`.
 
     Args:
-        parser: of the command.
+        parser: parser of the command.
         what: is shown while it runs.
     """
     parser.add_argument(
@@ -200,7 +200,7 @@ class Watch:
     """Target of a live view.
 
     Attributes:
-        address: of the page for browsers.
+        address: address of the page for browsers.
         file: is written instead; None = no file.
     """
 

@@ -206,7 +206,7 @@ def found_broken(report: Path, paths: Sequence[Path], views: Sequence[str]) -> d
 
     Args:
         report: folder that `mtv-world check` wrote.
-        paths: of the episodes.
+        paths: paths of the episodes.
         views: names of those that are trained on; others may be broken.
 
     Raises:

@@ -86,9 +86,9 @@ def _seen_links(
     """Return (T, H, W) 1 + the number of the link that is seen in each pixel, 0 = none.
 
     Args:
-        pixels: of each of P parts (T, N, 2), whose convex hull is its silhouette.
-        depths: (P, T) of the parts [m].
-        numbers: (P,) of their links.
+        pixels: pixels of each of P parts (T, N, 2), whose convex hull is its silhouette.
+        depths: (P, T) depths of the parts [m].
+        numbers: (P,) numbers of their links.
         camera: the view.
     """
     images = np.zeros((depths.shape[1], camera.height, camera.width), np.uint8)

@@ -44,7 +44,7 @@ class ControlInputs:
     """A chunk of a plan as the transformer takes it. None = the control does not feed this input.
 
     Attributes:
-        num_frames: T.
+        num_frames: number of frames, T.
         video: (V, 1 + T, H, W, 3) uint8 RGB, encoded to latents that are concatenated by channel;
             frame k shows the state after command k.
         context: tokens of the cross-attention: (L,) int64 indices, or (L, D) float32 vectors.
@@ -142,8 +142,8 @@ class InputLayout:
         """Raise if inputs are not those of the layout.
 
         Args:
-            inputs: of one chunk.
-            name: of the control.
+            inputs: inputs of one chunk.
+            name: name of the control.
 
         Raises:
             CheckpointError: an input is missing, is not declared, or has another size.
@@ -176,7 +176,7 @@ class ControlOptions:
         robot: the robot that the model is trained on.
         rendering: section `rendering` of the preset or checkpoint, for controls that draw.
         object_mask: whether drawings carry the objects' masks.
-        num_frames: T.
+        num_frames: number of frames, T.
     """
 
     robot: RobotModel

@@ -89,7 +89,7 @@ def load_control(name: str, options: ControlOptions, folder: Path) -> Control:
     """Return the control of a checkpoint, or of a training that is resumed.
 
     Args:
-        name: of the control.
+        name: name of the control.
         options: what it is created for.
         folder: may hold `control.json`.
 

@@ -391,7 +391,7 @@ class ToolMotion:
 
     Attributes:
         times: (N,) [s].
-        points: (A, N, 3) in the base frame [m].
+        points: (A, N, 3) points in the base frame [m].
         closed: (A, T) 0 open .. 1 closed, at the frames.
         shown_at: (T,) index of the point at each frame.
         fingers: two per arm: (2, T, 3) end points of a line along the finger, at the frames [m];
@@ -411,8 +411,8 @@ def tool_motion(
     """Interpolate the joints between the frames, so that trails follow the arms' arcs.
 
     Args:
-        motion: at the T frames.
-        times: (T,) of the frames [s].
+        motion: motion at the T frames.
+        times: (T,) times of the frames [s].
         points_per_frame: least number of points from one frame to the next.
         max_gap_m: largest distance of neighbouring points [m]; None = any.
     """
@@ -458,7 +458,7 @@ class ArmLinks:
         camera: the view.
         poses: (T, 4, 4) T_base_camera.
         arms: for each arm (N, T, 3) points along it, in the base frame [m].
-        width_m: of the lines [m]; None = nothing is drawn.
+        width_m: width of the lines [m]; None = nothing is drawn.
     """
 
     def __init__(

@@ -260,8 +260,8 @@ def fill_template(template: object, values: Mapping[str, int | str]) -> str:
     braces. Python's own format strings reach attributes of objects and make texts of any length.
 
     Args:
-        template: from a file.
-        values: of the fields.
+        template: template from a file.
+        values: values of the fields.
 
     Raises:
         ValueError: it is no text, too long, or has another field or format, or a lone brace.

@@ -185,7 +185,7 @@ class Observation:
     Attributes:
         cameras: V calibrated views, in the model's order, for the size of `frames`.
         frames: (V, H, W, 3) uint8 RGB.
-        positions: (J,) in the robot's joint order [rad or m].
+        positions: (J,) positions in the robot's joint order [rad or m].
         stamp_ns: time of the frames [ns].
     """
 
@@ -318,7 +318,7 @@ class SuccessEstimate:
     """Probability that the task succeeds, given the world model.
 
     Attributes:
-        probability: in [0, 1]; NaN = abstains.
+        probability: probability in [0, 1]; NaN = abstains.
         interval: (low, high); NaN where it abstains.
         jaccard: (V, O) Jaccard index, NaN where absent.
         reasons: grounds of the estimate, or why it abstains.

@@ -129,8 +129,8 @@ def check_output(path: Path, option: str = '--out') -> None:
     """Check that a file or folder can be written, before any work; it leaves nothing behind.
 
     Args:
-        path: that would be made, or replaced; folders above it may be missing.
-        option: that names another place.
+        path: path that would be made, or replaced; folders above it may be missing.
+        option: option that names another place.
 
     Raises:
         ConfigError: it cannot be written; names the path, the reason and the option.

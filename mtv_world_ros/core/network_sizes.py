@@ -41,7 +41,7 @@ def check_sizes(config: Mapping[str, Any], what: str) -> None:
     """Raise if a network of this configuration would be larger than any that is known.
 
     Args:
-        config: of the network; configurations in it are looked at as well.
+        config: config of the network; configurations in it are looked at as well.
         what: beginning of the error, e.g. the file.
 
     Raises:

@@ -45,7 +45,7 @@ class Starting:
     """Ends the process at once on a signal, whatever it imports or makes, until `is_over`.
 
     Args:
-        name: of the program, for the line on stderr.
+        name: name of the program, for the line on stderr.
     """
 
     def __init__(self, name: str) -> None:

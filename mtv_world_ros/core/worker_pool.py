@@ -73,7 +73,7 @@ def run_all(
         make_run: makes what runs a job, once in every process; has to be picklable for more than
             one.
         workers: processes; 1 = this one.
-        threads: of each process, where there are several.
+        threads: threads of each process, where there are several.
 
     Raises:
         ConfigError: less than one worker.
@@ -249,10 +249,10 @@ def score_all(
     """Yield jobs with their scores, or why there are none; see `run_all`.
 
     Args:
-        jobs: to score, in any order.
+        jobs: jobs to score, in any order.
         make_scorer: called once in every process; has to be picklable for more than one.
         workers: processes; 1 = this one.
-        threads: of each process, where there are several.
+        threads: threads of each process, where there are several.
     """
     several = workers > 1 and len(jobs) > 1
     make_run = partial(_Scoring, make_scorer, is_late=several)
@@ -267,10 +267,10 @@ def score_with_ray(
     Every machine of the cluster needs this package, and checkpoints under the same path.
 
     Args:
-        jobs: to score, in any order.
+        jobs: jobs to score, in any order.
         make_scorer: called once in every actor; has to be picklable.
         workers: actors, of one core each.
-        address: of the cluster; empty = `RAY_ADDRESS`, else a new one on this machine.
+        address: address of the cluster; empty = `RAY_ADDRESS`, else a new one on this machine.
 
     Raises:
         ConfigError: Ray is not installed or cannot be reached, or less than one worker.

@@ -69,7 +69,7 @@ class JointSample(NamedTuple):
     """Positions that one JointState gives.
 
     Attributes:
-        positions: by joint name [rad or m]; those that can be used.
+        positions: positions by joint name [rad or m]; those that can be used.
         faults: reason by name of each joint whose position cannot.
     """
 
@@ -83,7 +83,7 @@ def read_sample(
     """Return the positions of a JointState by joint.
 
     Args:
-        names: of the message.
+        names: names of the message.
         positions: one a name.
         joints: those that matter; the others are ignored, whatever they hold. None = all.
     """
@@ -189,10 +189,10 @@ def find_unreachable(
     faster than its speed limit: the limit of the robot's description is too low.
 
     Args:
-        topic: for texts.
-        stamps_ns: (N,) in increasing order.
-        positions: (N, J) in the order of `reach` [rad or m]; NaN = not in the message.
-        reach: of the robot.
+        topic: topic, for texts.
+        stamps_ns: (N,) stamps in increasing order.
+        positions: (N, J) positions in the order of `reach` [rad or m]; NaN = not in the message.
+        reach: reach of the robot.
         items: word for the samples, for texts.
 
     Raises:
@@ -388,8 +388,8 @@ def mend_rows(
 
     Args:
         what: name of the table or feature, for texts.
-        times: (T,) of the rows [s].
-        positions: (T, J) in the robot's order [rad or m].
+        times: (T,) times of the rows [s].
+        positions: (T, J) positions in the robot's order [rad or m].
         robot: gives names and limits.
 
     Raises:
@@ -443,7 +443,7 @@ def merge_joint_states(
     from the start. Each repair is a line in `warnings`.
 
     Args:
-        topic: for texts.
+        topic: topic, for texts.
         messages: (stamp [ns], sensor_msgs/JointState), in the order received.
         warnings: gets what was odd and how it was handled.
         robot: samples that its joints cannot have moved to are left out; None = not checked.

@@ -43,7 +43,7 @@ class Recording:
 
     Attributes:
         path: folder of the episode.
-        task: its name.
+        task: name of the task.
         outcome: `success`, `failure` or `unknown`.
         instruction: text for the robot.
         objects: names of the objects by the episode; what `object_ids` stand for.

@@ -101,7 +101,7 @@ def cut_clip(
     Args:
         recording: the episode.
         start: recorded frame.
-        spec: of the model; its clock counts.
+        spec: spec of the model; its clock counts.
         num_frames: frames that follow the first one; default: those of a chunk.
 
     Raises:

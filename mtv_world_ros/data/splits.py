@@ -92,7 +92,7 @@ class Selection:
 
     Attributes:
         paths: their folders.
-        split: of the chosen episodes; `all` where the data set has no splits.
+        split: split of the chosen episodes; `all` where the data set has no splits.
         zero_shot: by folder what the model was not trained for, where the data set says so.
         num_in_dataset: number of episodes in the data set.
     """

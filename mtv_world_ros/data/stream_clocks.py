@@ -76,7 +76,7 @@ class StampedStream:
     Attributes:
         name: topic.
         key: view or stream of the mapping, e.g. `front` or `joint_states`.
-        stamps_ns: (N,) of the headers [ns]; 0 = not stamped.
+        stamps_ns: (N,) stamps of the headers [ns]; 0 = not stamped.
         received_ns: (N,) when the messages were recorded [ns].
         spans_ns: (N,) lengths of plans [ns]; None = the messages are no plans. The stamp of a
             plan is its start, which may lie ahead; 0 = at once.
@@ -141,7 +141,7 @@ class SettledClocks:
     """Stamps of all streams on one clock.
 
     Attributes:
-        stamps_ns: (N,) of each stream.
+        stamps_ns: (N,) stamps of each stream.
         is_kept: (N,) of each stream; the others have stamps that cannot be.
         offset_s: offset of the clock against the receive times, at the middle of the recording.
         notes: repairs and oddities, one line each.

@@ -55,7 +55,7 @@ class _Edge:
         last: position and quaternion of the last one.
         low: (4, 4) least entries.
         high: (4, 4) greatest entries.
-        stamp_ns: of the newest one [ns]; None = from /tf_static.
+        stamp_ns: stamp of the newest one [ns]; None = from /tf_static.
         count: transforms.
         is_still: whether they vary by no more than `STILL`.
         recent: stamps [ns] and numbers of the last ones while it moves, in the order received.
@@ -136,7 +136,7 @@ class TransformTree:
     are named there, too.
 
     Args:
-        prefix: of frame names, removed.
+        prefix: prefix of frame names, removed.
     """
 
     def __init__(self, prefix: str = '') -> None:
@@ -149,7 +149,7 @@ class TransformTree:
         """Take the transforms of a tf2_msgs/TFMessage.
 
         Args:
-            message: of /tf or /tf_static.
+            message: message of /tf or /tf_static.
             latched: of /tf_static; the transforms hold for all times, and the newest wins.
         """
         for item in message.transforms:
@@ -252,7 +252,7 @@ class TransformTree:
 
         Args:
             frame: e.g. a camera's optical frame.
-            links: of the robot; empty = the topmost frame that is fixed to it.
+            links: links of the robot; empty = the topmost frame that is fixed to it.
 
         Raises:
             CalibrationError: the frame is not there, or nothing fixed to it is a link.
@@ -394,9 +394,9 @@ def pose_track(
     Args:
         messages: TFMessages of /tf.
         frame: e.g. a camera's optical frame.
-        links: of the robot; the nearest one counts.
+        links: links of the robot; the nearest one counts.
         stamps_ns: (N,) when the poses are wanted; between two transforms they are interpolated.
-        prefix: of frame names, removed.
+        prefix: prefix of frame names, removed.
         static: TFMessages of /tf_static, in the order received.
 
     Raises:

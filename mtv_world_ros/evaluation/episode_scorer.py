@@ -59,7 +59,7 @@ class EvaluationJob:
 
     Attributes:
         path: its folder.
-        name: of its results, unique in the evaluation.
+        name: name of its results, unique in the evaluation.
         donor: the episode that lends its actions, if there is one.
         zero_shot: what the model was not trained for in it: `view`, `task`, `object`; or empty.
         objects: names of its objects; empty = the pipeline's, or recorded, or named by the task.
@@ -80,7 +80,7 @@ class Instruments:
         pipeline: imagines and segments.
         reconstruct: the autoencoder's round trip, for the ceiling.
         quality: PSNR, SSIM, LPIPS.
-        features: for FID and FVD.
+        features: features, for FID and FVD.
     """
 
     pipeline: Pipeline

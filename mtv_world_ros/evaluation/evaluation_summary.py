@@ -57,11 +57,11 @@ class EvaluationSummary:
     """All episodes of one checkpoint.
 
     Attributes:
-        folder: of the evaluation.
+        folder: folder of the evaluation.
         name: fingerprint of the checkpoint.
         label: name of its rows in tables that compare checkpoints.
         spec: views, rate and size of the model's frames.
-        settings: of the evaluation, by name; written to metrics.json.
+        settings: settings of the evaluation, by name; written to metrics.json.
         results: scored episodes.
         failed: reason by path of those that could not be scored.
         provenance: versions, machine and command, by heading.

@@ -46,12 +46,12 @@ class Sample:
     """An imagined episode of known outcome.
 
     Attributes:
-        episode: its name.
-        task: its name.
+        episode: name of the episode.
+        task: name of the task.
         success: the true outcome.
-        features: of the estimate by seed; empty where it abstained.
+        features: features of the estimate by seed; empty where it abstained.
         before: probabilities by seed with the stated weights; NaN = abstained.
-        reasons: of the first seed's estimate.
+        reasons: reasons of the first seed's estimate.
         kinds: faults of the policy that acted; empty = none, or not a scripted policy.
         observed: features of the estimate on the recorded frames; empty where it abstained, or
             they were not judged.
@@ -110,7 +110,7 @@ def samples_of(
     """Return the episodes of known outcome.
 
     Args:
-        runs: of the same episodes, one run a seed.
+        runs: runs of the same episodes, one run a seed.
         kinds: faults of the policies that acted, by episode; episodes may be missing.
     """
     known_kinds = kinds or {}

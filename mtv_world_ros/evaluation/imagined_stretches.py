@@ -131,7 +131,7 @@ def imagine_stretch(
         recording: the episode that the stretch was cut from.
         stretch: recorded frames to imagine.
         actions: the episode whose commands are executed: the same one, or another for a control.
-        seed: of the noise.
+        seed: seed of the noise.
         num_inference_steps: denoising steps.
         num_seeds: rollouts whose mean the success estimate is.
     """

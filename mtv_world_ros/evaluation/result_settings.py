@@ -45,7 +45,7 @@ def check_same_settings(results: Path, settings: Mapping[str, Any], overwrite: b
 
     Args:
         results: folder of JSON files, each with the `settings` it was made with.
-        settings: of this run; stored ones may have more keys.
+        settings: settings of this run; stored ones may have more keys.
         overwrite: the user asked to replace such results.
 
     Raises:

@@ -32,7 +32,7 @@ class EpisodeResult:
         reasons: reasons of that estimate.
         notes: defects of the recording, and rollouts that could not be imagined.
         seconds_per_chunk: mean time to imagine a chunk [s].
-        seconds: by stage of the episode's evaluation [s].
+        seconds: seconds by stage of the episode's evaluation [s].
         pictures: `picture_scores` by view and name, with the held frame and shuffled commands.
         features: features of the success estimate, by name; empty if it abstained.
         observed: features of the success estimate at the end of the recorded frames, by name;
@@ -119,10 +119,10 @@ def stored_stretch(
     Args:
         chunks: imagined from the stretch's first frame.
         stretch: the recorded frames.
-        start_seconds: from the episode's first frame to the stretch's [s].
+        start_seconds: start seconds from the episode's first frame to the stretch's [s].
         fps: frames a second.
-        true_masks: of the recorded frames 1..T.
-        masks: of the predicted frames.
+        true_masks: true masks of the recorded frames 1..T.
+        masks: masks of the predicted frames.
         j: (V, O, T) J per frame.
     """
     shown = compare(chunks, stretch.frames[:, 1:])

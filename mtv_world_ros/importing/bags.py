@@ -50,7 +50,7 @@ class BagPart:
 
     Attributes:
         bag: rosbag2 folder or file.
-        number: of the part, from 1 on; 0 = the whole bag.
+        number: number of the part, from 1 on; 0 = the whole bag.
         window: the part, by receive times.
     """
 

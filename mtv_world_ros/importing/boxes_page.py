@@ -23,7 +23,7 @@ def boxes_page(
     Args:
         found: the recordings by name.
         read: reads one.
-        names: of objects, to choose from.
+        names: names of objects, to choose from.
 
     Raises:
         MtvWorldError: a recording cannot be read.

@@ -122,7 +122,7 @@ class CameraTrack(NamedTuple):
     """A view's camera in an episode.
 
     Attributes:
-        camera: at the images' size, posed as at the first row.
+        camera: camera at the images' size, posed as at the first row.
         poses: (T, 4, 4) T_mount_camera [m] of the rows, where it moves.
         note: how images of another size than the calibration's were taken; empty = they are not.
     """
@@ -144,7 +144,7 @@ def camera_track(
     Args:
         source: calibration file or camera parameters of the view.
         dataset: root of the dataset.
-        episode_index: for file names that hold `{episode_index}`.
+        episode_index: episode index, for file names that hold `{episode_index}`.
         values: (T, ...) values of the features that the source names.
         size: width and height of the images [px].
 

@@ -61,7 +61,7 @@ class EpisodeEntry:
         index: its number.
         length: number of rows.
         data_file: parquet file with its rows, maybe among others'.
-        videos: by feature.
+        videos: videos by feature.
         tasks: texts.
     """
 
@@ -77,7 +77,7 @@ class LeRobotDataset:
 
     Attributes:
         root: the folder.
-        version: of the format.
+        version: version of the format.
         fps: rows a second [Hz].
         features: types and shapes of the columns, by name.
         episodes: entries by number.

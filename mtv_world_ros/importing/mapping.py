@@ -101,7 +101,7 @@ class ActionStream(Stream):
         """Return one column a joint; those of the state where the mapping gives none.
 
         Args:
-            names: of the columns; those that are named like the robot's joints go first.
+            names: names of the columns; those that are named like the robot's joints go first.
             state: stream of the measured joints; None = the own columns alone.
         """
         own = self.columns
@@ -121,8 +121,8 @@ class ActionStream(Stream):
         """Return (T, J) positions of a feature's values (T, C), and what was odd.
 
         Args:
-            values: in the dataset's units.
-            names: of the columns; empty where the dataset does not name them.
+            values: values in the dataset's units.
+            names: names of the columns; empty where the dataset does not name them.
             measured: (T, J) positions of the same rows.
             robot: gives the order of joints, and the tools.
             state: stream of the measured joints, for commands without `joints`.

@@ -22,7 +22,7 @@ class Recovered:
         source: the damaged bag, which stays as it is.
         path: the recovered bag.
         num_messages: number of messages by topic.
-        seconds: from the first message to the last.
+        seconds: seconds from the first message to the last.
         lost: one line for each part that could not be read.
     """
 

@@ -46,7 +46,7 @@ class GuessedRobot:
     """A robot file's values and how they were found.
 
     Attributes:
-        values: of the YAML.
+        values: values of the YAML.
         notes: one line a guess, with its grounds, and one a joint that was left out.
     """
 

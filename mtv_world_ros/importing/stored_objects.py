@@ -109,7 +109,7 @@ class MaskWriter:
     """Writer of the masks of frames that are added view by view, in order of time.
 
     Attributes:
-        writer: of the episode; its objects are looked for.
+        writer: writer of the episode; its objects are looked for.
         segmenter: finds them; None = nothing is written.
     """
 

@@ -236,7 +236,8 @@ class VideoFileFrames:
     """Frames of a video file, decoded one after the other.
 
     Attributes:
-        times: (N,) of the frames in the file [s]; None where the file has none that increase.
+        times: (N,) times of the frames in the file [s]; None where the file has none that
+            increase.
         note: what is done to the frames and why; empty if nothing is.
 
     Raises:
@@ -310,7 +311,7 @@ class FrameMatch:
     """Frames of a video that lie within the rows of a table.
 
     Attributes:
-        numbers: (M,) of the frames.
+        numbers: (M,) numbers of the frames.
         times: (M,) since the first row [s].
         note: how frames were matched where it is not one frame a row; else empty.
     """
@@ -335,7 +336,7 @@ def match_frames(
     belongs to the first row.
 
     Args:
-        frame_times: (N,) in the file [s]; None = not known.
+        frame_times: (N,) frame times in the file [s]; None = not known.
         count: N.
         row_times: (T,) since the first row [s].
         rows_are_timed: whether each row has a time of its own, in place of a rate.

@@ -24,7 +24,7 @@ class CameraEstimate:
     """An estimated pose.
 
     Attributes:
-        camera: with the estimated pose, at the size of the recorded images.
+        camera: camera with the estimated pose, at the size of the recorded images.
         std_mm: standard error of the camera's place [mm].
         std_deg: standard error of its direction and roll [degrees].
         evidence: data of the estimate and its residuals, as text.
@@ -66,10 +66,10 @@ def aligned(
 
     Args:
         T: the pose (4, 4) to start from.
-        errors: (N,) of a pose.
+        errors: (N,) errors of a pose.
         centre: point that it is turned about; None = its own place.
         outlier: errors from here on count less (Cauchy's loss).
-        iterations: at most.
+        iterations: iterations at most.
     """
     damping = 0.01
 

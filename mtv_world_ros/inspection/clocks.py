@@ -110,7 +110,7 @@ def check_commands(
     Args:
         commands: all of the recording, in the robot's order; None where there are none.
         origin_ns: their time zero.
-        frames_ns: of the first view.
+        frames_ns: frames of the first view.
         joints: measured.
     """
     if commands is None:
@@ -188,7 +188,7 @@ class JointTrack:
 
     Attributes:
         stamps_ns: (N,) int64, increasing.
-        positions: (N, J) in the robot's order [rad or m].
+        positions: (N, J) positions in the robot's order [rad or m].
 
     Raises:
         TrajectoryError: a joint of the robot is missing.

@@ -67,7 +67,7 @@ class Section:
     """One view, or what concerns all views (joints, commands, clocks).
 
     Attributes:
-        name: of the view, or `recording`.
+        name: name of the view, or `recording`.
         measures: measured values as text, by name.
         numbers: values of `NUMBERS` that were measured.
         findings: faults, and checks that were not possible with the reason.

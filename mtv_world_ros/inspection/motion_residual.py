@@ -112,7 +112,7 @@ def measure_residual(
         track: frames of a camera that stands still.
         camera: its calibration, at the size of the frames.
         robot: gives the links' poses.
-        shapes: of the links.
+        shapes: shapes of the links.
         joints: measured positions.
         search: what is tried.
     """
@@ -272,7 +272,7 @@ def _correlate(
         seen: change of each pixel, a pair of frames each, with a rim.
         drawn: (2 P, H, W) silhouettes of the link in the frames of the pairs.
         whole: (2 P, H, W) those of the robot.
-        radius: of the search [px].
+        radius: radius of the search [px].
     """
     size = (2 * radius + 1,) * 2
     total, energy_seen, energy_drawn = np.zeros(size), np.zeros(size), np.zeros(size)

@@ -34,8 +34,8 @@ class CameraPlaces:
         place: (R,) number of the place of each recording, from 0 in the order of recordings.
         apart: (R, R) median shift of the background between two recordings [share of the image
             width]; infinite where the backgrounds have nothing in common.
-        matches: of two recordings, matched points (M, 2, 2) [share of the image width], from the
-            middle of the image.
+        matches: matches of two recordings, matched points (M, 2, 2) [share of the image width],
+            from the middle of the image.
     """
 
     place: NDArray[np.int64]

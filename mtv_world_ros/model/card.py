@@ -159,7 +159,7 @@ def check_same_model(card: CheckpointCard, adapter: Path) -> None:
     """Check that an adapter was trained for a model of the same inputs and outputs.
 
     Args:
-        card: of the checkpoint.
+        card: card of the checkpoint.
         adapter: its folder; one without a card of its own is not checked.
 
     Raises:

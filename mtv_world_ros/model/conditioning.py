@@ -128,7 +128,7 @@ class ControlBatch:
     """Inputs of a control for B chunks; see `control.ControlInputs`.
 
     Attributes:
-        num_frames: T.
+        num_frames: number of frames, T.
         video: (B, V, 1 + T, H, W, 3) uint8 RGB.
         context: (B, L) int64, `PADDING` = no token, or (B, L, size) float32, NaN = none.
         frame: (B, 1 + T, size) float32.
@@ -196,9 +196,9 @@ def condition(autoencoder: Autoencoder, start_frame: Tensor, inputs: ControlBatc
     and with it public weights.
 
     Args:
-        autoencoder: of the preset.
+        autoencoder: autoencoder of the preset.
         start_frame: (B, V, H, W, 3) uint8 RGB.
-        inputs: of the control, on the device of the autoencoder.
+        inputs: inputs of the control, on the device of the autoencoder.
     """
     reference = encode_frames(autoencoder, start_frame.unsqueeze(2))[:, :, :, 0]
     if inputs.video is None:
@@ -238,8 +238,8 @@ def check_history(
     """Check that history frames divide into latents and tokens.
 
     Args:
-        settings: of the model.
-        autoencoder: of the model.
+        settings: settings of the model.
+        autoencoder: autoencoder of the model.
         transformer: configuration of the transformer.
 
     Raises:

@@ -31,7 +31,7 @@ class TextEncoder:
 
     Args:
         checkpoint: folder with `text_encoder/` and `tokenizer/`.
-        dtype: of its computations.
+        dtype: dtype of its computations.
     """
 
     def __init__(self, checkpoint: Path, *, dtype: torch.dtype = torch.float32) -> None:

@@ -96,8 +96,8 @@ class PeftSettings(Schema):
         """Return the scale of the product of a module's factors.
 
         Args:
-            module: its name in the file.
-            rank: of its factors.
+            module: name of the module in the file.
+            rank: rank of its factors.
 
         Raises:
             ConfigError: another rank than the settings say, or no alpha.

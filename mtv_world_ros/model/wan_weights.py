@@ -177,7 +177,7 @@ def import_weights(
         transformer: arguments of `MultiViewWanTransformer`.
         autoencoder: arguments of the autoencoder.
         scheduler: arguments of the noise schedule.
-        card: of the checkpoint.
+        card: card of the checkpoint.
         elsewhere: files or folders of parts that are not in `path`.
         robot: YAML of the robot that it will be trained on, to be carried by the checkpoint.
         shard_bytes: size at which a new file is begun.

@@ -72,8 +72,8 @@ def sample_latents(
     Args:
         transformer: the model.
         scheduler: noise levels, shift and step rule.
-        conditioning: of one chunk (batch 1).
-        seed: of the noise.
+        conditioning: conditioning of one chunk (batch 1).
+        seed: seed of the noise.
         num_inference_steps: denoising steps.
         should_stop: asked between steps.
         guidance_scale: how far to go from what `conditioning.negative_text` gives to what
@@ -166,7 +166,7 @@ class DiffusionWorldModel:
     Args:
         checkpoint: the trained parts.
         device: e.g. `cpu` or `cuda`.
-        dtype: of the transformer's computations.
+        dtype: dtype of the transformer's computations.
         serving: options that make the model faster or smaller.
 
     Raises:

@@ -128,9 +128,9 @@ class ArmResponse:
 
         Args:
             robot: gives the inertia.
-            commands: in its joint order, `PERIOD_S` apart; the first row is where `state` is, or
-                where the joints rest.
-            state: at the first row.
+            commands: commands in its joint order, `PERIOD_S` apart; the first row is where `state`
+                is, or where the joints rest.
+            state: state at the first row.
 
         Raises:
             TrajectoryError: the arms do not get to the commands, but faster and faster.
@@ -191,7 +191,7 @@ class _Tips:
     """Fingertips near the table.
 
     Attributes:
-        heights: (P,) over it [m].
+        heights: (P,) heights over it [m].
         jacobians: (P, 3, J).
         positions: (J,) that both are of.
     """

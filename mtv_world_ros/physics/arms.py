@@ -45,7 +45,7 @@ class Drives:
     """Coupling of D degrees of freedom to joints: each is `multiplier * joint + offset`.
 
     Attributes:
-        names: of the degrees of freedom.
+        names: names of the degrees of freedom.
         columns: (D,) the robot's joints that they follow.
         multipliers: (D,).
         offsets: (D,) [rad or m].
@@ -84,14 +84,14 @@ class Arms:
     """Adds a robot to a scene.
 
     Args:
-        robot: with any number of arms; its base stands still.
+        robot: robot with any number of arms; its base stands still.
         response: how its joints follow their commands; None = nothing was found yet.
 
     Attributes:
         robot: the same, with inertias for all of its bodies.
         response: as given.
         notes: assumptions about the robot, as text.
-        drives: of its joints, with the numbers of free air.
+        drives: drives of its joints, with the numbers of free air.
 
     Raises:
         RobotError: the robot is no tree of bodies on a fixed base.

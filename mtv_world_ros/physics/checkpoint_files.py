@@ -27,7 +27,7 @@ def load_foresight(folder: Path, robot: RobotModel, threads: int = 1) -> SolidFo
 
     Args:
         folder: that it wrote.
-        robot: of the same joints.
+        robot: robot of the same joints.
         threads: number of computing threads.
 
     Raises:

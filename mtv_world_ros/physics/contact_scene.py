@@ -91,7 +91,7 @@ class CompiledScene:
     """A compiled scene; `model_of` gives it the numbers of a future.
 
     Attributes:
-        arms: of the robot.
+        arms: arms of the robot.
         kinds: O kinds of solids, see `kind_of`.
         model: the `MjModel`, whose numbers are replaced.
         arm_qpos: (D,) where the arms' positions are.
@@ -150,9 +150,9 @@ class CompiledScene:
         """Return a model with the numbers of settings and of solids of these kinds.
 
         Args:
-            settings: of contact.
+            settings: settings of contact.
             solids: O.
-            data: of a model of this scene, which is written to; None = new data.
+            data: data of a model of this scene, which is written to; None = new data.
         """
         model = copy(self.model)
         set_drives(model, self.arms.drives, settings)

@@ -43,7 +43,7 @@ class FreeMotion:
         """Return the course, delayed by a number of steps.
 
         Args:
-            steps: of the engine.
+            steps: steps of the engine.
             last: the course before it; None = the arms rested.
         """
         if not steps:
@@ -89,8 +89,8 @@ class CoursePlanner:
     """Computes the course of commands.
 
     Args:
-        scene: of the arms without solids.
-        settings: of contact.
+        scene: scene of the arms without solids.
+        settings: settings of contact.
     """
 
     def __init__(self, scene: CompiledScene, settings: ContactSettings) -> None:

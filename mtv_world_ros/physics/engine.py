@@ -104,8 +104,8 @@ class BatchMotion:
     Attributes:
         points: (K, T + 1, O, 3) centres of the solids [m].
         rotations: (K, T + 1, O, 3, 3).
-        joints: (K, T + 1, J) of the robot, which what it touches may stop [rad or m].
-        steps: of the engine that were computed, of all futures together.
+        joints: (K, T + 1, J) joints of the robot, which what it touches may stop [rad or m].
+        steps: steps of the engine that were computed, of all futures together.
     """
 
     points: FloatArray
@@ -130,7 +130,7 @@ class Engine:
     """Computes futures of a robot and solids; holds compiled scenes and threads.
 
     Args:
-        arms: of the robot.
+        arms: arms of the robot.
         threads: number of computing threads.
     """
 
@@ -167,7 +167,7 @@ class Batch:
     """K futures of the same robot and kinds of solids.
 
     Args:
-        engine: that computes them.
+        engine: engine that computes them.
         futures: K.
 
     Attributes:

@@ -100,7 +100,7 @@ class ObjectForesight:
 
         Args:
             plan: the chunk.
-            motion: of the robot and the cameras at its 1 + T states.
+            motion: motion of the robot and the cameras at its 1 + T states.
         """
         if self.found is None:
             return None

@@ -20,11 +20,12 @@ class ForeseenMotions:
     """Motions since the objects were found.
 
     Attributes:
-        names: of O objects.
+        names: names of O objects.
         points: (K, N, O, 3) [m], NaN where not known.
-        rotations: (K, N, O, 3, 3) from the frame in which the objects were found, or were whole.
+        rotations: (K, N, O, 3, 3) rotations from the frame in which the objects were found, or
+            were whole.
         sizes: (K, O, 3) extents [m].
-        openings: (K, A, N) of the grippers, 0 closed to 1 open.
+        openings: (K, A, N) openings of the grippers, 0 closed to 1 open.
         weights: (K,) weight of each motion.
         step_s: time between rows [s].
         is_begun: whether the motions begin with the rollout, not later.

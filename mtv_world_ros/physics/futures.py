@@ -48,9 +48,9 @@ def draw_futures(
     The same number always gives the same draws, so that plans are compared under the same ones.
 
     Args:
-        settings: of contact; their spread says how far futures differ.
+        settings: settings of contact; their spread says how far futures differ.
         solids: O, as found.
-        drives: of the arms.
+        drives: drives of the arms.
     """
     return tuple(
         _drawn(settings, solids, drives, number) for number in range(settings.num_motions)

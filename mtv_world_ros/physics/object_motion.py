@@ -40,9 +40,9 @@ class ObjectMotion:
     Attributes:
         reference: (O, 3) where their centres were at the reference [m]; NaN = not known.
         points: (T, O, 3) where they are [m].
-        rotations: (T, O, 3, 3) from the reference.
-        openings: (T, A) of the grippers, 0 closed to 1 open, which what they touch may stop; None
-            = not foreseen.
+        rotations: (T, O, 3, 3) rotations from the reference.
+        openings: (T, A) openings of the grippers, 0 closed to 1 open, which what they touch may
+            stop; None = not foreseen.
         weight: relative weight among the motions of the same plan.
     """
 
@@ -194,7 +194,7 @@ class FoundObjects:
     """The named objects as a real frame shows them, and where they are now.
 
     Attributes:
-        names: of the O objects.
+        names: names of the O objects.
         cuts: (V, O, H, W, 4) `cut_outs` of the frame that shows each best, at the model's size.
         poses: (V, O, 4, 4) T_base_camera then.
         tracked: current poses of the objects.
@@ -267,7 +267,7 @@ class FoundObjects:
         Where the part shows another motion than the one before, objects pass to it gradually.
 
         Args:
-            times: (T,) from its row 0 on [s].
+            times: (T,) times from its row 0 on [s].
             cameras: V cameras at the masks' size.
             poses: (V, T, 4, 4) T_base_camera at these times.
         """
@@ -322,7 +322,7 @@ def cut_outs(frames: ByteArray, masks: BoolArray) -> ByteArray:
 
     Args:
         frames: (V, H, W, 3) uint8 RGB.
-        masks: (V, O, H, W) in them.
+        masks: (V, O, H, W) masks in them.
     """
     cover = np.where(masks, 255, 0).astype(np.uint8)[..., None]
     colours = np.where(masks[..., None], frames[:, None], 0).astype(np.uint8)

@@ -48,7 +48,7 @@ class Part:
         link: name of the link that carries the part.
         kind: `box`, `cylinder`, `sphere` or `hull`.
         size: half extents of a box, radius and half length of a cylinder, radius of a sphere [m].
-        pose: (4, 4) in the link.
+        pose: (4, 4) pose in the link.
         points: (N, 3) whose convex hull it is, in the link [m].
     """
 

@@ -48,8 +48,8 @@ class SolidForesight:
 
     Args:
         robot: any whose base stands still.
-        response: of the arms to their commands; None = not known yet.
-        settings: of contact.
+        response: response of the arms to their commands; None = not known yet.
+        settings: settings of contact.
         threads: number of computing threads.
 
     Raises:

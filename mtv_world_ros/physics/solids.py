@@ -69,7 +69,7 @@ class Solid:
     """A box or an upright cylinder.
 
     Attributes:
-        centre: (3,) of its bounding box [m].
+        centre: (3,) centre of its bounding box [m].
         size: (3,) along its own x, y and z [m].
         yaw: rotation about z [rad].
         is_round: it is a cylinder.
@@ -124,7 +124,7 @@ def bottom_of(
         point: (3,) where it is, roughly [m].
         cameras: V.
         poses: V of T_base_camera (4, 4).
-        name: of the object.
+        name: name of the object.
         floor: where it may stand [m]; a fit is drawn to it.
         fits: each is drawn to where the one before ended.
     """
@@ -212,7 +212,7 @@ def find_solid(
 
     Args:
         solid: the object's solid from a frame in which nothing hid it.
-        masks: (V, H, W) of what is seen of it now.
+        masks: (V, H, W) masks of what is seen of it now.
         point: (3,) the middle of that; NaN = not known, as of one view: then where it would look
             as large as it does there [m].
         cameras: V cameras at the masks' size.

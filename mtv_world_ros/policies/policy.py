@@ -25,7 +25,7 @@ class EpisodeOrigin:
     """Origin of an episode, for policies that use it in place of pictures.
 
     Attributes:
-        task: its name; empty = not known.
+        task: name of the task; empty = not known.
         scene_seed: seed of the simulated scene; -1 = not known.
         recording: folder of the recorded episode; empty = there is none.
         recording_ns: stamp of the recorded frame that it begins from [ns].
@@ -49,7 +49,7 @@ class Policy(Protocol):
         """Begin an episode; the next observation is its first.
 
         Args:
-            seed: of the policy's own randomness.
+            seed: seed of the policy's own randomness.
         """
         ...
 
@@ -90,8 +90,8 @@ class RecordedPolicy:
 
     Args:
         commands: times count from the moment that the episode begins from [s].
-        hold_s: from the last command, or from the begin where that is later, to the end of the
-            episode [s].
+        hold_s: time from the last command, or from the begin where that is later, to the end of
+            the episode [s].
     """
 
     name = 'recorded'

@@ -26,8 +26,8 @@ def find_flips(results: Sequence[Result], folder: Path) -> dict[str, bool]:
 
     Args:
         results: the rollouts of all policies.
-        folder: with their last frames as `last_frames_png` writes them, `<name>.png`, and where
-            objects are, `<name>.objects.png`; rollouts without are left out.
+        folder: folder with their last frames as `last_frames_png` writes them, `<name>.png`, and
+            where objects are, `<name>.objects.png`; rollouts without are left out.
     """
     experts = {(r.task, r.index): r for r in results if r.policy == EXPERT}
     found = {}

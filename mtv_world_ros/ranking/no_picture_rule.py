@@ -79,8 +79,8 @@ def judge_without_pictures(pipeline: Pipeline, episode: Rollout, commands: Float
 
     Args:
         pipeline: knows the tasks and finds the objects.
-        episode: at its first observation, where the objects are found; its instruction says
-            which task's relations judge.
+        episode: episode at its first observation, where the objects are found; its instruction
+            says which task's relations judge.
         commands: (C, J) joint positions at the simulator's control rate [rad or m].
 
     Raises:

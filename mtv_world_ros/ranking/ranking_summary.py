@@ -68,8 +68,8 @@ class Optimism:
 
         Args:
             judge: key of `JUDGES`.
-            kind: of the policies' faults; None = all. r, MMRV and AUROC of a kind are over its
-                policies and the expert.
+            kind: kind of the policies' faults; None = all. r, MMRV and AUROC of a kind are over
+                its policies and the expert.
         """
         chosen = self.rollouts(kind)
         compared = [

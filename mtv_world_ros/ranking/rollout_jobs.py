@@ -56,7 +56,7 @@ class Job:
     """One policy on one episode, in the simulator and in imagination.
 
     Attributes:
-        policy: its name.
+        policy: name of the policy.
         task: name of the task.
         index: number of the episode within the task.
         seed: random seed of the scene, the policy and the denoising noise.
@@ -174,7 +174,7 @@ class Result:
     """One policy on one episode.
 
     Attributes:
-        policy: its name.
+        policy: name of the policy.
         task: name of the task.
         index: number of the episode within the task.
         seed: random seed of the episode, the policy and the denoising noise.

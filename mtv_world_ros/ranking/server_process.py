@@ -34,7 +34,7 @@ class ServerProcess:
         port: TCP port of the server on this machine; 0 before the first start.
 
     Args:
-        name: of the policy; log files begin with it.
+        name: name of the policy; log files begin with it.
         command: program and arguments; `{port}` in them is replaced by a free port.
         logs: folder of the log files, one a start.
         start_timeout_s: longest wait until it listens [s].

@@ -50,8 +50,8 @@ class Dot:
     """A value with its interval; NaN = not measured.
 
     Attributes:
-        label: on the left.
-        value: in [0, 1].
+        label: label on the left.
+        value: value in [0, 1].
         interval: (low, high).
         colour: variable of the style sheet.
         is_filled: drawn full, not as a ring.
@@ -70,7 +70,7 @@ class ChartLine:
 
     Attributes:
         label: shown where the mouse is, and for those who cannot see it.
-        values: in [0, 1], one per frame; NaN leaves a gap.
+        values: values in [0, 1], one per frame; NaN leaves a gap.
         band: (low, high) per frame; empty = none.
         colour: variable of the style sheet.
         dashes: matplotlib's line style.

@@ -77,7 +77,7 @@ class LiveRanking:
 
     Args:
         stream: recording of the viewer, which is served or saved already.
-        folder: of the ranking.
+        folder: folder of the ranking.
         file: that is written; None = a page for browsers.
     """
 

@@ -58,7 +58,7 @@ class ArmSolver:
         """Return the arm's joints (n,) [rad] that bring the tool to `pose` (4, 4).
 
         Args:
-            pose: of the tool in the robot's base link.
+            pose: pose of the tool in the robot's base link.
             start: (n,) joints to start from [rad].
 
         Raises:

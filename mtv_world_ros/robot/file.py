@@ -340,7 +340,7 @@ def save_robot(file: Path, folder: Path) -> SavedRobot:
 
     Args:
         file: robot YAML.
-        folder: to make; one that is there is replaced.
+        folder: folder to make; one that is there is replaced.
 
     Raises:
         ConfigError, RobotError: the robot cannot be used.

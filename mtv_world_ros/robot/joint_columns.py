@@ -27,7 +27,7 @@ class JointColumn:
     Attributes:
         joint: name in the robot.
         column: name or number of the column in the dataset's feature.
-        factor: from the dataset's unit, sign included.
+        factor: factor from the dataset's unit, sign included.
         offset: [rad or m].
     """
 
@@ -158,9 +158,9 @@ def to_positions(
 
     Args:
         values: joint values in the dataset's units.
-        names: of the columns; empty where the dataset does not name them.
-        joints: in the robot's order.
-        feature: its name, for error texts.
+        names: names of the columns; empty where the dataset does not name them.
+        joints: joints in the robot's order.
+        feature: name of the feature, for error texts.
 
     Raises:
         ConfigError: a column is not there.
@@ -183,9 +183,9 @@ def to_columns(
     """Return (C,) values of positions by joint [rad or m]; the inverse of `to_positions`.
 
     Args:
-        positions: by joint name.
-        names: of the columns; if empty, there are as many columns as joints use.
-        joints: without constants.
+        positions: positions by joint name.
+        names: names of the columns; if empty, there are as many columns as joints use.
+        joints: joints without constants.
 
     Raises:
         ConfigError: a column does not exist, or no joint fills it.

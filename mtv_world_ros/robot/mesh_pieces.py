@@ -274,8 +274,8 @@ def convex_pieces(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatA
     its principal axes, until no cut gains much.
 
     Args:
-        vertices: (N, 3) of the mesh, which need not be closed [m].
-        edges: (E, 2) of its triangles.
+        vertices: (N, 3) vertices of the mesh, which need not be closed [m].
+        edges: (E, 2) edges of its triangles.
     """
     if _is_convex(vertices):
         return [outermost(vertices)]

@@ -28,7 +28,7 @@ class Tool:
     """Tool of an arm: its tool centre point and gripper.
 
     Attributes:
-        arm: its name.
+        arm: name of the arm.
         link: link that carries the tool.
         T_link_tool: (4, 4) pose of the tool centre point in the link [m].
         gripper_joint: joint that opens the gripper, or None.
@@ -91,7 +91,7 @@ class RobotModel:
     """A robot with any number of arms. Nothing changes after construction: threads may share it.
 
     Args:
-        name: of the robot.
+        name: name of the robot.
         model: its Pinocchio model; joints that are neither commanded nor mimics rest at zero.
         joint_names: J commanded joints, in the order of all position vectors.
         tools: one per arm.
@@ -384,7 +384,7 @@ class _Setter:
         first: index of its first entry in a configuration vector.
         velocity: index of its entry in a velocity vector.
         endless: whether the joint turns without limits; its position is then cosine and sine.
-        column: of the robot's joint that it follows.
+        column: column of the robot's joint that it follows.
         multiplier: factor of that joint's position.
         offset: added to it [rad or m].
     """

@@ -181,7 +181,7 @@ class ChunkPlan:
 
     Attributes:
         plan: the whole plan.
-        times: (1 + T,) of a whole chunk, from the plan's observation [s]; row 0 its start.
+        times: (1 + T,) times of a whole chunk, from the plan's observation [s]; row 0 its start.
         positions: (1 + T, J) joint positions then [rad or m].
         num_frames: number of frames that are kept: the last chunk ends with the plan.
         chunk: index of the chunk in the plan.

@@ -75,7 +75,7 @@ class RobotShape:
     """Shapes of a robot's links.
 
     Attributes:
-        parts: of its links.
+        parts: parts of its links.
         source: origin of the shapes, for reports.
         is_known: False where rods stand for the links.
         missing: meshes that are not there or cannot be read, and why.

@@ -21,7 +21,7 @@ class EpisodeViewer:
     """Logs the starts and chunks of episodes.
 
     Args:
-        stream: of `rerun_log.recording`.
+        stream: stream of `rerun_log.recording`.
         save: file that the stream is written to; None = a viewer is open.
     """
 

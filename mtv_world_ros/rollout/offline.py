@@ -96,7 +96,7 @@ def replay_offline(
         episode_path: rosbag2 folder or .mcap file, also one that was cut off.
         out: folder for the predictions; appears only when all is written.
         source: topics and robot of an episode that is not in this package's format.
-        seed: of the noise; the k-th trajectory uses `seed + 1000 k`.
+        seed: seed of the noise; the k-th trajectory uses `seed + 1000 k`.
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
         overwrite: replace an existing folder of predictions.
         show_progress: draw a progress bar, on a terminal.

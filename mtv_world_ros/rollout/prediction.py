@@ -45,7 +45,7 @@ class Prediction:
     Attributes:
         start: the observation that the chunk starts from, at the model's size.
         video: the T predicted frames, frame k after command k; its times count from `stamp_ns`.
-        seed: of the noise.
+        seed: seed of the noise.
         positions: (T, J) commanded at these times [rad or m].
         trajectory_video: 1 + T frames of the drawn plan, frame 0 at the chunk's start; the model's
             control input where that is a video.

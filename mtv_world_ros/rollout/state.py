@@ -28,7 +28,7 @@ class RolloutState:
         observation: its last frame, at the model's size.
         history: the frames before that one.
         objects: foreseen poses of the named objects.
-        memory: of the success estimate; None before the first chunk.
+        memory: memory of the success estimate; None before the first chunk.
         num_imagined: frames since the last real one.
         camera_check: calibration check on the episode's first frames; its corrections are
             applied.
@@ -81,9 +81,9 @@ class RolloutState:
         Args:
             frames: (V, T, H, W, 3) uint8 RGB after `observation`.
             positions: (J,) commanded at the last one [rad or m].
-            stamp_ns: of the last one [ns].
+            stamp_ns: stamp of the last one [ns].
             num_history: most frames to keep before it.
-            memory: of the success estimate after the chunk.
+            memory: memory of the success estimate after the chunk.
             objects: foreseen poses after the chunk.
         """
         start = self.observation

@@ -31,7 +31,7 @@ class LiveViewer(Node):
 
     Args:
         stream: recording of the viewer, which is served or saved already.
-        name: of the node.
+        name: name of the node.
     """
 
     def __init__(self, stream: Any, name: str = 'viewer') -> None:

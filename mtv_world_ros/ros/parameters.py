@@ -316,7 +316,7 @@ def declare_one(
 
     Args:
         node: owner.
-        name: of the parameter.
+        name: name of the parameter.
         default: its default, which says the type.
         described: range and meaning.
         within: range, in words.

@@ -36,7 +36,7 @@ def best_offer(publishers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfil
     """Return the best profile that all publishers of a topic can serve.
 
     Args:
-        publishers: of the topic, as the graph knows them.
+        publishers: publishers of the topic, as the graph knows them.
         depth: messages that the subscription keeps.
     """
     offers = [publisher.qos_profile for publisher in publishers]

@@ -78,7 +78,7 @@ def run(
         spin: runs the node's callbacks until shutdown.
         signals: signals that rclpy handles; NO = the node has handlers of its own.
         help_text: printed instead if the command line has `--help`.
-        name: of the node, before remapping; needed for `own_paths`.
+        name: name of the node, before remapping; needed for `own_paths`.
         own_paths: topics that do not share their receive buffers with images, in groups that share
             a port (see `receive_paths`).
 

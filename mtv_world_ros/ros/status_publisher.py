@@ -26,7 +26,7 @@ class StatusPublisher:
 
     Attributes:
         counts: whatever is counted, by name.
-        hardware_id: of its statuses; empty = none.
+        hardware_id: hardware id of its statuses; empty = none.
 
     Args:
         node: owner of the publishers and the logger.

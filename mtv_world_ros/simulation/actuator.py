@@ -10,7 +10,7 @@ class Actuator:
     """Drives one joint of the simulated robot to `multiplier * position + offset`.
 
     Attributes:
-        joint: its name in the MJCF.
+        joint: name of the joint in the MJCF.
         column: column of the robot's joint that it follows.
         multiplier: factor of that joint's position; other than 1 for mimic joints of a URDF.
         offset: added to it [rad or m].

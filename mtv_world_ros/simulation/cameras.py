@@ -201,8 +201,8 @@ def camera_xml(camera: CameraModel, pose: FloatArray) -> str:
     MuJoCo's camera looks along its own -z with y up; the optical frame has y down, z ahead.
 
     Args:
-        camera: its name, size and K.
-        pose: (4, 4) of its optical frame in the body that carries it.
+        camera: name of the camera, size and K.
+        pose: (4, 4) pose of its optical frame in the body that carries it.
     """
     x, y, z = pose[:3, 3]
     right, down = pose[:3, 0], pose[:3, 1]

@@ -31,7 +31,7 @@ class SceneObject:
         name: what the instruction calls it, e.g. `red block`.
         shape: key of `SHAPES`.
         size: full extents (x, y, z) of its bounding box [m].
-        rgb: (3,) in 0..1.
+        rgb: (3,) rgb in 0..1.
         position: (x, y, z) of its centre in the base frame [m].
         yaw: about z [rad].
     """
@@ -65,7 +65,7 @@ class Scene:
 
     Attributes:
         objects: the instance id of `objects[i]` is i + 1.
-        cameras: in the order of the views.
+        cameras: cameras in the order of the views.
         look: table and light.
         goals: where the subject of each of the task's moves should come to rest [m].
         table_m: height of the table [m].

@@ -40,8 +40,8 @@ def second_engine(
     Args:
         model: the compiled `MjModel` of the scene, whose gains, masses and friction these are.
         scene: whose objects these are.
-        robot: from a URDF with inertias.
-        actuators: of its joints.
+        robot: robot from a URDF with inertias.
+        actuators: actuators of its joints.
         home: (J,) where they rest [rad or m].
 
     Raises:

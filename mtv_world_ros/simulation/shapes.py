@@ -31,7 +31,7 @@ class Grasp:
         height: height of the tool over the object's bottom, as a share of the object's height.
         rim_m: thickness of the rim that is held, on the object's side of the table; None = across
             the middle.
-        opening: of the gripper on the way down, 0..1.
+        opening: opening of the gripper on the way down, 0..1.
     """
 
     height: float = 0.5
@@ -42,7 +42,7 @@ class Grasp:
         """Return how far the tool is from the object's centre along its x [m].
 
         Args:
-            size: of the object [m].
+            size: size of the object [m].
             side: on which a rim is held, -1 left, 1 right.
         """
         if self.rim_m is None:

@@ -26,7 +26,7 @@ class SeenChunk:
     Attributes:
         frames: (V, T, H, W, 3) uint8 RGB at the model's rate.
         positions: (1 + T, J) measured, row 0 before the first frame [rad or m].
-        commands: (T, J) at the frames [rad or m].
+        commands: (T, J) commands at the frames [rad or m].
     """
 
     frames: ByteArray

@@ -61,10 +61,10 @@ def situation_of(scene: Scene, task: Task, poses: FloatArray, openings: FloatArr
     """Return the objects' poses over time, with heights above the table.
 
     Args:
-        scene: of O objects.
+        scene: scene of O objects.
         task: has the goals.
         poses: T_base_object (T, O, 4, 4) [m].
-        openings: (A, T) of the grippers.
+        openings: (A, T) openings of the grippers.
     """
     up = np.array([0.0, 0.0, scene.table_m])
     goals = task.goals(scene.goals)

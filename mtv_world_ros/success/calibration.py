@@ -157,7 +157,7 @@ class HorizonCurve(Schema):
     """Mean J of the objects that move, of episodes imagined as a whole from their first frame.
 
     Attributes:
-        period_s: between frames [s]; frame k is `(k + 1) * period_s` ahead.
+        period_s: period between frames [s]; frame k is `(k + 1) * period_s` ahead.
         values: (T,) mean J.
         lower: (T,) lower end of the 95 % interval over episodes; 0 where too few reach it.
         segmenter: name of the segmenter whose masks were fitted on.
@@ -200,7 +200,7 @@ def fit_path(folder: Path, kind: type[Schema], *, of_pictures: bool = False) -> 
     """Return the file of a `Calibration` or `HorizonCurve` in a checkpoint's folder.
 
     Args:
-        folder: of the checkpoint.
+        folder: folder of the checkpoint.
         kind: `Calibration` or `HorizonCurve`.
         of_pictures: the fit to rollouts without foreseen object motion, of a checkpoint that can
             foresee it.

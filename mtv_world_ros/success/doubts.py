@@ -86,7 +86,7 @@ def doubted(
     """Return an estimate with remarks, or without a verdict.
 
     Args:
-        estimate: of pictures and foreseen motions.
+        estimate: estimate of pictures and foreseen motions.
         notes: remarks for the reader, one line each.
         refusal: why there is no verdict; empty = there may be one.
     """
@@ -110,7 +110,7 @@ def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
     """Return a less certain estimate, for foreseen motions under a doubtful physics.
 
     Args:
-        estimate: under the fitted physics.
+        estimate: estimate under the fitted physics.
         doubt: why that does not hold.
     """
     reasons = (doubt, *estimate.reasons)

@@ -146,7 +146,7 @@ class SuccessEstimator:
         Args:
             footage: masks and poses of the chunk.
             instruction: text for the robot; selects the task and its objects.
-            memory: of the chunks before; None = the chunk is the rollout's first.
+            memory: memory of the chunks before; None = the chunk is the rollout's first.
             foreseen: motions of the objects up to the chunk's end.
             is_real: whether the frames are real, not imagined.
         """

@@ -156,8 +156,8 @@ class Evidence:
     Attributes:
         worst: the condition nearest to failing, or furthest from holding; None = pictures do not
             tell.
-        features: by `FEATURES`, larger = likelier; NaN = says nothing about this task. And
-            `moved`, 0 where an object that has to move is where it was.
+        features: features by `FEATURES`, larger = likelier; NaN = says nothing about this task.
+            And `moved`, 0 where an object that has to move is where it was.
         sigma: standard error of the worst margin, in units of its softness.
         goal_jaccard: object -> (V,) J with its goal mask.
         notes: assumptions made on the way.

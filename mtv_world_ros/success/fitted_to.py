@@ -105,7 +105,7 @@ class FittedTo(Setting):
         """Return what episodes were made with.
 
         Args:
-            setting: of all episodes.
+            setting: setting of all episodes.
             sets: cameras of each episode.
         """
         views: dict[str, list[CameraModel]] = {}
@@ -122,7 +122,7 @@ class FittedTo(Setting):
 
         Args:
             setting: where the estimate is made.
-            cameras: that the estimate is made from.
+            cameras: cameras that the estimate is made from.
             is_foreseen: the estimate rests on foreseen motions.
         """
         if not self.is_same_robot(setting):

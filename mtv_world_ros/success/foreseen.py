@@ -50,7 +50,7 @@ def foreseen_ends(
     """Return whether the task is done at the end of each; None = they do not tell.
 
     Args:
-        motions: of the objects, in several futures.
+        motions: motions of the objects, in several futures.
         task: its relations are evaluated.
         bound: placeholder -> name of its object.
         starts: (O, 3) where the objects were when the rollout began [m], NaN = as row 0.

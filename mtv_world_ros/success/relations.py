@@ -33,9 +33,9 @@ class Margin(NamedTuple):
     """Margin of a condition.
 
     Attributes:
-        condition: in words.
-        values: (T,) of a situation's samples; positive = the condition holds.
-        unit: of the values: `m`, or what is counted or measured.
+        condition: condition in words.
+        values: (T,) values of a situation's samples; positive = the condition holds.
+        unit: unit of the values: `m`, or what is counted or measured.
         soft: value that counts as one; None = the task's softness [m].
         is_required: False = no part of the definition of success, but evidence against it where
             poses are estimated from pictures.
@@ -86,7 +86,7 @@ class Relation(Schema):
     """Condition on one object, or between objects, at the end of a task.
 
     Attributes:
-        kind: its name in task files, a key of `KINDS`.
+        kind: name of the kind in task files, a key of `KINDS`.
         subject: placeholder of the object that moves.
         target: placeholder of the object that it is placed by, where there is one.
         is_of_course: True if it depends on the course of the episode, not on the end alone.
@@ -338,7 +338,7 @@ class Apart(Relation):
 
     Attributes:
         target: placeholder of the other.
-        min_distance_m: of their centres in the plane.
+        min_distance_m: min distance of their centres in the plane.
     """
 
     target: str
@@ -354,7 +354,7 @@ class Moved(Relation):
     """The subject is away from where it started.
 
     Attributes:
-        min_distance_m: in the plane.
+        min_distance_m: min distance in the plane.
     """
 
     min_distance_m: Length = 0.1

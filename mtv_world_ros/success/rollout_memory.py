@@ -34,12 +34,12 @@ class Footage:
     """A chunk of V views, O objects, A arms and T predicted frames; row 0 is the start frame.
 
     Attributes:
-        masks: of the T predicted frames.
-        start_masks: of the frame before them (T = 1).
+        masks: masks of the T predicted frames.
+        start_masks: start masks of the frame before them (T = 1).
         cameras: V cameras at the masks' size.
         poses: (V, 1 + T, 4, 4) T_base_camera.
         tools: (A, 1 + T, 3) where the tools are commanded to be [m]; None = not known.
-        openings: (A, 1 + T) of the grippers, 0 closed to 1 open; None = not known.
+        openings: (A, 1 + T) openings of the grippers, 0 closed to 1 open; None = not known.
     """
 
     masks: ObjectMasks
@@ -103,14 +103,14 @@ class RolloutMemory:
     """Memory of a rollout: V views, O objects, A arms, N frames.
 
     Attributes:
-        start_masks: of the rollout's first frame (T = 1).
+        start_masks: start masks of the rollout's first frame (T = 1).
         points: (O, N, 3) centres, NaN where fewer than two views know one [m].
         leans: (O, N, 2) x and y of unit vectors along the objects' long axes, NaN where no view
             knows one.
         seen_masks: (V, O, H, W) last masks in which an object was not hidden.
         seen_points: (O, 3) where it was then [m].
         largest: (V, O) largest area of each mask in these frames [px].
-        grasps: in order.
+        grasps: grasps in order.
         levels: (A,) opening since which a gripper's closing or opening counts.
         closed: (A,) whether a gripper has closed since it last opened.
     """

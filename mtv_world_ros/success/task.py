@@ -67,7 +67,7 @@ class TaskSpec(Schema):
     Attributes:
         name: e.g. `stack_blocks_two`.
         instruction: template with placeholders for the objects, `stack the {a} on the {b}`.
-        relations: between objects; all must hold at the end.
+        relations: relations between objects; all must hold at the end.
         sizes_m: usual extents (x, y, z) of a placeholder's object, for where they are not known:
             from pictures, an object that is not named here is taken as a cube [m].
         nouns: what a placeholder's object may be called, by its last word; not given = anything.
@@ -133,7 +133,7 @@ class TaskSpec(Schema):
 
         Args:
             at: object poses and gripper openings over time.
-            openings: (A, T) of the grippers, 0 closed to 1 open.
+            openings: (A, T) openings of the grippers, 0 closed to 1 open.
 
         Raises:
             CannotTell: the situation does not know what a relation asks for.

@@ -31,7 +31,7 @@ class Views:
 
     Attributes:
         footage: the last chunk.
-        memory: of the rollout, with this chunk.
+        memory: memory of the rollout, with this chunk.
         used: names of the views to look at; empty = all.
     """
 

@@ -31,7 +31,7 @@ def add_adapter(transformer: MultiViewWanTransformer, rank: int = 32, alpha: flo
 
     Args:
         transformer: whose phi, view embedding and patch embedding stay trainable as they are.
-        rank: of the adapter's factors (the paper's: 32).
+        rank: rank of the adapter's factors (the paper's: 32).
         alpha: the factors' product counts alpha / rank.
 
     Raises:
@@ -65,8 +65,8 @@ def save_adapter(
 
     Args:
         transformer: has the adapter.
-        folder: to write.
-        weights: in place of the transformer's, by name; such as averaged ones.
+        folder: folder to write.
+        weights: weights in place of the transformer's, by name; such as averaged ones.
         card: base model and training data, as in a checkpoint.
         control: how plans enter the model.
     """

@@ -29,9 +29,9 @@ class Base:
     """A loaded checkpoint, ready to be trained.
 
     Attributes:
-        folder: of the checkpoint.
+        folder: folder of the checkpoint.
         checkpoint: its parts; the transformer has a new adapter where the preset trains one.
-        encoders: on the device.
+        encoders: encoders on the device.
         digest: identifies its transformer's weights.
     """
 

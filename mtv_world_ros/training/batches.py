@@ -45,7 +45,7 @@ class ClipBatch:
     Attributes:
         frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
         start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model sees it (maybe disturbed).
-        inputs: of the control.
+        inputs: inputs of the control.
         object_ids: (B, V, 1 + T, H, W) uint8, zero in clips without; None where no clip has them.
         anchor: (B, V, H, W, 3) uint8 RGB, the first frame of the clip's rollout, in models with a
             history; see `draw_past`.
@@ -53,9 +53,9 @@ class ClipBatch:
         history_sigmas: (B,) float32 noise levels of those, 1 = there are none.
         lead_ins: B entries: the chunks to imagine before a clip, None = the clip starts from its
             recorded frame; empty = all do.
-        step: of the training, from 0.
-        numbers: of its clips within the step's whole batch, which processes and accumulation
-            split; each clip's noise depends on its own.
+        step: step of the training, from 0.
+        numbers: numbers of its clips within the step's whole batch, which processes and
+            accumulation split; each clip's noise depends on its own.
     """
 
     frames: Tensor
@@ -99,7 +99,7 @@ class BatchSource:
         robot: kinematics of the recorded robot.
         segmenter: finds the objects of the first frames.
         control: fitted to the recordings; None = that of the configuration, which needs no fit.
-        seed: of choice and disturbances.
+        seed: seed of choice and disturbances.
         numbers: the clips of a step that this process makes; None: all.
         workers: processes that make them; 0 = a thread of this one.
     """

@@ -76,7 +76,7 @@ class LeadIn:
     Attributes:
         clip: (num_chunks + 1) * T frames after its first one.
         num_chunks: chunks to imagine.
-        names: of the objects.
+        names: names of the objects.
         colours: order of the colour channels of the clip that is trained on.
         foresees: whether the objects' motion counts as foreseen.
     """
@@ -149,7 +149,7 @@ class ControlMaker:
     """Maker of the control input of a clip, equal to that of serving.
 
     Attributes:
-        robot: of the episodes.
+        robot: robot of the episodes.
         segmenter: finds the objects of the start frame.
         control: how plans enter the model.
     """
@@ -175,7 +175,7 @@ class ControlMaker:
 
         Args:
             clip: the chunk.
-            names: of the objects.
+            names: names of the objects.
             start: (V, H, W, 3) uint8 RGB imagined frame in place of the clip's first one.
             foresees: whether the objects' motion counts as foreseen in this clip.
         """

@@ -37,7 +37,7 @@ class Encoders:
     """The frozen encoders: pixels to latents, text and images to tokens.
 
     Attributes:
-        autoencoder: on the device that trains.
+        autoencoder: autoencoder on the device that trains.
         text: (1, 512, text_dim) umT5 tokens of the prompt that all clips share, in models with
             text; the paper has one for all tasks.
         image: CLIP, in models with text.
@@ -57,7 +57,7 @@ class EncodedBatch:
     Attributes:
         clean: (B, V, C, F, h, w) targets of denoising.
         conditioning: inputs of denoising.
-        weights: of each latent in the loss, at least 1; the shape of `clean`.
+        weights: weights of each latent in the loss, at least 1; the shape of `clean`.
         step, numbers: see `Batch`.
     """
 
@@ -142,7 +142,7 @@ def drop_conditions(
     samples; classifier-free guidance needs a model trained without its condition.
 
     Args:
-        conditioning: of a batch.
+        conditioning: conditioning of a batch.
         augment: probabilities.
         draws: random numbers of the batch.
         control_dropout: the control's own, where it is higher than `augment.control_dropout`.

@@ -34,10 +34,10 @@ def fitted_control(
     checkpoint takes over the checkpoint's, whose numbers these weights know.
 
     Args:
-        folder: of the training.
+        folder: folder of the training.
         config: the preset.
         recordings: episodes that are trained on.
-        robot: of the episodes.
+        robot: robot of the episodes.
         initial: checkpoint that weights are taken from; None = weights are new.
 
     Raises:

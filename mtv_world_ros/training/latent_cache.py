@@ -62,7 +62,7 @@ class LatentCache:
         shard_bytes: size at which a shard is written.
 
     Attributes:
-        folder: of these settings.
+        folder: folder of these settings.
         notes: caches in `root` that are not used, and why.
     """
 
@@ -188,7 +188,7 @@ class CachedClip:
     Attributes:
         recording: its episode.
         start: recorded frame that it starts from.
-        key: in the cache.
+        key: key in the cache.
     """
 
     recording: Recording
@@ -437,9 +437,9 @@ class CachedSource:
         objective: pixel weights.
         text: (1, 512, text_dim) umT5 tokens of the prompt, in models with text.
         batch_size: clips of a step, over all processes.
-        seed: of the order.
+        seed: seed of the order.
         numbers: the clips of a step that this process takes; None: all.
-        device: of the batches.
+        device: device of the batches.
     """
 
     def __init__(

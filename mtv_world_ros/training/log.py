@@ -26,7 +26,8 @@ class TrainingLog:
         step: at which the training starts; later rows are dropped.
         total: steps of the training.
         active: False writes nothing, for all processes except the main one.
-        ideal_seconds: of a step at the machine's peak arithmetic rate; None = unknown.
+        ideal_seconds: ideal seconds of a step at the machine's peak arithmetic rate; None =
+            unknown.
     """
 
     def __init__(

@@ -98,9 +98,9 @@ def pooled_weights(weights: Tensor, shape: Sequence[int]) -> Tensor:
     """Return weights of shape (B, V, C, 1 + k, h, w) for latents that begin with the start frame.
 
     Args:
-        weights: (B, V, T, H, W) of the pixels of the T frames after it; each latent gets the mean
-            of those it stands for, the start frame 1.
-        shape: of the latents.
+        weights: (B, V, T, H, W) weights of the pixels of the T frames after it; each latent gets
+            the mean of those it stands for, the start frame 1.
+        shape: shape of the latents.
     """
     frames, height, width = shape[3:]
     pooled = F.adaptive_avg_pool3d(weights.flatten(0, 1), (frames - 1, height, width))

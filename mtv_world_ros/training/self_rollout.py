@@ -32,11 +32,11 @@ class SelfRollout:
 
     Args:
         controls: makes the inputs of what was imagined.
-        encoders: on the device that trains.
+        encoders: encoders on the device that trains.
         scheduler: noise levels and step rule of serving.
         num_inference_steps: denoising steps of a chunk.
-        seed: of the noise.
-        device: of the model.
+        seed: seed of the noise.
+        device: device of the model.
     """
 
     def __init__(

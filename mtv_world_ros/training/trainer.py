@@ -61,9 +61,9 @@ class StepReport:
 
     Attributes:
         step: its number, from 1.
-        loss: over all clips of the step, of all processes.
-        average: of the recent losses.
-        learning_rate: of the step.
+        loss: loss over all clips of the step, of all processes.
+        average: average of the recent losses.
+        learning_rate: learning rate of the step.
         grad_norm: before clipping.
         seconds: duration, waiting included.
         waited: seconds of it spent waiting for the batch.
@@ -95,11 +95,11 @@ class Trainer:
     Args:
         config: the preset.
         folder: gets state, logs and checkpoints.
-        seed: of weights, noise and batches.
+        seed: seed of weights, noise and batches.
         device: e.g. `cpu`, `cuda`.
-        dtype: of forward and backward; master weights stay float32.
+        dtype: dtype of forward and backward; master weights stay float32.
         trained_on: entry of the checkpoint's card.
-        processes: that train together; None: those that the launcher started.
+        processes: processes that train together; None: those that the launcher started.
         base: checkpoint to train on top of; None: all weights are new.
         control: how plans enter the model; None = the paper's.
 

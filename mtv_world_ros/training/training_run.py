@@ -211,7 +211,7 @@ def train(
 
     Args:
         run: preset, data, device, saving.
-        robot: of the episodes.
+        robot: robot of the episodes.
         segmenter: finds the objects of the first frames.
         describer: names the objects; None = see `load_recordings`.
         held_out: scores checkpoints on held-out episodes and keeps the best.
@@ -447,7 +447,7 @@ class StopSignals:
     A context manager; outside the main thread, which alone gets signals, it does nothing.
 
     Attributes:
-        number: of the signal that came; 0 = none.
+        number: number of the signal that came; 0 = none.
     """
 
     def __init__(self) -> None:

@@ -207,9 +207,9 @@ def open_viewer(
     """Open the viewer for what is logged from here on; return a line for the user.
 
     Args:
-        stream: of `recording`.
-        blueprint: of `layout`; None = the viewer's own.
-        address: of the page for browsers.
+        stream: stream of `recording`.
+        blueprint: blueprint of `layout`; None = the viewer's own.
+        address: address of the page for browsers.
         save: write a file for `rerun FILE` instead.
         is_native: open a window instead.
 

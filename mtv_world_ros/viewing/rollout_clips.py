@@ -37,9 +37,9 @@ class RolloutClip:
 
     Attributes:
         video: MP4 with the columns real, trajectory and imagined, and one row per view.
-        num_frames: of the video.
-        width: of the video [px].
-        height: of the video [px].
+        num_frames: number of frames of the video.
+        width: width of the video [px].
+        height: height of the video [px].
         sheet: WebP; some of the same frames; empty = not wanted.
         outlines: (object, RGB) pairs.
     """

@@ -49,7 +49,7 @@ class Comparison:
         trajectory: (V, T, H, W, 3) uint8 RGB trajectory video.
         imagined: (V, T, H, W, 3) uint8 RGB predicted frames.
         captions: (V, T) short texts under the imagined frames, e.g. their J; empty = none.
-        kinds: of `KINDS`, those that are there and shown.
+        kinds: kinds of `KINDS`, those that are there and shown.
     """
 
     views: tuple[str, ...]

@@ -94,8 +94,8 @@ def check_ports(address: PageAddress, option: str = '--port') -> None:
     """Check that the ports of the page and of its data are free on the address to listen on.
 
     Args:
-        address: of the page.
-        option: of the command, which sets it.
+        address: address of the page.
+        option: option of the command, which sets it.
 
     Raises:
         ConfigError: a port is taken, or this machine does not have the address.

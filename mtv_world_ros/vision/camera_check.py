@@ -105,7 +105,7 @@ class CameraFit:
     """Result of the check for one view.
 
     Attributes:
-        view: its name.
+        view: name of the view.
         status: `fits`, `corrected` for this episode, `refused` as too far off, or `unchecked`.
         T_given_found: (4, 4) found optical frame in the calibrated one; identity where not found.
         offset_px: how far the arm is from where it should be, at the picture's size; NaN = not

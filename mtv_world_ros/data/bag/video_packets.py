@@ -80,8 +80,8 @@ class VideoFrames(LazyFrames):
     """Frames of packets, decoded when asked for, in order best.
 
     Args:
-        topic: of the packets, for error texts.
-        packets: in the order of their stamps; the first one is a key frame.
+        topic: topic of the packets, for error texts.
+        packets: packets in the order of their stamps; the first one is a key frame.
     """
 
     def __init__(self, topic: str, packets: Sequence[Any]) -> None:

@@ -299,7 +299,7 @@ class _Spool:
         reserves: whether to hold space for the index, so that `release` makes room for it.
 
     Attributes:
-        num_channels: of the bag; the index grows with it.
+        num_channels: number of channels of the bag; the index grows with it.
     """
 
     def __init__(self, path: Path, *, reserves: bool) -> None:

@@ -36,7 +36,7 @@ class ScoreRow:
         stretch: its number in the episode.
         num_frames: T, frames that were predicted.
         view: name.
-        name: of the object; empty for the union of the scored objects.
+        name: name of the object; empty for the union of the scored objects.
         status: `ok`, or why it is not scored, or why to doubt it.
         moving: whether it really moves (see `MOVING_RULE`).
         j: mean over frames.
@@ -212,7 +212,7 @@ def score_rows(
         truth: masks of the recorded frames.
         predicted: scores of the prediction.
         others: scores by name, of `OTHERS`; those that are missing were not measured.
-        masks: in the predicted frames; None = what is imagined to move is not known.
+        masks: masks in the predicted frames; None = what is imagined to move is not known.
     """
     first = truth.first.masks[:, :, 0]
     imagined = np.zeros_like(truth.moving) if masks is None else moves(masks.masks, first)

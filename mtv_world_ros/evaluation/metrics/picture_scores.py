@@ -172,7 +172,7 @@ def following(estimates: Mapping[str, Estimate], objects: Estimate | None = None
     """Decide by PSNR where the picture changes, against held frame and shuffled commands.
 
     Args:
-        estimates: of `picture_estimates`.
+        estimates: estimates of `picture_estimates`.
         objects: J of the moving objects minus that of the held first frame, paired within the
             episodes; None = no episode names a moving object. A model below the held frame does
             not follow the commands, whatever its pictures of the arm are like.

@@ -42,7 +42,7 @@ def draw_rates(
             not as drawn.
         true: (P, K, E) true outcomes.
         num_draws: D.
-        seed: of the draws.
+        seed: seed of the draws.
     """
     rng = np.random.default_rng(seed)
     observed, noise = _observed(np.stack([judged, true]))
@@ -340,7 +340,7 @@ class PoweredMean:
         value: the estimate, cut to [0, 1].
         interval: 95 %, with the t quantile of the true values, cut to [0, 1]; NaN where these
             are fewer than `MIN_SCENES` or do not vary.
-        weight: of the predictions (lambda), 0 = the mean of the true values alone.
+        weight: weight of the predictions (lambda), 0 = the mean of the true values alone.
         num_true: true values.
         num_more: predictions without a true value.
     """

@@ -90,7 +90,7 @@ class Bin:
     """Estimates of about the same probability, and how often they came true.
 
     Attributes:
-        middle: of the probabilities that belong here.
+        middle: middle of the probabilities that belong here.
         estimate: their mean.
         came_true: share, with its interval.
         interval: 95 % Wilson interval of the share.

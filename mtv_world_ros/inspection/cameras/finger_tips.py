@@ -25,9 +25,9 @@ def tip_middles(
     without fingers, or of fingers without shapes, it is the tool point.
 
     Args:
-        robot: of the positions.
-        shapes: of its links.
-        positions: (T, J) of the joints [rad or m].
+        robot: robot of the positions.
+        shapes: shapes of its links.
+        positions: (T, J) positions of the joints [rad or m].
         arm: number of the tool.
     """
     tools = robot.tool_poses(positions)[arm]

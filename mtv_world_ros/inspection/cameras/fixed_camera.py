@@ -131,9 +131,9 @@ class FixedCamera:
         track: its frames.
         camera: its intrinsics; the pose is the guess, where there is one.
         robot: gives the links' poses.
-        shapes: of the links.
+        shapes: shapes of the links.
         joints: measured positions.
-        num_frames: that are compared, spread over the recording.
+        num_frames: number of frames that are compared, spread over the recording.
         num_corners: directions in which a part's outermost points are drawn.
 
     Raises:
@@ -465,7 +465,7 @@ def best_apart(
 
     Args:
         tried: fit, number, T_base_camera (4, 4) and what it was tried with.
-        reach: of the robot [m]; poses nearer than 15 % of it count as one.
+        reach: reach of the robot [m]; poses nearer than 15 % of it count as one.
     """
     best: list[tuple[FloatArray, _Item]] = []
     for _, _, T, item in sorted(tried, key=lambda one: one[:2], reverse=True):

@@ -72,7 +72,7 @@ def through(camera: CameraModel, lens: FloatArray) -> CameraModel:
     """Return the camera with another lens.
 
     Args:
-        camera: with the lens that `lens` changes.
+        camera: camera with the lens that `lens` changes.
         lens: (3,) logarithms of factors of fx and of fy / fx, and what is added to k1.
     """
     K = camera.K.copy()
@@ -93,7 +93,7 @@ class SeenPoint:
     Attributes:
         recording: number of the recording.
         seconds: after its first joint state [s].
-        position: (3,) of the tool point, by the joint states, in the base link [m].
+        position: (3,) position of the tool point, by the joint states, in the base link [m].
         pixel: (2,) where it was seen [px].
     """
 
@@ -170,10 +170,10 @@ class JointCamera:
         """Estimate all poses and the lens.
 
         Args:
-            places: of the recordings.
-            guess: to start from; None = from points, or from cameras all around.
+            places: places of the recordings.
+            guess: guess to start from; None = from points, or from cameras all around.
             points: seen tool points, of any of the recordings.
-            seed: of the search.
+            seed: seed of the search.
             rough: leave out the finer images.
         """
         self._take(points)
@@ -204,8 +204,8 @@ class JointCamera:
         """Return the best state near some that were found view by view.
 
         Args:
-            starts: with the poses of all places. A camera farther away with a longer lens looks
-                much alike, so that one start does not lead to all focal lengths.
+            starts: starts with the poses of all places. A camera farther away with a longer lens
+                looks much alike, so that one start does not lead to all focal lengths.
             points: seen tool points, of any of the recordings.
         """
         self._take(points)
@@ -240,9 +240,9 @@ class JointCamera:
         """Return the state at which tool points are seen where somebody saw them.
 
         Args:
-            places: of the recordings.
-            points: of any of the recordings.
-            seed: of the cameras that are tried.
+            places: places of the recordings.
+            points: points of any of the recordings.
+            seed: seed of the cameras that are tried.
             lens: (3,), held there; None = fx and fy are estimated.
         """
         camera = self._recordings[0].camera
@@ -324,7 +324,7 @@ class JointCamera:
 
         Args:
             members: numbers of recordings in which the camera stands at about the same place.
-            seed: of the cameras tried.
+            seed: seed of the cameras tried.
         """
         generator = np.random.default_rng(seed)
         members = members[:_NUM_SEARCHED]

@@ -77,7 +77,7 @@ class SharedEstimate:
     """Estimated camera poses of one view in several recordings.
 
     Attributes:
-        cameras: of each recording, (R,).
+        cameras: cameras of each recording, (R,).
         places: which recordings share one.
         measures: the doctor's measure of each recording.
         guess_measures: the same of the guess; empty where there was none.
@@ -160,14 +160,15 @@ def estimate_shared(
     """Estimate fixed cameras of one make, each from several recordings.
 
     Args:
-        episodes: with cameras of the views, whose intrinsics and, with `guess`, poses are starts.
+        episodes: episodes with cameras of the views, whose intrinsics and, with `guess`, poses are
+            starts.
         views: V views that share their focal length.
-        robot: of the recordings.
-        shapes: of its links.
+        robot: robot of the recordings.
+        shapes: shapes of its links.
         guess: start from the poses of the recordings.
         points: seen tool points by view and by the name of the episode: (time [s], x, y [px]).
         focal_known: whether the focal length is right as it is.
-        seed: of the search.
+        seed: seed of the search.
 
     Returns:
         One of each view.
@@ -417,11 +418,11 @@ def seen_points(
     """Return where what was seen is by the joint states.
 
     Args:
-        points: by the name of the episode: (time [s], x, y [px]).
+        points: points by the name of the episode: (time [s], x, y [px]).
         episodes: R recordings; points of others are left out.
         tracks: joint states of each.
-        robot: of the recordings.
-        shapes: of its links.
+        robot: robot of the recordings.
+        shapes: shapes of its links.
 
     Raises:
         ConfigError: a point is of a time without joint states.

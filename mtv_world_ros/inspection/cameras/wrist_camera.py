@@ -113,10 +113,10 @@ class SceneTracks:
     Attributes:
         rays: (M, L, 3) unit rays in the optical frame.
         stretch: (M,) which stretch each is of, 0 .. S - 1, by time.
-        positions: (S, L, J) of the joints.
+        positions: (S, L, J) positions of the joints.
         turns: (S, K, 3) ways in which the camera may have turned over a stretch, in its first
             optical frame [rad]; NaN where there are fewer than K.
-        focal_px: of the images that they were tracked in.
+        focal_px: focal of the images that they were tracked in.
     """
 
     rays: FloatArray

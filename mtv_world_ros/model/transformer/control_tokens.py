@@ -158,8 +158,8 @@ class ControlTokens(nn.Module):
             kept: (B,) bool, False = the sample goes without its control; None = all have it.
             text: (B, N, D) embedded text; None in models without.
             image: (B, M, D) embedded images; None = none.
-            num_slots: S.
-            num_views: V.
+            num_slots: number of slots, S.
+            num_views: number of views, V.
 
         Raises:
             CheckpointError: an input is missing, or does not divide into time slots.

@@ -109,9 +109,9 @@ def unembed(
     Args:
         transformer: its `proj_out` is used.
         kept: the video's tokens.
-        skips: of `embed_video`.
+        skips: skips of `embed_video`.
         temb: (B, D) embedding of the video's noise level.
-        keys: of `embed_reference`.
+        keys: keys of `embed_reference`.
         reference: (B, V, C, H, W) latents of the start image.
         control: (B, V, C, F, H, W) latents of the trajectory video.
     """

@@ -231,7 +231,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
 
         Args:
             hidden_states: (B, V, C, F, H, W) noisy latents.
-            timestep: (B,) in [0, 1000].
+            timestep: (B,) timestep in [0, 1000].
             control: (B, V, C, F, H, W) latents of the trajectory video.
             start: (B, V, C, F, H, W) latents for the start-image slot.
             reference: (B, V, C, H, W) latents of the start image.
@@ -242,7 +242,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
                 place of the start image: the first one of the rollout.
             history: (B, V, C, P, H, W) latents of what was seen before the chunk, as noisy as
                 `history_timestep` says; None = no such tokens.
-            history_timestep: (B,) in [0, 1000]; 1000 = nothing is known of it.
+            history_timestep: (B,) history timestep in [0, 1000]; 1000 = nothing is known of it.
             control_context: (B, L) indices or (B, L, size) vectors of the control, in models with
                 `context_input`.
             control_frame: (B, 1 + T, size) vectors of the control, in models with `frame_input`.

@@ -260,7 +260,7 @@ class ContactRecording:
     """Motion of objects in an episode, and the commands that caused it.
 
     Attributes:
-        names: of O objects.
+        names: names of O objects.
         frame: the first.
         positions: (1 + T * n, J) commanded, `PERIOD_S` apart [rad or m].
         recorded: (1 + T * n, J) reported by the joints then.
@@ -286,7 +286,7 @@ class FittedNumber:
     """A number that was found.
 
     Attributes:
-        name: of the setting, or of a product of settings.
+        name: name of the setting, or of a product of settings.
         value: the mean of what is likely.
         low: lower end of its 90 % interval, whatever the other numbers are.
         high: upper end.
@@ -614,10 +614,10 @@ def _finding(
     """Return the posterior of a parameter from its draws.
 
     Args:
-        name: of the number.
+        name: name of the number.
         values: (N,) logarithms.
-        likelihoods: (N, E) of the draws, by recording.
-        weights: (N,) of the draws, which sum to 1.
+        likelihoods: (N, E) likelihoods of the draws, by recording.
+        weights: (N,) weights of the draws, which sum to 1.
         conditional: standard deviation if the other numbers are known; None = it stands alone.
     """
     order = np.argsort(values)
@@ -648,7 +648,7 @@ class _Trial:
     """An episode whose objects are foreseen under several settings.
 
     Attributes:
-        solids: of the O objects that two views see at first.
+        solids: solids of the O objects that two views see at first.
         positions: (1 + T * n, J) commanded.
         displacements: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
         table_m: height of its table.

@@ -150,7 +150,7 @@ class Player(Node):
     """Publishes what an episode holds.
 
     Args:
-        options: of the command line, see `_parse`.
+        options: options of the command line, see `_parse`.
 
     Raises:
         EpisodeError: the episode cannot be read, or holds a type that is not installed.

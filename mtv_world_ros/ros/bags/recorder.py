@@ -50,8 +50,8 @@ class Recorder(Node):
     new subscription late, e.g. while it still serves one that was killed.
 
     Args:
-        options: of the command line, see `parse`.
-        name: of the node.
+        options: options of the command line, see `parse`.
+        name: name of the node.
 
     Raises:
         EpisodeError: the folder exists already or cannot be written.

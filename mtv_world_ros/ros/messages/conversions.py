@@ -118,7 +118,7 @@ def to_sample(message: JointState, joints: Collection[str] | None = None) -> Joi
     """Return the positions of a message by joint, and the joints whose position is no number.
 
     Args:
-        message: of one or several joints.
+        message: message of one or several joints.
         joints: those that matter; None = all.
 
     Raises:

@@ -175,7 +175,7 @@ class PolicyLoop:
     """Runs one episode after the other; everything happens in the caller's thread.
 
     Args:
-        spec: of the world model.
+        spec: spec of the world model.
         joint_names: J names, in the robot's order.
         actor: asks the policy.
         frames: gets what the world model publishes.

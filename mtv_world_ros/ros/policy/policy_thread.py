@@ -21,7 +21,7 @@ class PolicyAnswer:
     """The answer to a question.
 
     Attributes:
-        ticket: of the question.
+        ticket: ticket of the question.
         trajectory: the commands; None where the episode is over, or the question was a reset.
         error: why there is no answer; empty where there is one.
         seconds: duration of the policy's answer [s].

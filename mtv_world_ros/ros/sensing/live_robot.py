@@ -113,7 +113,7 @@ class Extrinsics:
 
     Args:
         node: owner of the subscriptions and the publisher.
-        links: of the robot, those whose pose its joint states determine.
+        links: links of the robot, those whose pose its joint states determine.
         events: has the present parameters.
         publishes: whether frames that TF lacks are published.
 
@@ -155,7 +155,7 @@ class Extrinsics:
         Args:
             view: name of the view.
             frame: its optical frame, as images or CameraInfo name it.
-            stamp_ns: of the image [ns].
+            stamp_ns: stamp of the image [ns].
 
         Raises:
             Rejection: TF does not say it, what it says is too old, or it changed.

@@ -63,7 +63,7 @@ def live_starts(
     """Return starts of episodes without end; each is observed when it is asked for.
 
     Args:
-        spec: of the world model; names the views.
+        spec: spec of the world model; names the views.
         robot: the checkpoint's; its description and limits are taken from `robot_description`.
         cameras_file: poses of the views where neither `calibration_file` nor TF has them.
         ros_arguments: `--ros-args` and what follows, e.g. `-r low/image_raw:=/camera/image_raw`;
@@ -110,7 +110,7 @@ class LiveObserver(Node):
     Images may be raw or compressed; a view of which both are published is taken raw.
 
     Args:
-        spec: of the world model; names the views.
+        spec: spec of the world model; names the views.
         robot: the checkpoint's.
         cameras_file: poses of the views where neither `calibration_file` nor TF has them.
         context: ROS context of the node.

@@ -77,7 +77,7 @@ class ObservationBuffer:
         on_image: also gets every image that is stored.
         pose: asked with view, frame and stamp [ns] of an image for what carries the camera; None
             = the calibrated pose.
-        time: of the node; None = samples are not compared with a clock when they arrive.
+        time: time of the node; None = samples are not compared with a clock when they arrive.
     """
 
     def __init__(

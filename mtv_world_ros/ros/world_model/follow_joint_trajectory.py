@@ -53,7 +53,7 @@ class Goal:
         """Refuse what no plan on the topic can have.
 
         Args:
-            joint_names: of the robot.
+            joint_names: joint names of the robot.
 
         Raises:
             Rejection: joints of several degrees of freedom, or a tolerance of another joint.

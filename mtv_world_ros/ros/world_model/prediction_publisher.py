@@ -65,7 +65,7 @@ class ImageStream:
             pixels: (H, W, 3) uint8 RGB, or (H, W) uint8 labels.
             header: stamp and frame.
             info: CameraInfo of the source image, of any size.
-            quality: of JPEG.
+            quality: quality of JPEG.
         """
         height, width = pixels.shape[:2]
         if self._info.get_subscription_count():
@@ -120,7 +120,7 @@ class PredictionPublisher:
 
     Args:
         node: owner of the publishers and timers.
-        spec: of the world model.
+        spec: spec of the world model.
         joint_names: J names, in the robot's order.
         events: has the present parameters; takes chunks that are judged or sent, and ends.
     """

@@ -155,7 +155,7 @@ class _Arrived(NamedTuple):
 
     Attributes:
         received_s: when it came [s], of `time.monotonic`.
-        plan: of the topic or the action.
+        plan: plan of the topic or the action.
         transport_s: how long it was under way [s].
     """
 

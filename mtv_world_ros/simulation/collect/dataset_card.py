@@ -44,7 +44,7 @@ class CardEntry:
         seed: reproduces the scene.
         attempt: seeds dropped before this one.
         num_frames: number of frames of each view.
-        duration_s: from the first to the last message [s].
+        duration_s: duration from the first to the last message [s].
         instruction: the language instruction.
         objects: names, in the order of the mask ids.
         scene: name of the scene that it shares with its siblings; empty = it has none.

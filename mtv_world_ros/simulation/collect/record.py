@@ -33,7 +33,7 @@ class RecordConfig:
     """Sampling settings of a recorded episode.
 
     Attributes:
-        hold_s: from the end of the commands to the last frame, at least [s].
+        hold_s: time from the end of the commands to the last frame, at least [s].
         frame_period_s: between frames [s], at least 0.02; each is taken at the nearest multiple of
             0.02 s, and stamped with it.
         chunk_s: the policy publishes an action chunk this often, of this horizon [s].

@@ -20,9 +20,9 @@ class FingerDrives:
     """Drives of F fingers, in the units of their joints; all (F,).
 
     Attributes:
-        stiffness: of the drive [N/m or N m/rad].
-        damping: of the drive [N s/m or N m s/rad].
-        mass: of finger and drive [kg or kg m^2].
+        stiffness: stiffness of the drive [N/m or N m/rad].
+        damping: damping of the drive [N s/m or N m s/rad].
+        mass: mass of finger and drive [kg or kg m^2].
         lower: lower joint limits [m or rad].
         upper: upper joint limits [m or rad].
     """

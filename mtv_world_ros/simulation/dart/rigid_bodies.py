@@ -93,13 +93,13 @@ class RigidBodies:
     """A world that is stepped.
 
     Args:
-        robot: from a URDF whose base link is its root.
+        robot: robot from a URDF whose base link is its root.
         response: how its joints follow; all have a compliance.
         solids: O, on the table.
-        settings: of contact.
-        step_s: of the engine.
+        settings: settings of contact.
+        step_s: step of the engine.
         pose: (J,) near which the arms work [rad or m].
-        masses: (O,) of the solids [kg].
+        masses: (O,) masses of the solids [kg].
 
     Raises:
         RobotError: the robot cannot be a tree of rigid bodies, or its drives are too stiff.

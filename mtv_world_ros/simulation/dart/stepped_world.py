@@ -31,9 +31,9 @@ class SteppedWorld:
     """A table, a robot and O solids; J joints.
 
     Args:
-        robot: from a URDF with inertias.
+        robot: robot from a URDF with inertias.
         response: how its joints follow; all have a compliance.
-        settings: of contact.
+        settings: settings of contact.
         solids: O, on the table.
         masses: (O,) [kg].
         home: (J,) where the joints rest at first [rad or m].

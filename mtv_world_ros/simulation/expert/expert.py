@@ -33,8 +33,8 @@ class PickingConfig:
     """Gaps between fingers and objects.
 
     Attributes:
-        release: on either side when the fingers let go; they open wholly above [m].
-        miss_margin: between the fingers and an object that is missed, range [m].
+        release: release on either side when the fingers let go; they open wholly above [m].
+        miss_margin: miss margin between the fingers and an object that is missed, range [m].
         max_miss: largest shift past an object, across the fingers' travel [m].
     """
 
@@ -48,10 +48,10 @@ class Pick:
     """Grasp of one object by one arm.
 
     Attributes:
-        arm: its name.
-        position: of the tool at the grasp (3,) [m].
-        yaw: of the tool [rad].
-        opening: of the gripper on the way down, 0..1.
+        arm: name of the arm.
+        position: position of the tool at the grasp (3,) [m].
+        yaw: yaw of the tool [rad].
+        opening: opening of the gripper on the way down, 0..1.
         released: its opening when the object is let go, 0..1.
     """
 

@@ -53,7 +53,7 @@ class ScriptedPolicy:
         expert: the scripted expert, which plans.
         task: the task to carry out.
         scene: where everything is.
-        hold_s: from the end of the plan to the end of the episode [s].
+        hold_s: time from the end of the plan to the end of the episode [s].
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class ScriptedPolicy:
         """Plan the next episode.
 
         Args:
-            seed: of the plan's tempo and heights, and of the faults.
+            seed: seed of the plan's tempo and heights, and of the faults.
 
         Raises:
             PolicyError: no plan within the arms' reach, or the task has no other object to take.
@@ -250,9 +250,9 @@ def scripted_policy(
     Args:
         name: e.g. `expert` or `expert-miss-0.5`; see `parse_variant`.
         task: name of a task.
-        seed: of the episode, as `SimEpisode.reset` takes it and a recorded episode has it.
+        seed: seed of the episode, as `SimEpisode.reset` takes it and a recorded episode has it.
         expert: the scripted expert, which plans.
-        hold_s: from the end of the plan to the end of the episode [s].
+        hold_s: time from the end of the plan to the end of the episode [s].
 
     Raises:
         PolicyError: no such policy.
@@ -272,7 +272,7 @@ def policy_of_recording(
         name: as in `scripted_policy`.
         recording: the episode's folder.
         expert: the scripted expert, which plans.
-        hold_s: from the end of the plan to the end of the episode [s].
+        hold_s: time from the end of the plan to the end of the episode [s].
 
     Raises:
         PolicyError: no such policy.

@@ -16,11 +16,11 @@ class WayPoint:
 
     Attributes:
         phase: `above`, `grasp`, `close`, `lift`, `carry`, `lower`, `open`, `retreat` or `home`.
-        position: (3,) of the tool [m].
-        yaw: of the tool [rad].
-        opening: of the gripper, 0..1.
+        position: (3,) position of the tool [m].
+        yaw: yaw of the tool [rad].
+        opening: opening of the gripper, 0..1.
         seconds: duration of the segment; None = by the arm's speed.
-        lean: of the tool about its own x [rad].
+        lean: lean of the tool about its own x [rad].
     """
 
     phase: str
@@ -43,10 +43,10 @@ class Draws:
     """Random draws for a faulty move: side, direction and errors of way points.
 
     Attributes:
-        yaw: of the grasp [rad]; the fingers travel along it.
+        yaw: yaw of the grasp [rad]; the fingers travel along it.
         sign: +1 or -1.
-        angle: of a direction in the plane [rad].
-        errors: (N, 3) of way points, standard normal.
+        angle: angle of a direction in the plane [rad].
+        errors: (N, 3) errors of way points, standard normal.
         openings: (N,) the same of openings.
         play: draws anew for every plan that is tried.
         objects: (3,) centre of every object of the scene [m].

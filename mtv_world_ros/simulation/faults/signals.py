@@ -23,7 +23,7 @@ class Commands:
 
     Attributes:
         positions: (T, J) [rad or m].
-        period: between two rows [s].
+        period: period between two rows [s].
         robot: the robot that these joints belong to.
     """
 

@@ -59,7 +59,7 @@ class WayPointFaults:
         """Return the random draws for the faulty move.
 
         Args:
-            yaw: of its grasp [rad]; the fingers travel along it.
+            yaw: yaw of its grasp [rad]; the fingers travel along it.
             objects: (3,) centre of every object of the scene [m].
             other_home: (3,) where another arm's tool rests [m].
         """
@@ -80,7 +80,7 @@ class WayPointFaults:
             stops: way points of the move, with its faults.
             draws: what is drawn for it.
             home: way point at which the second arm rests.
-            times: of the way points, before scaling [s].
+            times: times of the way points, before scaling [s].
         """
         visits = (
             visit_of(fault.second_arm, stops, size, draws, home, times)

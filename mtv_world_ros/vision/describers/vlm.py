@@ -157,7 +157,7 @@ class VlmDescriber:
 
     Args:
         chat: the model.
-        cache: of answers; None = none are kept.
+        cache: cache of answers; None = none are kept.
     """
 
     def __init__(self, chat: Chat, cache: DescriptionCache | None = None) -> None:

@@ -65,7 +65,7 @@ def choose_segmenter(
             (MM-Grounding-DINO and SAM 2), `sam3`, the name of an entry point, `module:Class`, or
             a file of examples, `*.safetensors`.
         weights: folder of weights, at any depth up to two; default: `MTV_WORLD_WEIGHTS`.
-        device: of the models: `cpu`, `cuda`, ...
+        device: device of the models: `cpu`, `cuda`, ...
 
     Raises:
         ConfigError: no such segmenter, it cannot be used, no folder, or its weights are not in

@@ -68,7 +68,7 @@ class Example:
     """An object in one frame.
 
     Attributes:
-        name: of the object.
+        name: name of the object.
         frame: (h, w, 3) uint8 RGB, the object and what surrounds it.
         mask: (h, w) of the object.
         size: (2,) width and height of the whole frame [px].
@@ -84,7 +84,7 @@ class Example:
         """Cut the object in a box out of its background, by GrabCut.
 
         Args:
-            name: of the object.
+            name: name of the object.
             frame: (H, W, 3) uint8 RGB.
             box: around it.
         """
@@ -126,7 +126,7 @@ class ObjectExamples:
     """Appearance of objects in example pictures.
 
     Attributes:
-        examples: of all objects.
+        examples: examples of all objects.
         elsewhere: (N, 3) uint8 RGB of what is no object, drawn from the frames evenly.
     """
 
@@ -294,7 +294,7 @@ class ExampleSegmenter:
     same there, and else where its colours are, near where it was last.
 
     Args:
-        examples: of the objects.
+        examples: examples of the objects.
     """
 
     def __init__(self, examples: ObjectExamples) -> None:
@@ -344,7 +344,7 @@ class _Follower:
     """Follows one object through the frames of a view.
 
     Args:
-        look: of the object.
+        look: look of the object.
         rivals: the looks of the others that are looked for.
     """
 

@@ -82,8 +82,8 @@ def prepare(
     Args:
         frame: (H, W, 3) uint8 RGB.
         size: height and width that the model wants [px].
-        normalisation: of the model.
-        device: of the returned tensor.
+        normalisation: normalisation of the model.
+        device: device of the returned tensor.
     """
     import torch
 

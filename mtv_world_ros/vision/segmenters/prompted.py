@@ -145,7 +145,7 @@ class PromptedSegmenter:
     objects correspond without matching.
 
     Attributes:
-        name: of the models, for reports.
+        name: name of the models, for reports.
         finder: finds the names where no first masks are given.
         video: follows the masks.
         tracking: when a followed mask is to be doubted.

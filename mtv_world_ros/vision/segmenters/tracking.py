@@ -146,7 +146,7 @@ class _Patch(NamedTuple):
         pixels: (h, w) bool; a view.
         top: its first row in the frame.
         left: its first column.
-        shape: (H, W) of the frame.
+        shape: (H, W) shape of the frame.
     """
 
     pixels: BoolArray
