@@ -103,7 +103,13 @@ class Motion:
 
     def first(self, num_states: int) -> Motion:
         """Return the motion through the first states."""
-        kept = slice(0, num_states)
+        return self._part(slice(0, num_states))
+
+    def after_first(self) -> Motion:
+        """Return the motion through all states but the first."""
+        return self._part(slice(1, None))
+
+    def _part(self, kept: slice) -> Motion:
         return replace(
             self,
             positions=self.positions[kept],

@@ -96,6 +96,9 @@ class CheckpointCard(Schema):
         default=4, description='denoising steps that the model is made for'
     )
     history: HistorySettings = HistorySettings()
+    scene_memory: bool = Field(
+        default=False, description='background is held as real frames showed it'
+    )
 
     @model_validator(mode='after')
     def _chunk_fits_the_memory(self) -> Self:

@@ -37,6 +37,7 @@ from mtv_world_ros.rollout.assembly import asked_describer
 from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions
 from mtv_world_ros.rollout.prediction import Prediction, StageClock
 from mtv_world_ros.rollout.rollout import ObservedChunk, Rollout
+from mtv_world_ros.rollout.scene_memory import SceneKeeper
 from mtv_world_ros.rollout.state import RolloutState
 from mtv_world_ros.success.calibration import Calibration, Fits, HorizonCurve, load_fits
 from mtv_world_ros.success.doubts import doubted, Grounds, widened
@@ -112,6 +113,8 @@ class Pipeline:
         drawing: draws the plan for people where the control itself is no video.
         picture_fits: fits to rollouts without foreseen object motion, for `without_foresight`;
             None = the estimate stays as it is, e.g. bare.
+        scene_keeper: keeps the background of rollouts as real frames showed it; None = the model
+            draws it anew in each chunk.
     """
 
     robot: RobotModel
@@ -127,6 +130,7 @@ class Pipeline:
     grounds: Grounds = Grounds()
     drawing: TrajectoryVideo = TrajectoryVideo(config=TrajectoryVideoConfig())
     picture_fits: Fits | None = None
+    scene_keeper: SceneKeeper | None = None
 
     @classmethod
     def load(
@@ -262,6 +266,7 @@ class Pipeline:
             horizon=horizon,
             object_motion=object_motion,
             camera_checker=camera_checker,
+            scene_keeper=SceneKeeper.of(robot) if card.scene_memory else None,
         )
 
     @property
@@ -277,6 +282,7 @@ class Pipeline:
             robot=robot,
             camera_checker=None if checker is None else checker.with_robot(robot),
             object_motion=None if motion is None else motion.with_robot(robot),
+            scene_keeper=self.scene_keeper and self.scene_keeper.with_robot(robot),
         )
 
     def without_foresight(self) -> Pipeline:
@@ -339,7 +345,7 @@ class Pipeline:
         """Return one chunk of one rollout, stage by stage, and the rollout's state after it."""
         start, clock = state.observation, StageClock()
         num_steps = options.num_inference_steps or self.spec.num_inference_steps
-        motion = Motion.of(self.robot, start.cameras, plan.positions, self.control.links)
+        motion = Motion.of(self.robot, start.cameras, plan.positions, self._links)
         in_view = motion.tools_in_view()
         start_masks = self.find(state, options)
         clock.lap('start masks')
@@ -352,12 +358,13 @@ class Pipeline:
             state.is_begun,
             options.should_stop,
         )
+        pictures = objects.pictures(plan, motion)
         scene = ControlScene(
             motion=motion,
             times=plan.times,
             start_frames=start.frames,
             masks=start_masks.masks[:, :, 0],
-            objects=objects.pictures(plan, motion),
+            objects=pictures,
         )
         clock.lap('object motion')
         control = self.control.make(scene)
@@ -377,9 +384,21 @@ class Pipeline:
             history=state.history,
         )[:, : plan.num_frames]
         clock.lap('model')
-        masks = self.follow(state, start_masks, frames, options)
-        clock.lap('masks')
         motion = motion.first(plan.num_frames + 1)
+        masks = self.follow(state, start_masks, frames, options)
+        background = state.scene
+        if self.scene_keeper is not None and options.objects:
+            if not state.num_imagined:
+                background = self.scene_keeper.seen(
+                    background, motion.first(1), start.frames[:, None], start_masks
+                )
+            assert background is not None
+            drawn_objects = None if pictures is None else pictures[:, 1 : plan.num_frames + 1]
+            frames, background = self.scene_keeper.held(
+                background, motion.after_first(), frames, masks, drawn_objects
+            )
+            masks = self.follow(state, start_masks, frames, options)
+        clock.lap('masks')
         foreseen = objects.motions(plan, state.is_begun)
         success, memory = self.judge(state, motion, start_masks, masks, options, foreseen)
         unseen = () if control.video is None or in_view.any() else (_UNSEEN,)
@@ -389,7 +408,13 @@ class Pipeline:
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
         state = state.after(
-            frames, motion.positions[-1], stamp_ns, self.spec.num_history, memory, objects
+            frames,
+            motion.positions[-1],
+            stamp_ns,
+            self.spec.num_history,
+            memory,
+            objects,
+            background,
         )
         prediction = Prediction(
             start=start,
@@ -430,13 +455,28 @@ class Pipeline:
         """
         start_masks = self.find(state, options)
         masks = self.follow(state, start_masks, frames, options)
-        motion = Motion.of(self.robot, state.observation.cameras, positions)
+        motion = Motion.of(self.robot, state.observation.cameras, positions, self._links)
+        background = state.scene
+        if self.scene_keeper is not None and options.objects:
+            background = self.scene_keeper.seen(background, motion.after_first(), frames, masks)
         success, memory = self.judge(state, motion, start_masks, masks, options, is_real=True)
         stamp_ns = state.observation.stamp_ns + round(frames.shape[1] / self.spec.fps * 1e9)
         after = state.after(
-            frames, positions[-1], stamp_ns, self.spec.num_history, memory, state.objects
+            frames,
+            positions[-1],
+            stamp_ns,
+            self.spec.num_history,
+            memory,
+            state.objects,
+            background,
         )
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success), after
+
+    @property
+    def _links(self) -> tuple[str, ...]:
+        """Names of the links whose poses are needed."""
+        keeper = self.scene_keeper
+        return tuple(dict.fromkeys([*self.control.links, *(keeper.links if keeper else ())]))
 
     def find(self, state: RolloutState, options: RolloutOptions) -> ObjectMasks:
         """Return masks of the frame that a chunk starts from (T = 1)."""

@@ -16,6 +16,7 @@ from mtv_world_ros.core.data_types import (
 from mtv_world_ros.core.errors import ObservationError
 from mtv_world_ros.core.images import resize_frames
 from mtv_world_ros.physics.episode_objects import ObjectForesight
+from mtv_world_ros.rollout.scene_memory import SceneMemory
 from mtv_world_ros.success.rollout_memory import RolloutMemory
 from mtv_world_ros.vision.camera_check import CameraCheck
 
@@ -32,6 +33,7 @@ class RolloutState:
         num_imagined: frames since the last real one.
         camera_check: calibration check on the episode's first frames; its corrections are
             applied.
+        scene: memory of the background; None = nothing is held.
     """
 
     observation: Observation
@@ -40,6 +42,7 @@ class RolloutState:
     memory: RolloutMemory | None = None
     num_imagined: int = 0
     camera_check: CameraCheck = CameraCheck()
+    scene: SceneMemory | None = None
 
     @classmethod
     def at(
@@ -75,6 +78,7 @@ class RolloutState:
         num_history: int,
         memory: RolloutMemory,
         objects: ObjectForesight,
+        scene: SceneMemory | None = None,
     ) -> RolloutState:
         """Return the state at the last of the frames (V, T, H, W, 3).
 
@@ -85,6 +89,7 @@ class RolloutState:
             num_history: most frames to keep before it.
             memory: memory of the success estimate after the chunk.
             objects: foreseen poses after the chunk.
+            scene: memory of the background after the chunk.
         """
         start = self.observation
         return replace(
@@ -96,6 +101,7 @@ class RolloutState:
             objects=objects,
             memory=memory,
             num_imagined=self.num_imagined + frames.shape[1],
+            scene=scene,
         )
 
     def seen_by(self, cameras: tuple[CameraModel, ...] | None) -> RolloutState:

@@ -177,6 +177,11 @@ class SamplingConfig(Schema):
         description='text guidance; 1 = none, which halves the time',
     )
     negative_prompt: str = Field(default='', description='text that guidance leads away from')
+    scene_memory: bool = Field(
+        default=False,
+        description='what neither the robot nor a named object that it may have moved covers '
+        'stays as real frames of the rollout showed it (cameras that stand still)',
+    )
 
 
 class OptimizerConfig(Schema):
@@ -295,6 +300,8 @@ class TrainingConfig(Schema):
 
     def card(self, trained_on: Mapping[str, Any], **text: Any) -> CheckpointCard:
         """Return the checkpoint's card; `trained_on` says where weights come from."""
+        if self.sampling.scene_memory:
+            text['scene_memory'] = True
         return CheckpointCard(
             **self.video.model_dump(mode='json', exclude={'clip_stride_s'}),
             rendering=self.rendering.model_dump(),

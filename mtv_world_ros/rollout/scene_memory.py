@@ -1,0 +1,210 @@
+"""Memory of a rollout's background: what nothing covers stays as real frames showed it.
+
+A model that starts each chunk from its own last frame draws the background anew each time: what
+the arm uncovers becomes a smear, and errors of flat walls grow from chunk to chunk. A camera that
+stands still has seen that background before.
+
+Shape letters: V views, O objects, T frames, H W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from mtv_world_ros.cameras.motion import Motion
+from mtv_world_ros.cameras.silhouettes import project_part
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, FloatArray, ObjectMasks
+from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.shape import fill, LinkShape, load_shape, moving_links
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneMemorySettings:
+    """Settings of what counts as covered.
+
+    Attributes:
+        arm_margin: distance from the drawn robot within which the model's picture counts: cables,
+            what a gripper holds, shadows [fraction of the image width].
+        object_margin: the same around objects that may have moved [fraction of the image width].
+        blend: width of the passage between memory and model [fraction of the image width].
+    """
+
+    arm_margin: float = 0.05
+    object_margin: float = 0.02
+    blend: float = 0.012
+
+
+_SETTINGS = SceneMemorySettings()
+#: largest difference of the entries of equal camera poses
+_SAME_POSE = 1e-4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneMemory:
+    """Background of each view, as it was last seen uncovered.
+
+    Attributes:
+        pictures: (V, H, W, 3) uint8 RGB.
+        known: (V, H, W) where it was seen.
+        masks: (V, O, H, W) of the objects in the last real frame.
+        touched: (O,) whether the robot may have moved an object since.
+        camera_poses: (V, 4, 4) T_base_camera of the pictures [m].
+    """
+
+    pictures: ByteArray
+    known: BoolArray
+    masks: BoolArray
+    touched: BoolArray
+    camera_poses: FloatArray
+
+
+class SceneKeeper:
+    """Keeps the background of rollouts.
+
+    Args:
+        robot: the robot of the rollouts.
+        parts: shapes of its links.
+        settings: what counts as covered.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        parts: Sequence[LinkShape],
+        settings: SceneMemorySettings = _SETTINGS,
+    ) -> None:
+        self._parts, self._settings = tuple(parts), settings
+        self._moving = moving_links(robot)
+        #: names of the links whose poses `Motion` has to have
+        self.links = tuple(dict.fromkeys(part.link for part in self._parts))
+
+    @classmethod
+    def of(cls, robot: RobotModel) -> SceneKeeper | None:
+        """Return the keeper of a robot; None = its shapes are not known."""
+        shape = load_shape(robot)
+        return cls(robot, shape.parts) if shape.is_known else None
+
+    def with_robot(self, robot: RobotModel) -> SceneKeeper:
+        """Return the same for a robot of the same joints and links."""
+        return SceneKeeper(robot, self._parts, self._settings)
+
+    def seen(
+        self, memory: SceneMemory | None, motion: Motion, frames: ByteArray, masks: ObjectMasks
+    ) -> SceneMemory:
+        """Return the memory after real frames.
+
+        Args:
+            memory: before them; None = nothing was seen.
+            motion: T states of the robot with `links`.
+            frames: (V, T, H, W, 3) uint8 RGB at these states.
+            masks: of the objects in them.
+        """
+        arms = self._near(self._drawn(motion), self._settings.arm_margin)
+        poses = motion.camera_poses[:, -1]
+        pictures, known = np.zeros_like(frames[:, 0]), np.zeros(arms[:, 0].shape, np.bool_)
+        if memory is not None and memory.pictures.shape == pictures.shape:
+            pictures = memory.pictures.copy()
+            stayed = np.abs(memory.camera_poses - poses).max((1, 2)) < _SAME_POSE
+            known = memory.known & stayed[:, None, None]
+        for frame in range(frames.shape[1]):
+            free = ~arms[:, frame] & self._stands_still(motion)[:, None, None]
+            pictures[free], known = frames[:, frame][free], known | free
+        last = masks.masks[:, :, -1]
+        return SceneMemory(
+            pictures=pictures,
+            known=known,
+            masks=last,
+            touched=np.zeros(last.shape[1], np.bool_),
+            camera_poses=poses,
+        )
+
+    def held(
+        self,
+        memory: SceneMemory,
+        motion: Motion,
+        frames: ByteArray,
+        masks: ObjectMasks,
+        drawn: ByteArray | None,
+    ) -> tuple[ByteArray, SceneMemory]:
+        """Return imagined frames with the background of the memory, and the memory after them.
+
+        Args:
+            memory: of the background.
+            motion: T states of the robot with `links`, at the frames.
+            frames: (V, T, H, W, 3) uint8 RGB as the model predicts them.
+            masks: of the objects in them.
+            drawn: (V, T, H, W, 4) the objects where they are foreseen; None = not foreseen.
+        """
+        robot, found = self._drawn(motion), masks.masks
+        memory = self._after_contact(memory, robot, found)
+        covered = self._near(robot, self._settings.arm_margin) | self._moved(memory, found)
+        if drawn is not None:
+            covered |= self._near(drawn[..., 3] > 0, self._settings.object_margin)
+        share = self._shares(memory.known[:, None] & ~covered)
+        mixed = frames + share[..., None] * (memory.pictures[:, None].astype(np.float32) - frames)
+        frames = np.rint(mixed).astype(np.uint8)
+        # what the model uncovers is drawn once, and then stays
+        new = ~covered[:, -1] & ~memory.known & self._stands_still(motion)[:, None, None]
+        pictures = np.where(new[..., None], frames[:, -1], memory.pictures)
+        return frames, replace(memory, pictures=pictures, known=memory.known | new)
+
+    def _drawn(self, motion: Motion) -> BoolArray:
+        """(V, T, H, W) masks of the robot."""
+        drawn = [
+            fill(
+                [
+                    project_part(part, motion.links[part.link], camera, poses)
+                    for part in self._parts
+                ],
+                camera,
+            )
+            > 0
+            for camera, poses in zip(motion.cameras, motion.camera_poses, strict=True)
+        ]
+        return np.stack(drawn)
+
+    def _after_contact(
+        self, memory: SceneMemory, robot: BoolArray, found: BoolArray
+    ) -> SceneMemory:
+        """Return the memory with the objects that the robot comes near to in all views.
+
+        A view in which the robot stays away from an object shows that it does not touch it.
+        """
+        if found.shape[1] != len(memory.touched):
+            touched = np.ones(found.shape[1], np.bool_)
+            return replace(memory, masks=found[:, :, 0], touched=touched)
+        seen = memory.masks.any((-2, -1))
+        reach = self._near(robot, self._settings.object_margin)
+        near = (reach[:, None] & memory.masks[:, :, None]).any((-2, -1))  # (V, O, T)
+        may_touch = (near | ~seen[..., None]).all(0).any(-1)
+        return replace(memory, touched=memory.touched | may_touch)
+
+    def _moved(self, memory: SceneMemory, found: BoolArray) -> BoolArray:
+        """(V, T, H, W) near objects that may have moved: where they were, and are."""
+        which = memory.touched
+        now = found[:, which].any(1) | memory.masks[:, which].any(1)[:, None]
+        return self._near(now, self._settings.object_margin)
+
+    def _stands_still(self, motion: Motion) -> BoolArray:
+        """(V,) whether no joint of the robot moves a camera."""
+        return np.array([camera.mount_link not in self._moving for camera in motion.cameras])
+
+    @staticmethod
+    def _near(masks: BoolArray, margin: float) -> BoolArray:
+        """Pixels within a margin [fraction of the image width] of masks (..., H, W)."""
+        size = 2 * round(margin * masks.shape[-1]) + 1
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+        flat = masks.reshape(-1, *masks.shape[-2:])
+        grown = [cv2.dilate(mask.view(np.uint8), kernel) > 0 for mask in flat]
+        return np.reshape(grown, masks.shape)
+
+    def _shares(self, held: BoolArray) -> np.ndarray:
+        """(V, T, H, W) share of the memory in each pixel: 1 inside, less towards the edge."""
+        size = 2 * max(round(self._settings.blend * held.shape[-1]), 1) + 1
+        flat = held.reshape(-1, *held.shape[-2:]).astype(np.float32)
+        soft = [np.minimum(mask, cv2.blur(mask, (size, size))) for mask in flat]
+        return np.reshape(soft, held.shape)
