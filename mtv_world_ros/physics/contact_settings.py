@@ -84,6 +84,11 @@ class ContactSettings(Schema):
         description='share of its travel by which a gripper that is not open closes further than '
         'it is told: measured positions that stand for commands stop at what is held',
     )
+    grips_hold: bool = Field(
+        default=False,
+        description='what stops measured fingers short of shut is held until they open, whatever '
+        'contact would do: of recordings whose commands are measured positions',
+    )
     delay_s: float = Field(
         default=0.0, ge=0, le=1, description='by which commands take effect later [s]'
     )

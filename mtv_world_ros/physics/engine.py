@@ -20,6 +20,7 @@ from mtv_world_ros.physics.arms import Arms, SOLIDS
 from mtv_world_ros.physics.contact_scene import CompiledScene, kind_of, STEP_S
 from mtv_world_ros.physics.drive_inputs import ArmsState, CoursePlanner, FreeMotion, FULL, SUBSTEPS
 from mtv_world_ros.physics.futures import Future
+from mtv_world_ros.physics.grips import Grip, GripCourse
 from mtv_world_ros.physics.mujoco_import import mujoco, Rollout
 
 
@@ -88,6 +89,7 @@ class BatchState:
         last: the course before; None = the arms rested.
         still: (K,) rows for which all was at rest.
         lost: why futures no longer count, by their number.
+        grips: of each future, what measured fingers hold (`ContactSettings.grips_hold`).
     """
 
     physics: FloatArray
@@ -95,6 +97,7 @@ class BatchState:
     still: np.ndarray
     last: FreeMotion | None = None
     lost: dict[int, str] = field(default_factory=dict)
+    grips: tuple[dict[int, Grip], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -237,6 +240,9 @@ class Batch:
         courses = [course.late(delay, state.last) for delay in self._delays]
         rows = (len(commands) - 1) // every
         run = _Run(self._scene, self.futures, courses, every * SUBSTEPS, state)
+        if self.futures[0].settings.grips_hold:
+            robot = self._scene.arms.robot
+            run.grip(GripCourse.of(robot, commands[: 1 + rows * every : every]))
         cap_s = time.monotonic() + SLOWDOWN_LIMIT * rows * every * PERIOD_S + EXTRA_S
 
         def check() -> None:
@@ -249,7 +255,13 @@ class Batch:
             check()
             self._advance_row(run, row, check)
         return run.motion(), replace(
-            state, physics=run.physics, arms=arms, last=course, still=run.still, lost=run.lost
+            state,
+            physics=run.physics,
+            arms=arms,
+            last=course,
+            still=run.still,
+            lost=run.lost,
+            grips=tuple(run.grips),
         )
 
     def _advance_row(self, run: _Run, row: int, check: Callable[[], None]) -> None:
@@ -341,7 +353,35 @@ class _Run:
         self.physics, self.still = state.physics.copy(), state.still.copy()
         self.lost, self.computed = dict(state.lost), 0
         self._spent = np.zeros(len(futures), np.int64)
+        self.grips = list(state.grips) or [{} for _ in futures]
+        self._grip_course: GripCourse | None = None
         self._rows = [self._read()]
+
+    def grip(self, course: GripCourse) -> None:
+        """Hold what the fingers of a course are seen to hold, from its first row on."""
+        self._grip_course = course
+        self._hold(0)
+        self._rows = [self._read()]
+
+    def _hold(self, row: int) -> None:
+        """Move the solids that are held at a row with their grippers."""
+        scene, course = self._scene, self._grip_course
+        if course is None:
+            return
+        nq = scene.model.nq
+        at = scene.solid_qpos[:, None] + np.arange(7)
+        for number, future in enumerate(self._futures):
+            if number in self.lost or not len(scene.solid_qpos):
+                continue
+            qpos, poses = self.qpos(number), np.tile(np.eye(4), (len(scene.solid_qpos), 1, 1))
+            poses[:, :3, 3] = qpos[at[:, :3]]
+            poses[:, :3, :3] = _matrices(qpos[at[:, 3:]])
+            held, poses = course.after(row, self.grips[number], poses, future.solids)
+            self.grips[number] = held
+            for item in held:
+                qpos[at[item]] = [*poses[item, :3, 3], *_quaternion(poses[item, :3, :3])]
+                speeds = self.physics[number, 1 + nq :]
+                speeds[scene.solid_dofs[item] + np.arange(6)] = 0.0
 
     def first_step(self, row: int) -> int:
         return row * self._steps
@@ -354,7 +394,7 @@ class _Run:
 
     def may_pass(self, number: int, row: int) -> bool:
         """Return True if all solids are at rest and the arms move as in free air."""
-        if self.still[number] < _SLEEP.num_still_rows:
+        if self.still[number] < _SLEEP.num_still_rows or self.grips[number]:
             return False
         course, step, scene = self.courses[number], self.first_step(row), self._scene
         off = self.qpos(number)[scene.arm_qpos] - self._futures[number].zeros
@@ -401,6 +441,7 @@ class _Run:
                 self.still[number] += 1
             else:
                 self.still[number] = 0
+        self._hold(row + 1)
         self._rows.append(self._read())
 
     def motion(self) -> BatchMotion:
@@ -476,6 +517,13 @@ class _Nearby:
             if data.ncon:
                 return False
         return True
+
+
+def _quaternion(rotation: FloatArray) -> FloatArray:
+    """Return the quaternion (4,), w first, of a rotation (3, 3)."""
+    found = np.zeros(4)
+    mujoco.mju_mat2Quat(found, np.ascontiguousarray(rotation).ravel())
+    return found
 
 
 def _matrices(quaternions: FloatArray) -> FloatArray:

@@ -216,14 +216,15 @@ class SuccessEstimator:
         weights = None
         if self.calibration is not None and not basis:
             weights = self.calibration.given(is_real, ends is not None)
+        counted = dict(features)
         if is_real and weights is None:  # what was really seen needs no grasp that explains it
-            features |= dict.fromkeys(DOUBTS, nan)
+            counted |= dict.fromkeys(DOUBTS, nan)
         probability = weights.probability if weights else stated_probability
         margins = [features['margin'] + shift for shift in (-spread, 0.0, spread)]
         if evidence.worst is None:  # between the worst and the best that pictures could show
             margins = [-MAX_MARGIN, nan, MAX_MARGIN]
         low, middle, high = (
-            capped(probability({**features, 'margin': clipped(margin)}), features)
+            capped(probability({**counted, 'margin': clipped(margin)}), features)
             for margin in margins
         )
         first = [view_mean(views.start_jaccard(item)) for item in evidence.goal_jaccard]

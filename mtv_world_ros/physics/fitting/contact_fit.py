@@ -426,7 +426,12 @@ def fit_contact(
         }
     )
     first = first.model_copy(
-        update={'table_m': table.value, 'delay_s': delay.value, 'spread': spread}
+        update={
+            'table_m': table.value,
+            'delay_s': delay.value,
+            'spread': spread,
+            'grips_hold': False,
+        }
     )
     first = settings_of_place(first, recordings, report)
     engine = Engine(arms, threads)
@@ -466,6 +471,8 @@ def fit_contact(
         telling=hold.count,
     )
     update = {**values, 'spread': spread, 'fitted': origin}
+    # measured fingers show what they hold; slipping was fitted without that, as only slips tell it
+    update['grips_hold'] = first.squeeze > 0
     return first.model_copy(update=update), [table, delay, cameras, *found, hold]
 
 
