@@ -25,14 +25,12 @@ from mtv_world_ros.inspection.foreseen_scene import SceneFile
 from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.policies.lerobot_client import LeRobotConfig
 from mtv_world_ros.policies.openpi_client import OpenPiConfig
-from mtv_world_ros.policies.policy import (
-    PythonPolicyConfig,
-    RecordedPolicySettings,
-    ScriptedPolicySettings,
-)
+from mtv_world_ros.policies.python_policy import PythonPolicyConfig
+from mtv_world_ros.policies.scripted_settings import ScriptedPolicySettings
 from mtv_world_ros.ranking.policy_list import PolicyList
 from mtv_world_ros.robot.file import RobotFile
 from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.rollout.recorded_policy import RecordedPolicySettings
 from mtv_world_ros.simulation.physics import Physics
 from mtv_world_ros.simulation.tasks import SceneSpec
 from mtv_world_ros.success.task import TaskSpec

@@ -118,7 +118,7 @@ class Registry:
 
     def _remedy(self, error: Exception) -> str:
         package = getattr(error, 'name', None) if isinstance(error, ModuleNotFoundError) else None
-        if package in self.extras:
+        if package is not None and package in self.extras:
             return f"; install it with: pip install 'mtv_world_ros[{self.extras[package]}]'"
         if package is not None and find_spec(package.partition('.')[0]) is None:
             return (

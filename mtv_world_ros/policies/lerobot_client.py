@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 import pickle
 import time
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -18,8 +18,10 @@ from mtv_world_ros.core.bounded_input import limits
 from mtv_world_ros.core.config import Count, Schema, Seconds
 from mtv_world_ros.core.data_types import FloatArray, JointTrajectory, Observation
 from mtv_world_ros.core.errors import ConfigError, PolicyError, PolicyServerError
+from mtv_world_ros.policies.policy import EpisodeOrigin, PolicySettings
 from mtv_world_ros.policies.server_mapping import ServerMapping
 from mtv_world_ros.policies.timed_actions import read_timed_actions
+from mtv_world_ros.robot.model import RobotModel
 
 _SERVICE = '/transport.AsyncInference/'
 
@@ -36,8 +38,11 @@ class LeRobotPolicySettings(Schema):
     )
 
 
-class LeRobotConfig(ServerMapping):
+class LeRobotConfig(ServerMapping, PolicySettings):
     """A policy file of kind `lerobot`: which server and policy, and what it gets and gives."""
+
+    server_address: ClassVar[str] = '127.0.0.1:{port}'
+    serves_one_client: ClassVar[bool] = True
 
     kind: Literal['lerobot'] = 'lerobot'
     server: str = Field(description='e.g. `localhost:8080`')
@@ -65,12 +70,8 @@ class LeRobotConfig(ServerMapping):
             )
         return self
 
-    def make(self) -> LeRobotPolicy:
-        """Return the client; it connects at its first reset.
-
-        Raises:
-            ConfigError: a package is missing.
-        """
+    def check(self) -> None:
+        """Raise if a package is missing."""
         try:
             import grpc  # noqa: F401
         except ImportError as error:
@@ -78,6 +79,16 @@ class LeRobotConfig(ServerMapping):
                 "the client of LeRobot's server needs the package 'grpcio'; install it with: pip "
                 "install 'mtv_world_ros[policies]'"
             ) from error
+
+    def make(
+        self, origin: EpisodeOrigin | None = None, robot: RobotModel | None = None
+    ) -> LeRobotPolicy:
+        """Return the client; it connects at its first reset.
+
+        Raises:
+            ConfigError: a package is missing.
+        """
+        self.check()
         return LeRobotPolicy(self)
 
 

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 import os
 import socket
 import struct
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
@@ -21,7 +21,9 @@ from mtv_world_ros.core.bounded_input import limits
 from mtv_world_ros.core.config import Seconds
 from mtv_world_ros.core.data_types import JointTrajectory, Observation
 from mtv_world_ros.core.errors import ConfigError, masked, PolicyError, PolicyServerError
+from mtv_world_ros.policies.policy import EpisodeOrigin, PolicySettings
 from mtv_world_ros.policies.server_mapping import find, Key, ServerMapping
+from mtv_world_ros.robot.model import RobotModel
 
 
 def _address(server: str) -> str:
@@ -30,8 +32,10 @@ def _address(server: str) -> str:
     return server
 
 
-class OpenPiConfig(ServerMapping):
+class OpenPiConfig(ServerMapping, PolicySettings):
     """A policy file of kind `openpi`: which server, and what it gets and gives."""
+
+    server_address: ClassVar[str] = 'ws://127.0.0.1:{port}'
 
     kind: Literal['openpi'] = 'openpi'
     server: Annotated[str, AfterValidator(_address)] = Field(
@@ -47,12 +51,8 @@ class OpenPiConfig(ServerMapping):
         default=None, description='where the instruction goes; empty = nowhere'
     )
 
-    def make(self) -> OpenPiPolicy:
-        """Return the client; it connects at its first reset.
-
-        Raises:
-            ConfigError: a package is missing.
-        """
+    def check(self) -> None:
+        """Raise if a package is missing."""
         try:
             import msgpack  # noqa: F401
             import websockets  # noqa: F401
@@ -61,6 +61,16 @@ class OpenPiConfig(ServerMapping):
                 f"the client of openpi's server needs the package '{error.name}'; install it "
                 "with: pip install 'mtv_world_ros[policies]'"
             ) from error
+
+    def make(
+        self, origin: EpisodeOrigin | None = None, robot: RobotModel | None = None
+    ) -> OpenPiPolicy:
+        """Return the client; it connects at its first reset.
+
+        Raises:
+            ConfigError: a package is missing.
+        """
+        self.check()
         return OpenPiPolicy(self)
 
     def request(self, observation: Observation, instruction: str) -> dict[str, Any]:

@@ -1,21 +1,16 @@
-"""A policy that acts, and the files like those in `config/policies` that name one."""
+"""A policy that acts, and the settings of a policy: the content of its file."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import abstractmethod
 from dataclasses import dataclass
-from importlib import import_module
-from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
-from pydantic import BeforeValidator, Field
 
-from mtv_world_ros.core.config import read_yaml, Schema, validated, Wait
+from mtv_world_ros.core.config import Schema
 from mtv_world_ros.core.data_types import FloatArray, JointTrajectory, Observation
-from mtv_world_ros.core.errors import ConfigError, nearest
-from mtv_world_ros.policies.lerobot_client import LeRobotConfig
-from mtv_world_ros.policies.openpi_client import OpenPiConfig
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.resample import cut_off, SAME_S
 
@@ -65,6 +60,50 @@ class Policy(Protocol):
         ...
 
 
+class PolicySettings(Schema):
+    """Settings of one kind of policies: a file like those in `config/policies`.
+
+    A new kind is a subclass in a file of its own. A policy file chooses it by `kind`: a name of
+    `policies/kinds.py`, the name of an entry point of `mtv_world.policies`, or `module:Class`.
+
+    Attributes:
+        is_made_for_episode: the policy depends on the origin of its episode, so that one is made
+            for each; else one serves all episodes.
+        needs_recording: an episode must begin from a recorded one.
+        needs_first_frame: an episode must begin from the first frame of the recorded one.
+        server_address: address of a server that a ranking starts, with `{port}`; such settings
+            have a field `server`. Empty = there is no server.
+        serves_one_client: the server serves one client at a time.
+    """
+
+    is_made_for_episode: ClassVar[bool] = False
+    needs_recording: ClassVar[bool] = False
+    needs_first_frame: ClassVar[bool] = False
+    server_address: ClassVar[str] = ''
+    serves_one_client: ClassVar[bool] = False
+
+    kind: str
+
+    def check(self) -> None:
+        """Raise if no policy can be made of the settings; no server is asked.
+
+        Raises:
+            ConfigError, PolicyError: a package is missing, or a value is wrong.
+        """
+
+    @abstractmethod
+    def make(self, origin: EpisodeOrigin, robot: RobotModel) -> Policy:
+        """Return the policy.
+
+        Args:
+            origin: origin of the episode; without values unless `is_made_for_episode`.
+            robot: the robot that the policy moves.
+
+        Raises:
+            ConfigError, PolicyError: a package is missing, or the origin is not enough.
+        """
+
+
 def first_part(
     trajectory: JointTrajectory, start_positions: FloatArray, seconds: float
 ) -> JointTrajectory:
@@ -112,89 +151,3 @@ class RecordedPolicy:
         times = self._commands.times - (observation.stamp_ns - self._first_ns) / 1e9
         rest = np.flatnonzero(times > SAME_S)
         return self._commands.points(rest, times) if len(rest) else None
-
-
-class ScriptedPolicySettings(Schema):
-    """A scripted policy of the simulator."""
-
-    kind: Literal['scripted'] = 'scripted'
-    variant: str = Field(
-        default='expert', description='e.g. `expert` or, with faults, `expert-noise-0.02`'
-    )
-    hold_s: Wait = Field(
-        default=0.6, description='from the end of its plan to the end of the episode [s]'
-    )
-
-
-class RecordedPolicySettings(Schema):
-    """The recorded commands of the episode that an imagined one begins from."""
-
-    kind: Literal['recorded'] = 'recorded'
-    hold_s: Wait = Field(
-        default=0.6, description='from the last command to the end of the episode [s]'
-    )
-
-
-class PythonPolicyConfig(Schema):
-    """A policy in Python code of the user's."""
-
-    kind: Literal['python'] = 'python'
-    factory: str = Field(
-        description='`package.module:function`; called with the arguments it returns a `Policy`'
-    )
-    arguments: Annotated[dict[str, Any], BeforeValidator(lambda value: value or {})] = Field(
-        default={}, description='by keyword'
-    )
-
-    def make(self) -> Policy:
-        """Call the factory.
-
-        Raises:
-            ConfigError: there is no such function, or it does not take the arguments.
-        """
-        module, _, function = self.factory.partition(':')
-        try:
-            return getattr(import_module(module), function)(**self.arguments)
-        except (ImportError, AttributeError, TypeError, ValueError) as error:
-            raise ConfigError(
-                f"policy factory '{self.factory}' cannot be used: {error}; it must be "
-                "'package.module:function' of something that Python finds (PYTHONPATH)"
-            ) from error
-
-
-#: of these the layers above make the policy, once they know the episode's origin
-OriginSettings = ScriptedPolicySettings | RecordedPolicySettings
-PolicyConfig = OriginSettings | PythonPolicyConfig | OpenPiConfig | LeRobotConfig
-_KINDS: dict[str, type[PolicyConfig]] = {
-    'scripted': ScriptedPolicySettings,
-    'recorded': RecordedPolicySettings,
-    'python': PythonPolicyConfig,
-    'openpi': OpenPiConfig,
-    'lerobot': LeRobotConfig,
-}
-
-
-def load_policy_config(path: Path, robot: RobotModel) -> PolicyConfig:
-    """Read a file like those in `config/policies`.
-
-    Raises:
-        ConfigError: it cannot be read, a key is unknown or missing, a value is wrong.
-    """
-    return policy_config(read_yaml(path, 'policy file', 'policy'), robot, str(path))
-
-
-def policy_config(values: Any, robot: RobotModel, where: str) -> PolicyConfig:
-    """Return the policy that a file's values describe; errors begin with `where`.
-
-    Raises:
-        ConfigError: a key is unknown or missing, a value is wrong.
-    """
-    if not isinstance(values, Mapping) or 'kind' not in values:
-        raise ConfigError(f"{where}: expected a key 'kind': {', '.join(_KINDS)}")
-    kind = values['kind']
-    if kind not in _KINDS:
-        raise ConfigError(
-            f"{where}: kind '{kind}' is none{nearest(str(kind), _KINDS)}; valid are "
-            f'{", ".join(_KINDS)}'
-        )
-    return validated(_KINDS[kind], values, where, context={'robot': robot})

@@ -16,29 +16,19 @@ from mtv_world_ros.core.config import expected, ListOf, read_yaml, Schema, Secon
 from mtv_world_ros.core.data_types import JointTrajectory, Observation
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError, PolicyError, PolicyServerError
 from mtv_world_ros.core.files import bundled
-from mtv_world_ros.policies.lerobot_client import LeRobotConfig
-from mtv_world_ros.policies.openpi_client import OpenPiConfig
-from mtv_world_ros.policies.policy import (
-    OriginSettings,
-    Policy,
-    policy_config,
-    PolicyConfig,
-    RecordedPolicySettings,
-    ScriptedPolicySettings,
-)
+from mtv_world_ros.policies.kinds import policy_config, settings_class
+from mtv_world_ros.policies.policy import EpisodeOrigin, Policy, PolicySettings
+from mtv_world_ros.policies.scripted_settings import ScriptedPolicySettings
 from mtv_world_ros.ranking.server_process import PORT, ServerProcess
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
-from mtv_world_ros.simulation.faults.catalogue import parse_variant
 from mtv_world_ros.simulation.tasks import tasks_named
 
 #: names are parts of file names
 _NAME = r'^[A-Za-z0-9][A-Za-z0-9._-]*$'
 #: settings that do not distinguish policies
 _TIMEOUTS = ('timeout_s', 'setup_timeout_s', 'start_timeout_s')
-#: addresses of servers that are started by a ranking
-_ADDRESSES = {'openpi': 'ws://127.0.0.1:{port}', 'lerobot': '127.0.0.1:{port}'}
 
 
 class PolicyEntry(Schema):
@@ -91,7 +81,7 @@ class ListedPolicy:
     """
 
     name: str
-    config: PolicyConfig
+    config: PolicySettings
     command: tuple[str, ...]
     start_timeout_s: float
     tasks: tuple[str, ...]
@@ -117,23 +107,20 @@ def load_policy_list(path: Path, robot: RobotModel) -> tuple[ListedPolicy, ...]:
 def _listed(entry: PolicyEntry, path: Path, robot: RobotModel) -> ListedPolicy:
     where = f"{path}: policy '{entry.name}'"
     values = _merged(_values(entry.policy, path.parent), entry.change)
-    kind = values.get('kind')
-    if entry.command and kind in _ADDRESSES:
-        values['server'] = _ADDRESSES[kind].format(port=0)
+    address = settings_class(values, where).server_address
+    if entry.command and address:
+        values['server'] = address.format(port=0)
     config = policy_config(values, robot, where)
-    if isinstance(config, ScriptedPolicySettings):
-        parse_variant(config.variant)
-    if isinstance(config, RecordedPolicySettings):
+    config.check()
+    if config.needs_recording:
         raise ConfigError(
-            f"{where} is of kind 'recorded': it repeats an episode, and a ranking draws scenes of "
-            'its own; `mtv-world imagine` runs it'
+            f"{where} is of kind '{config.kind}': it repeats an episode, and a ranking draws "
+            'scenes of its own; `mtv-world imagine` runs it'
         )
-    if isinstance(config, OpenPiConfig | LeRobotConfig):
-        config.make().close()  # says which package is missing
-    elif entry.command:
+    if entry.command and not address:
         raise ConfigError(
-            f"{where} has a 'command', but is of kind '{config.kind}'; only policies of the kinds "
-            f'{", ".join(_ADDRESSES)} have a server'
+            f"{where} has a 'command', but is of kind '{config.kind}', which has no server; "
+            'openpi and lerobot have one'
         )
     known = {key: value for key, value in values.items() if key not in _TIMEOUTS}
     text = json.dumps([known, entry.command], sort_keys=True, default=str)
@@ -204,9 +191,10 @@ def check_single_clients(policies: Sequence[ListedPolicy], workers: int) -> None
         ConfigError: a LeRobot server is given by its address, and there are several workers.
     """
     for policy in policies:
-        if workers > 1 and isinstance(policy.config, LeRobotConfig) and not policy.command:
+        if workers > 1 and policy.config.serves_one_client and not policy.command:
+            server = getattr(policy.config, 'server', '')
             raise ConfigError(
-                f"LeRobot's server serves one client, '{policy.config.server}' of policy "
+                f"a server of kind '{policy.config.kind}' serves one client, '{server}' of policy "
                 f"'{policy.name}' would get {workers}; give a 'command' that starts one for every "
                 'worker, or --workers 1'
             )
@@ -231,8 +219,11 @@ class ListedPolicies:
         config = listed.config
         if isinstance(config, ScriptedPolicySettings):
             return scripted_policy(config.variant, task, seed, expert, hold_s=config.hold_s)
+        origin = EpisodeOrigin(task=task, scene_seed=seed)
+        if config.is_made_for_episode:
+            return GuardedPolicy(listed, self.logs, origin, expert.robot)
         if name not in self._made:
-            self._made[name] = GuardedPolicy(listed, self.logs)
+            self._made[name] = GuardedPolicy(listed, self.logs, EpisodeOrigin(), expert.robot)
         return self._made[name]
 
 
@@ -245,10 +236,15 @@ class GuardedPolicy:
     Args:
         listed: the policy.
         logs: folder for the logs of its server.
+        origin: origin of its episode, if the policy is made for one.
+        robot: the robot that it moves.
     """
 
-    def __init__(self, listed: ListedPolicy, logs: Path) -> None:
+    def __init__(
+        self, listed: ListedPolicy, logs: Path, origin: EpisodeOrigin, robot: RobotModel
+    ) -> None:
         self.name = listed.name
+        self._origin, self._robot = origin, robot
         self._config = listed.config
         self._policy: Any = None
         self._server = (
@@ -281,12 +277,10 @@ class GuardedPolicy:
         if self._server is not None and self._server.ensure():
             self._close()
             config = self._config
-            assert isinstance(config, OpenPiConfig | LeRobotConfig)
-            address = _ADDRESSES[config.kind].format(port=self._server.port)
+            address = config.server_address.format(port=self._server.port)
             self._config = config.model_copy(update={'server': address})
         if self._policy is None:
-            assert not isinstance(self._config, OriginSettings)
-            self._policy = self._config.make()
+            self._policy = self._config.make(self._origin, self._robot)
         self._policy.reset(seed=seed)
 
     def _close(self) -> None:

@@ -8,19 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.core.entry_points import DESCRIBERS as GROUP
-from mtv_world_ros.core.entry_points import policy_kind
-from mtv_world_ros.core.errors import PolicyError
 from mtv_world_ros.core.files import bundled
 from mtv_world_ros.core.registry import Registry
-from mtv_world_ros.policies.policy import (
-    EpisodeOrigin,
-    load_policy_config,
-    Policy,
-    PolicyConfig,
-    RecordedPolicy,
-    RecordedPolicySettings,
-    ScriptedPolicySettings,
-)
+from mtv_world_ros.policies.kinds import load_policy_config, policy_config
+from mtv_world_ros.policies.policy import EpisodeOrigin, Policy, PolicySettings
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.vision.describers.describer import Describer, InstructionDescriber
 
@@ -52,43 +43,24 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
         ConfigError, PolicyError: no such policy, or its file is wrong.
     """
     config = policy_settings(name, robot)
-    if isinstance(config, ScriptedPolicySettings):
-        return policy_kind(config.kind).policy_maker(config, robot)
-    if isinstance(config, RecordedPolicySettings):
-        return partial(_recorded, config, robot)
-    made = config.make()
+    if config.is_made_for_episode:
+        return partial(config.make, robot=robot)
+    made = config.make(EpisodeOrigin(), robot)
     return lambda origin: made
 
 
-def policy_settings(name: str | Path, robot: RobotModel) -> PolicyConfig:
+def policy_settings(name: str | Path, robot: RobotModel) -> PolicySettings:
     """Return the settings of the policy of a name, checked; no server is asked.
 
     Raises:
         ConfigError, PolicyError: as in `assemble_policy`.
     """
     if str(name).startswith('expert'):
-        config: PolicyConfig = ScriptedPolicySettings(variant=str(name))
+        config = policy_config({'kind': 'scripted', 'variant': str(name)}, robot, f"'{name}'")
     else:
         config = load_policy_config(bundled('policies', name, 'policy'), robot)
-    if isinstance(config, ScriptedPolicySettings):
-        policy_kind(config.kind).check(config)
+    config.check()
     return config
-
-
-def _recorded(
-    settings: RecordedPolicySettings, robot: RobotModel, origin: EpisodeOrigin
-) -> RecordedPolicy:
-    from mtv_world_ros.data.episode_reader import read_episode
-    from mtv_world_ros.data.recording import stitched_commands
-
-    if not origin.recording:
-        raise PolicyError(
-            "policy 'recorded' repeats the commands of the episode that it begins from, and there "
-            "is none: give --episodes instead of --live, or set the parameter 'recording'"
-        )
-    episode = read_episode(Path(origin.recording), with_cameras=False, with_masks=False)
-    commands = stitched_commands(episode, robot, origin.recording_ns)
-    return RecordedPolicy(commands, settings.hold_s)
 
 
 def asked_describer(file: str | Path | None) -> Describer | None:

@@ -26,12 +26,7 @@ from mtv_world_ros.core.errors import (
 from mtv_world_ros.core.files import check_free, check_room, write_whole
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.observations import observation_after
-from mtv_world_ros.policies.policy import (
-    EpisodeOrigin,
-    Policy,
-    RecordedPolicySettings,
-    ScriptedPolicySettings,
-)
+from mtv_world_ros.policies.policy import EpisodeOrigin, Policy
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import PlanLimits
 from mtv_world_ros.rollout.assembly import assemble_policy, policy_settings, PolicyMaker
@@ -144,11 +139,11 @@ def check_start(policy: str, robot: RobotModel, start_s: float, *, is_recorded: 
         PolicyError: there is no such policy.
     """
     settings = policy_settings(policy, robot)
-    if isinstance(settings, RecordedPolicySettings) and not is_recorded:
+    if settings.needs_recording and not is_recorded:
         raise ConfigError(
             f"policy '{policy}' repeats what was commanded in a recorded episode: give --episodes"
         )
-    if isinstance(settings, ScriptedPolicySettings) and start_s > 0:
+    if settings.needs_first_frame and start_s > 0:
         raise ConfigError(
             f"policy '{policy}' plans for the scene as it is in the recording's first frame, "
             f'--start is {start_s:g} s: leave --start out, or take --policy recorded or one that '

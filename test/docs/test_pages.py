@@ -17,9 +17,11 @@ import yaml
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.data.bag_mapping import load_source
 from mtv_world_ros.importing.object_boxes import load_object_boxes
-from mtv_world_ros.policies.policy import load_policy_config
+from mtv_world_ros.policies.kinds import load_policy_config
+from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.ranking.policy_list import load_policy_list
-from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.file import load_robot, robot_path
+from mtv_world_ros.rollout.assembly import policy_settings
 from mtv_world_ros.simulation.tasks import Task
 from mtv_world_ros.success.relations import KINDS
 from mtv_world_ros.success.task import load_task
@@ -130,7 +132,7 @@ def has_boxes(file, values):
 
 
 @pytest.mark.parametrize('block', YAML_BLOCKS)
-def test_yaml_in_the_pages_can_be_used(block, tmp_path):
+def test_yaml_in_the_pages_can_be_used(block, tmp_path, monkeypatch):
     file = tmp_path / 'block.yaml'
     file.write_text(block)
     values = yaml.safe_load(block)
@@ -142,6 +144,15 @@ def test_yaml_in_the_pages_can_be_used(block, tmp_path):
     elif 'dh' in values or 'urdf' in values:
         (tmp_path / 'my_robot.urdf').write_text(URDF)
         load_robot(file)
+    elif ':' in values.get('kind', ''):  # a client that the page shows above it
+        page = (ROOT / 'docs' / 'policies.md').read_text()
+        name = values['kind'].partition(':')[0]
+        code = re.search(rf'```python\n(# {name}.py.*?)```', page, re.S)
+        assert code is not None
+        (tmp_path / f'{name}.py').write_text(code[1])
+        monkeypatch.syspath_prepend(tmp_path)
+        robot = load_robot(robot_path('yam_bimanual'))
+        assert policy_settings(file, robot).make(EpisodeOrigin(), robot).name == name
     elif 'kind' in values:
         robot = load_robot(ROOT / 'config' / 'robots' / 'yam_bimanual' / 'robot.yaml')
         load_policy_config(file, robot)

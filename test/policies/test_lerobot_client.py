@@ -12,7 +12,7 @@ pytest.importorskip('google.protobuf', reason='protobuf is not installed')
 
 from mtv_world_ros.core.errors import ConfigError, PolicyError
 from mtv_world_ros.core.files import share_path
-from mtv_world_ros.policies.policy import load_policy_config
+from mtv_world_ros.policies.kinds import load_policy_config
 
 MARK = Path('/tmp/mtv_world_ros_was_here')
 NOISE = np.random.default_rng(0).integers(0, 256, (2, 72, 96, 3), np.uint8)

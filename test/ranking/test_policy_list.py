@@ -127,7 +127,7 @@ def test_a_policy_is_ranked_on_its_own_tasks(load):
         ([{'name': 'a'}], 'policy'),
         ([{'name': 'a', 'policy': 'expert-mis-1'}], "unknown fault 'mis'"),
         ([{'name': 'a', 'policy': 'opnpi'}], "did you mean 'openpi'"),
-        ([{'name': 'a', 'policy': {'kind': 'opnpi'}}], "policy 'a': kind 'opnpi'"),
+        ([{'name': 'a', 'policy': {'kind': 'opnpi'}}], "policy 'a': policy kind 'opnpi'"),
         ([{'name': 'a', 'policy': 'openpi', 'changes': {}}], "did you mean 'change'"),
         ([{'name': 'a', 'policy': 'openpi', 'change': {'sever': 1}}], "did you mean 'server'"),
         ([{'name': 'a', 'policy': 'expert', 'command': ['x', '{port}']}], "has a 'command'"),

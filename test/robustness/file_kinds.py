@@ -438,7 +438,7 @@ def _load_checkpoint(folder: Path) -> Any:
 
 
 DESCRIBERS = 'vision.describers.describer_config'
-READS_POLICY = _reads('policy.yaml', 'policies.policy.load_policy_config', _yam)
+READS_POLICY = _reads('policy.yaml', 'policies.kinds.load_policy_config', _yam)
 READS_PRESET = _reads('preset.yaml', 'training.training_config.load_training_config')
 READS_SCENE = _reads('scene.yaml', 'inspection.foreseen_scene.load_scene', _yam)
 CHECKPOINT_PARTS = partial(parts, make_checkpoint, '.json')

@@ -1,18 +1,18 @@
-"""The policy kind `scripted`: what assembly and recorded episodes ask of it."""
+"""The policy kind `scripted`: checks and makes scripted policies, and names their faults."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from mtv_world_ros.core.errors import PolicyError
-from mtv_world_ros.policies.policy import EpisodeOrigin, Policy, ScriptedPolicySettings
+from mtv_world_ros.policies.policy import EpisodeOrigin, Policy
+from mtv_world_ros.policies.scripted_settings import ScriptedPolicySettings
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import policy_of_recording, scripted_policy
 from mtv_world_ros.simulation.faults.catalogue import parse_variant, refuse_test_kinds
 
-__all__ = ['check', 'fault_kinds', 'policy_maker', 'refuse_test_kinds']
+__all__ = ['check', 'fault_kinds', 'make', 'refuse_test_kinds']
 
 
 def check(settings: ScriptedPolicySettings) -> None:
@@ -24,24 +24,22 @@ def check(settings: ScriptedPolicySettings) -> None:
     parse_variant(settings.variant)
 
 
-def policy_maker(
-    settings: ScriptedPolicySettings, robot: RobotModel
-) -> Callable[[EpisodeOrigin], Policy]:
-    """Return what makes the policy of a variant for an episode's task and scene."""
+def make(settings: ScriptedPolicySettings, origin: EpisodeOrigin, robot: RobotModel) -> Policy:
+    """Return the policy of a variant for an episode's task and scene.
+
+    Raises:
+        PolicyError: neither a recording nor task and scene are known.
+    """
     variant, expert = settings.variant, Expert(robot)
-
-    def make(origin: EpisodeOrigin) -> Policy:
-        if origin.recording:
-            return policy_of_recording(variant, Path(origin.recording), expert, settings.hold_s)
-        task, scene_seed = origin.task, origin.scene_seed
-        if not task or scene_seed < 0:
-            raise PolicyError(
-                f"policy '{variant}' knows its scene instead of looking at it: set 'task' and "
-                "'scene_seed' to those of the recorded episode"
-            )
-        return scripted_policy(variant, task, scene_seed, expert, hold_s=settings.hold_s)
-
-    return make
+    if origin.recording:
+        return policy_of_recording(variant, Path(origin.recording), expert, settings.hold_s)
+    task, scene_seed = origin.task, origin.scene_seed
+    if not task or scene_seed < 0:
+        raise PolicyError(
+            f"policy '{variant}' knows its scene instead of looking at it: set 'task' and "
+            "'scene_seed' to those of the recorded episode"
+        )
+    return scripted_policy(variant, task, scene_seed, expert, hold_s=settings.hold_s)
 
 
 def fault_kinds(variant: str) -> tuple[str, ...]:
