@@ -6,6 +6,7 @@ N samples, J joints.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -55,6 +56,10 @@ class ReachSettings:
     beside_s: float = 0.2
     #: longest time for which a sample repeats the joint's last measurement [s]
     repeated_s: float = 0.25
+    #: live: newest samples of a joint that are looked at, and how many of them must be out of
+    #: reach for two publishers
+    window: int = 64
+    least_turns: int = 4
 
 
 REACH = ReachSettings()
@@ -123,6 +128,9 @@ class JointReach:
         self.speed = settings.speed_factor * limits
         grippers = {tool.gripper_joint for tool in robot.tools}
         self.noise[[name in grippers for name in self.names]] = np.inf
+        # plain numbers: samples arrive one by one at up to 1 kHz
+        limits_each = (self.noise.tolist(), self.speed.tolist(), self.is_endless.tolist())
+        self._limits = list(zip(*limits_each, strict=True))
 
     def distance(
         self, before: FloatArray, after: FloatArray, chosen: Any = slice(None)
@@ -153,6 +161,141 @@ class JointReach:
                 held_s = min(float(np.quantile(gaps, 0.25)), self.settings.repeated_s)
                 other.noise[joint] += self.speed[joint] * max(held_s - period, 0.0)
         return other
+
+    def allows(self, joint: int, before: float, after: float, seconds: float) -> bool:
+        """Return whether a joint can move from one position to another in this time [s]."""
+        noise, speed, is_endless = self._limits[joint]
+        moved = abs(after - before)
+        if is_endless:
+            moved = abs((moved + math.pi) % (2 * math.pi) - math.pi)
+        return moved <= noise + speed * abs(seconds)
+
+
+@dataclass(slots=True)
+class _Course:
+    """Samples of one joint while they arrive.
+
+    Attributes:
+        stamp_ns, position: of the last sample that was taken [ns], [rad or m].
+        other: stamp of the first and the last sample of a course out of reach [ns], and its last
+            position; None = there is none.
+        jumps: for each of the newest samples, whether it was out of reach.
+        step, step_s: last step that was taken [rad or m], [s].
+    """
+
+    stamp_ns: int
+    position: float
+    jumps: deque[bool]
+    other: tuple[int, int, float] | None = None
+    step: float = 0.0
+    step_s: float = 0.0
+
+
+class ReachWatch:
+    """The limits of `JointReach` for samples that arrive one by one, as in the live node.
+
+    A sample out of reach is refused. Where those out of reach go on for longer than a glitch and
+    agree with each other, the joint has been moved, and they are taken. Where samples within and
+    out of reach take turns, two publishers contradict each other: see `contradiction`.
+
+    Args:
+        reach: limits of the robot's joints.
+    """
+
+    def __init__(self, reach: JointReach) -> None:
+        self._reach = reach
+        self._numbers = {name: number for number, name in enumerate(reach.names)}
+        self._courses: dict[str, _Course] = {}
+
+    def clear(self) -> None:
+        """Forget all samples."""
+        self._courses.clear()
+
+    def add(self, name: str, stamp_ns: int, position: float) -> str:
+        """Take a sample of a joint of the robot; return why it is out of reach, or ''."""
+        course = self._courses.get(name)
+        if course is None:
+            jumps: deque[bool] = deque(maxlen=self._reach.settings.window)
+            self._courses[name] = _Course(stamp_ns, position, jumps)
+            return ''
+        number = self._numbers[name]
+        seconds = (stamp_ns - course.stamp_ns) / NANO
+        step = position - course.position
+        if self._reach.allows(number, course.position, position, seconds):
+            self._settle(course, number, stamp_ns, position)
+        elif self._is_steady(course.step, course.step_s, step, seconds):
+            course.jumps.append(False)
+        elif self._has_lasted(course, number, stamp_ns, position):
+            _, last_ns, last = course.other or (0, course.stamp_ns, course.position)
+            step, seconds = position - last, (stamp_ns - last_ns) / NANO
+            course.jumps.clear()
+            course.other = None
+        else:
+            course.jumps.append(True)
+            return (
+                f'it jumps from {course.position:g} to {position:g} in {seconds:.4f} s, which no '
+                'joint can'
+            )
+        course.stamp_ns, course.position = stamp_ns, position
+        course.step, course.step_s = step, seconds
+        return ''
+
+    def contradiction(self) -> str:
+        """Return which joints are reported at two places in turn, or ''."""
+        names = [name for name, course in self._courses.items() if self._takes_turns(course)]
+        if not names:
+            return ''
+        more = f' and {len(names) - MAX_NAMES} more' if len(names) > MAX_NAMES else ''
+        course = self._courses[names[0]]
+        return (
+            f'joint states contradict each other: {", ".join(names[:MAX_NAMES])}{more} are at two '
+            f'places in turn ({sum(course.jumps)} of the last {len(course.jumps)} samples of '
+            f"'{names[0]}' are out of reach of the others); do two nodes publish them?"
+        )
+
+    def _settle(self, course: _Course, number: int, stamp_ns: int, position: float) -> None:
+        """Note a sample within reach; those before it that lead to it were motion, no jumps."""
+        if course.other is not None:
+            _, last_ns, last = course.other
+            if self._reach.allows(number, last, position, (stamp_ns - last_ns) / NANO):
+                while course.jumps and course.jumps[-1]:
+                    course.jumps.pop()
+            course.other = None
+        course.jumps.append(False)
+
+    def _takes_turns(self, course: _Course) -> bool:
+        settings, num_jumps = self._reach.settings, sum(course.jumps)
+        return (
+            num_jumps >= settings.least_turns
+            and num_jumps > settings.glitch_ratio * len(course.jumps)
+            and not all(course.jumps)
+        )
+
+    def _has_lasted(self, course: _Course, number: int, stamp_ns: int, position: float) -> bool:
+        """Return whether a course out of reach is motion, or has gone on longer than a glitch."""
+        first_ns = stamp_ns
+        if course.other is not None:
+            begun_ns, last_ns, last = course.other
+            seconds = (stamp_ns - last_ns) / NANO
+            before_s = (last_ns - course.stamp_ns) / NANO
+            if self._is_steady(last - course.position, before_s, position - last, seconds):
+                return True
+            if self._reach.allows(number, last, position, seconds):
+                first_ns = begun_ns
+        if (stamp_ns - first_ns) / NANO > self._reach.settings.glitch_s:
+            return True
+        course.other = (first_ns, stamp_ns, position)
+        return False
+
+    def _is_steady(self, first: float, first_s: float, second: float, second_s: float) -> bool:
+        """Return whether two steps in a row are one fast motion: same sign, similar speed."""
+        settings = self._reach.settings
+        if not (0 < first_s <= settings.beside_s and 0 < second_s <= settings.beside_s):
+            return False
+        slower, faster = sorted((first / first_s, second / second_s), key=abs)
+        if abs(faster) > settings.speed_factor * settings.default_speed:
+            return False
+        return slower * faster > 0 and abs(slower) >= settings.smooth_ratio * abs(faster)
 
 
 class Unreachable(NamedTuple):

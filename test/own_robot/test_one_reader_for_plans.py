@@ -117,7 +117,7 @@ def ask_node(case, robot):
     )  # fmt: skip
     start = SensedScene(observation=seen, camera_infos=(), source_stamp_ns=START_NS)
     buffer = ObservationBuffer(
-        cameras=(), joint_names=robot.joint_names, width=96, height=72, limits=lambda: settings
+        cameras=(), robot=robot, width=96, height=72, limits=lambda: settings
     )
     maker = RequestMaker(robot, buffer, lambda: settings, lambda: start)
     data = messages.serialize(messages.JOINT_TRAJECTORY, case.message(START_NS))

@@ -222,7 +222,7 @@ def send(key: str, message: Any) -> None:
         return
     buffer = ObservationBuffer(
         cameras=cameras,
-        joint_names=robot.joint_names,
+        robot=robot,
         width=48,
         height=36,
         limits=lambda: settings,

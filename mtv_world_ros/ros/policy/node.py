@@ -72,7 +72,7 @@ class PolicyNode(Node):
         self._status = StatusPublisher(self)
         self._buffer = ObservationBuffer(
             cameras=reload_cameras(settings, self._spec),
-            joint_names=joint_names,
+            robot=robot,
             width=self._spec.width,
             height=self._spec.height,
             limits=self._settings,

@@ -137,7 +137,7 @@ class LiveObserver(Node):
         self._extrinsics = Extrinsics(self, robot.posed_links, self, publishes=False)
         self._buffer = ObservationBuffer(
             cameras=read_cameras(Path(settings.calibration_file or cameras_file), spec),
-            joint_names=robot.joint_names,
+            robot=robot,
             width=spec.width,
             height=spec.height,
             limits=self.settings,
@@ -181,6 +181,7 @@ class LiveObserver(Node):
     def on_robot(self, robot: RobotModel) -> None:
         """Take the robot as it describes itself."""
         self._robot = robot
+        self._buffer.use_robot(robot)
 
     def observe(self) -> EpisodeStart:
         """Wait for an observation of all views and joints, and return it.

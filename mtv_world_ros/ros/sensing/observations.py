@@ -19,7 +19,9 @@ from mtv_world_ros.cameras.camera_info import read_camera_info
 from mtv_world_ros.cameras.image_window import window_of, windowed_camera
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, Observation
 from mtv_world_ros.core.images import resize_frames
+from mtv_world_ros.data.measured_joints import JointReach, ReachWatch
 from mtv_world_ros.data.transform_tree import Mount
+from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.ros.messages import image_messages
 from mtv_world_ros.ros.messages.conversions import check_sample, NANO, to_ns, to_sample
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
@@ -35,9 +37,6 @@ _NUM_SAMPLES = 256
 _MOST_PIXELS = 640 * 480
 #: images whose sides are below this fraction of the model's frame show no objects
 _LEAST_SIDE_FRACTION = 0.5
-#: no joint moves faster than this [rad/s or m/s]; encoders may jump by a little
-_FASTEST = 1000.0
-_LEAST_JUMP = 0.3
 _AGE_LIMITS = {
     Reason.IMAGE_STALE: 'max_image_age_s',
     Reason.JOINT_STATE_STALE: 'max_joint_state_age_s',
@@ -69,7 +68,7 @@ class ObservationBuffer:
 
     Args:
         cameras: calibrated cameras of the V views, in the model's order.
-        joint_names: J names, in the robot's order.
+        robot: names the J joints, and limits how far they move between two samples.
         width: width of the model's frames [px]. Observations are of the images' own size, which
             shows better where objects are, but for very large ones that are larger than these.
         height: height of the model's frames [px].
@@ -84,7 +83,7 @@ class ObservationBuffer:
         self,
         *,
         cameras: Sequence[CameraModel],
-        joint_names: Sequence[str],
+        robot: RobotModel,
         width: int,
         height: int,
         limits: Callable[[], ObservationSettings],
@@ -99,11 +98,11 @@ class ObservationBuffer:
         self._images: dict[str, Samples[AnyImage]] = {
             camera.view: Samples(_NUM_IMAGES) for camera in cameras
         }
-        self._received: dict[str, float] = {}
+        self._reach = ReachWatch(JointReach(robot))
         #: frame of the images of each view, as they came first
         self._frames: dict[str, str] = {}
         self._joints: dict[str, Samples[float]] = {
-            name: Samples(_NUM_SAMPLES) for name in joint_names
+            name: Samples(_NUM_SAMPLES) for name in robot.joint_names
         }
 
     @property
@@ -174,16 +173,17 @@ class ObservationBuffer:
         sample = to_sample(message, self._joints.keys())
         faults = dict(sample.faults)
         stale = ''
-        before, self._received = self._received, {**self._received, **sample.positions}
         for name, position in sample.positions.items():
             joint = self._joints[name]
             what = f"a state of joint '{name}'"
             joint.refusal = _refusal(joint, what, stamp_ns, now_ns, limit_s)
             stale = stale or joint.refusal
-            jump = self._jump(name, stamp_ns, position, before.get(name, position))
+            if joint.refusal:
+                continue
+            jump = self._reach.add(name, stamp_ns, position)
             if jump:
                 faults[name] = jump
-            elif not joint.refusal:
+            else:
                 joint.add(stamp_ns, position)
         for name, fault in faults.items():
             self._joints[name].refusal = fault
@@ -191,21 +191,15 @@ class ObservationBuffer:
         if stale:
             raise Rejection(Reason.JOINT_STATE_STALE, stale)
 
-    def _jump(self, name: str, stamp_ns: int, position: float, received: float) -> str:
-        """Return why a sample is out of reach of the last one, unless two in a row agree."""
-        if not self._joints[name]:
-            return ''
-        last_ns, last = self._joints[name].newest
-        seconds = (stamp_ns - last_ns) / NANO
-        reach = _LEAST_JUMP + _FASTEST * abs(seconds)
-        if min(abs(position - last), abs(position - received)) <= reach:
-            return ''
-        return f'it jumps from {last:g} to {position:g} in {seconds:.4f} s'
+    def use_robot(self, robot: RobotModel) -> None:
+        """Take the limits of the same robot as it describes itself."""
+        self._reach = ReachWatch(JointReach(robot))
 
     def clear(self) -> None:
         """Forget images and joint states (the clock jumped); camera infos stay."""
         for samples in (*self._images.values(), *self._joints.values()):
             samples.clear()
+        self._reach.clear()
         self._frames.clear()
 
     def accept_cameras(self, cameras: Sequence[CameraModel]) -> None:
@@ -367,6 +361,8 @@ class ObservationBuffer:
                 Reason.JOINT_STATE_MISSING,
                 f'no joint state of {missing} was received{_because(why)}',
             )
+        if contradiction := self._reach.contradiction():
+            raise Rejection(Reason.JOINT_STATE_INVALID, contradiction)
         for name, samples in self._joints.items():
             what, limit = f"the newest state of joint '{name}'", limits.max_joint_state_age_s
             stamp = samples.newest[0]

@@ -128,11 +128,14 @@ class LiveFidelity:
 
     def replan(self, request: Request) -> Request:
         """Drop imagined frames after a new request's start, which nobody executes; return it."""
-        starts_ns = request.stamp_ns or request.scene.observation.stamp_ns
+        self.stop_at(request.stamp_ns or request.scene.observation.stamp_ns)
+        return request
+
+    def stop_at(self, stamp_ns: int) -> None:
+        """Drop imagined frames after a time, at which the plan was given up."""
         with self._changed:
             for expected in self._expected:
-                expected.stamps = [stamp for stamp in expected.stamps if stamp <= starts_ns]
-        return request
+                expected.stamps = [stamp for stamp in expected.stamps if stamp <= stamp_ns]
 
     def expect(self, result: Result) -> None:
         """Remember a chunk until its real frames are here."""

@@ -40,6 +40,10 @@ _STARVED = 5
 _ERRORS = (Reason.OUT_OF_MEMORY, Reason.WORKER_STUCK, Reason.INTERNAL_ERROR)
 
 
+#: end of an empty trajectory, in words
+STOPS = 'it has no points: the plans before it are given up, and the robot holds'
+
+
 class Reporter:
     """Publishes reports and diagnostics.
 
@@ -87,6 +91,12 @@ class Reporter:
         values = {'reason': error.reason.value, 'text': str(error)}
         self._publish_report('rejected', {'trajectory_stamp_ns': trajectory_stamp_ns, **values})
         self.publish_diagnostics()
+
+    def stopped(self, trajectory_stamp_ns: int) -> None:
+        """Count and report an empty trajectory, which stopped the plans before it."""
+        self.count('trajectories_empty')
+        values = {'trajectory_stamp_ns': trajectory_stamp_ns, 'num_chunks': 0, 'text': STOPS}
+        self._publish_report('done', values)
 
     def guarded(self, handle: Callable[..., None]) -> Callable[..., None]:
         """Return the handler as a callback that no message makes raise."""

@@ -115,6 +115,16 @@ class RequestMaker:
             received_ns=now_ns,
         )
 
+    def is_stop(self, message: JointTrajectoryMsg) -> bool:
+        """Return whether a trajectory without points stops this robot.
+
+        It names no joints, or some of the robot's.
+        """
+        names = message.joint_names
+        return not message.points and (
+            not names or any(name in self.robot.joint_names for name in names)
+        )
+
     def _real_scene(self, now_ns: int) -> SensedScene:
         if now_ns == 0:
             raise Rejection(
@@ -243,7 +253,7 @@ class Rollouts:
             self._description = RobotDescription(node, self._robot, self)
         self._buffer = ObservationBuffer(
             cameras=load_cameras(settings(), self._spec),
-            joint_names=self._robot.joint_names,
+            robot=self._robot,
             width=self._spec.width,
             height=self._spec.height,
             limits=settings,
@@ -392,6 +402,8 @@ class Rollouts:
         Nothing orders topics: a policy may answer before this node receives the start of an
         imagined episode, and the first plan of a replay overtakes the first images.
         """
+        if self._maker.is_stop(arrived.message):
+            return False
         if not self._maker.imagine:
             is_first = self._buffer.awaits_first and not self._inputs.unpublished()
             return is_first and time.monotonic() - arrived.received_s < _FIRST_S
@@ -413,6 +425,9 @@ class Rollouts:
                 raise Rejection(
                     Reason.NOT_ACTIVE, 'the node is inactive; its lifecycle manager activates it'
                 )
+            if goal is None and self._maker.is_stop(message):
+                self._stop(message)
+                return
             if self._description is not None:
                 self._description.check()
             if goal is not None:
@@ -428,6 +443,15 @@ class Rollouts:
             return
         if goal is not None and self._action is not None:
             self._action.started(goal, request)
+
+    def _stop(self, message: JointTrajectoryMsg) -> None:
+        """Give up the plans before an empty trajectory, and answer it."""
+        self._worker.give_up(None, 'an empty trajectory stopped it')
+        if not self._maker.imagine:  # frames that are not out show what is no longer planned
+            self._publisher.reset()
+            self._fidelity.stop_at(self._node.get_clock().now().nanoseconds)
+        self._publish_results()
+        self._reporter.stopped(to_ns(message.header.stamp))
 
     def _publish_results(self) -> None:
         for result in self._worker.take():
@@ -462,7 +486,7 @@ class Rollouts:
     def on_robot(self, robot: RobotModel) -> None:
         """Take the robot as it describes itself."""
         self._maker.robot = robot
-        for part in (self._worker, self._fidelity):
+        for part in (self._buffer, self._worker, self._fidelity):
             part.use_robot(robot)
 
     def _give_up(self, state: str = 'reset', text: str = '') -> None:

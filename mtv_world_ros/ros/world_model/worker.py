@@ -255,21 +255,21 @@ class RolloutWorker:
             self._episode, self._last = None, None
             self._observed.forget()
 
-    def give_up(self, rollout: int, text: str) -> None:
+    def give_up(self, rollout: int | None, text: str) -> None:
         """Pre-empt a plan that runs or waits; imagine mode continues from its chunks.
 
         Args:
-            rollout: number of the plan's rollout.
+            rollout: number of the plan's rollout; None = every plan.
             text: reason in words.
         """
         with self._changed:
             running, pending = self._running, self._pending
-            if pending is not None and pending.rollout == rollout:
-                self._put(Ended(request=pending, state='preempted', num_chunks=0, text=text))
-                self._pending = None
-            elif running is not None and running.rollout == rollout and not self._abandoned:
+            if running is not None and rollout in (None, running.rollout) and not self._abandoned:
                 self._put(self._ended(running, 'preempted', text=text))
                 self._abandoned = True
+            if pending is not None and rollout in (None, pending.rollout):
+                self._put(Ended(request=pending, state='preempted', num_chunks=0, text=text))
+                self._pending = None
 
     def take(self) -> list[Result]:
         """Return the results since the last call, in order."""

@@ -67,6 +67,18 @@ def published(ros, publish, topics=()):
             client.close()
 
 
+def refusal(observe, *says, words=()):
+    """Return why there is no observation; a busy machine gets more time for what must come."""
+    text = ''
+    for timeout_s in (1.0, 4.0, 16.0):
+        with pytest.raises(ObservationError) as error:
+            observe(*words, timeout_s=timeout_s)
+        text = str(error.value)
+        if all(said in text for said in says):
+            break
+    return text
+
+
 def scene_topics(ros):
     return {t: k for t, k in ros.INPUTS.items() if t != '/joint_trajectory'}
 
@@ -138,10 +150,9 @@ def test_a_topic_that_brings_nothing_is_named(observe, ros):
     def publish(client):
         client.send_scene(joints=None)
 
-    with published(ros, publish, scene_topics(ros)), pytest.raises(ObservationError) as error:
-        observe(timeout_s=2.0)
-    assert 'nothing was received on /joint_states' in str(error.value)
-    assert 'image' not in str(error.value).partition('): ')[2]
+    with published(ros, publish, scene_topics(ros)):
+        text = refusal(observe, '): nothing was received on /joint_states')
+    assert text.endswith('): nothing was received on /joint_states')
 
 
 def test_quality_of_service_that_does_not_match_is_named(observe, ros):
@@ -151,10 +162,10 @@ def test_quality_of_service_that_does_not_match_is_named(observe, ros):
     override = 'qos_overrides./joint_states.subscription.reliability:=reliable'
     with published(ros, lambda client: client.send_scene(joints=None), kinds) as client:
         client.node.create_publisher(joints, '/joint_states', client_qos)
-        with pytest.raises(ObservationError) as error:
-            observe('-p', override, timeout_s=2.0)
-    assert 'reliability best_effort, asked for is reliable' in str(error.value)
-    assert 'nothing was received on /joint_states' in str(error.value)
+        says = ('asked for is reliable', 'nothing was received on /joint_states')
+        text = refusal(observe, *says, words=('-p', override))
+    assert 'reliability best_effort, asked for is reliable' in text
+    assert 'nothing was received on /joint_states' in text
 
 
 @pytest.mark.parametrize(
@@ -168,12 +179,8 @@ def test_quality_of_service_that_does_not_match_is_named(observe, ros):
     ],
 )
 def test_an_observation_that_cannot_be_used_says_why(observe, ros, publish, says):
-    with (
-        published(ros, publish, scene_topics(ros)),
-        pytest.raises(ObservationError) as error,
-    ):
-        observe(timeout_s=2.0)
-    assert says in str(error.value)
+    with published(ros, publish, scene_topics(ros)):
+        assert says in refusal(observe, says)
 
 
 def send_without_a_joint(client):

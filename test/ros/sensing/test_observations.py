@@ -1,5 +1,8 @@
 """Which images and joint states make up an observation."""
 
+from contextlib import suppress
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
@@ -23,7 +26,14 @@ def make_buffer(ros, tmp_path):
         limits = NodeSettings(max_view_skew_s=skew)
         buffer = ObservationBuffer(
             cameras=[cameras[view] for view in ('low', 'high')],
-            joint_names=joint_names,
+            robot=SimpleNamespace(
+                joint_names=joint_names,
+                lower=np.full(len(joint_names), -3.0),
+                upper=np.full(len(joint_names), 3.0),
+                is_endless=np.zeros(len(joint_names), bool),
+                velocity_limits=np.full(len(joint_names), 2.0),
+                tools=(),
+            ),
             width=96,
             height=72,
             limits=lambda: limits,
@@ -112,9 +122,9 @@ def test_joint_states_of_several_publishers_are_merged_at_the_images_time(make_b
     for view in ('low', 'high'):
         buffer.add_image(view, ros.make_image(view, NOW - 50 * MS))
     for step in range(-100, 1, 10):
-        buffer.add_joint_state(joints(NOW + step * MS, a=step, lift=9.0))
+        buffer.add_joint_state(joints(NOW + step * MS, a=step / 1000, lift=9.0))
     buffer.add_joint_state(joints(NOW - 30 * MS, b=7.0))
-    np.testing.assert_array_equal(buffer.observe(NOW).observation.positions, [-50, 7])
+    np.testing.assert_array_equal(buffer.observe(NOW).observation.positions, [-0.05, 7])
 
 
 def test_one_joint_that_stopped_is_stale(make_buffer, ros):
@@ -274,6 +284,80 @@ def test_one_joint_that_jumps_does_not_blind_the_others(make_buffer):
     with pytest.raises(Rejection, match="joint 'b': it jumps from 0 to 5000"):
         buffer.add_joint_state(joints(NOW, a=0.1, b=5000.0))
     assert 'no fresh joint_states of b' in buffer.problems(NOW)
+
+
+def test_the_limit_of_a_jump_is_that_of_recordings(make_buffer):
+    """3 times the joint's speed limit of 2 rad/s, and .05 rad of noise: .35 rad in 50 ms."""
+    buffer = make_buffer()
+    buffer.add_joint_state(joints(NOW - 150 * MS, a=0.0, b=0.0))
+    buffer.add_joint_state(joints(NOW - 100 * MS, a=0.34, b=0.0))
+    with pytest.raises(Rejection, match="joint 'a': it jumps from 0.34 to -0.02 in 0.0500 s"):
+        buffer.add_joint_state(joints(NOW - 50 * MS, a=-0.02, b=0.0))
+    buffer.add_joint_state(joints(NOW, a=-0.02, b=0.0))  # .05 + .6 in 100 ms
+
+
+def test_a_joint_that_was_moved_is_taken_after_the_time_of_a_glitch(make_buffer):
+    buffer = make_buffer()
+    buffer.add_joint_state(joints(NOW - 700 * MS, a=0.0, b=0.0))
+    refused = []
+    for step in range(-690, 1, 10):
+        try:
+            buffer.add_joint_state(joints(NOW + step * MS, a=2.5, b=0.0))
+        except Rejection:
+            refused.append(step)
+    # within reach after (2.5 - .05) / 6 s = .408 s, before a glitch may last that long
+    assert refused[0] == -690 and refused[-1] == -300
+    assert 'joint_states' not in ' '.join(buffer.problems(NOW))
+
+
+def test_two_publishers_that_take_turns_are_no_observation(make_buffer, ros):
+    """Neither of the two can be told to be the robot's."""
+    buffer = make_buffer()
+    show(buffer, ros, NOW)
+    for step in range(-100, 1, 10):
+        place = 1.2 if step % 20 else 0.0
+        with suppress(Rejection):
+            buffer.add_joint_state(joints(NOW + step * MS, a=place, b=0.0))
+    with pytest.raises(Rejection, match='contradict each other: a are at two places'):
+        buffer.observe(NOW)
+    for step in range(1, 102):  # the other one is gone
+        buffer.add_joint_state(joints(NOW + step * MS, a=0.0, b=0.0))
+    assert buffer.observe(NOW + 101 * MS).observation.positions.tolist() == [0.0, 0.0]
+
+
+def test_a_joint_that_is_measured_less_often_than_published_is_no_contradiction(make_buffer, ros):
+    """Measured at 5 Hz while it moves at 1 rad/s, published at 100 Hz: it moves in steps of .2."""
+    buffer = make_buffer()
+    show(buffer, ros, NOW)
+    for step in range(-1000, 200, 10):
+        with suppress(Rejection):
+            place = 0.2 * (step // 200)
+            buffer.add_joint_state(joints(NOW + step * MS, a=place, b=0.0))
+    assert buffer.observe(NOW + 190 * MS).observation.positions[0] in (-0.2, 0.0)
+
+
+def test_a_joint_that_moves_fast_and_steadily_is_followed(make_buffer, ros):
+    """At 8 rad/s, four times its limit, at 10 Hz: the first step alone is doubtful."""
+    buffer = make_buffer()
+    show(buffer, ros, NOW)
+    refused = []
+    for step in range(-500, 1, 100):
+        try:
+            place = 0.008 * max(step + 300, 0)
+            buffer.add_joint_state(joints(NOW + step * MS, a=place, b=0.0))
+        except Rejection:
+            refused.append(step)
+    assert refused == [-200]
+    assert buffer.observe(NOW).observation.positions.tolist() == [2.4, 0.0]
+
+
+def test_a_glitch_is_refused_and_the_joint_goes_on(make_buffer, ros):
+    buffer = make_buffer()
+    show(buffer, ros, NOW)
+    for step in range(-100, 1, 10):
+        with suppress(Rejection):
+            buffer.add_joint_state(joints(NOW + step * MS, a=3.0 if step == -50 else 0.0, b=0.0))
+    assert buffer.observe(NOW).observation.positions.tolist() == [0.0, 0.0]
 
 
 def test_a_stale_joint_is_named_with_why_its_newer_states_were_refused(make_buffer, ros):

@@ -195,6 +195,37 @@ def test_refused_trajectory_does_not_pre_empt(client):
     client.wait_for_state('done', since)
 
 
+@pytest.mark.parametrize('names', [(), 'robot'])
+def test_an_empty_trajectory_stops_the_running_plan_and_is_answered_once(client, ros, names):
+    client.set(seed=BLOCKS)
+    client.send_scene()
+    client.send_trajectory_and_wait_until_it_runs()
+    since = len(client.report_values())
+    named = {} if names == 'robot' else {'names': names}
+    stamp_ns = client.now_ns()
+    client.send_trajectory(times=(), positions=(), stamp_ns=stamp_ns, **named)
+    running, empty = client.wait_for_ends(2, since)
+    assert (running['state'], running['text']) == ('preempted', 'an empty trajectory stopped it')
+    assert (empty['state'], empty['num_chunks']) == ('done', '0')
+    assert empty['trajectory_stamp_ns'] == str(stamp_ns) and 'no points' in empty['text']
+    client.set(seed=0)  # the node goes on
+    assert client.imagine_one()['state'] == 'done'
+    assert len([v for v in client.report_values()[since:] if v['state'] in ros.ENDS]) == 3
+
+
+def test_an_empty_trajectory_drops_frames_that_are_not_out_yet(client):
+    client.set(pace='realtime')
+    since = len(client.report_values())
+    client.send_scene()
+    client.send_trajectory(seconds=8.0)
+    client.wait_for_state('done', since)  # its frames go on for eight seconds
+    client.send_trajectory(times=(), positions=())
+    client.wait_for_ends(2, since)
+    client.wait_for_all(FRAME_TOPICS)
+    sent = [r for r in client.report_values()[since:] if r['state'] == 'published']
+    assert sum(int(r['frames_dropped']) for r in sent) >= NUM_FRAMES
+
+
 def test_newer_chunk_drops_frames_of_a_plan_that_no_longer_holds(client):
     client.set(pace='realtime')
     since = len(client.report_values())
