@@ -109,6 +109,10 @@ class Motion:
         """Return the motion through all states but the first."""
         return self._part(slice(1, None))
 
+    def last(self) -> Motion:
+        """Return the last state."""
+        return self._part(slice(-1, None))
+
     def _part(self, kept: slice) -> Motion:
         return replace(
             self,

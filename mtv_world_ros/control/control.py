@@ -20,6 +20,19 @@ from mtv_world_ros.robot.model import RobotModel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SeenFrame:
+    """A real frame of a rollout.
+
+    Attributes:
+        frames: (V, H, W, 3) uint8 RGB.
+        motion: one state: of the robot and the cameras in that frame.
+    """
+
+    frames: ByteArray
+    motion: Motion
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ControlScene:
     """One chunk of a plan and the frame that it starts from: what a control is computed from.
 
@@ -30,6 +43,8 @@ class ControlScene:
         masks: (V, O, H, W) object masks of that frame; None if the control uses none.
         objects: (V, 1 + T, H, W, 4) uint8 RGB and cover of the objects where they are expected to
             be; None if the control shows none, or their motion is not foreseen.
+        seen: the last real frame, where the start frame is imagined; None = it is real, or no
+            real frame is kept.
     """
 
     motion: Motion
@@ -37,6 +52,7 @@ class ControlScene:
     start_frames: ByteArray
     masks: BoolArray | None = None
     objects: ByteArray | None = None
+    seen: SeenFrame | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

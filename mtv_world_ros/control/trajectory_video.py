@@ -556,7 +556,7 @@ class TrajectoryVideo(Control):
             times=scene.times,
             object_masks=scene.masks if self.object_mask else None,
             objects=scene.objects if self.shows_objects else None,
-            arms=arm_pictures(self.parts, scene.motion, scene.start_frames),
+            arms=arm_pictures(self.parts, scene.motion, scene.start_frames, scene.seen),
             config=self.config,
         )
         return ControlInputs.drawn(video.frames)

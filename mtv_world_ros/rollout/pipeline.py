@@ -365,6 +365,7 @@ class Pipeline:
             start_frames=start.frames,
             masks=start_masks.masks[:, :, 0],
             objects=pictures,
+            seen=state.scene.last if state.scene and state.num_imagined else None,
         )
         clock.lap('object motion')
         control = self.control.make(scene)

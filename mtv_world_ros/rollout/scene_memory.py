@@ -17,7 +17,8 @@ import numpy as np
 
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.cameras.silhouettes import project_part
-from mtv_world_ros.core.data_types import BoolArray, ByteArray, FloatArray, ObjectMasks
+from mtv_world_ros.control.control import SeenFrame
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import fill, LinkShape, load_shape, moving_links
 
@@ -52,14 +53,14 @@ class SceneMemory:
         known: (V, H, W) where it was seen.
         masks: (V, O, H, W) of the objects in the last real frame.
         touched: (O,) whether the robot may have moved an object since.
-        camera_poses: (V, 4, 4) T_base_camera of the pictures [m].
+        last: the last real frame.
     """
 
     pictures: ByteArray
     known: BoolArray
     masks: BoolArray
     touched: BoolArray
-    camera_poses: FloatArray
+    last: SeenFrame
 
 
 class SceneKeeper:
@@ -108,7 +109,8 @@ class SceneKeeper:
         pictures, known = np.zeros_like(frames[:, 0]), np.zeros(arms[:, 0].shape, np.bool_)
         if memory is not None and memory.pictures.shape == pictures.shape:
             pictures = memory.pictures.copy()
-            stayed = np.abs(memory.camera_poses - poses).max((1, 2)) < _SAME_POSE
+            before = memory.last.motion.camera_poses[:, -1]
+            stayed = np.abs(before - poses).max((1, 2)) < _SAME_POSE
             known = memory.known & stayed[:, None, None]
         for frame in range(frames.shape[1]):
             free = ~arms[:, frame] & self._stands_still(motion)[:, None, None]
@@ -119,7 +121,7 @@ class SceneKeeper:
             known=known,
             masks=last,
             touched=np.zeros(last.shape[1], np.bool_),
-            camera_poses=poses,
+            last=SeenFrame(frames=frames[:, -1], motion=motion.last()),
         )
 
     def held(
@@ -141,9 +143,8 @@ class SceneKeeper:
         """
         robot, found = self._drawn(motion), masks.masks
         memory = self._after_contact(memory, robot, found)
-        covered = self._near(robot, self._settings.arm_margin) | self._moved(memory, found)
-        if drawn is not None:
-            covered |= self._near(drawn[..., 3] > 0, self._settings.object_margin)
+        covered = self._near(robot, self._settings.arm_margin)
+        covered |= self._moved(memory, found, drawn)
         share = self._shares(memory.known[:, None] & ~covered)
         mixed = frames + share[..., None] * (memory.pictures[:, None].astype(np.float32) - frames)
         frames = np.rint(mixed).astype(np.uint8)
@@ -183,11 +184,18 @@ class SceneKeeper:
         may_touch = (near | ~seen[..., None]).all(0).any(-1)
         return replace(memory, touched=memory.touched | may_touch)
 
-    def _moved(self, memory: SceneMemory, found: BoolArray) -> BoolArray:
-        """(V, T, H, W) near objects that may have moved: where they were, and are."""
+    def _moved(self, memory: SceneMemory, found: BoolArray, drawn: ByteArray | None) -> BoolArray:
+        """Return (V, T, H, W) near objects that may have moved: where they were, and are.
+
+        Where motion is foreseen, masks count near these places alone: those of imagined frames
+        wander off into smears.
+        """
         which = memory.touched
-        now = found[:, which].any(1) | memory.masks[:, which].any(1)[:, None]
-        return self._near(now, self._settings.object_margin)
+        now, were = found[:, which].any(1), memory.masks[:, which].any(1)[:, None]
+        if drawn is not None:
+            were = were | (drawn[..., 3] > 0)
+            now &= self._near(were, self._settings.arm_margin)
+        return self._near(now | were, self._settings.object_margin)
 
     def _stands_still(self, motion: Motion) -> BoolArray:
         """(V,) whether no joint of the robot moves a camera."""

@@ -2,9 +2,11 @@
 
 import cv2
 import numpy as np
+import pytest
 
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.control.arm_pictures import arm_pictures
+from mtv_world_ros.control.control import SeenFrame
 from mtv_world_ros.control.trajectory_video import render_trajectory_video, TrajectoryVideoConfig
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
@@ -125,3 +127,31 @@ def test_trails_lie_over_the_arms(one_arm, make_camera):
     np.testing.assert_array_equal(video['arms'][free], arms[..., :3][free])
     bright = video['trails'].max(axis=-1) > 200
     assert bright.any() and (video['arms'][bright] >= video['trails'][bright] - 2).all()
+
+
+def seen_frame(robot, camera, tool, frame):
+    positions = np.array([[*tool, 1.0]])
+    return SeenFrame(frames=frame[None], motion=Motion.of(robot, [camera], positions, ['hand0']))
+
+
+@pytest.mark.parametrize(
+    ('tool', 'is_sharp'), [((-0.2, 0.0, 1.0), True), ((5.0, 0.0, 1.0), False)]
+)
+def test_a_link_keeps_the_pixels_of_the_real_frame_that_shows_it(
+    one_arm, make_camera, tool, is_sharp
+):
+    camera = make_camera(192, 144)
+    start, goal = np.array([0.1, 0.0, 1.0]), np.array([0.2, 0.1, 1.0])
+    # what an imagined frame has made of the plate: one smear
+    smeared = np.full((camera.height, camera.width, 3), 110, np.uint8)
+    real = seen_frame(one_arm, camera, tool, start_frame(camera, np.array(tool)))
+    positions = np.array([[*start, 1.0], [*goal, 1.0]])
+    motion = Motion.of(one_arm, [camera], positions, ['hand0'])
+    parts = [LinkShape(link='hand0', points=PLATE)]
+    (_, picture) = arm_pictures(parts, motion, smeared[None], real)[0]
+    rows, columns = np.nonzero(picture[..., 3])
+    middle, wide = (int(rows.mean()), int(columns.mean())), np.ptp(columns) // 4
+    left, right = picture[middle[0], middle[1] - wide], picture[middle[0], middle[1] + wide]
+    expected = (PAINT, PAINT // 2) if is_sharp else ((110,) * 3,) * 2
+    for found, colour in zip((left, right), expected, strict=True):
+        assert np.abs(found[:3].astype(int) - colour).max() < 12
