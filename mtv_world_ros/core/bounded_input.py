@@ -8,7 +8,7 @@ limit that is too low for you is raised with an environment variable, e.g.
 from __future__ import annotations
 
 import codecs
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 import errno
@@ -289,8 +289,15 @@ def fill_template(template: object, values: Mapping[str, int | str]) -> str:
     return _FIELD.sub(filled, template)
 
 
-def read_arrays(path: Path | str, limit: str = 'array_bytes') -> dict[str, np.ndarray]:
+def read_arrays(
+    path: Path | str, limit: str = 'array_bytes', without: Collection[str] = ()
+) -> dict[str, np.ndarray]:
     """Return the arrays of an .npz file by name; inflated they are within a field of `Limits`.
+
+    Args:
+        path: the file.
+        limit: field of `Limits`.
+        without: members of the archive that are not read.
 
     Raises:
         OSError: the file cannot be read, or is no regular file.
@@ -298,7 +305,7 @@ def read_arrays(path: Path | str, limit: str = 'array_bytes') -> dict[str, np.nd
     """
     try:
         with _open_regular(path) as (file, _), zipfile.ZipFile(file) as archive:
-            members = archive.infolist()
+            members = [one for one in archive.infolist() if one.filename not in without]
             check_limit(limit, sum(member.file_size for member in members), f"'{path}', inflated,")
             return {
                 member.filename.removesuffix('.npy'): _array(archive.read(member))

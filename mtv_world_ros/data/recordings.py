@@ -5,6 +5,7 @@ V views, N recorded frames, T frames a chunk, J joints, H W the model's size.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 import hashlib
@@ -38,6 +39,8 @@ from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.resample import cut_off, resample
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 
+#: reads the arrays of an .npz file by name, within a field of `Limits`
+ArrayReader = Callable[[Path, str], dict[str, np.ndarray]]
 #: to be increased when the stored data or their computation change
 _VERSION = 3
 
@@ -193,21 +196,31 @@ def cached_recording(
     robot: RobotModel,
     cache: Path,
     source: EpisodeSource = DEFAULT,
+    read: ArrayReader = read_arrays,
 ) -> Recording:
     """Return `load_recording`'s result, from the cache where it is current.
 
     The key holds the bag's files (name, size, time), views, size, and robot: a changed episode
     or setting misses the cache instead of using stale data.
+
+    Args:
+        path: folder of the episode.
+        spec: views and size of the frames.
+        robot: of the episode.
+        cache: folder of the cache.
+        source: topics and calibration of the episode.
+        read: reads a file of the cache, as `read_arrays` does.
     """
     stored = cache / f'{_key(path, spec, robot, source)}.npz'
     if stored.is_file():
         with suppress(OSError, ValueError, LookupError, TypeError):
-            return _load(stored, path)  # where it is damaged it is made anew
+            return _load(stored, path, read)  # where it is damaged it is made anew
     recording = load_recording(path, spec, robot, source=source)
     archive = BytesIO()
     _save(archive, recording)
     write_whole(stored, archive.getvalue())
-    return replace(recording, recorded=())
+    # a reader that maps files must not leave the first recordings in memory
+    return replace(recording, recorded=()) if read is read_arrays else _load(stored, path, read)
 
 
 def _key(path: Path, spec: WorldModelSpec, robot: RobotModel, source: EpisodeSource) -> str:
@@ -246,8 +259,8 @@ def _save(file: BytesIO, recording: Recording) -> None:
     np.savez(file, text=np.array(json.dumps(text)), **known)
 
 
-def _load(file: Path, path: Path) -> Recording:
-    stored = read_arrays(file, 'video_bytes')
+def _load(file: Path, path: Path, read: ArrayReader) -> Recording:
+    stored = read(file, 'video_bytes')
     text = parse_json(str(stored['text']), f"'{file}'")
     cameras = tuple(
         CameraModel(

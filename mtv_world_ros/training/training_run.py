@@ -46,6 +46,7 @@ from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.fit_control import fitted_control
 from mtv_world_ros.training.latent_cache import cached, CachedSource
 from mtv_world_ros.training.log import TrainingLog
+from mtv_world_ros.training.mapped_arrays import read_mapped
 from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
@@ -109,7 +110,7 @@ def load_recordings(
             if str(path) in broken:
                 raise EpisodeError(broken[str(path)])
             with disk_errors_named(cache):
-                recording = cached_recording(path, spec, robot, cache, source)
+                recording = cached_recording(path, spec, robot, cache, source, read_mapped)
             check_clips(recording, spec)
             check_recording(recording, robot)
             if describer is not None:
