@@ -6,12 +6,15 @@
 In each physics of `config/physics.yaml` the expert and faulty policies act in the same scenes of the
 simulator; kinds of faults have the size `--size`, a factor of what was drawn. Each plan is foreseen
 from the pictures of the first frame alone, as the node does: cameras are checked against the arm's
-outline, objects are found by the segmenter. Judges: *foreseen motions alone*, the share of futures
-that succeed; where `--pictures` says so, *pictures alone* (no motion foreseen) and *both* (the estimate);
+outline, objects are found by the segmenter. Judges: *foreseen motions alone*, the estimate without
+frames: contact parameters were fitted in `nominal`, and futures of every other physics are drawn from
+the wide prior of a robot cell in which nothing was fitted; *foreseen motions, as if fitted here*: with
+the parameters of `nominal` all the same; where `--pictures` says so, *pictures alone* (no motion
+foreseen) and *both* (the estimate, which frames make less sure where they contradict the drawn motion);
 where `--real` says so, *real frames*, the estimate on the simulator's; where `--contact FOLDER` has a
 folder `FOLDER/PHYSICS` that `fit contact` wrote in that physics, *foreseen motions, fitted there*; the
 *no-picture rule*: an object sticks to a gripper that closes near it. From .75 on it is called a success,
-below .5 a failure.
+below .5 a failure, unless the interval reaches the opposite verdict.
 False success is of real failures that have a verdict, false failure of real successes. Intervals over
 scenes: AUROC jackknife, shares clustered Wilson. The log keeps what was done, and the same command
 goes on; physics that show the same first picture share what is imagined. `--no-camera-check` leaves
@@ -19,7 +22,8 @@ cameras as they are told. Flips of contact, as `mtv-world rank` has them: of rol
 is another than the expert's in the same scene, the share in which the last imagined frame is nearer to
 what really happened than to what the expert's commands make happen, where objects are. The last table is
 of the node's watch, which compares the end of every executed chunk (here where objects truly are) with
-the futures: how many rollouts it takes to say that the physics is another one, over random orders.
+the futures of the fitted parameters: how many rollouts it takes to say that the physics is another one,
+over random orders.
 """  # noqa: E501
 
 from __future__ import annotations
@@ -50,6 +54,7 @@ from mtv_world_ros.core.errors import MtvWorldError, PolicyError, SimulatorError
 from mtv_world_ros.core.images import encode_png, resize_frames
 from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.evaluation.metrics.statistics import clustered_wilson
+from mtv_world_ros.evaluation.metrics.success_agreement import expected_calibration_error
 from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
 from mtv_world_ros.physics.arm_response import PERIOD_S
 from mtv_world_ros.physics.checkpoint_files import load_foresight
@@ -73,7 +78,14 @@ from mtv_world_ros.simulation.physics import catalogue, physics_named
 from mtv_world_ros.simulation.simulator import CONTROL_PERIOD_S, SimEpisode
 from mtv_world_ros.simulation.tasks import task_named
 from mtv_world_ros.success.doubts import Grounds, NEAR_M, PhysicsWatch, unforeseen
-from mtv_world_ros.success.estimator import capped, stated_probability, verdict
+from mtv_world_ros.success.estimator import (
+    capped,
+    estimate_of_futures,
+    stated_probability,
+    verdict,
+)
+from mtv_world_ros.success.foreseen import foreseen_feature, ForeseenEnds
+from mtv_world_ros.success.share_fit import ShareEstimate, ShareFit
 from mtv_world_ros.success.situation import CannotTell
 from mtv_world_ros.vision.camera_check import CameraCheck
 
@@ -85,10 +97,10 @@ TASKS = (
 )  # fmt: skip
 HEAD = (
     'truth', 'judged by', 'n', 'succeed', 'AUROC', 'false success', 'false failure', 'no verdict',
-    'from .9 on succeed',
+    'from .9 on succeed', 'ECE',
 )  # fmt: skip
 ACROSS = ('judged by', 'truths', 'AUROC, mean', 'worst', 'false success, mean', 'worst',
-          'no verdict, mean')  # fmt: skip
+          'no verdict, mean', 'ECE, mean')  # fmt: skip
 WATCHED = (
     'truth', 'foreseen by', 'chunks that ended unforeseen',
     'says so after rollouts: median [5 %, 95 %]', 'orders in which it never does',
@@ -96,6 +108,11 @@ WATCHED = (
 FLIPPED = ('truth', 'imagined by', 'flips of contact that are imagined')
 FORESEEN, PICTURES, BOTH = 'foreseen motions alone', 'pictures alone', 'both'
 REAL, RULE, FITTED = 'real frames', 'no-picture rule', 'foreseen motions, fitted there'
+AS_FITTED = 'foreseen motions, as if fitted here'
+#: judges that rest on futures alone
+OF_FUTURES = (FORESEEN, AS_FITTED, FITTED)
+#: a robot cell in which nothing was fitted
+_ELSEWHERE = 'another robot cell'
 #: random orders of rollouts in which the watch sees them
 _ORDERS = 100
 #: what pictures are made for
@@ -133,19 +150,19 @@ class Ahead:
     """What is foreseen of a rollout.
 
     Attributes:
-        share: of the futures that succeed; NaN = they do not tell.
+        ends: outcomes of the futures; None = they do not tell.
         names: of the O objects.
         points: (K, 1 + C, O, 3) centres at first and at the ends of chunks [m].
         times: (1 + C,) [s].
     """
 
-    share: float
+    ends: ForeseenEnds | None
     names: tuple[str, ...]
     points: FloatArray
     times: FloatArray
 
     def said(self, sim: SimEpisode, take: Take) -> Said:
-        """Return the share, and how far each chunk's end truly was from all futures [m]."""
+        """Return the features, and how far each chunk's end truly was from all futures [m]."""
         items = {item.name: number for number, item in enumerate(sim.scene.objects)}
         known = [number for number, name in enumerate(self.names) if name in items]
         frames = np.rint(self.times / _RECORD.frame_period_s).astype(int)
@@ -155,7 +172,11 @@ class Ahead:
         points = self.points[:, :, known]
         chunks = [slice(chunk, chunk + 2) for chunk in range(len(self.times) - 1)]
         apart = [unforeseen(points[:, chunk], real[chunk]) for chunk in chunks]
-        return {'value': self.share if isfinite(self.share) else None, 'apart': apart}
+        features = None
+        if self.ends is not None:
+            number = self.ends.num_effective
+            features = {'foreseen': foreseen_feature(self.ends), 'futures': number}
+        return {'features': features, 'apart': apart}
 
 
 def foreseen_by(
@@ -180,7 +201,7 @@ def foreseen_by(
     each = round(pipeline.spec.num_frames / pipeline.spec.fps / motions.step_s)
     rows = np.array([*range(0, num_rows - 1, each), num_rows - 1])
     return Ahead(
-        share=nan if ends is None or ahead.tracked.refusal else ends.share,
+        ends=None if ahead.tracked.refusal else ends,
         names=names,
         points=motions.points[:, rows],
         times=rows * motions.step_s,
@@ -199,7 +220,12 @@ def imagined(pipeline: Pipeline, episode: Rollout, commands: FloatArray) -> Said
         joint_names=pipeline.robot.joint_names, times=times, positions=commands[1:]
     )
     *_, last = episode.extend(plan)
-    return {'features': features_of(last.success), 'ends': packed(episode.observation.frames)}
+    return {
+        'features': features_of(last.success),
+        'interval': list(last.success.interval),
+        'reasons': list(last.success.reasons),
+        'ends': packed(episode.observation.frames),
+    }
 
 
 def packed(frames: ByteArray) -> str:
@@ -252,6 +278,11 @@ class Scenes:
     def __init__(self, pipelines: dict[str, Pipeline], options: argparse.Namespace) -> None:
         self._pipelines, self._known = pipelines, dict[tuple, Any]()
         self._fitted = dict[str, ObjectMotionModel]()
+        #: foresight of a robot cell in which nothing was fitted, by checkpoint
+        self._unfitted = {
+            name: pipeline.object_motion and pipeline.object_motion.at_place(_ELSEWHERE)
+            for name, pipeline in pipelines.items()
+        }
         for physics in options.physics.split(',') if options.contact else ():
             folder = options.contact / physics / OBJECT_MOTION_FOLDER
             robot = next(iter(pipelines.values())).robot
@@ -265,7 +296,8 @@ class Scenes:
 
     def wanted(self, physics: str) -> list[str]:
         """Return the judges of a physics."""
-        more = [FITTED] if physics in self._fitted else []
+        more = [] if physics == NOMINAL else [AS_FITTED]
+        more += [FITTED] if physics in self._fitted else []
         more += IMAGINED if physics in self._of['pictures'] else ()
         return [FORESEEN, *more, *([REAL] if physics in self._of['real'] else ())]
 
@@ -293,16 +325,14 @@ class Scenes:
         commands = resample(take.commands, sim.home, np.arange(0.0, end, PERIOD_S))
         said: dict[str, Any] = {}
         for name, pipeline in self._pipelines.items():
-            judges = [judge for judge in self.wanted(physics) if judge not in (REAL, FITTED)]
+            judges = [judge for judge in self.wanted(physics) if judge != REAL]
             found = {
-                judge: self._once(name, judge, first, sim.instruction, commands, seed)
-                for judge in judges[::-1]
-            }
-            if physics in self._fitted:
-                motion = self._fitted[physics]
-                found[FITTED] = self._once(
-                    name, FITTED, first, sim.instruction, commands, seed, motion
+                judge: self._once(
+                    name, judge, first, sim.instruction, commands, seed,
+                    self._motion(name, judge, physics),
                 )
+                for judge in judges[::-1]
+            }  # fmt: skip
             said[name] = {
                 judge: one.said(sim, take) if isinstance(one, Ahead) else one
                 for judge, one in found.items()
@@ -327,6 +357,14 @@ class Scenes:
             self._known[key] = acting.plan, expert.home
         return self._known[key]
 
+    def _motion(self, name: str, judge: str, physics: str) -> ObjectMotionModel | None:
+        """Return the foresight that a judge uses in a physics."""
+        if judge == FITTED:
+            return self._fitted[physics]
+        if judge == AS_FITTED or physics == NOMINAL:
+            return self._pipelines[name].object_motion
+        return self._unfitted[name]
+
     def _once(
         self,
         name: str,
@@ -339,18 +377,22 @@ class Scenes:
     ) -> Said | Ahead:
         """What a judge says, who is asked once for all physics that look the same.
 
-        The motion is that of the physics, and None is the checkpoint's.
+        The rule is asked without a motion.
         """
         cameras = [camera.T_mount_camera.tobytes() for camera in first.cameras]
         same = (first.frames.tobytes(), first.positions.tobytes(), commands.tobytes(), *cameras)
-        key = (name, judge, motion, *same)
+        key = (name, FORESEEN if judge in OF_FUTURES else judge, motion, *same)
         if key not in self._known:
             whole = self._pipelines[name]
             check = self._check(whole, (name, *same), first)
             if check.refusal and judge != RULE:
                 return {'refused': True}
-            motion = motion or whole.object_motion
-            pipeline = replace(whole, camera_checker=None, object_motion=motion)
+            pipeline = replace(
+                whole,
+                camera_checker=None,
+                object_motion=motion or whole.object_motion,
+                checks_place=False,
+            )
             if judge == PICTURES:
                 pipeline = pipeline.without_foresight()
             # features are logged whether or not weights were ever fitted to them
@@ -436,24 +478,34 @@ def is_whole(known: dict[str, Any], judges: Sequence[str], names: Iterable[str])
     return all(set(judges) <= set(known['said'].get(name, ())) for name in names)
 
 
-def estimated(pipeline: Pipeline, judge: str, said: Said) -> float:
-    """Return the probability of success that a judge gives; NaN = it abstains.
+def estimated(pipeline: Pipeline, judge: str, said: Said, physics: str) -> ShareEstimate:
+    """Return the probability of success that a judge gives, with its interval; NaN = it abstains.
 
     Estimates are those of the checkpoint as it is calibrated now; of one that is not calibrated
-    for rollouts of this kind, those of the stated weights.
+    for rollouts of this kind, those of the stated weights. An interval of frames alone is that
+    of the run.
     """
     if said.get('value') is not None:
-        return float(said['value'])
+        return ShareEstimate(float(said['value']), nan, nan)
     features, judging = said.get('features'), pipeline
+    if features is None:
+        return ShareEstimate(nan, nan, nan)
+    features = {key: nan if value is None else value for key, value in features.items()}
     if judge == PICTURES:
         judging = pipeline.without_foresight()
-    if features is None:
-        return nan
     calibration = judging.estimator.calibration
+    if isfinite(features.get('foreseen', nan)):
+        is_fitted = physics == NOMINAL or judge in (AS_FITTED, FITTED)
+        fit = None if calibration is None else calibration.futures
+        fit = fit or ShareFit()
+        if not is_fitted:
+            fit = ShareFit(max_picture_gap_m=fit.max_picture_gap_m)
+        return estimate_of_futures(fit, features, is_fitted=is_fitted)
+    interval = tuple(nan if end is None else end for end in said.get('interval', (nan, nan)))
     if calibration is None:
-        return capped(stated_probability(features), features)
-    weights = calibration.given(judge == REAL, isfinite(features.get('foreseen', nan)))
-    return capped(weights.probability(features), features)
+        return ShareEstimate(capped(stated_probability(features), features), *interval)
+    weights = calibration.given(judge == REAL)
+    return ShareEstimate(capped(weights.probability(features), features), *interval)
 
 
 @dataclass(frozen=True, slots=True)
@@ -466,14 +518,18 @@ class Row:
     auroc: float
     false_success: float
     unknown: float
+    calibration_error: float
 
 
-def row(physics: str, judge: str, rows: Sequence[dict[str, Any]], said: FloatArray) -> Row:
-    """Return a row of the table, of estimates (N,)."""
+def row(
+    physics: str, judge: str, rows: Sequence[dict[str, Any]], estimates: Sequence[ShareEstimate]
+) -> Row:
+    """Return a row of the table, of N estimates."""
+    said = np.array([one.probability for one in estimates])
     real = np.array([r['final'] for r in rows], np.bool_)
-    scenes = [(r['job'][1], r['job'][2]) for r in rows]
+    scenes = [(r['job'][1], r['job'][3]) for r in rows]
     known = np.isfinite(said)
-    calls = np.array([verdict(float(value)) for value in said])
+    calls = np.array([verdict(one.probability, one[1:]) for one in estimates])
     cells = [physics, judge, str(len(rows)), str(int(real.sum()))]
     auroc, text = nan, '–'
     if known.any() and len(set(real[known])) == 2:
@@ -485,9 +541,10 @@ def row(physics: str, judge: str, rows: Sequence[dict[str, Any]], said: FloatArr
              _share(calls == 0, real & np.isfinite(calls), scenes)]  # fmt: skip
     none, sure = ~np.isfinite(calls), known & (said >= 0.9)
     held = f'{(real & sure).sum()} of {sure.sum()}'
-    cells += [text, *wrong, f'{none.sum()} of {len(rows)}', held]
+    error = expected_calibration_error(said[known], real[known]) if known.any() else nan
+    cells += [text, *wrong, f'{none.sum()} of {len(rows)}', held, f'{error:.2f}']
     share = float((calls[failed] == 1).mean()) if failed.any() else nan
-    return Row(physics, judge, cells, auroc, share, float(none.mean()))
+    return Row(physics, judge, cells, auroc, share, float(none.mean()), error)
 
 
 def across(rows: Sequence[Row]) -> list[list[str]]:
@@ -504,7 +561,8 @@ def across(rows: Sequence[Row]) -> list[list[str]]:
              f'{least.auroc:.2f} ({least.physics})',
              f'{_mean([r.false_success for r in of]):.2f}',
              f'{most.false_success:.2f} ({most.physics})',
-             f'{np.mean([r.unknown for r in of]):.2f}']
+             f'{np.mean([r.unknown for r in of]):.2f}',
+             f'{_mean([r.calibration_error for r in of]):.2f}']
         )  # fmt: skip
     return lines
 
@@ -537,12 +595,19 @@ def rows_of(
             continue
         for name, pipeline in pipelines.items():
             for judge in scenes.wanted(physics):
-                said = [estimated(pipeline, judge, r['said'][name][judge]) for r in chosen]
+                said = [
+                    estimated(pipeline, judge, r['said'][name][judge], physics) for r in chosen
+                ]
                 title = judge if len(pipelines) == 1 else f'{judge}, {name}'
-                rows.append(row(physics, title, chosen, np.array(said)))
-        rule = [nan if r['rule']['value'] is None else r['rule']['value'] for r in chosen]
-        rows.append(row(physics, RULE, chosen, np.array(rule)))
+                rows.append(row(physics, title, chosen, said))
+        rows.append(row(physics, RULE, chosen, [ruled(r) for r in chosen]))
     return rows
+
+
+def ruled(line: dict[str, Any]) -> ShareEstimate:
+    """Return what the no-picture rule says of a rollout of the log."""
+    value = line['rule']['value']
+    return ShareEstimate(nan if value is None else float(value), nan, nan)
 
 
 def flip_rows(
@@ -559,7 +624,7 @@ def flip_rows(
             for judge in IMAGINED:
                 known = [(r, e) for r, e in flips if 'ends' in r['said'][name].get(judge, {})]
                 hits = np.array([is_flip(r, e, r['said'][name][judge]['ends']) for r, e in known])
-                scenes = [(r['job'][1], r['job'][2]) for r, _ in known]
+                scenes = [(r['job'][1], r['job'][3]) for r, _ in known]
                 if known:
                     title = judge if len(names) == 1 else f'{judge}, {name}'
                     share = _share(hits, np.ones(len(known), np.bool_), scenes)
@@ -581,7 +646,9 @@ def watch_rows(
     rows = []
     for physics in options.physics.split(','):
         for name in names:
-            for judge in (FORESEEN, FITTED):
+            # those of a wide prior foresee nearly everything
+            fitted = FORESEEN if physics == NOMINAL else AS_FITTED
+            for judge in (fitted, FITTED):
                 said = [r['said'][name].get(judge, {}) for r in found if r['job'][0] == physics]
                 apart = [one['apart'] for one in said if 'apart' in one]
                 if any(np.isfinite(one).any() for one in apart):
@@ -610,7 +677,7 @@ def needed(apart: Sequence[Sequence[float]], order: Iterable[int]) -> int:
     watch = PhysicsWatch()
     for count, number in enumerate(order, 1):
         for away in apart[number]:
-            watch.take(away)
+            watch.take(away, count)
         if watch.doubt:
             return count
     return 0

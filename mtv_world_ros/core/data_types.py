@@ -187,12 +187,14 @@ class Observation:
         frames: (V, H, W, 3) uint8 RGB.
         positions: (J,) positions in the robot's joint order [rad or m].
         stamp_ns: time of the frames [ns].
+        place: name of the robot cell, see `EpisodeInfo.place`; empty = not stated.
     """
 
     cameras: tuple[CameraModel, ...]
     frames: ByteArray
     positions: FloatArray
     stamp_ns: int
+    place: str = ''
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'cameras', tuple(self.cameras))

@@ -32,10 +32,17 @@ MASKS_BY = 'masks_by'
 UNKNOWN_CAMERAS = 'unknown_cameras'
 #: key of the metadata that names the physics of a simulated episode
 PHYSICS = 'physics'
+#: key of the metadata that names the robot cell of an episode
+PLACE = 'place'
 #: name of the default physics
 NOMINAL = 'nominal'
 CALIBRATION_FILE = 'calibration.yaml'
 OUTCOMES = ('success', 'failure', 'unknown')
+
+
+def simulated_place(physics: str) -> str:
+    """Name of the robot cell that the simulator is with a physics."""
+    return f'simulator/{physics}'
 
 
 def image_topic(view: str) -> str:
@@ -90,6 +97,19 @@ class EpisodeInfo:
     instruction: str = ''
     robot: str = ''
     metadata: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def physics(self) -> str:
+        """Name of the physics of a simulated episode; empty for a real one.
+
+        Older simulated episodes do not store it.
+        """
+        return self.metadata.get(PHYSICS, NOMINAL if self.seed is not None else '')
+
+    @property
+    def place(self) -> str:
+        """Robot cell of the episode; empty = not stated. Each physics of the simulator is one."""
+        return self.metadata.get(PLACE, simulated_place(self.physics) if self.physics else '')
 
 
 def dump_info(info: EpisodeInfo) -> dict[str, str]:

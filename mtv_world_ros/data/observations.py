@@ -95,6 +95,7 @@ def _observation(
         frames=np.stack([episode.images[view].frames[index] for view, index in chosen]),
         positions=_positions(episode, robot, state),
         stamp_ns=stamp_ns,
+        place=episode.info.place,
     )
 
 

@@ -61,6 +61,7 @@ class Recording:
         object_poses: (N, O, 4, 4) T_base_object [m] at `times`: recorded, or of masks in two
             views, then NaN until seen; None where neither is there.
         warnings: problems found and how the reader handled them.
+        place: name of the robot cell; empty = not stated.
         recorded: V views as they were recorded, and their cameras; empty = from a cache.
     """
 
@@ -79,6 +80,7 @@ class Recording:
     object_poses: FloatArray | None = None
     described: tuple[str, ...] = ()
     masks_by: str = ''
+    place: str = ''
     camera_tracks: Mapping[str, FloatArray] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     recorded: tuple[tuple[Track, CameraModel], ...] = ()
@@ -108,6 +110,7 @@ class Recording:
             frames=frames,
             positions=self.positions[frame],
             stamp_ns=self.stamp_ns + round(float(self.times[frame]) * 1e9),
+            place=self.place,
         )
 
     def cameras_at(self, frame: int) -> tuple[CameraModel, ...]:
@@ -203,6 +206,7 @@ def load_recording(
         stamp_ns=origin,
         object_poses=_object_poses(episode, robot, spec.views, stamps, positions),
         masks_by=episode.info.metadata.get(MASKS_BY, ''),
+        place=episode.info.place,
         camera_tracks={
             view: track[nearest_rows(np.asarray(episode.images[view].stamps_ns), stamps)]
             for view, track in episode.camera_tracks.items()

@@ -237,7 +237,7 @@ def _key(path: Path, spec: WorldModelSpec, robot: RobotModel, source: EpisodeSou
 
 
 #: fields of a recording, of its commands and of a camera, as they are stored
-_TEXT = ('task', 'outcome', 'instruction', 'objects', 'masks_by', 'stamp_ns')
+_TEXT = ('task', 'outcome', 'instruction', 'objects', 'masks_by', 'place', 'stamp_ns')
 _ARRAYS = ('times', 'frames', 'positions', 'object_ids', 'object_poses')
 _OF_COMMANDS = ('times', 'positions', 'velocities')
 _OF_CAMERA = ('view', 'width', 'height', 'distortion_model', 'mount_link')

@@ -13,7 +13,7 @@ from pydantic import BaseModel, BeforeValidator, ValidationError
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.entry_points import policy_kind
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest, PolicyError
-from mtv_world_ros.data.episode import EpisodeInfo, NOMINAL, PHYSICS
+from mtv_world_ros.data.episode import EpisodeInfo
 from mtv_world_ros.data.episode_reader import list_episodes, read_info
 
 #: key of the metadata that names the policy of an episode
@@ -172,8 +172,7 @@ def of_physics(selection: Selection, physics: str | None = None) -> tuple[Select
 
 def _physics(info: EpisodeInfo) -> str:
     """Return the name of an episode's physics; older simulated episodes do not store it."""
-    usual = NOMINAL if info.seed is not None else 'not stated'
-    return info.metadata.get(PHYSICS, usual)
+    return info.physics or 'not stated'
 
 
 class _Entry(BaseModel):

@@ -165,6 +165,7 @@ class EpisodeScorer:
             pictures=_mean_quality(found.pictures),
             probability=success.probability if success else np.nan,
             reasons=success.reasons if success else (),
+            interval=success.interval if success else (np.nan, np.nan),
             features=dict(success.features) if success else {},
             observed=dict(observed),
             resumed=dict(resumed),

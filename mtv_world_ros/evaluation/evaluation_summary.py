@@ -156,7 +156,10 @@ class EvaluationSummary:
     @property
     def judgements(self) -> list[Judgement]:
         """Success estimates and true outcomes of the episodes."""
-        return [Judgement(probability=r.probability, outcome=r.outcome) for r in self.results]
+        return [
+            Judgement(probability=r.probability, outcome=r.outcome, interval=r.interval)
+            for r in self.results
+        ]
 
     @cached_property
     def pictures(self) -> dict[str | None, dict[str, Estimate]]:

@@ -16,8 +16,14 @@ from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.evaluation.metrics.success_agreement import agreement, Judgement
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.success.calibration import Calibration, weighed, Weights
-from mtv_world_ros.success.estimator import capped, STATED_WEIGHTS
+from mtv_world_ros.success.doubts import NEAR_M
+from mtv_world_ros.success.estimator import (
+    capped,
+    estimate_of_futures,
+    STATED_WEIGHTS,
+)
 from mtv_world_ros.success.evidence import FEATURES
+from mtv_world_ros.success.share_fit import share_logit, ShareEstimate, ShareFit
 
 #: minimum number of episodes of known outcome
 MIN_EPISODES = 8
@@ -29,6 +35,8 @@ BEFORE = 'before'
 AFTER = 'after'
 #: judgements by a fit without the fault kind of the judged episode
 AFTER_KINDS = 'after_kinds'
+#: judgements by a fit without the simulated physics of the judged episode
+AFTER_PHYSICS = 'after_physics'
 #: judgements by the fit to all episodes: too good, because it contains the judged episode
 FITTED = 'fitted'
 #: judgements of recorded frames, by a fit to recorded frames
@@ -37,6 +45,8 @@ OBSERVED = 'observed'
 UNFORESEEN = 'unforeseen'
 #: judgements with only the last chunk imagined
 RESUMED = 'resumed'
+#: fraction of episodes whose imagined frames are farther from the drawn motion than the limit
+CONTRADICTING_FRACTION = 0.025
 #: baseline: every episode is called a success
 ALWAYS = 'always success'
 
@@ -53,6 +63,7 @@ class Sample:
         before: probabilities by seed with the stated weights; NaN = abstained.
         reasons: reasons of the first seed's estimate.
         kinds: faults of the policy that acted; empty = none, or not a scripted policy.
+        physics: name of the simulated physics; empty = a real recording, or not stated.
         observed: features of the estimate on the recorded frames; empty where it abstained, or
             they were not judged.
         resumed: features where all but the last chunk was seen.
@@ -65,6 +76,7 @@ class Sample:
     before: tuple[float, ...]
     reasons: tuple[str, ...]
     kinds: tuple[str, ...] = ()
+    physics: str = ''
     observed: Mapping[str, float] = field(default_factory=dict)
     resumed: Mapping[str, float] = field(default_factory=dict)
 
@@ -94,9 +106,10 @@ class Calibrated:
         samples: episodes of known outcome.
         judgements: a judgement of each sample, by the names above. `AFTER` leaves each task out
             of the fit that judges it, `AFTER_KINDS` each fault kind (of episodes without a fault
-            their task). `OBSERVED` is that of the recorded frames and `UNFORESEEN` that with all
-            but the last chunk seen and nothing foreseen, each by a fit of its own. `RESUMED`: with
-            all but the last chunk seen. `FITTED`: on what it was fitted to, thus too good.
+            their task), `AFTER_PHYSICS` each simulated physics. `OBSERVED` is that of the recorded
+            frames and `UNFORESEEN` that with all but the last chunk seen and nothing foreseen,
+            each by a fit of its own. `RESUMED`: with all but the last chunk seen. `FITTED`: on
+            what it was fitted to, thus too good.
     """
 
     calibration: Calibration
@@ -105,15 +118,18 @@ class Calibrated:
 
 
 def samples_of(
-    runs: Sequence[Sequence[EpisodeResult]], kinds: Mapping[str, tuple[str, ...]] | None = None
+    runs: Sequence[Sequence[EpisodeResult]],
+    kinds: Mapping[str, tuple[str, ...]] | None = None,
+    physics: Mapping[str, str] | None = None,
 ) -> list[Sample]:
     """Return the episodes of known outcome.
 
     Args:
         runs: runs of the same episodes, one run a seed.
         kinds: faults of the policies that acted, by episode; episodes may be missing.
+        physics: names of the simulated physics, likewise.
     """
-    known_kinds = kinds or {}
+    known_kinds, known_physics = kinds or {}, physics or {}
     by_name = [{result.episode: result for result in run} for run in runs]
     samples = []
     for name, first in sorted(by_name[0].items()):
@@ -128,6 +144,7 @@ def samples_of(
                     before=tuple(result.probability for result in found),
                     reasons=first.reasons,
                     kinds=known_kinds.get(name, ()),
+                    physics=known_physics.get(name, ''),
                     observed=first.observed,
                     resumed=first.resumed,
                 )
@@ -158,15 +175,20 @@ def calibrate(
     groups = [{s.task} for s in samples]
     fits = _fits_without(samples, groups, segmenter, l2)
     judgements = {
-        BEFORE: tuple(_judged(s, _mean_of(s.before)) for s in samples),
+        BEFORE: tuple(_judged(s, _before(s)) for s in samples),
         AFTER: _judged_by(fits, samples),
-        FITTED: tuple(_judged(s, _probability(fitted, s)) for s in samples),
-        ALWAYS: tuple(_judged(s, 1.0) for s in samples),
+        FITTED: tuple(_judged(s, _estimate(fitted, s)) for s in samples),
+        ALWAYS: tuple(_judged(s, ShareEstimate(1.0, nan, nan)) for s in samples),
     }
     if any(sample.kinds for sample in samples):
         groups = [set(s.kinds) or {f'no fault, {s.task}'} for s in samples]
         fits = _fits_without(samples, groups, segmenter, l2)
         judgements[AFTER_KINDS] = _judged_by(fits, samples)
+    if len({sample.physics for sample in samples}) > 1:
+        places = [{s.physics} for s in samples]
+        judgements[AFTER_PHYSICS] = _judged_by(
+            _fits_without(samples, places, segmenter, l2), samples
+        )
     special: dict[str, Any] = {}
     for name, others in (
         (OBSERVED, [sample.as_observed for sample in samples]),
@@ -224,21 +246,56 @@ def _judged_by(
 ) -> tuple[Judgement, ...]:
     """Return each sample judged by a fit of its own."""
     return tuple(
-        _judged(sample, nan if fit is None else _probability(fit, sample))
+        _judged(sample, _NO_ESTIMATE if fit is None else _estimate(fit, sample))
         for fit, sample in zip(fits, samples, strict=True)
     )
 
 
 def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]:
     """Return the fields of `Calibration`."""
+    futures = fit_futures(samples, l2)
     return {
         **_weights(samples, l2),
+        'futures': futures,
         'segmenter': segmenter,
         'tasks': tuple(sorted({sample.task for sample in samples})),
         'num_episodes': len(samples),
         'num_seeds': max(len(sample.before) for sample in samples),
         'l2': l2,
     }
+
+
+def fit_futures(samples: Sequence[Sample], l2: float) -> ShareFit | None:
+    """Return the fit of the share of futures that succeed; None = too few samples have one."""
+    pairs = [(f, sample.success) for sample in samples for f in sample.features if f]
+    odds = np.array([share_logit(features) for features, _ in pairs])
+    labels = np.array([success for _, success in pairs], np.bool_)
+    known = np.isfinite(odds)
+    odds, labels = odds[known], labels[known]
+    if len(odds) < MIN_EPISODES or len(set(labels.tolist())) < 2:
+        return None
+    scale = max(float(odds.std()), 1e-6)
+    rows = odds[:, None] / scale
+    # where few episodes tell, the share stays as it is: a slope of 1
+    logistic = fit_logistic(rows, labels, l2=l2, prior=np.array([scale]), non_negative=True)
+    likely = logistic.probability(rows)
+    design = np.column_stack([np.ones(len(rows)), rows])
+    curvature = (design.T * (likely * (1 - likely))) @ design + np.diag([1e-6, l2])
+    covariance = np.linalg.inv(curvature)
+    gaps = np.array([features.get('picture_gap', nan) for features, _ in pairs])
+    gaps = gaps[np.isfinite(gaps)]
+    limit = float(np.quantile(gaps, 1 - CONTRADICTING_FRACTION)) if len(gaps) else 0.0
+    return ShareFit(
+        bias=logistic.bias,
+        slope=float(logistic.weights[0]) / scale,
+        covariance=(
+            float(covariance[0, 0]),
+            float(covariance[0, 1]) / scale,
+            float(covariance[1, 1]) / scale**2,
+        ),
+        num_episodes=len(odds),
+        max_picture_gap_m=max(limit, NEAR_M),
+    )
 
 
 def _weights(samples: Sequence[Sample], l2: float) -> dict[str, Any]:
@@ -273,25 +330,43 @@ def _design(samples: Sequence[Sample]) -> tuple[FloatArray, BoolArray]:
     return np.array(rows, np.float64), np.array([success for _, success in pairs], np.bool_)
 
 
-def _probability(fit: dict[str, Any], sample: Sample) -> float:
+_NO_ESTIMATE = ShareEstimate(nan, nan, nan)
+
+
+def _estimate(fit: dict[str, Any], sample: Sample) -> ShareEstimate:
+    """Return the mean estimate of a sample over the seeds with a verdict."""
     calibration = Calibration(**fit)
-    return _mean_of(
-        [
-            capped(calibration.probability(features), features) if features else nan
-            for features in sample.features
-        ]
-    )
+    return _mean_of([_one_estimate(calibration, features) for features in sample.features])
 
 
-def _mean_of(probabilities: Sequence[float]) -> float:
+def _one_estimate(calibration: Calibration, features: Mapping[str, float]) -> ShareEstimate:
+    if not features:
+        return _NO_ESTIMATE
+    if isfinite(share_logit(features)) and calibration.futures is not None:
+        return estimate_of_futures(calibration.futures, features)
+    return ShareEstimate(capped(calibration.probability(features), features), nan, nan)
+
+
+def _before(sample: Sample) -> ShareEstimate:
+    """Return the mean estimate with the stated weights, or of the share of futures itself."""
+    return _mean_of([ShareEstimate(probability, nan, nan) for probability in sample.before])
+
+
+def _mean_of(estimates: Sequence[ShareEstimate]) -> ShareEstimate:
     """Return the mean over the seeds with a verdict; NaN if half of the seeds or more abstain."""
-    known = [value for value in probabilities if isfinite(value)]
-    return float(np.mean(known)) if 2 * len(known) > len(probabilities) else nan
+    known = [one for one in estimates if isfinite(one.probability)]
+    if 2 * len(known) <= len(estimates):
+        return _NO_ESTIMATE
+    return ShareEstimate(*np.mean(known, axis=0).tolist())
 
 
-def _judged(sample: Sample, probability: float) -> Judgement:
+def _judged(sample: Sample, estimate: ShareEstimate) -> Judgement:
     outcome = 'success' if sample.success else 'failure'
-    return Judgement(probability=probability, outcome=outcome)
+    return Judgement(
+        probability=estimate.probability,
+        outcome=outcome,
+        interval=(estimate.low, estimate.high),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

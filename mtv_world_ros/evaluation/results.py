@@ -30,6 +30,7 @@ class EpisodeResult:
         quality: PSNR, SSIM and LPIPS by view, if measured.
         probability: success estimate at the end of the last stretch; NaN = abstained.
         reasons: reasons of that estimate.
+        interval: interval of that estimate; NaN = not known.
         notes: defects of the recording, and rollouts that could not be imagined.
         seconds_per_chunk: mean time to imagine a chunk [s].
         seconds: seconds by stage of the episode's evaluation [s].
@@ -53,6 +54,7 @@ class EpisodeResult:
     seconds_per_chunk: float
     seconds: Mapping[str, float]
     has_ids: bool
+    interval: tuple[float, float] = (np.nan, np.nan)
     pictures: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     features: Mapping[str, float] = field(default_factory=dict)
     observed: Mapping[str, float] = field(default_factory=dict)
@@ -76,6 +78,8 @@ class EpisodeResult:
         read['rows'] = tuple(ScoreRow.from_json(row) for row in values['rows'])
         read['reasons'], read['notes'] = tuple(values['reasons']), tuple(values['notes'])
         read['probability'] = np.nan if values['probability'] is None else values['probability']
+        ends = values.get('interval') or (None, None)
+        read['interval'] = tuple(np.nan if end is None else float(end) for end in ends)
         for name in ('features', 'observed', 'resumed'):
             read[name] = _nan_for_none(values.get(name, {}))
         read['pictures'] = {k: _nan_for_none(v) for k, v in values.get('pictures', {}).items()}

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field
+from scipy.special import ndtri
+from scipy.stats import qmc
 
-from mtv_world_ros.core.config import Metres, Schema
+from mtv_world_ros.core.config import ListOf, Metres, Schema
 
 Friction = Annotated[float, Field(ge=0.01, le=10)]
 Thickness = Annotated[float, Field(ge=1e-4, le=0.1)]
@@ -36,6 +40,21 @@ class ContactSpread(Schema):
     )
 
 
+#: range of each contact parameter; that of the stiffness is a factor of the first settings
+RANGES = {
+    'grip_friction': (0.03, 3.0),
+    'table_friction': (0.15, 2.5),
+    'density': (60.0, 3000.0),
+    'finger_stiffness': (0.2, 3.0),
+}
+#: parameters whose range is a factor of the first settings
+FACTORS = frozenset({'finger_stiffness'})
+#: prior standard deviation of the logarithm of a contact parameter that was not fitted
+PRIOR_LOG_STD = 1.0
+#: prior standard deviation of the common camera error where the cameras were not measured [m]
+PRIOR_CAMERA_M = 0.002
+#: largest number of futures of a plan
+MAX_MOTIONS = 64
 #: recordings that must tell whether things slip before verdicts rest on numbers of contact
 ENOUGH_TELLING = 3
 
@@ -46,10 +65,29 @@ class ContactOrigin(Schema):
     by: str = Field(description='the command')
     recordings: int = Field(ge=0, description='that were looked at')
     telling: int = Field(ge=0, description='that tell whether things slip between fingers')
+    place: str | None = Field(
+        default=None,
+        description='robot cell of the recordings; null = older file, which holds everywhere',
+    )
+
+
+class ContactDraw(Schema):
+    """Joint sample of the contact parameters that make up for each other."""
+
+    grip_friction: Friction = Field(description='of fingers on what they touch')
+    table_friction: Friction = Field(description='of all else')
+    density: float = Field(ge=10, le=25_000, description='of objects [kg/m^3]')
+    finger_stiffness: float = Field(ge=0.1, le=1e6, description='of each finger [N/m]')
+
+
+@lru_cache
+def _standard_draws() -> np.ndarray:
+    """Return (`MAX_MOTIONS`, P) standard normal draws of the parameters, evenly spread."""
+    return ndtri(qmc.Sobol(len(RANGES), rng=np.random.default_rng(4)).random(MAX_MOTIONS))
 
 
 class ContactSettings(Schema):
-    """Numbers of contact, found in recorded episodes (`training/object_motion/contact_fit.py`)."""
+    """Contact parameters, found in recorded episodes (`physics/fitting/contact_fit.py`)."""
 
     fitted: ContactOrigin | None = Field(
         default=None, description='what compared these numbers with recordings; None = nothing did'
@@ -95,7 +133,36 @@ class ContactSettings(Schema):
     spread: ContactSpread = Field(
         default=ContactSpread(), description='how exactly all this is known'
     )
-    num_motions: int = Field(default=4, ge=1, le=64, description='the last ones disturbed')
+    draws: ListOf[ContactDraw] = Field(
+        default=(),
+        description='equally likely joint samples of friction, density and stiffness, one a '
+        'future; empty = futures differ independently by `spread`',
+    )
+    num_motions: int = Field(
+        default=4, ge=1, le=MAX_MOTIONS, description='the last ones disturbed'
+    )
+
+    def is_fitted_at(self, place: str) -> bool:
+        """Return True if the parameters were fitted on recordings of a robot cell.
+
+        Args:
+            place: name of the robot cell, see `EpisodeInfo.place`; empty = not stated.
+        """
+        return self.fitted is not None and not self.doubt and self.fitted.place in (None, place)
+
+    def as_prior(self) -> ContactSettings:
+        """Return the settings with the wide prior of the parameters in place of their fit.
+
+        It is the prior with which `mtv-world fit contact` begins: log-normal around these
+        settings, within `RANGES`. The first future keeps the settings.
+        """
+        factors = [getattr(self, name) if name in FACTORS else 1.0 for name in RANGES]
+        low, high = np.log(np.array(list(RANGES.values())).T * factors)
+        middle = np.log([getattr(self, name) for name in RANGES])
+        rows = np.exp(np.clip(middle + PRIOR_LOG_STD * _standard_draws(), low, high))
+        draws = [ContactDraw(**dict(zip(RANGES, row, strict=True))) for row in rows.tolist()]
+        spread = self.spread.replace(camera_m=max(self.spread.camera_m, PRIOR_CAMERA_M))
+        return self.model_copy(update={'draws': tuple(draws), 'spread': spread})
 
     @property
     def doubt(self) -> str:

@@ -29,6 +29,9 @@ class ForeseenMotions:
         weights: (K,) weight of each motion.
         step_s: time between rows [s].
         is_begun: whether the motions begin with the rollout, not later.
+        is_fitted: contact parameters were fitted in this robot cell; False = they are drawn from
+            the prior, and each motion may be the one that this robot makes every time.
+        shown: index of the motion that the pictures show.
     """
 
     names: tuple[str, ...]
@@ -39,6 +42,8 @@ class ForeseenMotions:
     weights: FloatArray
     step_s: float = 0.1
     is_begun: bool = True
+    is_fitted: bool = True
+    shown: int = 0
 
     def at_frames(self, plan: ChunkPlan) -> FloatArray:
         """Return centres (K, 1 + T, O, 3) at the start and the frames kept of a chunk [m].
@@ -71,4 +76,6 @@ def foreseen_of(
         weights=np.array([motion.weight for motion in objects.motions]),
         step_s=objects.tracked.step_s,
         is_begun=is_begun,
+        is_fitted=objects.tracked.is_fitted,
+        shown=objects.shown,
     )

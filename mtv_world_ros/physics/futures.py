@@ -48,7 +48,8 @@ def draw_futures(
     The same number always gives the same draws, so that plans are compared under the same ones.
 
     Args:
-        settings: settings of contact; their spread says how far futures differ.
+        settings: settings of contact. Futures after the first take the joint samples of their
+            `draws` in turn; without them each parameter differs by its `spread`.
         solids: O, as found.
         drives: drives of the arms.
     """
@@ -68,25 +69,26 @@ def _drawn(
     def scaled(deviation: float) -> float:
         return float(np.exp(share * deviation * rng.normal()))
 
-    changed = settings.model_copy(
-        update={
-            'grip_friction': settings.grip_friction * scaled(spread.grip),
-            'table_friction': settings.table_friction * scaled(spread.friction),
-            'finger_stiffness': settings.finger_stiffness * scaled(spread.force),
-        }
-    )
-    heavier = scaled(spread.weight)
-    changed = changed.model_copy(
-        update={'density': settings.density * heavier, 'tray_kg': settings.tray_kg * heavier}
-    )
+    changed = {
+        'grip_friction': settings.grip_friction * scaled(spread.grip),
+        'table_friction': settings.table_friction * scaled(spread.friction),
+        'finger_stiffness': settings.finger_stiffness * scaled(spread.force),
+        'density': settings.density * scaled(spread.weight),
+    }
+    if number and settings.draws:
+        changed = settings.draws[(number - 1) % len(settings.draws)].model_dump()
+        changed['finger_damping'] = (
+            settings.finger_damping * changed['finger_stiffness'] / settings.finger_stiffness
+        )
+    changed['tray_kg'] = settings.tray_kg * changed['density'] / settings.density
     zeros = share * spread.zero_rad * rng.normal(size=len(drives.names))
     delay_s = settings.delay_s + share * spread.delay_s * abs(float(rng.normal()))
     shift = share * spread.camera_m * np.array([*rng.normal(size=2), 0.0])
     if settings.table_varies:  # else its height is known, whatever the cameras say
         shift[2] = share * spread.camera_m * np.random.default_rng((3, number)).normal()
     return Future(
-        settings=changed.model_copy(update={'table_m': settings.table_m + shift[2]}),
-        solids=tuple(shifted(_disturbed(solid, changed, share, rng), shift) for solid in solids),
+        settings=settings.model_copy(update={**changed, 'table_m': settings.table_m + shift[2]}),
+        solids=tuple(shifted(_disturbed(solid, settings, share, rng), shift) for solid in solids),
         zeros=np.where(drives.fingers, 0.0, zeros),
         delay_s=delay_s,
         shift=shift,

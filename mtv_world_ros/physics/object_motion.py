@@ -130,6 +130,11 @@ class TrackedObjects(Protocol):
         """Reason why the simulated motions allow no verdict; empty if they do."""
         ...
 
+    @property
+    def is_fitted(self) -> bool:
+        """Return True if contact parameters were fitted in this robot cell."""
+        ...
+
     def advance(
         self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
     ) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
@@ -186,6 +191,10 @@ class ObjectMotionModel(Protocol):
 
     def with_robot(self, robot: RobotModel) -> ObjectMotionModel:
         """Return the same for a robot of the same joints and tools."""
+        ...
+
+    def at_place(self, place: str) -> ObjectMotionModel:
+        """Return the model for a robot cell, with wide priors if it was fitted elsewhere."""
         ...
 
 

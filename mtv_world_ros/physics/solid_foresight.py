@@ -44,7 +44,7 @@ _TABLE_REACH_M = 2.0
 
 
 class SolidForesight:
-    """Finds objects in a frame, and predicts their motion under plans in several futures.
+    """Find objects in a frame, and predicts their motion under plans in several futures.
 
     Args:
         robot: any whose base stands still.
@@ -64,6 +64,8 @@ class SolidForesight:
         threads: int = 1,
     ) -> None:
         self.robot, self.response, self.settings = robot, response, settings
+        #: contact parameters were fitted in the robot cell; else futures draw them from the prior
+        self.is_fitted = True
         self._threads = threads
         self.engine = Engine(Arms(robot, response), threads)
         self.engine.scene_of(())
@@ -75,7 +77,21 @@ class SolidForesight:
 
     def with_robot(self, robot: RobotModel) -> SolidForesight:
         """Return the same for a robot of the same joints and tools."""
-        return SolidForesight(robot, self.response, self.settings, self._threads)
+        other = SolidForesight(robot, self.response, self.settings, self._threads)
+        other.is_fitted = self.is_fitted
+        return other
+
+    def at_place(self, place: str) -> SolidForesight:
+        """Return the foresight for a robot cell: with the wide prior if it was fitted elsewhere.
+
+        Args:
+            place: name of the robot cell; empty = not stated.
+        """
+        if not self.is_fitted or self.settings.is_fitted_at(place):
+            return self
+        other = copy.copy(self)
+        other.settings, other.is_fitted = self.settings.as_prior(), False
+        return other
 
     def find(
         self,
@@ -213,6 +229,11 @@ class TrackedSolids:
     def commands_a_step(self) -> int:
         """Number of joint positions that `advance` takes per step."""
         return COMMANDS_A_STEP
+
+    @property
+    def is_fitted(self) -> bool:
+        """Return True if contact parameters were fitted in this robot cell."""
+        return self.foresight.is_fitted
 
     @property
     def centres(self) -> FloatArray:

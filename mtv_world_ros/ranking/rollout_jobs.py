@@ -123,7 +123,7 @@ class StoredEstimate:
     @property
     def success(self) -> float:
         """1 or 0; NaN where there is no verdict, see `verdict`."""
-        return verdict(self.probability)
+        return verdict(self.probability, self.interval)
 
 
 _NOT_MEASURED = StoredEstimate.stated(nan, 'abstains: not measured')

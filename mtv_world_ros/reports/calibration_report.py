@@ -11,6 +11,7 @@ from mtv_world_ros.core.files import write_json, write_whole
 from mtv_world_ros.evaluation.fit import (
     AFTER,
     AFTER_KINDS,
+    AFTER_PHYSICS,
     ALWAYS,
     BEFORE,
     Calibrated,
@@ -24,6 +25,7 @@ from mtv_world_ros.evaluation.metrics.success_agreement import agreement, reliab
 from mtv_world_ros.reports.charts import reliability_chart
 from mtv_world_ros.success.calibration import HorizonCurve, Weights
 from mtv_world_ros.success.estimator import FAILURE_BELOW, SUCCESS_FROM
+from mtv_world_ros.success.share_fit import ShareFit
 
 _COLUMNS = {
     'num_abstained': 'no verdict',
@@ -36,9 +38,10 @@ _COLUMNS = {
     'false_success_rate': 'false-success rate',
 }
 _ROWS = {
-    BEFORE: 'before: stated weights',
+    BEFORE: 'before: stated weights, or the share of futures as it is',
     AFTER: 'after: each task left out of the fit',
     AFTER_KINDS: 'after: each fault kind left out of the fit',
+    AFTER_PHYSICS: 'after: each physics left out of the fit',
     OBSERVED: 'the recorded frames, each kind or task left out of a fit to them',
     RESUMED: 'all but the last chunk seen, each kind or task left out',
     UNFORESEEN: 'the same with nothing foreseen, each kind or task left out of a fit to them',
@@ -78,9 +81,21 @@ def markdown(found: Calibrated, horizon: HorizonCurve | None) -> str:
         scores=Table(head=['', *_COLUMNS.values()], rows=scores),
         tasks=_groups(found, AFTER, 'task', lambda sample: (sample.task,)),
         kinds=_kinds(found),
+        futures='' if calibration.futures is None else _futures(calibration.futures),
         weights={title: (_weights(w), w.bias) for title, w in weights.items() if w},
         horizon='' if horizon is None else _horizon_text(horizon),
         made=calibration.made,
+    )
+
+
+def _futures(fit: ShareFit) -> str:
+    """Return the fit of the share of simulated futures, in words."""
+    deviations = [f'{fit.covariance[k] ** 0.5:.2f}' for k in (0, 2)]
+    return (
+        f'logit of the probability = {fit.bias:.2f} (standard error {deviations[0]}) + '
+        f'{fit.slope:.2f} ({deviations[1]}) x log odds of the share, on {fit.num_episodes} '
+        f'estimates. Imagined frames contradict the drawn motion from '
+        f'{1e3 * fit.max_picture_gap_m:.0f} mm on.'
     )
 
 
@@ -101,7 +116,7 @@ def _summary(found: Calibrated) -> str:
         f'`{calibration.segmenter}`, L2 {calibration.l2:g}. Scores are of the episodes with an '
         'estimate; accuracies and the false-success rate, the share of real failures that were '
         f'called a success, of those with a verdict: a success from {SUCCESS_FROM} on, a failure '
-        f'below {FAILURE_BELOW}.'
+        f'below {FAILURE_BELOW}, unless the interval reaches the opposite verdict.'
     )
 
 

@@ -136,7 +136,7 @@ def _bin(score: float) -> str:
 
 def _estimate(result: EpisodeResult) -> str:
     """Return the verdict on the success estimate; empty if the outcome is not known."""
-    judged = verdict(result.probability)
+    judged = verdict(result.probability, result.interval)
     if not isfinite(judged):
         return 'no verdict'
     if result.outcome not in ('success', 'failure'):

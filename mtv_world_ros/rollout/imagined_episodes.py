@@ -285,7 +285,7 @@ class _EpisodeRun:
             'seed': self._seed,
             'num_chunks': self._num_chunks,
             **{key: value if isfinite(value) else None for key, value in numbers.items()},
-            'verdict': verdict_word(probability),
+            'verdict': verdict_word(probability, (low, high)),
             'reasons': '' if success is None else '; '.join(success.reasons),
         }
 

@@ -56,7 +56,7 @@ _YAML = ('.yaml', '.yml')
 
 
 class WorldModel(Protocol):
-    """Predicts one chunk of frames."""
+    """Predict one chunk of frames."""
 
     @property
     def spec(self) -> WorldModelSpec:
@@ -95,7 +95,7 @@ class WorldModel(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pipeline:
-    """Imagines and judges; stateless: `begin` returns the rollout, which holds the state.
+    """Imagine and judges; stateless: `begin` returns the rollout, which holds the state.
 
     Attributes:
         robot: joints, limits and tools.
@@ -111,6 +111,8 @@ class Pipeline:
         camera_checker: compares the first frames with the arm's outline; None = no check.
         grounds: what estimates that are not calibrated may rest on.
         drawing: draws the plan for people where the control itself is no video.
+        checks_place: futures are drawn from a wide prior where contact parameters were not fitted
+            in the robot cell of the observation; False for fits, which state a bare estimate.
         picture_fits: fits to rollouts without foreseen object motion, for `without_foresight`;
             None = the estimate stays as it is, e.g. bare.
         scene_keeper: keeps the background of rollouts as real frames showed it; None = the model
@@ -129,6 +131,7 @@ class Pipeline:
     camera_checker: CameraChecker | None = None
     grounds: Grounds = Grounds()
     drawing: TrajectoryVideo = TrajectoryVideo(config=TrajectoryVideoConfig())
+    checks_place: bool = False
     picture_fits: Fits | None = None
     scene_keeper: SceneKeeper | None = None
 
@@ -222,6 +225,7 @@ class Pipeline:
         return replace(
             pipeline,
             grounds=Grounds.of(doubt, calibration is not None),
+            checks_place=True,
             picture_fits=load_fits(opened.folder, of_pictures=True) if motion else None,
         )
 
@@ -304,6 +308,15 @@ class Pipeline:
             horizon=fits.horizon,
             grounds=Grounds.of('', fits.calibration is not None),
         )
+
+    def is_fitted_at(self, place: str) -> bool:
+        """Return True if futures are drawn as they were fitted, in a robot cell.
+
+        Args:
+            place: name of the robot cell; empty = not stated.
+        """
+        model = self.object_motion
+        return model is None or not self.checks_place or model.at_place(place) is model
 
     def begin(
         self, observation: Observation, options: RolloutOptions = DEFAULT_OPTIONS
@@ -531,8 +544,11 @@ class Pipeline:
 
     def _objects_in(self, observation: Observation) -> ObjectForesight:
         """Return the objects of an episode that begins at an observation."""
+        model = self.object_motion if self.control.shows_objects else None
+        if model is not None and self.checks_place:
+            model = model.at_place(observation.place)
         return ObjectForesight(
-            model=self.object_motion if self.control.shows_objects else None,
+            model=model,
             segmenter=self.segmenter,
             robot=self.robot,
             first=observation,

@@ -111,9 +111,10 @@ def mean_of_seeds(predictions: Sequence[Prediction]) -> Prediction:
 def mean_estimate(estimates: Sequence[SuccessEstimate]) -> SuccessEstimate:
     """Return the mean over rollouts that differ in their seeds alone.
 
-    `spread` is their standard deviation; the interval is Student's interval of the mean: it bounds
-    the mean of many rollouts of this world model, not reality. The mean abstains if most rollouts
-    do. J and features are those of the first rollout.
+    `spread` is their standard deviation. The interval holds Student's interval of the mean, which
+    bounds the mean of many rollouts of this world model, and the mean interval of one rollout:
+    noise of the world model alone says nothing of what else is unknown. The mean abstains if most
+    rollouts do. J and features are those of the first rollout.
     """
     first = estimates[0]
     known = [e.probability for e in estimates if isfinite(e.probability)]
@@ -138,9 +139,11 @@ def mean_estimate(estimates: Sequence[SuccessEstimate]) -> SuccessEstimate:
     half = quantile * spread / sqrt(len(known)) if degrees else 1.0
     text = (
         f'mean of {len(known)} of {num} seeds, spread {spread:.2f}; '
-        'the interval is of the mean, given the world model'
+        'the interval holds that of the mean, given the world model, and that of one seed'
     )
-    interval = (max(mean - half, 0.0), min(mean + half, 1.0))
+    ends = [e.interval for e in estimates if isfinite(e.probability)]
+    own_low, own_high = np.mean(ends, axis=0).tolist()
+    interval = (max(min(mean - half, own_low), 0.0), min(max(mean + half, own_high), 1.0))
     return replace(
         first,
         probability=mean,

@@ -220,4 +220,4 @@ class ImaginedWorld:
         success = self.success
         if success is None or not isfinite(success.probability):
             return None
-        return verdict(success.probability) == 1
+        return verdict(success.probability, success.interval) == 1

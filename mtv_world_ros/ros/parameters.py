@@ -166,6 +166,12 @@ class Settings(LiveSettings, NodeSettings):
         (),
         "Names of the objects, e.g. red block; `['']` = the ones that `describer` names.",
     )
+    place: str = parameter(
+        '',
+        'Name of this robot cell, as in `mtv-world fit contact --place`. Where contact parameters '
+        'were fitted in another one, futures are drawn from a wide prior, and most successes stay '
+        "open. Simulated episodes are of 'simulator/PHYSICS'.",
+    )
     seed: int = parameter(0, 'Seed of the noise; chunk k uses seed + k.', (0, 2**31 - 1))
     num_seeds: int = parameter(
         1,

@@ -9,6 +9,7 @@ import time
 import numpy as np
 
 from mtv_world_ros.core.data_types import ByteArray, FloatArray, JointTrajectory, Observation
+from mtv_world_ros.data.episode import simulated_place
 from mtv_world_ros.robot.plan import Plan
 from mtv_world_ros.robot.resample import resample
 from mtv_world_ros.simulation.collect.record import START_NS
@@ -132,4 +133,5 @@ class SimulatedWorld:
             frames=np.stack([seen.images[camera.view] for camera in cameras]),
             positions=seen.positions,
             stamp_ns=START_NS + round(seen.time_s * 1e9),
+            place=simulated_place(self._sim.physics),
         )

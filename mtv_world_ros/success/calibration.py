@@ -1,4 +1,4 @@
-"""Fits that `mtv-world fit success` stores with a checkpoint: logistic and trusted horizon."""
+"""Fit that `mtv-world fit success` stores with a checkpoint: logistic and trusted horizon."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from mtv_world_ros.core.data_types import CameraModel
 from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.core.files import write_whole
 from mtv_world_ros.success.fitted_to import FittedTo, Setting
+from mtv_world_ros.success.share_fit import ShareFit
 
 CALIBRATION = 'success_calibration.json'
 HORIZON = 'horizon.json'
@@ -38,13 +39,10 @@ _Known = Annotated[float, Field(ge=-1, le=1), WrapValidator(_or_nan)]
 def weighed(features: Mapping[str, float], name: str) -> float:
     """Return a feature's value for the logistic; NaN = unknown.
 
-    Doubts count only if negative, and only where no motion is foreseen: what is foreseen to move
-    is moved by something, which may push it with shut fingers.
+    Doubts count only if negative.
     """
     value = features.get(name, nan)
-    if name not in DOUBTS:
-        return value
-    return nan if isfinite(features.get('foreseen', nan)) else min(value, 0.0)
+    return min(value, 0.0) if name in DOUBTS else value
 
 
 class Weights(Schema):
@@ -87,7 +85,12 @@ class Weights(Schema):
 class Calibration(Weights):
     """Weights that `mtv-world fit success` fitted.
 
+    The weights are those of imagined frames. They are not used where object motion is simulated
+    and drawn into the control: the frames show what was drawn, and are no second witness.
+
     Attributes:
+        futures: for rollouts with simulated object motion: the share of futures that succeed
+            decides; None = older file, or rollouts without simulated motion.
         observed: for frames that were seen, not imagined, of the same episodes; None = as for
             those that are imagined.
         unforeseen: for imagined frames where no motion is foreseen, as of a rollout that begins
@@ -103,6 +106,7 @@ class Calibration(Weights):
             those of before 0.2.0, whose foresight was another.
     """
 
+    futures: ShareFit | None = None
     observed: Weights | None = None
     unforeseen: Weights | None = None
     segmenter: str
@@ -114,13 +118,11 @@ class Calibration(Weights):
     made: Mapping[str, str] = {}
     fitted_to: FittedTo | None = None
 
-    def given(self, is_real: bool, is_foreseen: bool = True) -> Weights:
-        """Return the weights for real frames, or imagined ones with or without foresight."""
+    def given(self, is_real: bool) -> Weights:
+        """Return the weights for real frames, or for imagined ones without simulated motion."""
         if is_real:
             return self.observed or self
-        if is_foreseen or self.is_of_pictures:
-            return self
-        return self.unforeseen or self
+        return self if self.is_of_pictures else self.unforeseen or self
 
     @property
     def is_of_pictures(self) -> bool:
@@ -228,7 +230,7 @@ def save_fit(folder: Path, fit: Calibration | HorizonCurve, *, of_pictures: bool
 
 
 class Fits(NamedTuple):
-    """Fits of a checkpoint to rollouts of one kind; None = not fitted."""
+    """Fit of a checkpoint to rollouts of one kind; None = not fitted."""
 
     calibration: Calibration | None = None
     horizon: HorizonCurve | None = None

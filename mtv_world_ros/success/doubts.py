@@ -2,29 +2,38 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import isfinite, nan
+from math import isfinite, log, nan
 
 import numpy as np
-from scipy.special import bdtrc
 
 from mtv_world_ros.core.data_types import FloatArray, SuccessEstimate
-from mtv_world_ros.success.estimator import capped, stated_probability
-from mtv_world_ros.success.evidence import MAX_MARGIN
 
 #: an object nearer than this to one of its futures moved as foreseen [m]; masks of small pictures
 #: are no more exact
 NEAR_M = 0.035
 #: minimum object motion for evidence about contact [m]
 _MIN_MOTION_M = 0.03
-#: maximum fraction of chunks with unforeseen ends under the fitted physics
-_MAX_UNFORESEEN_FRACTION = 0.15
-#: p-value below which the fitted physics is rejected
-_MAX_P_VALUE = 0.01
-#: number of last chunks in the test
-_NUM_CHUNKS = 24
+
+
+@dataclass(frozen=True, slots=True)
+class WatchSettings:
+    """Settings of the sequential test of the fitted physics.
+
+    Attributes:
+        max_unforeseen_fraction: largest fraction of comparisons with an unforeseen end under the
+            fitted physics.
+        other_unforeseen_fraction: fraction under another physics, for which the test is fastest.
+        run_length: mean number of comparisons to a false alarm is at least this.
+    """
+
+    max_unforeseen_fraction: float = 0.05
+    other_unforeseen_fraction: float = 0.4
+    run_length: int = 200
+
+
+WATCH = WatchSettings()
 SAYS = 'the physics here is not the one that was fitted'
 
 
@@ -46,35 +55,68 @@ def unforeseen(foreseen: FloatArray, real: FloatArray) -> float:
 
 
 class PhysicsWatch:
-    """Tests whether executed chunks end as foreseen, by a binomial test over the last ones."""
+    """Sequential test whether executed chunks end as simulated, over all rollouts.
+
+    A cumulative sum of e-values (CUSUM; Shin, Ramdas and Rinaldo, "E-detectors", 2022): each
+    comparison multiplies the evidence by the ratio of its likelihoods under another and under the
+    fitted physics, never below 1. If at most `max_unforeseen_fraction` of comparisons end
+    unforeseen under the fitted physics, a false alarm comes after `run_length` comparisons or more
+    in the mean. After an unforeseen end, the rest of a rollout does not count: it follows from it.
+    """
+
+    _log_evidence: float
+    _is_alarm: bool
+    _num_compared: int
+    _num_unforeseen: int
+    _diverged: int | None
 
     def __init__(self) -> None:
-        self._unforeseen: deque[bool] = deque(maxlen=_NUM_CHUNKS)
+        self.forget()
 
-    def take(self, away_m: float) -> None:
-        """Add the distance of a chunk's end from the nearest future [m]; NaN = no evidence."""
-        if np.isfinite(away_m):
-            self._unforeseen.append(away_m > NEAR_M)
+    def take(self, away_m: float, rollout: int) -> None:
+        """Add the end of a chunk.
+
+        Args:
+            away_m: distance from the nearest future [m]; NaN = no evidence.
+            rollout: number of the rollout.
+        """
+        if not np.isfinite(away_m) or rollout == self._diverged:
+            return
+        is_unforeseen = bool(away_m > NEAR_M)
+        if is_unforeseen:
+            self._diverged = rollout
+        self._num_compared += 1
+        self._num_unforeseen += is_unforeseen
+        fitted, other = WATCH.max_unforeseen_fraction, WATCH.other_unforeseen_fraction
+        ratio = other / fitted if is_unforeseen else (1 - other) / (1 - fitted)
+        limit = log(WATCH.run_length)
+        self._log_evidence = min(max(self._log_evidence + log(ratio), 0.0), limit)
+        if self._log_evidence == limit:
+            self._is_alarm = True
+        elif self._log_evidence == 0.0:
+            self._is_alarm = False
 
     def forget(self) -> None:
         """Begin anew: another task, or another fit."""
-        self._unforeseen.clear()
+        self._log_evidence, self._is_alarm = 0.0, False
+        self._num_compared = self._num_unforeseen = 0
+        self._diverged = None
 
     @property
     def doubt(self) -> str:
         """Reason why the fitted physics does not hold here; empty if it holds."""
-        count, of = sum(self._unforeseen), len(self._unforeseen)
-        if not of or bdtrc(count - 1, of, _MAX_UNFORESEEN_FRACTION) >= _MAX_P_VALUE:
+        if not self._is_alarm:
             return ''
         return (
-            f'{SAYS}: {count} of the last {of} executed chunks in which an object moved ended '
-            'where no future foresaw it; run mtv-world fit contact on recordings of this place'
+            f'{SAYS}: {self._num_unforeseen} of {self._num_compared} executed chunks in which an '
+            'object moved ended where no future foresaw it; run mtv-world fit contact on '
+            'recordings of this place'
         )
 
     @property
     def text(self) -> str:
         """Text for `/diagnostics`."""
-        of = len(self._unforeseen)
+        of = self._num_compared
         return self.doubt or (
             f'as it was fitted, by {of} executed chunks' if of else 'not compared yet'
         )
@@ -106,6 +148,16 @@ _SHRINKAGE = 0.5
 _MIN_HALF_WIDTH = 0.35
 
 
+def shrunk(probability: float, interval: tuple[float, float]) -> tuple[float, tuple[float, float]]:
+    """Return a probability nearer to 0.5, and a wider interval."""
+    middle = 0.5 + (1 - _SHRINKAGE) * (probability - 0.5)
+    low, high = interval
+    return middle, (
+        max(min(low, middle - _MIN_HALF_WIDTH), 0.0),
+        min(max(high, middle + _MIN_HALF_WIDTH), 1.0),
+    )
+
+
 def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
     """Return a less certain estimate, for foreseen motions under a doubtful physics.
 
@@ -116,12 +168,7 @@ def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
     reasons = (doubt, *estimate.reasons)
     if not isfinite(estimate.probability):
         return replace(estimate, reasons=reasons)
-    middle = 0.5 + (1 - _SHRINKAGE) * (estimate.probability - 0.5)
-    low, high = estimate.interval
-    interval = (
-        max(min(low, middle - _MIN_HALF_WIDTH), 0.0),
-        min(max(high, middle + _MIN_HALF_WIDTH), 1.0),
-    )
+    middle, interval = shrunk(estimate.probability, estimate.interval)
     return replace(estimate, probability=middle, interval=interval, reasons=reasons)
 
 
@@ -159,35 +206,13 @@ class Grounds:
         )
 
     def bear(self, estimate: SuccessEstimate) -> SuccessEstimate:
-        """Return an estimate of imagined frames by what it may rest on: none if by nothing.
-
-        Where pictures are no ground, foreseen motions alone decide.
-        """
+        """Return an estimate of imagined frames by what it may rest on: none if by nothing."""
         if estimate.is_calibrated or not isfinite(estimate.probability):
             return estimate
         is_foreseen = isfinite(estimate.features.get('foreseen', nan))
-        if is_foreseen and self.pictures:
-            estimate = _foreseen_alone(estimate)
         refusal = self.foreseen if is_foreseen else self.pictures
         if not refusal:
             return estimate
         low, high = estimate.interval
         without = f'without this doubt {estimate.probability:.2f} [{low:.2f}, {high:.2f}]'
         return doubted(estimate, refusal=f'{refusal}; {without}')
-
-
-def _foreseen_alone(estimate: SuccessEstimate) -> SuccessEstimate:
-    """Return an estimate by foreseen motions; its interval holds whatever pictures could show."""
-    known = {name: estimate.features.get(name, nan) for name in ('foreseen', 'released')}
-    low, middle, high = (
-        capped(stated_probability({**known, 'margin': margin}), known)
-        for margin in (-MAX_MARGIN, nan, MAX_MARGIN)
-    )
-    low = 0.0 if known['released'] == 0 else low
-    text = 'by foreseen motions alone: imagined pictures of this checkpoint were never calibrated'
-    return replace(
-        estimate,
-        probability=middle,
-        interval=(low, high),
-        reasons=(text, *estimate.reasons),
-    )

@@ -13,11 +13,19 @@ from mtv_world_ros.core.data_types import FloatArray, SuccessEstimate
 from mtv_world_ros.core.errors import CannotTell, ConfigError, nearest
 from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
 from mtv_world_ros.success.calibration import Calibration, DOUBTS, weighed
+from mtv_world_ros.success.doubts import shrunk
 from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
 from mtv_world_ros.success.fitted_to import Setting
-from mtv_world_ros.success.foreseen import foreseen_ends, foreseen_feature, ForeseenEnds
+from mtv_world_ros.success.foreseen import (
+    foreseen_ends,
+    foreseen_feature,
+    ForeseenEnds,
+    picture_gap,
+    PictureGap,
+)
 from mtv_world_ros.success.relations import Margin
 from mtv_world_ros.success.rollout_memory import Footage, remember, RolloutMemory
+from mtv_world_ros.success.share_fit import ShareEstimate, ShareFit
 from mtv_world_ros.success.situation import grippers_open, OPEN_SHARE
 from mtv_world_ros.success.task import load_tasks, match_task, object_called, TaskSpec
 from mtv_world_ros.success.views import Views
@@ -30,22 +38,44 @@ SUCCESS_FROM = 0.75
 FAILURE_BELOW = 0.5
 
 
-def verdict(probability: float) -> float:
-    """Return 1 = a success, 0 = a failure, NaN = open, or the estimator abstained (NaN)."""
+def verdict(probability: float, interval: tuple[float, float] = (nan, nan)) -> float:
+    """Return 1 = a success, 0 = a failure, NaN = open, or the estimator abstained.
+
+    The verdict is open if the probability is between `FAILURE_BELOW` and `SUCCESS_FROM`, or if
+    the interval reaches the opposite verdict.
+
+    Args:
+        probability: of success; NaN = abstained.
+        interval: of the probability; NaN = not known.
+    """
+    low, high = interval
     if probability >= SUCCESS_FROM:
-        return 1.0
-    return 0.0 if probability < FAILURE_BELOW else nan
+        return nan if low < FAILURE_BELOW else 1.0
+    if probability < FAILURE_BELOW:
+        return nan if high >= SUCCESS_FROM else 0.0
+    return nan
 
 
-def verdict_word(probability: float) -> str:
+def verdict_word(probability: float, interval: tuple[float, float] = (nan, nan)) -> str:
     """Return `success`, `failure`, `open`, or `abstains` where the probability is NaN."""
     if isnan(probability):
         return 'abstains'
-    return {1.0: 'success', 0.0: 'failure'}.get(verdict(probability), 'open')
+    return {1.0: 'success', 0.0: 'failure'}.get(verdict(probability, interval), 'open')
 
 
 __all__ = ['JudgedChunk', 'SuccessEstimator', 'load_tasks']
 
+#: why no estimate rests on the futures as they were fitted
+NOT_FITTED_HERE = (
+    'contact parameters were not fitted on this robot, so that futures are drawn from a wide '
+    'prior; run mtv-world fit contact on recordings of this robot'
+)
+#: objection to calibrations of earlier versions
+_COUNTED_TWICE = (
+    'uncalibrated: the calibration of this checkpoint counts frames as evidence beside the motion '
+    'that was drawn into them; run mtv-world fit success again'
+)
+_SHARE = 'the share of simulated futures that succeed'
 #: largest probability of a task that cannot be done yet: a gripper that has to be open is closed,
 #: or an object that has to move has not moved
 UNDONE_PROBABILITY = 0.1
@@ -53,7 +83,7 @@ UNDONE_PROBABILITY = 0.1
 
 #: logit per unit of a feature, used where no calibration holds; see `evidence.FEATURES` and
 #: `calibration.weighed`
-STATED_WEIGHTS = {'margin': 1.5, 'goal': 1.0, 'grasp': 8.0, 'carry': 0.5, 'foreseen': 1.5}
+STATED_WEIGHTS = {'margin': 1.5, 'goal': 1.0, 'grasp': 8.0, 'carry': 0.5}
 
 
 def stated_probability(features: Mapping[str, float]) -> float:
@@ -67,6 +97,8 @@ def capped(probability: float, features: Mapping[str, float]) -> float:
     closed = features.get('released', nan) == 0.0
     # a rollout may begin where the task is all but done: then the margin is small
     left = features.get('moved', nan) == 0.0 and features.get('margin', nan) <= -MAX_MARGIN
+    if isfinite(features.get('foreseen', nan)):
+        left = False  # simulated motion tells; frames show the motion that was drawn
     return min(probability, UNDONE_PROBABILITY) if closed or left else probability
 
 
@@ -80,6 +112,27 @@ _STILL_CLOSED = {
 }
 
 
+def estimate_of_futures(
+    fit: ShareFit, features: Mapping[str, float], *, is_fitted: bool = True
+) -> ShareEstimate:
+    """Return the probability of success from the features of simulated futures.
+
+    Frames count where they contradict the drawn motion: the estimate is then less sure.
+
+    Args:
+        fit: of the share of futures that succeed.
+        features: of an estimate: `foreseen`, `futures`, `released` and `picture_gap`.
+        is_fitted: contact parameters were fitted in this robot cell.
+    """
+    share, number = (1 + features['foreseen']) / 2, features['futures']
+    probability, low, high = fit.estimate(share, number, is_fitted=is_fitted)
+    if features.get('picture_gap', nan) > fit.max_picture_gap_m:
+        probability, (low, high) = shrunk(probability, (low, high))
+    if features.get('released', nan) == 0.0:
+        low, probability = 0.0, min(probability, UNDONE_PROBABILITY)
+    return ShareEstimate(probability, low, max(high, probability))
+
+
 class JudgedChunk(NamedTuple):
     """The estimate after a chunk, and the memory for the next chunk."""
 
@@ -88,7 +141,7 @@ class JudgedChunk(NamedTuple):
 
 
 class SuccessEstimator:
-    """Judges rollouts of known tasks."""
+    """Judge rollouts of known tasks."""
 
     def __init__(
         self,
@@ -169,7 +222,11 @@ class SuccessEstimator:
             if ends is None:
                 return JudgedChunk(_abstains(reason, views, subjects), memory)
             evidence = Evidence.none(reason)
-        return JudgedChunk(self._judge(task, evidence, views, subjects, ends, is_real), memory)
+        if ends is None or foreseen is None:
+            return JudgedChunk(self._judge(task, evidence, views, subjects, is_real), memory)
+        gap = picture_gap(views, foreseen, [bound[role] for role in task.movers])
+        judged = self._judge_futures(task, evidence, views, subjects, ends, gap)
+        return JudgedChunk(judged, memory)
 
     def foresee(
         self, foreseen: ForeseenMotions, instruction: str, memory: RolloutMemory | None = None
@@ -200,53 +257,79 @@ class SuccessEstimator:
         known = '; '.join(task.instruction for task in self.tasks) or 'none'
         raise CannotTell(f"'{instruction}' is no known task (known: {known})")
 
+    def _judge_futures(
+        self,
+        task: TaskSpec,
+        evidence: Evidence,
+        views: Views,
+        subjects: Sequence[int],
+        ends: ForeseenEnds,
+        gap: PictureGap | None,
+    ) -> SuccessEstimate:
+        """Return the estimate of simulated futures, which decide alone."""
+        features = {
+            **evidence.features,
+            'foreseen': foreseen_feature(ends),
+            'futures': ends.num_effective,
+            'picture_gap': nan if gap is None else gap.distance_m,
+            'released': _released(task, views, subjects),
+        }
+        basis, elsewhere, fit = self._objection(task), '', ShareFit()
+        if not basis and self.calibration is not None:
+            if self.calibration.futures is None:
+                basis = f'{_COUNTED_TWICE}: {_SHARE}'
+            else:
+                fit, elsewhere = self.calibration.futures, self._elsewhere(views, True)
+        if not ends.is_fitted:
+            # the fit is to futures of a known place; those of a prior are wider
+            fit = ShareFit(max_picture_gap_m=fit.max_picture_gap_m)
+            basis, elsewhere = f'uncalibrated: {NOT_FITTED_HERE}', ''
+        probability, low, high = estimate_of_futures(fit, features, is_fitted=ends.is_fitted)
+        counts = f'{ends.done.sum()} of {len(ends.done)} foreseen motions succeed'
+        reasons = [f'{counts}, {ends.share:.0%} by weight']
+        if gap is not None and gap.distance_m > fit.max_picture_gap_m:
+            reasons.append(gap.text)
+        reasons += self._shown(task, evidence, views)
+        reasons += self._gripper_reasons(task, views, features)
+        reasons.append(basis or self._origin(elsewhere, is_real=False))
+        return SuccessEstimate(
+            probability=probability,
+            interval=(low, high),
+            jaccard=_jaccard(views, evidence.goal_jaccard, list(evidence.goal_jaccard)),
+            reasons=tuple(reasons),
+            features=features,
+            is_calibrated=not (basis or elsewhere),
+        )
+
     def _judge(
         self,
         task: TaskSpec,
         evidence: Evidence,
         views: Views,
         subjects: Sequence[int],
-        ends: ForeseenEnds | None,
         is_real: bool,
     ) -> SuccessEstimate:
+        """Return the estimate of frames."""
         features, spread = dict(evidence.features), 1.96 * evidence.sigma
-        features['foreseen'] = foreseen_feature(ends)
+        features['foreseen'] = nan
         features['released'] = _released(task, views, subjects)
         basis = self._objection(task)
         weights = None
         if self.calibration is not None and not basis:
-            weights = self.calibration.given(is_real, ends is not None)
+            weights = self.calibration.given(is_real)
         counted = dict(features)
         if is_real and weights is None:  # what was really seen needs no grasp that explains it
             counted |= dict.fromkeys(DOUBTS, nan)
         probability = weights.probability if weights else stated_probability
-        margins = [features['margin'] + shift for shift in (-spread, 0.0, spread)]
-        if evidence.worst is None:  # between the worst and the best that pictures could show
-            margins = [-MAX_MARGIN, nan, MAX_MARGIN]
         low, middle, high = (
             capped(probability({**counted, 'margin': clipped(margin)}), features)
-            for margin in margins
+            for margin in (features['margin'] + shift for shift in (-spread, 0.0, spread))
         )
-        first = [view_mean(views.start_jaccard(item)) for item in evidence.goal_jaccard]
-        reached = [view_mean(values) for values in evidence.goal_jaccard.values()]
-        reasons = []
-        if evidence.worst is not None:
-            reasons.append(f'{task.name}: {_margin_text(evidence.worst, spread, task)}')
-        if reached:
-            pairs = zip(reached, first, strict=True)
-            reasons += [
-                f'J with the goal mask {g:.2f}, with the start mask {s:.2f}' for g, s in pairs
-            ]
-        reasons += evidence.notes
-        if ends is not None:
-            counts = f'{ends.done.sum()} of {len(ends.done)} foreseen motions succeed'
-            reasons.append(f'{counts}, {ends.share:.0%} by weight')
-        if task.gripper != 'any' and views.footage.openings is None:
-            reasons.append('gripper not checked')
-        elif features['released'] == 0.0:
+        if features['released'] == 0.0:
             low = 0.0
-            reasons.append(_STILL_CLOSED[task.gripper])
-        elsewhere = self._elsewhere(views, ends is not None) if weights else ''
+        reasons = self._shown(task, evidence, views)
+        reasons += self._gripper_reasons(task, views, features)
+        elsewhere = self._elsewhere(views, False) if weights else ''
         reasons.append(basis or self._origin(elsewhere, is_real))
         return SuccessEstimate(
             probability=middle,
@@ -256,6 +339,27 @@ class SuccessEstimator:
             features=features,
             is_calibrated=not (basis or elsewhere),
         )
+
+    @staticmethod
+    def _shown(task: TaskSpec, evidence: Evidence, views: Views) -> list[str]:
+        """Return what the frames show, in words."""
+        reasons = []
+        if evidence.worst is not None:
+            margin = _margin_text(evidence.worst, 1.96 * evidence.sigma, task)
+            reasons.append(f'{task.name}: {margin}')
+        for item, values in evidence.goal_jaccard.items():
+            goal, start = view_mean(values), view_mean(views.start_jaccard(item))
+            reasons.append(f'J with the goal mask {goal:.2f}, with the start mask {start:.2f}')
+        return reasons + list(evidence.notes)
+
+    @staticmethod
+    def _gripper_reasons(task: TaskSpec, views: Views, features: Mapping[str, float]) -> list[str]:
+        """Return doubts about the grippers, in words."""
+        if task.gripper != 'any' and views.footage.openings is None:
+            return ['gripper not checked']
+        if features['released'] == 0.0:
+            return [_STILL_CLOSED[task.gripper]]
+        return []
 
     def _objection(self, task: TaskSpec) -> str:
         """Return the reason why the probability is not fitted; empty if it is fitted."""

@@ -137,7 +137,7 @@ RIM_GAP_M = 0.01
 CARRY_ERROR_M = 0.025
 #: upper limit of J between the start mask and the goal mask
 MAX_START_JACCARD = 0.5
-#: names of the features, in order; the last comes from `foreseen`, not from masks
+#: names of the features of masks, in order
 FEATURES: tuple[str, ...] = (
     'margin',
     'mean_margin',
@@ -145,7 +145,6 @@ FEATURES: tuple[str, ...] = (
     'contained',
     'grasp',
     'carry',
-    'foreseen',
 )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import nan
+from math import isfinite, nan
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from mtv_world_ros.core.errors import CannotTell
 from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
 from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import ever_and_final, TaskSpec
+from mtv_world_ros.success.views import Views
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,15 +29,22 @@ class ForeseenEnds:
     Attributes:
         done: (K,) whether the task is done.
         weights: (K,) weight of each motion.
+        is_fitted: contact parameters were fitted in this robot cell.
     """
 
     done: BoolArray
     weights: FloatArray
+    is_fitted: bool = True
 
     @property
     def share(self) -> float:
         """Weighted share of the motions that succeed."""
         return float(np.average(self.done, weights=self.weights))
+
+    @property
+    def num_effective(self) -> float:
+        """Number of equally weighted motions that would tell as much."""
+        return float(self.weights.sum() ** 2 / (self.weights**2).sum())
 
     @property
     def is_majority(self) -> BoolArray:
@@ -66,7 +74,52 @@ def foreseen_ends(
         done = [_is_done(motions, k, task, items, starts) for k in range(len(motions.points))]
     except CannotTell:
         return None
-    return ForeseenEnds(done=np.array(done), weights=motions.weights)
+    return ForeseenEnds(done=np.array(done), weights=motions.weights, is_fitted=motions.is_fitted)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PictureGap:
+    """Largest distance of an object between the imagined frames and the drawn motion.
+
+    Attributes:
+        name: of the object.
+        distance_m: at the end of the chunk [m].
+    """
+
+    name: str
+    distance_m: float
+
+    @property
+    def text(self) -> str:
+        """Remark for the reader of an estimate."""
+        return (
+            f"imagined frames contradict the drawn motion: they show '{self.name}' "
+            f'{1e3 * self.distance_m:.0f} mm from where it was drawn'
+        )
+
+
+def picture_gap(views: Views, motions: ForeseenMotions, names: Sequence[str]) -> PictureGap | None:
+    """Return how far imagined frames are from the motion that was drawn into their control.
+
+    Args:
+        views: masks of the imagined frames up to the end of the motions.
+        motions: of the objects; the one that was shown counts.
+        names: objects that are compared.
+
+    Returns:
+        The object that is farthest from its drawn end; None if no object can be located.
+    """
+    gaps = []
+    for name in names:
+        try:
+            place, _ = views.end(views.index(name))
+        except CannotTell:
+            continue
+        drawn = motions.points[motions.shown, -1, motions.names.index(name)]
+        distance = float(np.linalg.norm(place.point - drawn))
+        if isfinite(distance):
+            gaps.append(PictureGap(name=name, distance_m=distance))
+    return max(gaps, key=lambda gap: gap.distance_m, default=None)
 
 
 def _is_done(

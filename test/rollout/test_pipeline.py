@@ -367,6 +367,7 @@ class ThreeWays:
     """Objects that go along x in the first second; how far, in each of three motions [m]."""
 
     step_s, commands_a_step, reasons, refusal, doubts = 0.1, 1, (), '', {}
+    is_fitted = True
     sizes = np.full((3, 2, 3), 0.04)
 
     reasons = ()
@@ -421,6 +422,7 @@ class DriftingObjects:
     """Objects that move by 1 cm along x at every step."""
 
     step_s, commands_a_step, reasons, refusal, doubts = 0.1, 1, (), '', {}
+    is_fitted = True
     sizes = np.full((1, 2, 3), 0.04)
 
     def __init__(
@@ -661,6 +663,7 @@ class SlidingObjects:
     """Moves every object 1 cm along x in each step of 0.1 s; remembers how often it was asked."""
 
     step_s, commands_a_step, reasons, refusal, doubts = 0.1, 1, (), '', {}
+    is_fitted = True
 
     def __init__(self, points: np.ndarray, steps: int = 0) -> None:
         self.points, self.steps = points, steps

@@ -1,5 +1,6 @@
 """Several seeds as one estimate."""
 
+from dataclasses import replace
 from math import nan
 
 import numpy as np
@@ -40,6 +41,12 @@ def test_interval_stays_within_what_a_probability_can_be():
         pytest.approx(0.3147, abs=1e-3),
         1,
     )
+
+
+def test_seeds_that_agree_are_no_surer_than_one_of_them():
+    """Noise of the world model says nothing of what the futures do not know."""
+    one = replace(estimate(0.67), interval=(0.36, 0.9))
+    assert mean_estimate([one, one, one]).interval == (pytest.approx(0.36), pytest.approx(0.9))
 
 
 def test_one_of_two_that_know_is_not_most_of_them():

@@ -118,13 +118,13 @@ def test_the_bundled_estimate_is_calibrated_for_its_own_foresight_and_cameras():
 def test_weights_are_those_of_rollouts_of_the_same_kind():
     calibration = load_fit(share_path('resource', 'checkpoint'), Calibration)
     here = Setting.of(ROBOT, Checkpoint.open('bundled').object_motion_digest)
-    assert calibration.given(False, is_foreseen=False) is calibration.unforeseen
+    assert calibration.given(False) is calibration.unforeseen
     seen_alone = calibration.replace(unforeseen=None)
     found = seen_alone.elsewhere(here, CAMERAS, is_foreseen=False)
     assert found == 'fitted to rollouts with foreseen object motion'
     pictures = calibration.replace(fitted_to=calibration.fitted_to.replace(foresight=''))
     assert pictures.is_of_pictures and not calibration.is_of_pictures
-    assert pictures.given(False, is_foreseen=False) is pictures
+    assert pictures.given(False) is pictures
     assert pictures.elsewhere(here, CAMERAS, is_foreseen=False) == ''
     assert 'another foresight' in pictures.elsewhere(here, CAMERAS, is_foreseen=True)
 

@@ -8,12 +8,21 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.physics.foreseen_motions import foreseen_of, ForeseenMotions
 from mtv_world_ros.physics.object_motion import FoundObjects, ObjectMotion
 from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
+from mtv_world_ros.success.calibration import Calibration, load_fit
+from mtv_world_ros.success.estimator import (
+    load_tasks,
+    SUCCESS_FROM,
+    SuccessEstimator,
+    verdict_word,
+)
 from mtv_world_ros.success.foreseen import foreseen_ends, foreseen_feature
 from mtv_world_ros.success.task import match_task
+from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 from test.support.drawn_blocks import BLUE, footage, LEFT, masks, NAMES, path, RED
 
 TASKS = load_tasks(share_path('config', 'tasks'))
+CALIBRATION = load_fit(share_path('resource', 'checkpoint'), Calibration)
+COLOUR = choose_segmenter('colour')
 GOAL = (BLUE[0] - 0.13, BLUE[1], 0.025)
 
 
@@ -84,7 +93,7 @@ def test_where_pictures_do_not_tell_the_motions_do(end, low, high):
     found = estimator.estimate(shown, LEFT, foreseen=held(end)).estimate
     assert low <= found.probability <= high
     assert found.interval[0] < found.probability < found.interval[1]
-    assert "pictures do not tell: 'red block'" in found.reasons[0]
+    assert "pictures do not tell: 'red block'" in found.reasons[1]
     assert np.isnan(found.features['margin']) and np.isfinite(found.features['foreseen'])
 
 
@@ -114,7 +123,7 @@ def test_grippers_open_as_foreseen_and_else_as_commanded(shares, expected):
         names=(),
         cuts=np.zeros((2, 0, 4, 4, 4), np.uint8),
         poses=np.zeros((2, 0, 4, 4)),
-        tracked=SimpleNamespace(sizes=np.zeros((len(shares), 0, 3)), step_s=0.1),
+        tracked=SimpleNamespace(sizes=np.zeros((len(shares), 0, 3)), step_s=0.1, is_fitted=True),
         motions=tuple(map(motion, shares)),
         positions=positions,
     )
@@ -151,18 +160,75 @@ def test_objects_that_were_not_found_leave_it_open():
         assert np.isnan(foreseen_feature(foreseen_ends(motions, task, bound, np.zeros((2, 3)))))
 
 
-def test_motions_that_fail_lower_an_estimate_whose_pictures_succeed():
-    shown = footage(masks(path(RED, GOAL), [BLUE] * 9), masks([RED], [BLUE]))
+def test_the_share_of_futures_decides_whatever_frames_show():
+    """Frames that show the motion that was drawn count for nothing more."""
     estimator = SuccessEstimator(TASKS)
+    shown = footage(masks(path(RED, GOAL), [BLUE] * 9), masks([RED], [BLUE]))
     found = {
         name: estimator.estimate(shown, LEFT, None, motions).estimate
         for name, motions in {
-            'not told': None,
             'good': held(GOAL, GOAL, GOAL),
             'doubtful': held(GOAL, RED, RED),
         }.items()
     }
     assert '1 of 3 foreseen motions succeed, 33% by weight' in found['doubtful'].reasons
-    assert found['doubtful'].probability < found['not told'].probability
-    assert found['good'].probability > found['not told'].probability
+    # the rule of succession
+    assert found['doubtful'].probability == pytest.approx(2 / 5)
+    assert found['good'].probability == pytest.approx(4 / 5)
     assert found['good'].features['foreseen'] == pytest.approx(1.0)
+    assert found['good'].features['futures'] == pytest.approx(3.0)
+    assert found['good'].features['picture_gap'] < 0.01
+
+
+def test_nine_of_sixteen_futures_are_an_open_verdict():
+    """The frames show the majority, which succeeds: that is no further evidence."""
+    motions = held(*[GOAL] * 9, *[RED] * 7)
+    shown = footage(masks(path(RED, GOAL), [BLUE] * 9), masks([RED], [BLUE]))
+    for calibration in (None, CALIBRATION):
+        estimator = SuccessEstimator(TASKS, calibration=calibration, segmenter=COLOUR)
+        found = estimator.estimate(shown, LEFT, foreseen=motions).estimate
+        assert 0.3 < found.probability < SUCCESS_FROM
+        low, high = found.interval
+        assert low < 9 / 16 < high and high - low > 0.3
+        assert verdict_word(found.probability, found.interval) == 'open'
+
+
+def test_frames_that_contradict_the_drawn_motion_are_named_and_open_the_verdict():
+    estimator = SuccessEstimator(TASKS)
+    drawn = held(*[GOAL] * 16)
+    said = {}
+    for name, end in (('as drawn', GOAL), ('otherwise', RED)):
+        frames = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
+        said[name] = estimator.estimate(frames, LEFT, foreseen=drawn).estimate
+    away = np.linalg.norm(np.array(GOAL) - RED)
+    assert said['otherwise'].features['picture_gap'] == pytest.approx(away, abs=0.005)
+    (text,) = [r for r in said['otherwise'].reasons if r.startswith('imagined frames contradict')]
+    assert "'red block'" in text
+    assert not any('contradict' in reason for reason in said['as drawn'].reasons)
+    words = [verdict_word(e.probability, e.interval) for e in said.values()]
+    assert words == ['success', 'open']
+
+
+def test_calibrations_that_count_frames_twice_are_not_used_for_futures():
+    old = CALIBRATION.replace(futures=None)
+    estimator = SuccessEstimator(TASKS, calibration=old, segmenter=COLOUR)
+    shown = footage(masks(path(RED, GOAL), [BLUE] * 9), masks([RED], [BLUE]))
+    found = estimator.estimate(shown, LEFT, foreseen=held(GOAL, GOAL, RED)).estimate
+    assert found.probability == pytest.approx(3 / 5) and not found.is_calibrated
+    assert 'run mtv-world fit success again' in found.reasons[-1]
+
+
+def test_where_nothing_was_fitted_futures_that_disagree_leave_the_verdict_open():
+    estimator = SuccessEstimator(TASKS, calibration=CALIBRATION, segmenter=COLOUR)
+    shown = footage(masks(path(RED, GOAL), [BLUE] * 9), masks([RED], [BLUE]))
+    mixed = replace(held(*[GOAL] * 15, RED), is_fitted=False)
+    found = estimator.estimate(shown, LEFT, foreseen=mixed).estimate
+    assert found.probability == pytest.approx(16 / 18)
+    assert found.interval[0] < 0.05 and found.interval[1] > 0.95
+    assert verdict_word(found.probability, found.interval) == 'open'
+    assert not found.is_calibrated and 'not fitted on this robot' in found.reasons[-1]
+    # what no value of the prior changes has a verdict
+    for end, word in ((GOAL, 'success'), (RED, 'failure')):
+        alike = replace(held(*[end] * 16), is_fitted=False)
+        found = estimator.estimate(shown, LEFT, foreseen=alike).estimate
+        assert verdict_word(found.probability, found.interval) == word

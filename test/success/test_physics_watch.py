@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.core.data_types import SuccessEstimate
-from mtv_world_ros.success.doubts import PhysicsWatch, SAYS, unforeseen, widened
+from mtv_world_ros.success.doubts import PhysicsWatch, SAYS, unforeseen, WATCH, widened
 
 
 def futures(*ways):
@@ -33,20 +33,47 @@ def test_what_rests_as_foreseen_or_is_not_seen_tells_nothing():
 def test_a_few_surprises_are_chance_and_many_are_another_physics():
     watch = PhysicsWatch()
     assert watch.text == 'not compared yet' and not watch.doubt
-    for away in (0.01, 0.02, nan, 0.01, 0.2):
-        watch.take(away)
+    for rollout, away in enumerate((0.01, 0.02, nan, 0.01, 0.2)):
+        watch.take(away, rollout)
     assert not watch.doubt and watch.text == 'as it was fitted, by 4 executed chunks'
-    watch.take(0.2)
-    watch.take(0.3)
-    # three of six: binomial tail at .15 is .047; four of seven: .012; five of eight: .0029
+    watch.take(0.2, 5)
+    # evidence 8 x 8 = 64 of 200; each end as foreseen makes it .6 / .95 of that
     assert not watch.doubt
-    watch.take(0.1)
-    assert not watch.doubt
-    watch.take(0.1)
-    assert watch.doubt.startswith(f'{SAYS}: 5 of the last 8 executed chunks')
+    watch.take(0.3, 6)
+    assert watch.doubt.startswith(f'{SAYS}: 3 of 6 executed chunks')
     assert watch.text == watch.doubt
+    # it takes as much evidence to the contrary: ln 200 / ln (.95 / .6) = 11.5
+    for rollout in range(7, 18):
+        watch.take(0.0, rollout)
+    assert watch.doubt
+    watch.take(0.0, 18)
+    assert not watch.doubt
     watch.forget()
     assert watch.text == 'not compared yet'
+
+
+def test_what_follows_from_a_surprise_in_the_same_rollout_is_no_further_evidence():
+    watch = PhysicsWatch()
+    for _ in range(20):
+        watch.take(0.2, 1)
+    assert not watch.doubt and watch.text == 'as it was fitted, by 1 executed chunks'
+
+
+def run_length(rate, rng):
+    """Comparisons until the watch doubts, of which a share ends unforeseen."""
+    watch, count = PhysicsWatch(), 0
+    while not watch.doubt:
+        count += 1
+        watch.take(0.2 if rng.random() < rate else 0.0, count)
+    return count
+
+
+def test_false_alarms_are_as_rare_as_stated_and_another_physics_is_noticed():
+    rng = np.random.default_rng(0)
+    fitted = [run_length(WATCH.max_unforeseen_fraction, rng) for _ in range(60)]
+    assert np.mean(fitted) > WATCH.run_length
+    other = [run_length(WATCH.other_unforeseen_fraction, rng) for _ in range(200)]
+    assert np.median(other) < 15
 
 
 def test_estimates_widen():

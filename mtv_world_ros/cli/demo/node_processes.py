@@ -23,6 +23,7 @@ from mtv_world_ros.core.processes import (
     StoppedProcesses,
 )
 from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.rollout.imagined_episodes import ROOM_BYTES
 
 STREAMS = ('predicted/image_raw', 'predicted/camera_info', 'trajectory/image_raw')
@@ -61,7 +62,7 @@ def record_through_node(
     logs = out / 'logs'
     logs.mkdir(parents=True, exist_ok=True)
     environment = private_domain()
-    node = start_process('node', _node_command(options), logs, environment)
+    node = start_process('node', _node_command(episode, options), logs, environment)
     recorder: subprocess.Popen[bytes] | None = None
     try:
         recorded = [f'{NODE}/{view}/{stream}' for view in views for stream in STREAMS]
@@ -87,7 +88,7 @@ def record_through_node(
         raise EpisodeError(how_it_ended('recorder', recorder, logs))
 
 
-def _node_command(options: DemoOptions) -> list[str]:
+def _node_command(episode: Path, options: DemoOptions) -> list[str]:
     parameters = {
         'use_sim_time': True,
         'compressed_input': True,
@@ -99,6 +100,7 @@ def _node_command(options: DemoOptions) -> list[str]:
         'num_threads': options.num_threads,
         'num_inference_steps': options.num_inference_steps,
         'seed': options.seed,
+        'place': read_info(episode).place,
         # the same numbers whatever weights are at hand
         'segmenter': 'colour',
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -41,6 +42,11 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument(
         '--motions', type=int, default=16, help='number of futures that the checkpoint simulates'
+    )
+    parser.add_argument(
+        '--place',
+        help="name of the robot cell of the recordings; the node's `place` must be the same. "
+        'Default: what the recordings state, or none',
     )
     parser.add_argument(
         '--threads', type=number_or_0, default=0, help='CPU threads; 0 = all but one'
@@ -99,6 +105,7 @@ def _fit(arguments: argparse.Namespace) -> int:
         threads=arguments.threads or threads_each(1),
         report=tqdm.write,
         progress=partial(tqdm, desc='foreseeing', unit='ep', disable=None),
+        place=_place_of(paths) if arguments.place is None else arguments.place,
     )
     settings = settings.replace(num_motions=arguments.motions)
     folder.mkdir(parents=True, exist_ok=True)
@@ -107,3 +114,21 @@ def _fit(arguments: argparse.Namespace) -> int:
     save_contact(settings, folder)
     print(f'{len(recordings)} episodes, {len(skipped)} left out: {folder / CONTACT_FILE}')
     return 0
+
+
+def _place_of(paths: Sequence[Path]) -> str:
+    """Return the robot cell that recordings state; empty if they state none.
+
+    Raises:
+        ConfigError: they are of several robot cells.
+    """
+    from mtv_world_ros.core.errors import ConfigError
+    from mtv_world_ros.data.episode_reader import read_info
+
+    places = sorted({read_info(path).place for path in paths})
+    if len(places) > 1:
+        raise ConfigError(
+            f'the recordings are of {len(places)} robot cells ({"; ".join(places)}), whose '
+            'contact parameters may differ; fit those of one, or name the cell (--place)'
+        )
+    return places[0]

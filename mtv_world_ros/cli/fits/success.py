@@ -84,7 +84,11 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     runs = _imagine(arguments, checkpoint, selection)
     failed = say_failed([run.failed for run in runs])  # before what is too few is refused
     segmenter = str(runs[0].settings['segmenter'])
-    samples = samples_of([run.results for run in runs], result_kinds(selection.paths))
+    samples = samples_of(
+        [run.results for run in runs],
+        result_kinds(selection.paths),
+        result_physics(selection.paths),
+    )
     found = calibrate(samples, segmenter=segmenter, l2=arguments.l2, made=made)
     horizon = _horizon([run.results for run in runs], runs[0], made)
     text = write_calibration_report(arguments.out, found, horizon)
@@ -129,6 +133,15 @@ def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
 
     names = result_names(paths)
     return {names[path]: kinds for path, kinds in recorded_kinds(paths).items()}
+
+
+def result_physics(paths: Sequence[Path]) -> dict[str, str]:
+    """Returns the physics of simulated episodes, by what their results are called."""
+    from mtv_world_ros.data.episode_reader import read_info
+    from mtv_world_ros.evaluation.evaluate_episodes import result_names
+
+    names = result_names(paths)
+    return {names[path]: read_info(path).physics for path in paths}
 
 
 def _check_places(arguments: argparse.Namespace, checkpoint: Checkpoint) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,17 @@ from mtv_world_ros.success.estimator import verdict
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """The estimate at the end of an episode (NaN = abstained), and the outcome or `unknown`."""
+    """Estimate at the end of an episode, and its outcome.
+
+    Attributes:
+        probability: of success; NaN = abstained.
+        outcome: `success`, `failure` or `unknown`.
+        interval: of the probability; NaN = not known.
+    """
 
     probability: float
     outcome: str
+    interval: tuple[float, float] = (nan, nan)
 
 
 #: equally wide bins of the calibration error
@@ -37,7 +45,7 @@ def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
     known = [item for item in judgements if item.outcome in ('success', 'failure')]
     probability = np.array([item.probability for item in known])
     real = np.array([item.outcome == 'success' for item in known], bool)
-    verdicts = np.array([verdict(item.probability) for item in known])
+    verdicts = np.array([verdict(item.probability, item.interval) for item in known])
     called, decided, judged = verdicts == 1, np.isfinite(verdicts), np.isfinite(probability)
     hit, avoided = _mean(called[real & decided]), _mean(~called[~real & decided])
     balanced = None if hit is None or avoided is None else (hit + avoided) / 2

@@ -26,7 +26,15 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.physics.arm_response import PERIOD_S
 from mtv_world_ros.physics.arms import Arms
 from mtv_world_ros.physics.contact_scene import CompiledScene
-from mtv_world_ros.physics.contact_settings import ContactOrigin, ContactSettings
+from mtv_world_ros.physics.contact_settings import (
+    ContactDraw,
+    ContactOrigin,
+    ContactSettings,
+    FACTORS,
+    MAX_MOTIONS,
+    PRIOR_LOG_STD,
+    RANGES,
+)
 from mtv_world_ros.physics.drive_inputs import CoursePlanner, SUBSTEPS
 from mtv_world_ros.physics.engine import Engine
 from mtv_world_ros.physics.fitting.tracks import (
@@ -164,15 +172,6 @@ def _loss(
     return loss
 
 
-#: range of each sampled parameter, where the prior begins
-RANGES = {
-    'grip_friction': (0.03, 3.0),
-    'table_friction': (0.15, 2.5),
-    'density': (60.0, 3000.0),
-    'finger_stiffness': (0.2, 3.0),
-}
-#: parameters whose range is a factor of the first settings
-_FACTORS = frozenset({'finger_stiffness'})
 #: names of parameters in messages
 _WORDS = {
     'grip_friction': 'friction of fingers',
@@ -195,7 +194,6 @@ class ContactFitSettings:
     """Settings of the importance sampling of contact parameters.
 
     Attributes:
-        prior_log_std: prior standard deviation of the logarithm of a parameter.
         num_draws: draws of a round.
         num_rounds: rounds; each draws around the posterior of the one before.
         proposal_scale: width of the next round's draws as a multiple of the posterior's.
@@ -225,7 +223,6 @@ class ContactFitSettings:
         max_spread: largest spread of a parameter over futures [log].
     """
 
-    prior_log_std: float = 1.0
     num_draws: int = 64
     num_rounds: int = 3
     proposal_scale: float = 1.3
@@ -395,6 +392,7 @@ def fit_contact(
     threads: int = 1,
     report: Callable[[str], None] = lambda line: None,
     progress: Callable[[Sequence[int]], Iterable[int]] = iter,
+    place: str = '',
 ) -> tuple[ContactSettings, list[FittedNumber]]:
     """Return likely settings with their spread, and what was found with intervals.
 
@@ -406,6 +404,7 @@ def fit_contact(
         threads: CPU threads of the engine.
         report: takes a line about each number and round.
         progress: wraps the numbers of what is foreseen, e.g. in a progress bar.
+        place: robot cell of the recordings; empty = not stated.
 
     Raises:
         TrainingError: no recording says where an object went.
@@ -469,8 +468,10 @@ def fit_contact(
         by='mtv-world fit contact',
         recordings=len(recordings),
         telling=hold.count,
+        place=place,
     )
-    update = {**values, 'spread': spread, 'fitted': origin}
+    draws = _joint_draws(first, factors, weights)
+    update = {**values, 'spread': spread, 'fitted': origin, 'draws': draws}
     # measured fingers show what they hold; slipping was fitted without that, as only slips tell it
     update['grips_hold'] = first.squeeze > 0
     return first.model_copy(update=update), [table, delay, cameras, *found, hold]
@@ -511,7 +512,7 @@ def settings_of_place(
 
 def _scales(first: ContactSettings) -> dict[str, float]:
     """Return the scale factor of each sampled parameter."""
-    return {name: getattr(first, name) if name in _FACTORS else 1.0 for name in RANGES}
+    return {name: getattr(first, name) if name in FACTORS else 1.0 for name in RANGES}
 
 
 def _populations(
@@ -524,7 +525,7 @@ def _populations(
     """Draw (N, P) as logarithms, their log likelihoods (N, E), and weights (N,)."""
     low, high = np.log(np.array(list(RANGES.values())).T)
     uniform = -float(np.log(high - low).sum())
-    middle = np.log([1.0 if n in _FACTORS else getattr(first, n) for n in RANGES])
+    middle = np.log([1.0 if n in FACTORS else getattr(first, n) for n in RANGES])
     drawn = qmc.scale(
         qmc.Sobol(len(RANGES), rng=np.random.default_rng(_FIT.seed)).random(_FIT.num_draws),
         low,
@@ -548,7 +549,7 @@ def _populations(
             for one in proposals
         ]
         mixture = np.logaddexp.reduce(densities, axis=0) - np.log(len(proposals))
-        usual = -(((draws - middle) / _FIT.prior_log_std) ** 2).sum(-1) / 2
+        usual = -(((draws - middle) / PRIOR_LOG_STD) ** 2).sum(-1) / 2
         weights, counts = _weights(likelihoods.sum(-1), usual - mixture)
         mean, wide = weights @ draws, _FIT.proposal_scale**2 * _covariance(draws, weights)
         wide += _FIT.proposal_min_log_std**2 * np.eye(len(mean))
@@ -608,6 +609,27 @@ def _settings(first: ContactSettings, logs: FloatArray) -> ContactSettings:
             'tray_kg': first.tray_kg * heavier,
             'finger_damping': first.finger_damping * stiffer,
         }
+    )
+
+
+def _joint_draws(
+    first: ContactSettings, logs: FloatArray, weights: FloatArray
+) -> tuple[ContactDraw, ...]:
+    """Return `MAX_MOTIONS` equally likely joint samples of draws (N, P) with weights (N,).
+
+    Their order is that of a van der Corput sequence along `_HOLD`, so that the first few of them
+    are spread evenly over what decides whether things slip.
+    """
+    order = np.argsort(logs @ [_HOLD.get(name, 0) for name in RANGES], kind='stable')
+    levels = np.cumsum(weights[order])
+    # bit reversal of 0, 1, 2, ...: 1/2, 1/4, 3/4, 1/8, ... of the way
+    bits = MAX_MOTIONS.bit_length() - 1
+    turned = [int(f'{number:0{bits}b}'[::-1], 2) for number in range(MAX_MOTIONS)]
+    at = (np.array(turned) + 0.5) / MAX_MOTIONS * levels[-1]
+    chosen = order[np.minimum(np.searchsorted(levels, at), len(order) - 1)]
+    settings = [_settings(first, row) for row in logs[chosen]]
+    return tuple(
+        ContactDraw(**{name: float(getattr(one, name)) for name in RANGES}) for one in settings
     )
 
 

@@ -45,6 +45,7 @@ from mtv_world_ros.ros.world_model.loading import (
 from mtv_world_ros.ros.world_model.prediction_publisher import PredictionPublisher
 from mtv_world_ros.ros.world_model.reporter import Reporter
 from mtv_world_ros.ros.world_model.worker import Request, RolloutWorker
+from mtv_world_ros.success.estimator import NOT_FITTED_HERE
 
 #: measured joints may be beyond their limits by this, and by this share of their range
 _MEASURED_SLACK = 0.1
@@ -344,7 +345,7 @@ class Rollouts:
             'views': self._spec.views,
             'busy': self._worker.busy,
             'cameras': self._worker.camera_check.text,
-            'physics': self._fidelity.watch.text,
+            'physics': self._physics_text(),
             **({} if self._description is None else self._description.values()),
             **self._extrinsics.values(),
             **self._fidelity.values(),
@@ -354,6 +355,11 @@ class Rollouts:
             **self._buffer.ages(self._node.get_clock().now().nanoseconds),
             **({'camera_notes': '; '.join(notes)} if (notes := self._buffer.notes) else {}),
         }
+
+    def _physics_text(self) -> str:
+        """Text about the contact parameters for `/diagnostics`."""
+        is_fitted = self._fidelity.is_fitted_at(self.settings().place)
+        return self._fidelity.watch.text if is_fitted else NOT_FITTED_HERE
 
     def on_results(self) -> None:
         """Wake the executor, which publishes the results; called from any thread."""

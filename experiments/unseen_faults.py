@@ -1,0 +1,342 @@
+"""What verdicts are worth on faults that a seed drew: one table of several fresh seeds.
+
+    python experiments/unseen_faults.py --seeds 72046,16337,64608 --logs out/unseen --readme
+
+For each seed the expert and seven fault kinds that the seed drew act in `--physics`, as
+`shifted_worlds.py` has it; logs are kept in `--logs` and the same command goes on. Seeds are drawn
+after the code is frozen, so that nothing could be fitted to them. All seeds are pooled; intervals
+are over scenes (tasks of a seed): AUROC jackknife, shares clustered Wilson. `--readme` writes the
+first table between the markers `unseen-faults` of README.md and docs/results.md.
+
+*Both* is the estimate with imagined frames, in the physics `--pictures`. In every physics but
+`nominal` nothing was fitted in the robot cell: *foreseen motions alone* draws contact parameters
+from the wide prior. *As if fitted here* takes the parameters of `nominal` all the same; its silent
+errors are what the prior is for. With `--before FILE`, a calibration of before ShareFit, the old
+estimate, which counts frames beside the motion that was drawn into them, is computed from the same
+rollouts; physics that show the same first picture as `nominal` share it.
+
+Coverage: rollouts are grouped by their estimate, in each truth. A group is covered if its success
+rate lies within the mean 95 % interval of its estimates; or, up to its own sampling error, if the
+95 % Wilson interval of the rate reaches the mean interval. Given is the share of rollouts in covered
+groups. The picture has the groups of all truths but `nominal` together, and those of `nominal`.
+"""  # noqa: E501
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+import copy
+from datetime import date
+from math import isfinite, nan
+from pathlib import Path
+import re
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+import numpy as np
+from page import parse_arguments, publish, ROOT, table
+from shifted_worlds import (
+    ACROSS,
+    across,
+    AS_FITTED,
+    BOTH,
+    estimated,
+    FITTED,
+    FORESEEN,
+    HEAD,
+    Row,
+    row,
+    RULE,
+    ruled,
+    run,
+    Scenes,
+    watch_rows,
+    WATCHED,
+)
+from shifted_worlds import (
+    more as shifted_options,
+)
+
+from mtv_world_ros.core.bounded_input import read_json
+from mtv_world_ros.data.episode import NOMINAL
+from mtv_world_ros.evaluation.metrics.statistics import wilson
+from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.success.calibration import Calibration, DOUBTS
+from mtv_world_ros.success.estimator import capped
+from mtv_world_ros.success.share_fit import ShareEstimate
+
+#: what a table of coverage is grouped by [probability]
+EDGES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0 + 1e-9)
+#: judge: the estimate of before, of `--before`
+BEFORE = 'both, before'
+COVERED = ('truth', 'judged by', 'estimates', 'covered', 'up to the sampling error of rates')
+BLOCK = ('judged by', 'nominal: AUROC', 'failures called a success', 'no verdict',
+         'other truths: AUROC, mean (worst)', 'failures called a success, mean (worst)',
+         'from .9 on succeed', 'no verdict, mean')  # fmt: skip
+_MARKED = re.compile(
+    r'(<!-- unseen-faults: begin -->\n).*?(<!-- unseen-faults: end -->)', re.DOTALL
+)
+#: text of a reason that states the 95 % error of the margin [mm]
+_KNOWN_TO = re.compile(r'(held|missed) by \d+ mm, known to (\d+) mm')
+Line = dict[str, Any]
+
+
+def more(parser: argparse.ArgumentParser) -> None:
+    """Adds options."""
+    shifted_options(parser)
+    parser.set_defaults(
+        physics='nominal,bold,mass_triple,camera_off,joint_zeros_1deg,objects_small,dart',
+        pictures=NOMINAL,
+        policies=8,
+        log=Path(),
+    )
+    for action in parser._actions:
+        action.required = False
+    parser.add_argument('--seeds', required=True, help='comma-separated, drawn for this page')
+    parser.add_argument('--logs', type=Path, required=True, help='folder of the logs')
+    parser.add_argument('--before', type=Path, help='calibration of before, for the rows before')
+    parser.add_argument('--readme', action='store_true', help='write the table into the pages')
+
+
+def of_seed(options: argparse.Namespace, seed: int) -> argparse.Namespace:
+    """Returns the options of `shifted_worlds` for a seed."""
+    chosen = copy.copy(options)
+    chosen.seed, chosen.faults = seed, f'drawn:{seed}'
+    chosen.log = options.logs / f'{seed}.jsonl'
+    return chosen
+
+
+def estimates_of(
+    options: argparse.Namespace, pipelines: dict[str, Pipeline], lines: Sequence[Line]
+) -> dict[tuple[str, str], tuple[list[Line], list[ShareEstimate]]]:
+    """Returns rollouts and estimates by physics and judge."""
+    (name, pipeline), found, scenes = *pipelines.items(), {}, Scenes(pipelines, options)
+    for physics in options.physics.split(','):
+        chosen = [line for line in lines if line['job'][0] == physics]
+        for judge in scenes.wanted(physics) if chosen else ():
+            said = [estimated(pipeline, judge, r['said'][name][judge], physics) for r in chosen]
+            found[physics, judge] = chosen, said
+        if chosen:
+            found[physics, RULE] = chosen, [ruled(line) for line in chosen]
+    if options.before is not None:
+        found |= before(Calibration(**read_json(options.before)), lines, name)
+    return found
+
+
+def before(
+    calibration: Calibration, lines: Sequence[Line], name: str
+) -> dict[tuple[str, str], tuple[list[Line], list[ShareEstimate]]]:
+    """Returns what the estimate was that counted frames beside the drawn motion.
+
+    Of physics whose rollouts begin with the same picture as those of `nominal`, thus have the same
+    estimate: bodies differ, not pictures.
+    """
+    imagined = {
+        tuple(line['job'][1:]): line['said'][name][BOTH]
+        for line in lines
+        if line['job'][0] == NOMINAL and BOTH in line['said'][name]
+    }
+    found: dict[tuple[str, str], tuple[list[Line], list[ShareEstimate]]] = {}
+    for line in lines:
+        physics, said = line['job'][0], imagined.get(tuple(line['job'][1:]))
+        if said is None or physics not in (NOMINAL, *SAME_PICTURE):
+            continue
+        rows, estimates = found.setdefault((physics, BEFORE), ([], []))
+        rows.append(line)
+        estimates.append(_before(calibration, said))
+    return found
+
+
+#: truths in which everything looks as in `nominal` before it moves
+SAME_PICTURE = ('bold', 'mass_triple', 'dart')
+
+
+def _before(calibration: Calibration, said: Line) -> ShareEstimate:
+    """Return the old estimate: a logistic of frames and share; its interval: the margin's."""
+    features = said.get('features')
+    if features is None:
+        return ShareEstimate(nan, nan, nan)
+    features = {key: nan if value is None else value for key, value in features.items()}
+    is_foreseen = isfinite(features.get('foreseen', nan))
+    features |= dict.fromkeys(DOUBTS if is_foreseen else (), nan)
+    margin, known = features.get('margin', nan), _KNOWN_TO.search('; '.join(said['reasons']))
+    # one softness is 10 mm in most tasks
+    spread = float(known[2]) / 10 if known else 0.0
+    shifts = (-spread, 0.0, spread) if isfinite(margin) else (nan, nan, nan)
+    margins = [float(np.clip(margin + shift, -3, 3)) for shift in shifts]
+    if not isfinite(margin):
+        margins = [-3.0, nan, 3.0]
+    low, middle, high = (
+        capped(calibration.probability({**features, 'margin': one}), features) for one in margins
+    )
+    return ShareEstimate(middle, low, high)
+
+
+def block(rows: Sequence[Row], num_scenes: int, seeds: str, count: int) -> str:
+    """Returns the table of README.md."""
+    lines = []
+    for judge in (BOTH, FORESEEN, AS_FITTED, RULE):
+        of = [r for r in rows if r.judge == judge]
+        nominal = next((r for r in of if r.physics == NOMINAL), None)
+        others = [r for r in of if r.physics != NOMINAL]
+        if nominal is None and judge == AS_FITTED:
+            nominal = next(r for r in rows if r.physics == NOMINAL and r.judge == FORESEEN)
+        cells = ['–'] * 3 if nominal is None else [nominal.cells[k] for k in (4, 5, 7)]
+        lines.append([f'**{judge}**' if judge == BOTH else judge, *cells, *_over(others)])
+    truths = sorted({r.physics for r in rows} - {NOMINAL})
+    note = (
+        f'*The expert and seven fault kinds that each of {len(seeds.split(","))} seeds ({seeds}) '
+        f'drew after the code was frozen, x 6 tasks = {num_scenes} scenes; {count} rollouts in '
+        f'the nominal physics, and as many in each of {", ".join(f"`{t}`" for t in truths)}; '
+        f'{date.today().isoformat()}, `experiments/unseen_faults.py`. Brackets: 95 % intervals '
+        'over scenes.*'
+    )
+    return f'{table(BLOCK, lines)}\n\n{note}\n'
+
+
+def _over(rows: Sequence[Row]) -> list[str]:
+    """Return cells over several truths."""
+    if not rows:
+        return ['–'] * 4
+    least = min(rows, key=lambda r: r.auroc if isfinite(r.auroc) else 2.0)
+    most = max(rows, key=lambda r: r.false_success if isfinite(r.false_success) else -1.0)
+    wrong = [r.false_success for r in rows if isfinite(r.false_success)]
+    held = [list(map(int, r.cells[8].split(' of '))) for r in rows]
+    return [
+        f'{np.nanmean([r.auroc for r in rows]):.2f} ({least.auroc:.2f}, `{least.physics}`)',
+        f'{np.mean(wrong):.2f} ({most.false_success:.2f}, `{most.physics}`)' if wrong else '–',
+        f'{sum(a for a, _ in held)} of {sum(b for _, b in held)}',
+        f'{np.mean([r.unknown for r in rows]):.2f}',
+    ]
+
+
+def groups(
+    lines: Sequence[Line], estimates: Sequence[ShareEstimate]
+) -> list[tuple[int, int, FloatRow]]:
+    """Return successes, number, and mean (probability, low, high) of each group of estimates."""
+    values = np.array(estimates)
+    real = np.array([line['final'] for line in lines], np.bool_)
+    found = []
+    for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
+        at = (values[:, 0] >= low) & (values[:, 0] < high) & np.isfinite(values).all(1)
+        if at.any():
+            found.append((int(real[at].sum()), int(at.sum()), values[at].mean(0)))
+    return found
+
+
+FloatRow = Any
+
+
+def coverage(lines: Sequence[Line], estimates: Sequence[ShareEstimate]) -> list[str]:
+    """Returns cells: estimates, and shares of them in groups that are covered."""
+    found = groups(lines, estimates)
+    total = sum(count for _, count, _ in found)
+    if not total:
+        return ['0', '–', '–']
+    strict = sum(n for hits, n, (_, low, high) in found if low <= hits / n <= high)
+    loose = 0
+    for hits, count, (_, low, high) in found:
+        bottom, top = wilson(hits, count)
+        loose += count * (bottom <= high and low <= top)
+    return [str(total), f'{strict / total:.2f}', f'{loose / total:.2f}']
+
+
+def reliability(
+    found: dict[tuple[str, str], tuple[list[Line], list[ShareEstimate]]], file: Path
+) -> None:
+    """Writes the reliability diagram: nominal and all shifts, before and after."""
+    figure = Figure(figsize=(11, 4.4), dpi=110, layout='constrained')
+    FigureCanvasAgg(figure)
+    panels: list[tuple[str, Callable[[str], bool]]] = [
+        ('nominal', lambda physics: physics == NOMINAL),
+        ('shifts that look like nominal', lambda physics: physics in SAME_PICTURE),
+        ('all shifts', lambda physics: physics != NOMINAL),
+    ]
+    styles = {
+        BEFORE: ('C3', 's'),
+        BOTH: ('C2', 'D'),
+        FORESEEN: ('C0', 'o'),
+        AS_FITTED: ('C1', '^'),
+    }
+    for axes, (title, holds) in zip(figure.subplots(1, 3), panels, strict=True):
+        axes.plot([0, 1], [0, 1], color='0.7', lw=1)
+        for number, (judge, (colour, mark)) in enumerate(styles.items()):
+            pooled = [
+                pair for (physics, who), pair in found.items() if who == judge and holds(physics)
+            ]
+            if not pooled:
+                continue
+            lines = [line for pair in pooled for line in pair[0]]
+            values = [estimate for pair in pooled for estimate in pair[1]]
+            for hits, count, (middle, low, high) in groups(lines, values):
+                bottom, top = wilson(hits, count)
+                x = middle + 0.006 * (number - 1.5)
+                axes.plot([x, x], [bottom, top], color=colour, lw=1.2)
+                axes.plot([low, high], [hits / count] * 2, color=colour, lw=0.8, ls=':')
+                axes.plot(x, hits / count, mark, color=colour, ms=4 + min(count, 100) ** 0.5 / 2)
+            axes.plot([], [], mark, color=colour, label=judge)
+        axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), title=title, aspect='equal')
+        axes.set_xlabel('estimate (dotted: mean 95 % interval)')
+        axes.legend(fontsize=7, loc='upper left')
+    figure.axes[0].set_ylabel('share that succeeded (bar: 95 % Wilson)')
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file)
+
+
+def main() -> None:
+    """Runs what is missing, and prints and writes the tables."""
+    options = parse_arguments(__doc__, 1, more)
+    pipelines = {
+        name: Pipeline.load(name, camera_check=not options.no_camera_check)
+        for name in options.checkpoints.split(',')[:1]
+    }
+    lines: list[Line] = []
+    for seed in map(int, options.seeds.split(',')):
+        lines += run(of_seed(options, seed), pipelines)
+    options.seed = int(options.seeds.split(',')[0])
+    found = estimates_of(options, pipelines, lines)
+    rows = [row(physics, judge, *pair) for (physics, judge), pair in found.items()]
+    scenes = {tuple(line['job'][1:4:2]) for line in lines}
+    first = block(rows, len(scenes), options.seeds, sum(r['job'][0] == NOMINAL for r in lines))
+    if options.readme:
+        for name in ('README.md', 'docs/results.md'):
+            page = (ROOT / name).read_text(encoding='utf-8')
+            page = _MARKED.sub(lambda match: match[1] + first + match[2], page)
+            (ROOT / name).write_text(page, encoding='utf-8')
+    covered = [
+        [physics, judge, *coverage(*pair)]
+        for (physics, judge), pair in found.items()
+        if judge in (BEFORE, BOTH, FORESEEN, AS_FITTED, FITTED)
+    ]
+    folder = options.out or Path('out')
+    picture = f'unseen_faults_{options.machine}_{date.today().isoformat()}.png'
+    reliability(found, folder / picture)
+    asked = ('seeds', 'physics', 'pictures', 'size', 'scenes', 'policies', 'tasks', 'before')
+    command = ' '.join(f'--{k} {getattr(options, k)}' for k in asked if getattr(options, k))
+    parts = [
+        (__doc__ or '').split('\n' * 2, 2)[-1].strip(),
+        f'{len(lines)} rollouts.',
+        first,
+        'By truth:',
+        table(HEAD, [r.cells for r in sorted(rows, key=lambda r: r.physics != NOMINAL)]),
+        'Over all truths but the nominal one:',
+        table(ACROSS, across(rows)),
+        'Coverage of the 95 % intervals:',
+        table(COVERED, covered),
+        f'![Reliability diagram]({picture})',
+        'Executed chunks against the futures of the fitted parameters:',
+        table(WATCHED, watch_rows(options, lines, list(pipelines))),
+    ]
+    publish(
+        'unseen_faults',
+        'Verdicts on faults that fresh seeds drew',
+        f'python experiments/unseen_faults.py {command}',
+        '\n\n'.join(parts),
+        options,
+        'one process',
+    )
+
+
+if __name__ == '__main__':
+    main()
