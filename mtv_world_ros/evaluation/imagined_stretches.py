@@ -37,6 +37,8 @@ class Stretch:
         frames: (V, 1 + T, H, W, 3) recorded frames on the model's clock, frame 0 the start.
         object_ids: (V, 1 + T, H, W) true masks as identities, None where not recorded.
         positions: (1 + T, J) measured at these frames [rad or m].
+        points: (1 + T, O, 3) where two views show the recording's objects [m], NaN until seen;
+            None where the identities are the simulator's, or no place is known.
     """
 
     index: int
@@ -44,17 +46,19 @@ class Stretch:
     frames: ByteArray
     object_ids: ByteArray | None
     positions: FloatArray
+    points: FloatArray | None = None
 
     @classmethod
     def of(cls, recording: Recording, index: int, rows: np.ndarray) -> Stretch:
         """Return the stretch of 1 + T recorded frames."""
-        ids = recording.object_ids
+        ids, poses = recording.object_ids, recording.object_poses
         return cls(
             index=index,
             start=int(rows[0]),
             frames=recording.frames[:, rows],
             object_ids=None if ids is None else ids[:, rows],
             positions=recording.positions[rows],
+            points=poses[rows, :, :3, 3] if recording.masks_by and poses is not None else None,
         )
 
     @property

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.core.data_types import ByteArray, ObjectMasks
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, FloatArray, ObjectMasks
 from mtv_world_ros.evaluation.imagined_stretches import Stretch
 from mtv_world_ros.evaluation.metrics.object_scores import moves, object_scores, ObjectScores
 from mtv_world_ros.vision.jaccard import held_masks
@@ -18,8 +18,12 @@ from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, Segmenter
 MOVING_RULE = (
     'an object moves in a stretch if in some recorded frame its mask and its first mask share '
     'less than half of the smaller of the two; {source} masks; frames that show less than a '
-    'quarter of its largest area do not count'
+    'quarter of its largest area do not count, and what two views of a recording show at one '
+    'place stays'
 )
+
+#: largest displacement of an object that stays, as masks in two views of a real camera show it [m]
+STAYS_M = 0.02
 
 #: statuses of a start mask that may belong to another object; later frames cannot correct it
 START_DOUBTS = frozenset({'ambiguous', 'low_confidence'})
@@ -155,9 +159,25 @@ def true_masks(
     true_first = masks_from_ids(ids[:, :1], objects, names)
     true = masks_from_ids(ids[:, 1:], objects, names)
     moving = moves(true.masks, true_first.masks[:, :, 0])
+    if stretch.points is not None:
+        moving &= ~_stay(stretch.points, objects, names)
     if use_ids:
         return Truth(first=true_first, first_frames=start, masks=true, moving=moving)
     return Truth(first=first, first_frames=start, masks=masks, moving=moving)
+
+
+def _stay(points: FloatArray, objects: tuple[str, ...], names: tuple[str, ...]) -> BoolArray:
+    """Return (O,) whether two views show that an object stays where it is.
+
+    Masks that a segmenter found in recordings come and go where something stands before an object.
+    """
+    stays = np.zeros(len(names), np.bool_)
+    for number, name in enumerate(names):
+        if name in objects:
+            way = points[:, objects.index(name)] - points[0, objects.index(name)]
+            # NaN = not seen by two views, which says nothing
+            stays[number] = bool((np.linalg.norm(way, axis=-1) < STAYS_M).all())
+    return stays
 
 
 def keep_doubts(first: ObjectMasks, masks: ObjectMasks) -> ObjectMasks:
