@@ -94,8 +94,8 @@ class Recordings:
             for episode, track in zip(self.episodes, self.tracks, strict=True)
         }
         moved = {
-            name: [(min(seconds + late_s, max(seconds, ends[name])), x, y)
-                   for seconds, x, y in rows]
+            name: [(min(seconds + late_s, max(seconds, ends[name])), *place)
+                   for seconds, *place in rows]
             for name, rows in points.items() if name in ends
         }  # fmt: skip
         seen = seen_points(moved, self.episodes, self.tracks, self.robot, self.shape.parts)

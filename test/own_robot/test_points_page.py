@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.inspection.cameras.shared_camera import load_points
+from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.data.episode import Episode, EpisodeInfo, JointStates, Track
+from mtv_world_ros.inspection.cameras.finger_tips import tip_middles
+from mtv_world_ros.inspection.cameras.points_page import points_page
+from mtv_world_ros.inspection.cameras.shared_camera import load_points, seen_points
+from mtv_world_ros.inspection.clocks import JointTrack
+from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.robot.shape import load_shape
 from test.support.browser import Browser
 from test.support.crane import load, make_cameras, make_positions, write_episode
 
@@ -89,3 +97,40 @@ def test_a_click_is_corrected_and_a_frame_that_lacks_a_finger_tip_is_not_saved(p
     rows = [row for rows in saved['door'].values() for row in rows]
     assert len(rows) == count - 1
     np.testing.assert_allclose(np.array(rows)[:, 1:], [[110, 70]] * (count - 1), atol=0.6)
+
+
+def test_each_arm_that_moves_has_frames_and_its_points_name_it(tmp_path):
+    """The second arm of two is the one that moves; a row without an arm is of the first."""
+    robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
+    arms = [tool.arm for tool in robot.tools]
+    count, right = 40, [n for n, name in enumerate(robot.joint_names) if name.startswith('right')]
+    positions = np.tile(np.clip(0.0, robot.lower, robot.upper), (count, 1))
+    positions[:, right[0]] += np.linspace(0, 0.6, count)
+    stamps = np.arange(1, count + 1) * 100_000_000
+    episode = Episode(
+        info=EpisodeInfo(path=tmp_path / 'e0'),
+        views=('door',),
+        images={'door': Track(stamps, np.zeros((count, 24, 32, 3), np.uint8))},
+        cameras={},
+        joint_states=JointStates(
+            stamps_ns=stamps, joint_names=robot.joint_names, positions=positions
+        ),
+        trajectories=[],
+        masks=None,
+        instructions=[],
+    )
+    page = points_page([episode], ['door'], robot, [2, 1])
+    assert page.count('data-arm="right"') >= 2 and 'data-arm="left"' not in page
+    assert page.count('data-tips="1"') == page.count('<figure')
+    file = tmp_path / 'points.yaml'
+    file.write_text('door: {e0: [[0.0, 10, 5, right], [1.0, 11, 5], [2, 9, 5, right], [3, 1, 1]]}')
+    rows = load_points(file, 'door', arms)['e0']
+    parts = load_shape(robot).parts
+    seen = seen_points({'e0': rows}, [episode], [JointTrack(episode.joint_states, robot)], robot,
+                       parts)  # fmt: skip
+    for point, row, arm in zip(seen, (0, 10, 20, 30), (1, 0, 1, 0), strict=True):
+        wanted = tip_middles(robot, parts, positions[row : row + 1], arm)[0]
+        np.testing.assert_allclose(point.position, wanted, atol=1e-6)
+    file.write_text('door: {e0: [[0.0, 10, 5, rihgt], [1, 1, 1], [2, 2, 2], [3, 3, 3]]}')
+    with pytest.raises(ConfigError, match="'rihgt' is no arm .did you mean 'right'"):
+        load_points(file, 'door', arms)

@@ -60,9 +60,11 @@ def calibrate_shared(arguments: argparse.Namespace) -> int:
             '(mtv-world import bag), or leave --apply out'
         )
     views = arguments.views
-    points = arguments.points and {view: load_points(arguments.points, view) for view in views}
     episodes, file = _read_all(arguments)
     robot = load_robot(file)
+    arms = [tool.arm for tool in robot.tools]
+    given = arguments.points
+    points = given and {view: load_points(given, view, arms) for view in views}
     if arguments.click:
         return _write_page(arguments, episodes, robot)
     if _has_all_poses(arguments, episodes):
@@ -106,7 +108,8 @@ def _write_page(
     from mtv_world_ros.inspection.cameras.points_page import points_page
     from mtv_world_ros.robot.shape import load_shape
 
-    tips = num_tips(robot, load_shape(robot).parts)
+    parts = load_shape(robot).parts
+    tips = [num_tips(robot, parts, arm) for arm in range(len(robot.tools))]
     write_whole(arguments.click, points_page(episodes, arguments.views, robot, tips))
     print(
         f'page: {arguments.click}\nopen it in a browser, click, save, and give what it saves as '

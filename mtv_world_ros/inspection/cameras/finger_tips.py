@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -21,7 +21,8 @@ def tip_middles(
 ) -> FloatArray:
     """Return (T, 3) the middle between the finger tips, in the base link [m].
 
-    Fingers that turn reach less far when they open: those of a Robotiq 2F-85 by 13 mm. Of a tool
+    Fingers that turn reach less far when they open: those of a Robotiq 2F-85 by 13 mm. The only
+    finger that a gripper joint moves, as of a hand, has its end. Of a tool
     without fingers, or of fingers without shapes, it is the tool point.
 
     Args:
@@ -51,7 +52,7 @@ def _tips(
     robot: RobotModel, shapes: Sequence[LinkShape], positions: FloatArray, arm: int
 ) -> list[list[FloatArray]]:
     """Return the finger tips (3,) of each of T states [m], base frame; empty without shapes."""
-    links = gripper_links(robot, robot.tools[arm])
+    links = _last_links(robot, gripper_links(robot, robot.tools[arm]))
     parts = [part for part in shapes if part.link in links]
     if not parts:
         return []
@@ -60,6 +61,14 @@ def _tips(
         _ends(parts, {link: T[row] for link, T in poses.items() if link in links}, tool)
         for row, tool in enumerate(robot.tool_poses(positions)[arm])
     ]
+
+
+def _last_links(robot: RobotModel, links: Collection[str]) -> set[str]:
+    """Return the links that carry no other of the links: a finger of phalanges has one tip."""
+    model = robot.pinocchio_model
+    joints = {f.name: f.parentJoint for f in model.frames if f.name in links}
+    carriers = {j for joint in joints.values() for j in list(model.supports[joint])[:-1]}
+    return {link for link in links if joints[link] not in carriers}
 
 
 def _ends(

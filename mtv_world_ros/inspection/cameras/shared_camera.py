@@ -13,7 +13,7 @@ from scipy.stats import f as f_distribution
 from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.core.config import read_yaml
 from mtv_world_ros.core.data_types import CameraModel, FloatArray
-from mtv_world_ros.core.errors import CalibrationError, ConfigError
+from mtv_world_ros.core.errors import CalibrationError, ConfigError, nearest
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.inspection.cameras.finger_tips import tip_middles
 from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
@@ -418,7 +418,7 @@ def seen_points(
     """Return where what was seen is by the joint states.
 
     Args:
-        points: points by the name of the episode: (time [s], x, y [px]).
+        points: points by the name of the episode: (time [s], x, y [px]), or with the arm's number.
         episodes: R recordings; points of others are left out.
         tracks: joint states of each.
         robot: robot of the recordings.
@@ -433,14 +433,15 @@ def seen_points(
         if name not in names:
             continue
         number = names.index(name)
-        for seconds, x, y in rows:
+        for seconds, x, y, *arm in rows:
             stamp = tracks[number].stamps_ns[:1] + round(seconds * 1e9)
             if not tracks[number].covers(stamp).all():
                 raise ConfigError(
                     f"points: '{name}' has no joint states at {seconds:g} s; times are from the "
                     'first joint state on'
                 )
-            position = tip_middles(robot, shapes, tracks[number].at(stamp))[0]
+            which = int(arm[0]) if arm else 0
+            position = tip_middles(robot, shapes, tracks[number].at(stamp), which)[0]
             found.append(
                 SeenPoint(
                     recording=number,
@@ -452,8 +453,14 @@ def seen_points(
     return found
 
 
-def load_points(path: Path, view: str) -> dict[str, list[FloatArray]]:
+def load_points(path: Path, view: str, arms: Sequence[str] = ()) -> dict[str, list[FloatArray]]:
     """Read seen tool points: `{<view>: {<episode>: [[seconds, x, y], ...]}}` [s, px].
+
+    Args:
+        path: file.
+        view: name of the view.
+        arms: names of the robot's arms; a row may end with one, whose number is returned. Rows
+            without are of the first arm.
 
     Raises:
         ConfigError: the file is no such table, or has fewer than four points of the view.
@@ -462,10 +469,12 @@ def load_points(path: Path, view: str) -> dict[str, list[FloatArray]]:
     rows = values.get(view) if isinstance(values, dict) else None
     try:
         found = {
-            str(name): [_row(row) for row in given] for name, given in dict(rows or {}).items()
+            str(name): [_row(row, arms) for row in given]
+            for name, given in dict(rows or {}).items()
         }
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"'{path}', view '{view}': {error}; a row is [seconds, x, y]") from error
+        form = '[seconds, x, y, arm]' if len(arms) > 1 else '[seconds, x, y]'
+        raise ConfigError(f"'{path}', view '{view}': {error}; a row is {form}") from error
     count = sum(map(len, found.values()))
     if count < _LEAST_POINTS:
         raise ConfigError(
@@ -475,7 +484,13 @@ def load_points(path: Path, view: str) -> dict[str, list[FloatArray]]:
     return found
 
 
-def _row(row: Any) -> FloatArray:
+def _row(row: Any, arms: Sequence[str]) -> FloatArray:
+    """Return time, x and y, and the number of the arm that a row names."""
+    if isinstance(row, list) and len(row) == 4:
+        *row, arm = row
+        if arm not in arms:
+            raise ValueError(f"'{arm}' is no arm{nearest(str(arm), arms)}; arms are {[*arms]}")
+        return np.append(_row(row, arms), arms.index(arm))
     numbers = np.asarray(row, float)
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
         raise ValueError(f'{row!r} is not three numbers')

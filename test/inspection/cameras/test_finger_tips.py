@@ -76,3 +76,31 @@ def test_each_finger_has_a_tip(robot):
 def test_without_shapes_it_is_the_tool_point(robot):
     positions = np.zeros((1, len(robot.joint_names)))
     np.testing.assert_allclose(tip_middles(robot, [], positions), [[0, 0, 0.39]], atol=1e-12)
+
+
+def test_a_finger_of_phalanges_has_one_tip_however_it_bends(tmp_path):
+    """Bent, the first phalanx of a hand's finger ends 10 mm behind the second, and is no tip."""
+    urdf = '\n'.join(
+        [
+            '<robot name="hand">',
+            LINK.format('base', 0.1, 0.2),
+            LINK.format('hand', 0.0, 0.02),
+            LINK.format('finger', 0.05, 0.1),
+            LINK.format('end', 0.02, 0.04),
+            JOINT.format('lift', 'base', 'hand', '0 0 0.3', '0 1 0', ''),
+            JOINT.format('left', 'hand', 'finger', '0 0.03 0', '-1 0 0', ''),
+            JOINT.format('knuckle', 'finger', 'end', '0 0 0.1', '-1 0 0',
+                         '<mimic joint="left"/>'),
+            '</robot>',
+        ]
+    )  # fmt: skip
+    (tmp_path / 'tongs.yaml').write_text(ROBOT.format(gripper=GRIPPER))
+    (tmp_path / 'tongs.urdf').write_text(urdf)
+    robot = load_robot(tmp_path / 'tongs.yaml')
+    parts = load_shape(robot).parts
+    assert num_tips(robot, parts) == 1
+    positions = np.zeros((2, 2))
+    positions[1, robot.joint_names.index('left')] = 0.7
+    heights = tip_middles(robot, parts, positions)[:, 2]
+    bent = 0.3 + 0.1 * np.cos(0.7) + 0.04 * np.cos(1.4) + 0.01 * np.sin(1.4)
+    np.testing.assert_allclose(heights, [0.44, bent], atol=1e-9)
