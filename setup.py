@@ -51,6 +51,7 @@ setup(
         'mujoco>=4.0,<5',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
+        'pillow>=10',
         'pin>=4.1,<5',
         'pydantic>=2.10',
         'rosbags>=0.11',

@@ -173,7 +173,11 @@ def test_every_tracked_config_launch_and_resource_file_is_installed(setup_argume
 
 def test_entry_points_import(setup_arguments):
     scripts = setup_arguments['entry_points']['console_scripts']
-    assert {script.partition(' = ')[0] for script in scripts} == {'mtv-world', 'world_model'}
+    assert {script.partition(' = ')[0] for script in scripts} == {
+        'mtv-world',
+        'policy_node',
+        'world_model',
+    }
     for script in scripts:
         module, _, function = script.partition(' = ')[2].partition(':')
         if importlib.util.find_spec('rclpy') is None and '.ros.' in module:
@@ -183,7 +187,11 @@ def test_entry_points_import(setup_arguments):
 
 def test_installed_like_colcon_the_commands_lie_where_ros2_run_looks(prefix):
     scripts = prefix / 'lib' / 'mtv_world_ros'
-    assert {path.name for path in scripts.iterdir()} == {'mtv-world', 'world_model'}
+    assert {path.name for path in scripts.iterdir()} == {
+        'mtv-world',
+        'policy_node',
+        'world_model',
+    }
     assert 'replay' in _run_installed(prefix, str(scripts / 'mtv-world'), '--help')
 
 

@@ -98,6 +98,7 @@ class Limits:
         trajectory_points: in a message.
         instruction_characters: of an instruction.
         table_values: numbers and texts in the columns that are read of a parquet file.
+        table_bytes: texts and images in these columns, each counted as often as it is repeated.
         answer_bytes: of an answer of a policy server or of a language model.
         array_bytes: of an array in an answer, and of all arrays in a file, inflated.
     """
@@ -120,6 +121,7 @@ class Limits:
     trajectory_points: int = 20_000
     instruction_characters: int = 4_000
     table_values: int = 200_000_000
+    table_bytes: int = 4 * 2**30
     answer_bytes: int = 64 * 2**20
     array_bytes: int = 256 * 2**20
 

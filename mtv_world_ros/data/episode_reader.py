@@ -20,6 +20,7 @@ from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, Jo
 from mtv_world_ros.core.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.image_decoding import check_image, to_ids, to_rgb
+from mtv_world_ros.data.bag.image_orientation import stored_note
 from mtv_world_ros.data.bag.messages import IMAGE_TYPES
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.video_packets import (
@@ -368,6 +369,8 @@ class _EpisodeReader:
         if not good:
             return None
         ordered = in_order(topic, good, self.warnings)
+        if hasattr(good[0][1], 'format') and (note := stored_note(bytes(good[0][1].data))):
+            self._warn_once(f"'{topic}': {note}")
         stamps = np.array([stamp for stamp, _ in ordered], np.int64)
         return Track(stamps, LazyFrames(topic, [message for _, message in ordered], decode))
 

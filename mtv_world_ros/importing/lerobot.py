@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -19,6 +20,7 @@ from mtv_world_ros.core.bounded_input import (
     check_limit,
     fill_template,
     LimitError,
+    limits,
     parse_json,
     placeholder,
     read_bytes,
@@ -28,6 +30,7 @@ from mtv_world_ros.core.bounded_input import (
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest, ObservationError
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
+from mtv_world_ros.data.bag.image_orientation import exif_orientation, turned_upright, UPRIGHT
 from mtv_world_ros.importing.video_frames import frames_at, times_in_video, video_note
 
 VERSIONS = ('v2.0', 'v2.1', 'v3.0')
@@ -92,6 +95,7 @@ class LeRobotDataset:
         pyarrow_modules()
         self.root = root
         self._video_notes: dict[Path, str] = {}
+        self._turns: dict[tuple[int, str], str] = {}
         self._matches: dict[tuple[int, str], str] = {}
         info = self._info()
         self.version = str(info.get('codebase_version', ''))
@@ -190,7 +194,7 @@ class LeRobotDataset:
         return found
 
     def video_note(self, entry: EpisodeEntry, feature: str) -> str:
-        """Return what was done to the frames of a video feature and why; empty if nothing was.
+        """Return what was done to the frames of a view and why; empty if nothing was.
 
         Call it when the frames have been read.
 
@@ -198,7 +202,7 @@ class LeRobotDataset:
             EpisodeError: the video is missing or damaged.
         """
         if self.feature(feature, _PICTURES)['dtype'] == 'image':
-            return ''
+            return self._turns.get((entry.index, feature), '')
         file = entry.videos[feature].file
         if file not in self._video_notes:
             self._video_notes[file] = video_note(file)
@@ -510,6 +514,7 @@ class LeRobotDataset:
             raise EpisodeError(f"image '{found}' cannot be read: {error}") from error
 
     def _decoded(self, cell: Any, entry: EpisodeEntry, feature: str) -> ByteArray:
+        """Return the RGB image of a cell, upright as Hugging Face's `datasets` shows it."""
         data = self._image_bytes(cell, entry, feature)
         if data[:4] == b'\x89PNG' and data[24:26] == _PNG_DEPTH:
             raise EpisodeError(
@@ -518,7 +523,14 @@ class LeRobotDataset:
             )
         layout = 'png' if data[:4] == b'\x89PNG' else 'jpeg'
         try:
-            return compressed_to_rgb(layout, np.frombuffer(data, np.uint8))
+            image = compressed_to_rgb(layout, np.frombuffer(data, np.uint8))
+            orientation = exif_orientation(data)
+            if orientation != UPRIGHT:
+                self._turns[entry.index, feature] = (
+                    f'images are turned upright (EXIF orientation {orientation}), as LeRobot '
+                    'shows them'
+                )
+            return turned_upright(image, orientation)
         except ObservationError as error:
             raise EpisodeError(
                 f"'{entry.data_file}': an image of '{feature}' is damaged: {error}"
@@ -576,22 +588,61 @@ def _read_table(file: Path, **options: Any) -> Any:
 
 
 def _check_table(metadata: Any, file: Path, columns: Sequence[str] | None) -> None:
-    """Check how many values a table has: a few kilobytes may state billions of equal ones.
+    """Check the size of a table: a few kilobytes may state billions of equal values or texts.
 
     Raises:
         EpisodeError: there are too many.
     """
     parts = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-    count = sum(
-        column.num_values
+    read = [
+        column
         for part in parts
         for column in map(part.column, range(part.num_columns))
         if columns is None or column.path_in_schema.partition('.')[0] in columns
-    )
+    ]
+    count = sum(column.num_values for column in read)
+    texts = [column for column in read if column.physical_type == 'BYTE_ARRAY']
+    least = sum(column.total_uncompressed_size for column in texts)
+    repeated = [c for c in texts if c.has_dictionary_page]
+    most = least + sum(c.num_values * c.total_uncompressed_size for c in repeated)
     try:
         check_limit('table_values', count, f"'{file}'")
+        check_limit('table_bytes', least, f"'{file}'")
+        if most > limits().table_bytes:
+            paths = sorted({column.path_in_schema for column in texts})
+            check_limit('table_bytes', _text_bytes(file, paths), f"'{file}'")
     except LimitError as error:
         raise EpisodeError(str(error)) from error
+
+
+def _text_bytes(file: Path, paths: Sequence[str]) -> int:
+    """Return the size of texts and images in these columns of a table.
+
+    A table stores a repeated text once. It is read that way here, as reading it row by row fills
+    the memory.
+    """
+    _, parquet = pyarrow_modules()
+    table = parquet.ParquetFile(file, read_dictionary=list(paths))
+    roots = sorted({path.partition('.')[0] for path in paths})
+    batches = table.iter_batches(columns=roots)
+    return sum(_array_bytes(column) for batch in batches for column in batch.columns)
+
+
+def _array_bytes(array: Any) -> int:
+    """Return the size of the texts in an array, and in the arrays that it consists of."""
+    pyarrow, _ = pyarrow_modules()
+    compute: Any = import_module('pyarrow.compute')
+    types, kind = pyarrow.types, array.type
+    if types.is_dictionary(kind):
+        lengths = compute.binary_length(array.dictionary)
+        return int(compute.sum(lengths.take(array.indices.drop_null())).as_py() or 0)
+    if types.is_struct(kind):
+        return sum(_array_bytes(array.field(number)) for number in range(kind.num_fields))
+    if types.is_list(kind) or types.is_large_list(kind):
+        return _array_bytes(array.flatten())
+    if any(check(kind) for check in (types.is_string, types.is_binary)):
+        return int(compute.sum(compute.binary_length(array.cast(pyarrow.binary()))).as_py() or 0)
+    return 0
 
 
 def pyarrow_modules() -> tuple[Any, Any]:

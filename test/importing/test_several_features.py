@@ -1,20 +1,25 @@
 """Data sets whose state and action are split into features, and whose images are files."""
 
+import io
 import json
 from pathlib import Path
+import resource
 import shutil
 
 import cv2
 import numpy as np
+from PIL import Image
 import pyarrow
 from pyarrow import parquet
 import pytest
 import yaml
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.errors import ConfigError, EpisodeError
 from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.importing import lerobot
 from mtv_world_ros.importing.convert import import_dataset
+from mtv_world_ros.importing.lerobot import LeRobotDataset
 
 ARM, GRIPPER = ['shoulder', 'elbow'], ['gripper']
 TABLE = 'data/chunk-000/episode_{:06d}.parquet'
@@ -253,3 +258,53 @@ def test_columns_have_names_however_a_data_set_writes_them(copy, make_mapping, t
     assert summary.made == [0, 1] and not summary.failed
     states = read_episode(tmp_path / 'out/episode_000000', with_cameras=False).joint_states
     assert states.positions[3] == pytest.approx([np.radians(9.0), 0.4, 0.0004 * 15], abs=1e-6)
+
+
+def test_images_with_an_exif_orientation_are_turned_upright_and_it_is_said(
+    datasets, make_mapping, tmp_path
+):
+    """As Hugging Face's `datasets` turns them, by which LeRobot reads images."""
+
+    def lying(path, data):
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        image[:10] = 250  # the upper edge
+        exif, file = Image.Exif(), io.BytesIO()
+        exif[0x0112] = 6  # to be turned by 90 degrees clockwise
+        stored = cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE)
+        Image.fromarray(stored).save(file, 'jpeg', quality=95, exif=exif)
+        return {'bytes': file.getvalue(), 'path': None}
+
+    root = with_image_files(shutil.copytree(datasets('images'), tmp_path / 'set'), lying, PLACE)
+    summary = import_dataset(root, make_mapping(), tmp_path / 'out')
+    assert summary.made == [0, 1] and not summary.failed
+    notes = ' '.join(summary.warnings[0])
+    assert "view 'front': images are turned upright (EXIF orientation 6)" in notes
+    frame = read_episode(tmp_path / 'out/episode_000000', with_cameras=False)
+    first = np.asarray(frame.images['front'].frames[0])
+    assert first.shape == (48, 64, 3)
+    assert first[:8].mean() > 230 > 200 > first[20:].mean()
+
+
+def repeated_text(file, text, count, column='task'):
+    """A table of one text that is stored once and repeated."""
+    places = pyarrow.array(np.zeros(count, np.int32))
+    texts = pyarrow.DictionaryArray.from_arrays(places, pyarrow.array([text]))
+    table = pyarrow.table({column: texts, 'task_index': pyarrow.array(range(count))})
+    parquet.write_table(table, file, store_schema=False, dictionary_pagesize_limit=2**26)
+
+
+def test_a_text_that_is_repeated_does_not_fill_the_memory(datasets, tmp_path):
+    """Two megabytes, 20,000 times: a file of .3 MB that would be 40 GB."""
+    root = shutil.copytree(datasets('v3.0'), tmp_path / 'set')
+    repeated_text(root / 'meta/tasks.parquet', 'x' * 2_000_000, 20_000)
+    assert (root / 'meta/tasks.parquet').stat().st_size < 1e6
+    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(EpisodeError, match=r'tasks.parquet.*table_bytes|40000000000'):
+        LeRobotDataset(root)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - used < 300_000  # kB
+
+
+def test_short_texts_that_are_repeated_are_read(datasets, tmp_path):
+    file = tmp_path / 'tasks.parquet'
+    repeated_text(file, 'stack the red block', 200_000)
+    assert lerobot._text_bytes(file, ['task']) == 200_000 * len('stack the red block')

@@ -19,6 +19,7 @@ from mtv_world_ros.cameras.camera_info import read_camera_info
 from mtv_world_ros.cameras.image_window import window_of, windowed_camera
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, Observation
 from mtv_world_ros.core.images import resize_frames
+from mtv_world_ros.data.bag.image_orientation import stored_note
 from mtv_world_ros.data.measured_joints import JointReach, ReachWatch
 from mtv_world_ros.data.transform_tree import Mount
 from mtv_world_ros.robot.model import RobotModel
@@ -101,6 +102,8 @@ class ObservationBuffer:
         self._reach = ReachWatch(JointReach(robot))
         #: frame of the images of each view, as they came first
         self._frames: dict[str, str] = {}
+        #: note on the EXIF orientation of the images of each view
+        self._turns: dict[str, str] = {}
         self._joints: dict[str, Samples[float]] = {
             name: Samples(_NUM_SAMPLES) for name in robot.joint_names
         }
@@ -135,6 +138,8 @@ class ObservationBuffer:
         images.refusal = _refusal(images, what, stamp_ns, self._now_ns(), limit_s)
         if images.refusal:
             raise Rejection(Reason.IMAGE_STALE, images.refusal)
+        if view not in self._turns and isinstance(message, CompressedImage):
+            self._turns[view] = stored_note(bytes(message.data))
         images.add(stamp_ns, message)
         if self._on_image is not None:
             self._on_image(view, message)
@@ -201,6 +206,7 @@ class ObservationBuffer:
             samples.clear()
         self._reach.clear()
         self._frames.clear()
+        self._turns.clear()
 
     def accept_cameras(self, cameras: Sequence[CameraModel]) -> None:
         """Take changed camera infos as the valid ones from now on.
@@ -230,7 +236,8 @@ class ObservationBuffer:
     @property
     def notes(self) -> list[str]:
         """Assumptions about images that their camera infos do not settle, as text."""
-        return [note for note in self._intrinsics.notes.values() if note]
+        turns = [f"view '{view}': {note}" for view, note in self._turns.items() if note]
+        return [*turns, *(note for note in self._intrinsics.notes.values() if note)]
 
     def problems(self, now_ns: int) -> list[str]:
         """Return what is missing or too old for an observation, as text."""

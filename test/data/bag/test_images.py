@@ -1,14 +1,22 @@
 from __future__ import annotations
 
+import io
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
+from PIL import Image, ImageOps
 import pytest
 
 from mtv_world_ros.core.errors import ObservationError
 from mtv_world_ros.data.bag import image_decoding
 from mtv_world_ros.data.bag.image_decoding import compressed_to_ids, compressed_to_rgb
+from mtv_world_ros.data.bag.image_orientation import (
+    exif_orientation,
+    stored_note,
+    turned_upright,
+    UPRIGHT,
+)
 
 RED, GREEN = (200, 10, 20), (30, 150, 40)
 #: a row of a red and a green pixel in each encoding
@@ -198,3 +206,51 @@ def test_sixteen_bits_become_eight(encoding, is_bigendian):
         data.ravel(), encoding=encoding, step=step, is_bigendian=is_bigendian, **size
     )
     assert np.array_equal(found, wanted)
+
+
+def jpeg(image, orientation=None):
+    """A JPEG file by Pillow, with the EXIF orientation."""
+    exif, file = Image.Exif(), io.BytesIO()
+    if orientation is not None:
+        exif[0x0112] = orientation
+    Image.fromarray(image).save(file, 'jpeg', quality=95, exif=exif)
+    return file.getvalue()
+
+
+def corners():
+    """An image whose four corners differ."""
+    image = np.full((16, 24, 3), 120, np.uint8)
+    image[:8, :8], image[:8, -8:], image[-8:, :8] = (220, 20, 20), (20, 220, 20), (20, 20, 220)
+    return image
+
+
+@pytest.mark.parametrize('orientation', range(1, 9))
+def test_exif_orientation_is_read_and_applied_as_pillow_does(orientation):
+    content = jpeg(corners(), orientation)
+    assert exif_orientation(content) == orientation
+    stored = compressed_to_rgb('jpeg', np.frombuffer(content, np.uint8))
+    expected = np.asarray(ImageOps.exif_transpose(Image.open(io.BytesIO(content))).convert('RGB'))
+    turned = turned_upright(stored, orientation)
+    assert turned.shape == expected.shape
+    assert np.abs(turned.astype(int) - expected).mean() < 3
+
+
+@pytest.mark.parametrize(
+    'content',
+    [
+        jpeg(corners()),
+        jpeg(corners(), 77),
+        b'\xff\xd8\xff\xe1\x00\x10Exif\x00\x00II*\x00\xff\xff\xff\xff' + b'\xff\xd9',
+        b'',
+    ],
+    ids=['none', 'unknown', 'damaged', 'empty'],
+)
+def test_without_a_usable_orientation_pixels_are_as_stored(content):
+    assert exif_orientation(content) == UPRIGHT and stored_note(content) == ''
+
+
+def test_images_of_topics_are_shown_as_stored_and_it_is_said():
+    """As ROS' decoder does: CameraInfo is of the stored pixels."""
+    content = jpeg(corners(), 6)
+    assert compressed_to_rgb('jpeg', np.frombuffer(content, np.uint8)).shape == (16, 24, 3)
+    assert 'EXIF orientation 6' in stored_note(content)
