@@ -242,6 +242,14 @@ class Control(Protocol):
         """
         ...
 
+    def unmarked(self, scene: ControlScene) -> ByteArray | None:
+        """Return what `make` draws as it looks (V, 1 + T, H, W, 4), without marks of the plan.
+
+        None = the control draws no such pictures. A model that may copy them copies marks, too.
+        """
+        del scene
+        return None
+
     def fitted(self, motions: Sequence[Motion]) -> Self:
         """Return the control with statistics of the training set's chunks, if it needs any."""
         del motions

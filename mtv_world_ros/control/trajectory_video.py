@@ -561,6 +561,17 @@ class TrajectoryVideo(Control):
         )
         return ControlInputs.drawn(video.frames)
 
+    def unmarked(self, scene: ControlScene) -> ByteArray | None:
+        """Return the robot and the objects of `make` (V, 1 + T, H, W, 4) without marks.
+
+        Marks are what no camera sees: trails, cores and lines along fingers.
+        """
+        shown = arm_pictures(self.parts, scene.motion, scene.start_frames, scene.seen)
+        if shown is None or scene.objects is None or not self.shows_objects:
+            return shown
+        rest = 255 - scene.objects[..., 3:].astype(np.uint16)
+        return scene.objects + (shown * rest // 255).astype(np.uint8)
+
     def cache_key(self) -> dict[str, Any]:
         """Return how the plan is drawn."""
         return {

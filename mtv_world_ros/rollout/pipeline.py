@@ -37,7 +37,7 @@ from mtv_world_ros.rollout.assembly import asked_describer
 from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions
 from mtv_world_ros.rollout.prediction import Prediction, StageClock
 from mtv_world_ros.rollout.rollout import ObservedChunk, Rollout
-from mtv_world_ros.rollout.scene_memory import SceneKeeper
+from mtv_world_ros.rollout.scene_memory import SceneKeeper, SceneMemory
 from mtv_world_ros.rollout.state import RolloutState
 from mtv_world_ros.success.calibration import Calibration, Fits, HorizonCurve, load_fits
 from mtv_world_ros.success.doubts import doubted, Grounds, widened
@@ -399,19 +399,10 @@ class Pipeline:
         )[:, : plan.num_frames]
         clock.lap('model')
         motion = motion.first(plan.num_frames + 1)
-        masks = self.follow(state, start_masks, frames, options)
         background = state.scene
         if self.scene_keeper is not None and options.objects:
-            if not state.num_imagined:
-                background = self.scene_keeper.seen(
-                    background, motion.first(1), start.frames[:, None], start_masks
-                )
-            assert background is not None
-            drawn_objects = None if pictures is None else pictures[:, 1 : plan.num_frames + 1]
-            frames, background = self.scene_keeper.held(
-                background, motion.after_first(), frames, masks, drawn_objects
-            )
-            masks = self.follow(state, start_masks, frames, options)
+            frames, background = self._kept(state, scene, motion, drawn, frames, options)
+        masks = self.follow(state, start_masks, frames, options)
         clock.lap('masks')
         foreseen = objects.motions(plan, state.is_begun)
         success, memory = self.judge(state, motion, start_masks, masks, options, foreseen)
@@ -485,6 +476,30 @@ class Pipeline:
             background,
         )
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success), after
+
+    def _kept(
+        self,
+        state: RolloutState,
+        scene: ControlScene,
+        motion: Motion,
+        drawn: ByteArray,
+        frames: ByteArray,
+        options: RolloutOptions,
+    ) -> tuple[ByteArray, SceneMemory]:
+        """Return imagined frames with the background of the rollout, and its memory after them."""
+        keeper, background, shown = self.scene_keeper, state.scene, slice(1, len(motion.positions))
+        assert keeper is not None
+        start_masks = self.find(state, options)
+        if not state.num_imagined:
+            start = state.observation.frames[:, None]
+            background = keeper.seen(background, motion.first(1), start, start_masks)
+        assert background is not None
+        unmarked = self.control.unmarked(scene)
+        if unmarked is not None:
+            frames = keeper.without_marks(background, frames, drawn[:, shown], unmarked[:, shown])
+        masks = self.follow(state, start_masks, frames, options)
+        objects = None if scene.objects is None else scene.objects[:, shown]
+        return keeper.held(background, motion.after_first(), frames, masks, objects)
 
     @property
     def _links(self) -> tuple[str, ...]:

@@ -32,11 +32,19 @@ class SceneMemorySettings:
             what a gripper holds, shadows [fraction of the image width].
         object_margin: the same around objects that may have moved [fraction of the image width].
         blend: width of the passage between memory and model [fraction of the image width].
+        min_saturation: smallest difference between the colour channels of a mark that is looked
+            for, of 255: white ones look like things.
+        min_contrast: smallest difference of a mark from what it is drawn on, of 255.
+        max_residual: largest difference of a pixel from the mixture of both, of 255; a pixel
+            further off shows something else.
     """
 
     arm_margin: float = 0.05
     object_margin: float = 0.02
     blend: float = 0.012
+    min_saturation: int = 70
+    min_contrast: int = 40
+    max_residual: int = 40
 
 
 _SETTINGS = SceneMemorySettings()
@@ -152,6 +160,36 @@ class SceneKeeper:
         new = ~covered[:, -1] & ~memory.known & self._stands_still(motion)[:, None, None]
         pictures = np.where(new[..., None], frames[:, -1], memory.pictures)
         return frames, replace(memory, pictures=pictures, known=memory.known | new)
+
+    def without_marks(
+        self, memory: SceneMemory, frames: ByteArray, drawn: ByteArray, unmarked: ByteArray
+    ) -> ByteArray:
+        """Return imagined frames without the colours of marks that the model copied.
+
+        The share of a mark in a pixel is the least squares one, between the mark and what would be
+        there without it: robot and objects as they are drawn, else the background.
+
+        Args:
+            memory: of the background.
+            frames: (V, T, H, W, 3) uint8 RGB as the model predicts them.
+            drawn: (V, T, H, W, 3) the trajectory video.
+            unmarked: (V, T, H, W, 4) what it shows, without marks.
+        """
+        cover = unmarked[..., 3:].astype(np.float32) / 255
+        behind = np.where(memory.known[..., None], memory.pictures, 0)[:, None]
+        plain = unmarked[..., :3] + (1 - cover) * behind
+        mark = drawn.astype(np.float32) - plain
+        saturation = np.ptp(drawn.astype(np.int16), axis=-1)
+        is_known = (cover[..., 0] > 0.5) | memory.known[:, None]
+        is_mark = (saturation > self._settings.min_saturation) & is_known
+        is_mark &= np.abs(mark).max(-1) > self._settings.min_contrast
+        # where nothing is drawn the video is black, which is no mark
+        is_mark &= np.ptp(unmarked[..., :3].astype(np.int16), axis=-1) < saturation
+        power = np.maximum((mark * mark).sum(-1), 1.0)
+        share = np.clip(((frames - plain) * mark).sum(-1) / power, 0.0, 1.0)
+        left = np.abs(frames - plain - share[..., None] * mark).max(-1)
+        share *= is_mark & (left < self._settings.max_residual)
+        return np.rint(frames - share[..., None] * mark).clip(0, 255).astype(np.uint8)
 
     def _drawn(self, motion: Motion) -> BoolArray:
         """(V, T, H, W) masks of the robot."""

@@ -133,3 +133,46 @@ def test_only_checkpoints_whose_preset_says_so_hold_the_background(preset, holds
     card = load_training_config(preset).card({})
     assert card.scene_memory is holds
     assert ('scene_memory' in card.plain()) is holds  # cards of before stay as they were
+
+
+def marked(one_arm, make_camera, keeper, pixel, mark, plain):
+    """One pixel of a frame in front of a robot that is drawn with a mark, without it."""
+    camera = make_camera(192, 144)
+    scene, nothing = texture(camera), masks_of(camera, [None])
+    memory = keeper.seen(None, motion_of(one_arm, [camera], [LEFT], keeper), scene, nothing)
+    unmarked = np.zeros((1, 1, camera.height, camera.width, 4), np.uint8)
+    unmarked[..., 70, 90, :] = *plain, 255
+    drawn = unmarked[..., :3].copy()
+    drawn[..., 70, 90, :] = mark
+    frames = np.array(scene)
+    frames[..., 70, 90, :] = pixel
+    cleaned = keeper.without_marks(memory, frames, drawn, unmarked)
+    others = np.ones(frames.shape[2:4], np.bool_)
+    others[70, 90] = False
+    assert (cleaned[0, 0][others] == frames[0, 0][others]).all()
+    return cleaned[0, 0, 70, 90]
+
+
+ORANGE, MAGENTA, WHITE, DARK = (250, 140, 20), (255, 0, 255), (255, 255, 255), (30, 30, 32)
+
+
+@pytest.mark.parametrize('mark', [ORANGE, MAGENTA])
+@pytest.mark.parametrize('share', [0.2, 0.6, 1.0])
+def test_copied_marks_are_taken_out_of_a_frame(one_arm, make_camera, keeper, mark, share):
+    pixel = np.rint((1 - share) * np.array(DARK) + share * np.array(mark))
+    found = marked(one_arm, make_camera, keeper, pixel, mark, DARK)
+    assert np.abs(found.astype(int) - DARK).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ('pixel', 'mark'),
+    [
+        (DARK, ORANGE),  # nothing was copied
+        ((40, 60, 200), ORANGE),  # a blue block between the fingers
+        ((230, 230, 225), ORANGE),  # a plate
+        (WHITE, WHITE),  # a white mark looks like a thing
+    ],
+)
+def test_what_is_no_copied_mark_stays(one_arm, make_camera, keeper, pixel, mark):
+    found = marked(one_arm, make_camera, keeper, pixel, mark, DARK)
+    assert np.abs(found.astype(int) - pixel).max() <= 6
