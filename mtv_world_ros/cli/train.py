@@ -150,7 +150,6 @@ def _train(arguments: argparse.Namespace) -> int:
             'training needs a folder of episodes and a folder for its results: '
             'mtv-world train DATASET --out DIR; without them only --dry-run works'
         )
-    from mtv_world_ros.model.card import read_card
     from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.robot.file import robot_path
     from mtv_world_ros.rollout.assembly import asked_describer
@@ -182,7 +181,7 @@ def _train(arguments: argparse.Namespace) -> int:
         broken=broken,
         num_episodes=arguments.episodes,
         source=source,
-        initial=initial.folder if initial else None,
+        initial=initial,
         **{name: getattr(arguments, name) for name in same},
     )
     folder = train(
@@ -195,7 +194,7 @@ def _train(arguments: argparse.Namespace) -> int:
     print(f'{f"adapter for {arguments.init}" if config.lora.rank else "checkpoint"}: {folder}')
     model = [str(arguments.init), '--adapter', str(folder)] if config.lora.rank else [str(folder)]
     dataset = str(arguments.held_out or arguments.dataset)
-    out = arguments.out / f'evaluation_{read_card(folder).trained_on["steps"]}'
+    out = arguments.out / f'evaluation_{Checkpoint.open(folder).card.trained_on["steps"]}'
     words = [model[0], dataset, *model[1:], '--out', str(out)]
     print(f'evaluate it with: {shlex.join(["mtv-world", "evaluate", *words])}')
     return 0

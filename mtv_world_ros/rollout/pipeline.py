@@ -34,7 +34,7 @@ from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import ChunkPlan
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.assembly import asked_describer
-from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions
+from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions, with_keywords
 from mtv_world_ros.rollout.prediction import Prediction, StageClock
 from mtv_world_ros.rollout.rollout import ObservedChunk, Rollout
 from mtv_world_ros.rollout.scene_memory import SceneKeeper, SceneMemory
@@ -79,8 +79,8 @@ class WorldModel(Protocol):
         Args:
             start_frame: (V, H, W, 3) uint8 RGB, the frame the chunk starts from.
             control: the plan as the model takes it, T commands.
-            positions: (1 + T, J) the plan itself: row 0 where the robot stands, row k command k
-                [rad or m].
+            positions: (1 + T, J) the plan itself, for models that take no drawing, such as a
+                simulator: row 0 where the robot stands, row k command k [rad or m].
             seed: seed of the noise.
             num_inference_steps: denoising steps.
             should_stop: asked between steps.
@@ -117,6 +117,7 @@ class Pipeline:
             None = the estimate stays as it is, e.g. bare.
         scene_keeper: keeps the background of rollouts as real frames showed it; None = the model
             draws it anew in each chunk.
+        checkpoint: checkpoint that the model was loaded from; None = made otherwise.
     """
 
     robot: RobotModel
@@ -134,6 +135,7 @@ class Pipeline:
     checks_place: bool = False
     picture_fits: Fits | None = None
     scene_keeper: SceneKeeper | None = None
+    checkpoint: Checkpoint | None = None
 
     @classmethod
     def load(
@@ -219,6 +221,7 @@ class Pipeline:
             camera_checker=CameraChecker(model, load_shape(model)) if camera_check else None,
             setting=Setting.of(model, opened.object_motion_digest),
         )
+        pipeline = replace(pipeline, checkpoint=opened)
         if not calibrated:  # to be fitted, or compared: the bare estimate
             return pipeline
         doubt = motion.settings.doubt if motion else ''
@@ -319,13 +322,23 @@ class Pipeline:
         return model is None or not self.checks_place or model.at_place(place) is model
 
     def begin(
-        self, observation: Observation, options: RolloutOptions = DEFAULT_OPTIONS
+        self,
+        observation: Observation,
+        options: RolloutOptions = DEFAULT_OPTIONS,
+        **keywords: Any,
     ) -> Rollout:
         """Return an episode that begins at an observation (V views, any image size).
 
+        Args:
+            observation: where it begins.
+            options: what is asked for, and how it is computed.
+            keywords: options one by one, as version 0.1.0 took them; deprecated.
+
         Raises:
             ObservationError: the views are not the model's.
+            TypeError: a keyword is no option.
         """
+        options = with_keywords(options, keywords)
         checker = self.camera_checker
         check = CameraCheck() if checker is None else checker.check(observation)
         observation = check.corrected_observation(observation)

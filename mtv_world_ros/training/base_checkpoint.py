@@ -48,7 +48,7 @@ def needs_base(config: TrainingConfig) -> bool:
 
 def load_base(
     config: TrainingConfig,
-    folder: Path | None,
+    checkpoint: Checkpoint | None,
     device: torch.device,
     dtype: torch.dtype,
     *,
@@ -61,15 +61,15 @@ def load_base(
     encode the prompt, then freed.
 
     Raises:
-        TrainingError: there is no folder, or its model is not the preset's.
+        TrainingError: there is no checkpoint, or its model is not the preset's.
         CheckpointError: the checkpoint cannot be loaded.
     """
-    if folder is None:
+    if checkpoint is None:
         raise TrainingError(
             'this preset trains on top of a checkpoint; give --init FOLDER, which '
             "'mtv-world import wan' makes of public weights"
         )
-    loaded = load_trained_model(Checkpoint.open(folder), dtype=dtype)
+    folder, loaded = checkpoint.folder, load_trained_model(checkpoint, dtype=dtype)
     digest, inputs = _digest(loaded.transformer), layout.transformer_arguments()
     if inputs and loaded.transformer.control_tokens is None:
         torch.manual_seed(seed)

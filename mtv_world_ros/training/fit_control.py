@@ -13,6 +13,7 @@ from mtv_world_ros.control.registry import CONTROL_FILE, create_control, load_co
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.data.recordings import clip_starts, cut_clip
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.training.training_config import TrainingConfig
 
@@ -26,7 +27,7 @@ def fitted_control(
     recordings: Sequence[Recording],
     robot: RobotModel,
     *,
-    initial: Path | None = None,
+    initial: Checkpoint | None = None,
 ) -> Control:
     """Return the control of a training; what it was fitted to is stored in the folder.
 
@@ -46,7 +47,7 @@ def fitted_control(
     """
     name, options = config.video.control, config.control_options(robot)
     control = create_control(name, options)
-    for known in (folder, initial):
+    for known in (folder, None if initial is None else initial.folder):
         if known is not None and (known / CONTROL_FILE).is_file():
             control = load_control(name, options, known)
             break

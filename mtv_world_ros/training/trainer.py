@@ -162,17 +162,17 @@ class Trainer:
             )
         return self.processes.share(settings.batch_size)
 
-    def start_from(self, folder: Path) -> None:
+    def start_from(self, checkpoint: Checkpoint) -> None:
         """Load the weights of a checkpoint of the same architecture; the optimizer state is new.
 
         Its physics (`object_motion/`) comes along where robot and views are the same and
         `rendering.object_motion` is on.
 
         Raises:
-            CheckpointError: the folder holds no checkpoint.
+            CheckpointError: the weights cannot be read.
             TrainingError: its transformer is of another shape.
         """
-        loaded = load_trained_model(Checkpoint.open(folder))
+        folder, loaded = checkpoint.folder, load_trained_model(checkpoint)
         theirs, video = loaded.card, self.config.video
         if not self.control.shows_objects:
             self._object_motion = None  # its trajectory videos will not show what is foreseen

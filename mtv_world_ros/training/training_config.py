@@ -7,7 +7,7 @@ from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, model_validator
 
 from mtv_world_ros.control.control import ControlOptions
 from mtv_world_ros.control.registry import check_control_name, TRAJECTORY_VIDEO
@@ -28,6 +28,7 @@ from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import bundled
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.model.card import CheckpointCard, HistorySettings
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.robot.model import RobotModel
 
 #: in a loss
@@ -312,6 +313,11 @@ class TrainingConfig(Schema):
         )
 
 
+def _opened(checkpoint: Any) -> Checkpoint | None:
+    """Return the checkpoint of a name or path; one that was opened before stays as it is."""
+    return None if checkpoint is None else Checkpoint.open(checkpoint)
+
+
 class TrainingRun(Schema):
     """A training as a whole: preset, data, device, saving."""
 
@@ -332,7 +338,7 @@ class TrainingRun(Schema):
         default=EpisodeSource(),
         description="how episodes are read that are not this package's own",
     )
-    initial: Path | None = Field(
+    initial: Annotated[InstanceOf[Checkpoint] | None, BeforeValidator(_opened)] = Field(
         default=None,
         description='checkpoint whose weights a new run starts from; a resumed run has its own. '
         'For an adapter or a model with text, its other parts are used too, also when resumed',

@@ -35,6 +35,7 @@ from mtv_world_ros.data.episode_reader import list_episodes, read_info
 from mtv_world_ros.data.recording import DEFAULT, Recording
 from mtv_world_ros.data.recordings import cached_recording, clip_starts, described_objects
 from mtv_world_ros.model.card import CAMERAS, CARD, read_card, ROBOT_FOLDER
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.runtime import check_device, choose_dtype
 from mtv_world_ros.robot.file import save_robot
 from mtv_world_ros.robot.model import check_positions, RobotModel
@@ -330,7 +331,7 @@ def _save_robot(
 
 
 def notes(
-    config: TrainingConfig, recordings: Sequence[Recording], initial: Path | None = None
+    config: TrainingConfig, recordings: Sequence[Recording], initial: Checkpoint | None = None
 ) -> list[str]:
     """Return notes on a training for the user, before it runs.
 
@@ -341,7 +342,7 @@ def notes(
     """
     found, optimizer = [], config.optimizer
     if initial is not None:
-        found += _drawn_otherwise(config.rendering, read_card(initial).rendering)
+        found += _drawn_otherwise(config.rendering, initial.card.rendering)
     if optimizer.warmup < optimizer.warmup_steps:
         found.append(
             f'the learning rate warms up over {optimizer.warmup} steps, a fifth of the training, '

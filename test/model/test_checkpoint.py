@@ -63,7 +63,6 @@ def predict(model: DiffusionWorldModel, seed: int = 0, should_stop=lambda: False
     return model.predict(
         generator.integers(0, 255, (2, 32, 32, 3), np.uint8),
         ControlInputs.drawn(generator.integers(0, 255, (2, 5, 32, 32, 3), np.uint8)),
-        positions=np.zeros((5, 14)),
         seed=seed,
         num_inference_steps=2,
         should_stop=should_stop,

@@ -194,7 +194,6 @@ def predict(model: DiffusionWorldModel, history: History | None):
     return model.predict(
         frames(2),
         ControlInputs.drawn(frames(2, 5, seed=1)),
-        positions=np.zeros((5, 14)),
         seed=0,
         num_inference_steps=1,
         should_stop=lambda: False,

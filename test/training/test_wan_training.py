@@ -65,7 +65,7 @@ def batches(clips, config, robot):
 
 def make(config: TrainingConfig, folder: Path, base: Path, device: str = 'cpu') -> Trainer:
     dtype = torch.float32 if device == 'cpu' else torch.bfloat16
-    loaded = load_base(config, base, torch.device(device), dtype, seed=0)
+    loaded = load_base(config, Checkpoint.open(base), torch.device(device), dtype, seed=0)
     return make_trainer(config, folder, device=device, base=loaded)
 
 
@@ -73,7 +73,6 @@ def predict(model: DiffusionWorldModel, clip: np.ndarray) -> np.ndarray:
     return model.predict(
         clip[:, 0],
         ControlInputs.drawn(clip),
-        positions=np.zeros((5, 14)),
         seed=0,
         num_inference_steps=2,
         should_stop=lambda: False,
@@ -212,7 +211,7 @@ def test_an_adapter_trains_and_continues_on_a_gpu(config, base, batches, tmp_pat
 
 def test_a_state_on_top_of_other_weights_is_refused(config, base, tmp_path):
     make(config, tmp_path, base).save_state()
-    other = load_base(config, base, CPU, torch.float32, seed=0)
+    other = load_base(config, Checkpoint.open(base), CPU, torch.float32, seed=0)
     changed = replace(other, digest='of other weights')
     trainer = make(config, tmp_path, base)
     trainer.base = changed
@@ -242,7 +241,9 @@ def test_a_base_of_another_kind_is_refused(config, base, section, changes, messa
     held = getattr(config, section)
     other = {**held, **changes} if isinstance(held, dict) else held.replace(**changes)
     with pytest.raises(TrainingError, match=message):
-        load_base(config.replace(**{section: other}), base, CPU, torch.float32, seed=0)
+        load_base(
+            config.replace(**{section: other}), Checkpoint.open(base), CPU, torch.float32, seed=0
+        )
 
 
 def test_without_a_base_the_command_to_make_one_is_named(config, episode, robot, tmp_path):

@@ -65,13 +65,13 @@ class PolicyNode(Node):
         super().__init__('policy', context=context)
         parameters.declare(self, PolicySettings)
         settings = self._settings()
-        checkpoint = Checkpoint.open(settings.checkpoint)
+        self._checkpoint = checkpoint = Checkpoint.open(settings.checkpoint)
         robot = checkpoint.load_robot(settings.robot_file or None)
         self._make_policy = load(settings, robot)
         self._spec, joint_names = checkpoint.spec, robot.joint_names
         self._status = StatusPublisher(self)
         self._buffer = ObservationBuffer(
-            cameras=reload_cameras(settings, self._spec),
+            cameras=reload_cameras(settings, self._spec, self._checkpoint),
             robot=robot,
             width=self._spec.width,
             height=self._spec.height,
@@ -101,7 +101,9 @@ class PolicyNode(Node):
         self.create_timer(settings.diagnostics_period_s, self._on_period, clock=steady)
         self.add_on_set_parameters_callback(
             parameters.refusing(
-                lambda changed: check_calibration(changed, self._settings(), self._spec)
+                lambda changed: check_calibration(
+                    changed, self._settings(), self._spec, self._checkpoint
+                )
             )
         )
         parameters.refuse_unknown(self)
@@ -181,7 +183,7 @@ class PolicyNode(Node):
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         settings = self._settings()
         try:
-            self._buffer.accept_cameras(reload_cameras(settings, self._spec))
+            self._buffer.accept_cameras(reload_cameras(settings, self._spec, self._checkpoint))
         except MtvWorldError as error:
             response.message = f'not started: {error}'
             return response

@@ -137,13 +137,20 @@ def load_named_pipeline(settings: Settings) -> Pipeline:
     )
 
 
-def load_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[CameraModel, ...]:
+def load_cameras(
+    settings: NodeSettings, spec: WorldModelSpec, checkpoint: Checkpoint | str
+) -> tuple[CameraModel, ...]:
     """Load the calibrated camera of every view, in the model's order.
+
+    Args:
+        settings: `calibration_file` names the file; empty = the checkpoint's default cameras.
+        spec: views of the model.
+        checkpoint: checkpoint of the model; its name, where it was not opened.
 
     Raises:
         CalibrationError: the file is wrong or lacks a view, or there is none.
     """
-    path = Path(settings.calibration_file or Checkpoint.open(settings.checkpoint).cameras_file)
+    path = Path(settings.calibration_file or Checkpoint.open(checkpoint).cameras_file)
     return read_cameras(path, spec)
 
 
@@ -163,14 +170,18 @@ def read_cameras(path: Path, spec: WorldModelSpec) -> tuple[CameraModel, ...]:
     return tuple(cameras[view] for view in spec.views)
 
 
-def reload_cameras(settings: NodeSettings, spec: WorldModelSpec) -> tuple[CameraModel, ...]:
-    """Exchange the adapter while the node runs.
+def reload_cameras(
+    settings: NodeSettings, spec: WorldModelSpec, checkpoint: Checkpoint | str
+) -> tuple[CameraModel, ...]:
+    """Load the cameras again while the node runs; see `load_cameras`.
 
     Raises:
         Rejection: the file is wrong, lacks a view, or cannot be read in time.
     """
     with rejected_as(Reason.CAMERA_INFO_INVALID):
-        return _in_time(lambda: load_cameras(settings, spec), settings.calibration_file)
+        return _in_time(
+            lambda: load_cameras(settings, spec, checkpoint), settings.calibration_file
+        )
 
 
 def _in_time(read: Callable[[], Cameras], path: str) -> Cameras:
@@ -200,7 +211,10 @@ def _in_time(read: Callable[[], Cameras], path: str) -> Cameras:
 
 
 def check_calibration(
-    changed: Sequence[Parameter], settings: NodeSettings, spec: WorldModelSpec
+    changed: Sequence[Parameter],
+    settings: NodeSettings,
+    spec: WorldModelSpec,
+    checkpoint: Checkpoint | str,
 ) -> None:
     """Refuse a `calibration_file` that is wrong or lacks a view, before it is taken.
 
@@ -209,4 +223,5 @@ def check_calibration(
     """
     for parameter in changed:
         if parameter.name == 'calibration_file':
-            reload_cameras(settings.model_copy(update={'calibration_file': parameter.value}), spec)
+            changed_settings = settings.model_copy(update={'calibration_file': parameter.value})
+            reload_cameras(changed_settings, spec, checkpoint)

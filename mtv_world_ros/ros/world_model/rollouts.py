@@ -237,9 +237,12 @@ class Rollouts:
 
     def _build(self, pipeline: Pipeline, undo: ExitStack) -> None:
         node, settings = self._node, self.settings
+        self._checkpoint = pipeline.checkpoint or settings().checkpoint
         self._time = NodeTime.of(node)
         self._time.step_s()
-        check = refusing(lambda changed: check_calibration(changed, settings(), self._spec))
+        check = refusing(
+            lambda changed: check_calibration(changed, settings(), self._spec, self._checkpoint)
+        )
         node.add_on_set_parameters_callback(check)
         undo.callback(node.remove_on_set_parameters_callback, check)
         self._worker = RolloutWorker(pipeline, self.on_results)
@@ -253,7 +256,7 @@ class Rollouts:
         if settings().use_robot_description:
             self._description = RobotDescription(node, self._robot, self)
         self._buffer = ObservationBuffer(
-            cameras=load_cameras(settings(), self._spec),
+            cameras=load_cameras(settings(), self._spec, self._checkpoint),
             robot=self._robot,
             width=self._spec.width,
             height=self._spec.height,
@@ -470,7 +473,8 @@ class Rollouts:
         self._give_up()
         try:
             self._extrinsics.accept()
-            self._buffer.accept_cameras(reload_cameras(self.settings(), self._spec))
+            cameras = reload_cameras(self.settings(), self._spec, self._checkpoint)
+            self._buffer.accept_cameras(cameras)
         except Rejection as error:
             self._reporter.reject(error)
             response.message = f'not reset: {error}'

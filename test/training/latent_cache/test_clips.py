@@ -13,6 +13,7 @@ import torch
 from mtv_world_ros.core.errors import ConfigError, TrainingError
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data.recordings import cut_clip
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import condition, ControlBatch, encode_chunk
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.training.base_checkpoint import Base, load_base
@@ -41,7 +42,7 @@ def folder(tmp_path_factory, config) -> Path:
 
 @pytest.fixture(scope='module')
 def base(folder, config) -> Base:
-    return load_base(config, folder, CPU, torch.float32, seed=0)
+    return load_base(config, Checkpoint.open(folder), CPU, torch.float32, seed=0)
 
 
 @pytest.fixture(scope='module')
@@ -141,11 +142,16 @@ def test_other_encoder_weights_are_noticed(source, root, config, folder, base, t
     tensors = load_file(file)
     tensors['quant_conv.bias'] += 1
     save_file(tensors, file)
-    changed = load_base(config, other, CPU, torch.float32, seed=0)
+    changed = load_base(config, Checkpoint.open(other), CPU, torch.float32, seed=0)
     held = fill(source, root, config, changed)
     said = capsys.readouterr().out
     assert 'is not used: autoencoder was' in said and '0 of' in said
-    again = fill(source, root, config, load_base(config, folder, CPU, torch.float32, seed=0))
+    again = fill(
+        source,
+        root,
+        config,
+        load_base(config, Checkpoint.open(folder), CPU, torch.float32, seed=0),
+    )
     assert not torch.allclose(held.batch(0).clean, again.batch(0).clean, atol=0.1)
 
 
