@@ -11,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 
+from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.cli import main
 from mtv_world_ros.control import registry
@@ -34,6 +35,7 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.model.checkpoint import checkpoint_folder
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.training.training_config import load_training_config
@@ -68,10 +70,38 @@ def options(robot) -> ControlOptions:
 
 
 def test_the_papers_control_and_its_three_baselines_are_registered():
-    assert list(CONTROLS) == ['trajectory_video', 'policy2vec', 'ee_mlp', 'fast_tokens']
-    assert control_names()[:4] == list(CONTROLS)
-    for name in CONTROLS:
-        assert control_class(name).__module__.startswith('mtv_world_ros.')
+    assert list(CONTROLS)[:4] == ['trajectory_video', 'policy2vec', 'ee_mlp', 'fast_tokens']
+    assert control_names()[: len(CONTROLS)] == list(CONTROLS)
+
+
+@pytest.mark.parametrize('name', CONTROLS)
+@pytest.mark.parametrize('robot_name', ['yam_bimanual', 'franka'])
+def test_every_control_of_the_package_makes_the_inputs_that_it_declares(name, robot_name):
+    robot = load_robot(robot_path(robot_name))
+    assert control_class(name).__module__.startswith('mtv_world_ros.')
+    control = create_control(name, options(robot))
+    middle, reach = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 4
+    cameras = tuple(
+        load_calibration(share_path('config', 'robots', robot_name, 'cameras.yaml')).values()
+    )
+    motions = [
+        Motion.of(robot, cameras, middle + reach * np.linspace(0, share, 17)[:, None])
+        for share in (0.3, 1.0)
+    ]
+    if control.state():
+        control = control.fitted(motions)
+        again = create_control(name, options(robot)).restored(control.state())
+        assert again.state() == control.state()
+    num_views, height, width = len(cameras), cameras[0].height, cameras[0].width
+    scene = ControlScene(
+        motion=motions[1],
+        times=np.linspace(0, 1.6, 17),
+        start_frames=np.zeros((num_views, height, width, 3), np.uint8),
+        masks=np.zeros((num_views, 0, height, width), bool),
+    )
+    inputs = control.make(scene)
+    control.layout.check(inputs, name)
+    assert inputs.num_frames == 16
 
 
 def test_a_name_that_is_not_registered_names_the_nearest(robot):

@@ -18,8 +18,8 @@ from mtv_world_ros.simulation.tasks import TASKS
 from mtv_world_ros.simulation.workcell import workcell_of
 from test.support.tiers import rest_slow
 
-ROBOTS = ('yam_bimanual', 'franka', 'ur5e_pair')
-OTHERS = ROBOTS[1:]
+ROBOTS = sorted(p.parent.name for p in share_path('config', 'robots').glob('*/workcell.yaml'))
+OTHERS = [name for name in ROBOTS if name != 'yam_bimanual']
 
 
 def bundled(name):

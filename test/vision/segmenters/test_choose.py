@@ -103,6 +103,22 @@ def test_a_segmenter_that_cannot_be_used_is_refused_with_the_reason(choice, said
         choose_segmenter(choice)
 
 
+@pytest.mark.parametrize('name', SEGMENTERS)
+def test_every_segmenter_of_the_package_finds_nothing_in_an_empty_picture(name):
+    frames = np.full((2, 3, 24, 32, 3), 128, np.uint8)
+    try:
+        segmenter = choose_segmenter(name)
+    except ConfigError as error:
+        assert 'whose weights are looked for' in str(error)
+        return
+    assert segmenter.name
+    found = segmenter.segment(frames, ('red block', 'blue cup'))
+    assert found.names == ('red block', 'blue cup')
+    assert found.masks.shape == (2, 2, 3, 24, 32)
+    assert not found.masks.any()
+    assert {status for view in found.status for status in view} == {'absent'}
+
+
 def test_all_names_of_the_package_are_valid_without_an_import():
     assert [check_segmenter_name(name) for name in SEGMENTERS] == list(SEGMENTERS)
     assert check_segmenter_name('runs/objects.safetensors') == 'runs/objects.safetensors'
