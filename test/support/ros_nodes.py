@@ -407,13 +407,15 @@ class NodeProcess:
         return self._log.read()
 
 
-def start_node(folder, *parameters, remaps=(), load=load_fake):
+def start_node(folder, *parameters, remaps=(), load=load_fake, clock=None):
     """Start the node in this process, with `name:=value` parameters and remappings."""
     words = ['--ros-args', *node_options(folder, *parameters)]
     words += [part for rule in remaps for part in ('-r', rule)]
 
     def make(context):
         node = WorldModelNode(load, context)
+        if clock is not None:
+            node._clock = clock(node.get_clock())
         try:
             node.start()
         except BaseException:

@@ -37,9 +37,10 @@ def exif_orientation(content: bytes) -> int:
     if not any(mark in content for mark in _MARKS):
         return UPRIGHT
     try:
-        with warnings.catch_warnings(), Image.open(io.BytesIO(content)) as image:
+        with warnings.catch_warnings():
             warnings.simplefilter('ignore')  # of damaged metadata
-            found = image.getexif().get(_ORIENTATION, UPRIGHT)
+            with Image.open(io.BytesIO(content)) as image:
+                found = image.getexif().get(_ORIENTATION, UPRIGHT)
     except Exception:  # damaged metadata say nothing; the decoder judges the pixels
         return UPRIGHT
     return found if found in _TURNS else UPRIGHT
