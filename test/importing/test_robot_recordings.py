@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
 import yaml
 
 from mtv_world_ros.cli import main
@@ -18,11 +19,13 @@ from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.core.images import encode_jpeg
 from mtv_world_ros.data.bag import messages
+from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.episode import JointStates
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.stream_clocks import ClockBreakError
 from mtv_world_ros.robot.file import load_robot
+from test.support.bags import STORE
 
 NANO = 1_000_000_000
 START = 1_750_000_000 * NANO
@@ -172,12 +175,29 @@ def test_a_recording_whose_clocks_jump_becomes_two_episodes(record, run, tmp_pat
         read_episode(bag)
 
 
-def test_a_recorder_whose_own_clock_is_set_back_makes_two_episodes(record, run):
+def as_sqlite(bag: Path) -> Path:
+    """Return the messages of a bag, in their order, as rosbag2_storage_sqlite3 stores them."""
+    made, connections = bag.parent / 'sqlite' / bag.name, {}
+    made.parent.mkdir()
+    with Writer(made, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        for message in BagReader(bag).messages():
+            if message.topic not in connections:
+                connections[message.topic] = writer.add_connection(
+                    message.topic, message.msgtype, typestore=STORE
+                )
+            writer.write(connections[message.topic], message.stamp_ns, message.data)
+    return made
+
+
+@pytest.mark.parametrize('stored', [lambda bag: bag, as_sqlite], ids=['mcap', 'sqlite'])
+def test_a_recorder_whose_own_clock_is_set_back_makes_two_episodes(record, run, stored):
     """Stamps and receive times go back together; the order of the file tells."""
     status, said = run(
-        record(
-            lambda topic, s, stamp: stamp - (NANO if s >= 2 else 0),
-            received=lambda s: s - (1 if s >= 2 else 0),
+        stored(
+            record(
+                lambda topic, s, stamp: stamp - (NANO if s >= 2 else 0),
+                received=lambda s: s - (1 if s >= 2 else 0),
+            )
         )
     )
     assert status == 0

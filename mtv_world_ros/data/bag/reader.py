@@ -179,9 +179,10 @@ class BagReader:
                 wanted = ', '.join(str(number) for number in known)
                 query = (
                     'SELECT topic_id, timestamp, data FROM messages '
-                    f'WHERE topic_id IN ({wanted}) ORDER BY timestamp, id'
+                    # not by timestamp: the order shows where the recorder's clock was set back
+                    f'WHERE topic_id IN ({wanted}) ORDER BY id'
                 )
-                if lost:  # sorting needs what is not there; so does looking for the next row
+                if lost:  # an index needs what is not there
                     query = (
                         'SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id'
                     )
