@@ -238,7 +238,8 @@ def unpack(data: bytes) -> Any:
         ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError,
         RecursionError, msgpack.UnpackException,
     ) as error:  # fmt: skip
-        raise PolicyError(f'the answer is not msgpack as openpi writes it: {error}') from error
+        reason = str(error) or 'values lie too deep in each other'  # msgpack's StackError has none
+        raise PolicyError(f'the answer is not msgpack as openpi writes it: {reason}') from error
 
 
 def _encode(value: Any) -> Any:

@@ -38,10 +38,10 @@ def calibrated(**values: Any) -> bytes:
     view = {
         'width': 96,
         'height': 72,
-        'intrinsics': {'fx': 90.0, 'fy': 90.0, 'cx': 47.5, 'cy': 35.5},
+        'K': [90.0, 90.0, 47.5, 35.5],
         'mount_link': 'base',
         'position': [0, 1, 1],
-        'quaternion': [0, 0, 0, 1],
+        'quaternion_xyzw': [0, 0, 0, 1],
     }
     return yaml.safe_dump({'views': {'low': {**view, **values}}}).encode()
 
@@ -108,8 +108,8 @@ def endless_view() -> bytes:
 
 
 def nested_answer() -> bytes:
-    """300 bytes of maps in maps."""
-    return b'\x81' * 300 + b'\xc0'
+    """60 kB of maps in maps."""
+    return b'\x81\xa1a' * 20_000 + b'\xc0'
 
 
 def vast_answer() -> bytes:
@@ -290,7 +290,7 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
             'checkpoint',
             partial(
                 altered_checkpoint,
-                rf'"{field}": \[?[\d, \n]+\]?'.encode(),
+                rf'"{field}": (?:\[[\d, \n]+\]|\d+)'.encode(),
                 f'"{field}": {value}'.encode(),
             ),
         )
@@ -306,8 +306,8 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
             ('stem_widths', [10**12] * 3),
             ('block_size', 10**6),
             ('num_train_timesteps', 10**9),
-            ('width', 16_000),
-            ('num_frames', 10_000),
+            ('width', 20_000),
+            ('num_frames', 20_000),
         )
     },
     'instruction of 15 kB': ('instruction', lambda: b'put the red block ' * 5_000),
@@ -318,7 +318,7 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
     'number of a megabyte': ('calibration', lambda: b'views: ' + b'9' * 10**6),
     'focal length 1e308': (
         'calibration',
-        lambda: calibrated(intrinsics={'fx': 1e308, 'fy': 90.0, 'cx': 47.5, 'cy': 35.5}),
+        lambda: calibrated(K=[1e308, 90.0, 47.5, 35.5]),
     ),
     'python object': ('calibration', lambda: b'!!python/object/apply:os.system [ls]'),
     'JPEG of 20000x20000': ('image', lambda: jpeg_of(20_000, 20_000)),
@@ -356,7 +356,7 @@ ACCIDENTS: dict[str, tuple[str, Make]] = {
     ),
     'policy whose name is no file name': (
         'policy list',
-        lambda: f'policies:\n- policy: {"9" * 400}a.yaml\n'.encode(),
+        lambda: f'policies:\n- {{name: a, policy: {"9" * 400}a.yaml}}\n'.encode(),
     ),
     'box of 400 digits': (
         'answer, language model',

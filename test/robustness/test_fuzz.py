@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.core.errors import MtvWorldError
-from test.robustness import fuzz, node_messages, parameter_calls
+from test.robustness import bad_input_table, fuzz, node_messages, parameter_calls
 from test.robustness.accidents import ACCIDENTS
 from test.robustness.file_kinds import Kind, KINDS
 from test.support.tiers import rest_slow
@@ -66,6 +66,9 @@ def test_what_once_was_an_accident_is_refused_in_time(name, tmp_path) -> None:
     # the node limits an instruction's length; matching one takes as long as it is
     assert outcome == ('survived' if kind == 'instruction' else 'rejected')
     assert more_mb < MOST_MB
+    # the page says what is answered: `python -m test.robustness.bad_input_table` writes it
+    shown = bad_input_table.answer(KINDS[kind], make(), tmp_path)
+    assert bad_input_table.row(name, shown) in bad_input_table.written_rows()
 
 
 def test_an_error_that_is_not_ours_and_a_slow_case_are_failures(tmp_path) -> None:
