@@ -491,16 +491,17 @@ class Sections:
             f'weights; commit {commit()}; {machine()}.\n\n{_ABOUT}'
         )
         found, which = self._last(is_real=False)
-        yield f'## Table 1: methods by view, {which}\n\n{found.methods(TABLE_1, VIEWS).text()}'
+        yield f'## Table 1: methods by view, {which}\n\n{found.methods(TABLE_1, VIEWS).markdown()}'
         yield f'## Do they react to their actions? {which}\n\n{found.reactions().markdown()}'
         yield f"## The paper's order, {which}\n\n{_ORDER}\n\n{found.order().markdown()}"
         for key, words in (('j_union', 'J x 100'), ('j_moving', 'J moving x 100')):
-            yield f'## Table 3: {words} by task and view, {which}\n\n{found.by_task(key).text()}'
+            table = found.by_task(key).markdown()
+            yield f'## Table 3: {words} by task and view, {which}\n\n{table}'
         if self._rows(is_real=True):
             found, which = self._last(is_real=True)
             yield (
                 f'## Table 2: real recordings, one view, {which}\n\n'
-                f'{found.methods(REAL_ORDER, found.real_views).text()}\n\n'
+                f'{found.methods(REAL_ORDER, found.real_views).markdown()}\n\n'
                 f'{found.reactions(is_real=True).markdown()}\n\n'
                 f'{found.real_order().markdown()}'
             )
@@ -566,7 +567,8 @@ HELD_KEY = 'j_copy_moving'
 _DIFFERENCES = ['n', 'J x 100', 'J moving x 100', "paper's order"]
 _ORDER = (
     'Differences of J x 100, paired by episode, of rows in the order of the paper\'s "Task '
-    'Averaged". Confirmed: the interval of the difference of J is above 0; contradicted: below 0.'
+    'Averaged". Confirmed: the interval of the difference of J is above 0; contradicted: below 0. '
+    'Where neither row reacts to its actions the order says nothing about the methods.'
 )
 
 
@@ -636,7 +638,7 @@ class Results:
         for view in views:
             copies = [self.cell(first, view, k) for k in ('j_copy_union', 'j_copy_moving')]
             held += [DASH] * 3 + copies
-        return Table(head=head, rows=[*rows, held], num_labels=2)
+        return Table(head=head, rows=[*rows, held])
 
     def _distance(self, name: str, view: str, key: str) -> str:
         if getattr(self._run.options, f'{key}_weights') is None:
@@ -659,17 +661,21 @@ class Results:
             for row in ROWS
             if row.is_real == is_real and self.evaluations(row.name)
         ]
-        return Table(head=['Method', *REACTION_HEAD], rows=rows, num_labels=2)
+        return Table(head=['Method', *REACTION_HEAD], rows=rows)
 
     def reaction(self, name: str) -> list[str]:
         """Return the cells of a row under `REACTION_HEAD`."""
+        cells = [self.cell(name, None, key) for key in REACTION_KEYS]
+        return [self.count(name), *cells, self.reacts(name)]
+
+    def reacts(self, name: str) -> str:
+        """Return whether true commands beat other ones by all seeds of a row."""
         lows = [
             evaluated.estimates(None)['margin_over_shuffled'].interval[0]
             for evaluated in self.evaluations(name)
         ]
         known = [low for low in lows if isfinite(low)]
-        reacts = 'cannot tell' if not known else ('yes' if min(known) > 0 else 'not shown')
-        return [self.count(name), *(self.cell(name, None, key) for key in REACTION_KEYS), reacts]
+        return 'cannot tell' if not known else 'yes' if min(known) > 0 else 'not shown'
 
     @property
     def real_views(self) -> tuple[str, ...]:
@@ -707,6 +713,8 @@ class Results:
         whole, moving = (self.difference(better, worse, view, k) for k in ('j_union', 'j_moving'))
         low, high = whole.interval
         says = 'confirmed' if low > 0 else 'contradicted' if high < 0 else 'cannot be told'
+        if self.reacts(better) != 'yes' and self.reacts(worse) != 'yes':
+            says = 'neither reacts'
         cells = [joined([one], 1, 100.0) for one in (whole, moving)]
         return [str(whole.num_episodes or DASH), *cells, says if isfinite(whole.value) else DASH]
 
@@ -733,12 +741,11 @@ class Results:
         return str(sum(len(e.results) for e in self.evaluations(name, test)) or DASH)
 
     def by_task(self, key: str) -> Table:
-        """Return Table 3: the paper's rows, tasks by view, and all tasks together, times 100."""
+        """Return Table 3 turned: a line a task and view, a column a method, J times 100."""
         tasks = sorted(self._run.options.tasks)
-        columns = [(task, view) for task in tasks for view in VIEWS]
-        columns += [(None, view) for view in VIEWS]
-        head = ['Method', 'n', *(f'{task or "Task Averaged"} {view}' for task, view in columns)]
-        lines: list[tuple[str, dict[str, str], str, str]] = [
+        lines = [(task, view) for task in tasks for view in VIEWS]
+        lines += [(None, view) for view in VIEWS]
+        columns: list[tuple[str, dict[str, str], str, str]] = [
             (self._rows[name].title, dict.fromkeys(VIEWS, name), 'test', key)
             for name in ('policy2vec', 'ee_mlp', 'fast_tokens')
         ]
@@ -749,25 +756,30 @@ class Results:
             view: next((name for name in simulated if self._has_view(name, view)), FULL)
             for view in VIEWS
         }
-        lines += [
+        columns += [
             (ZERO_SHOT, dict.fromkeys(VIEWS, FULL), 'zero_shot', key),
             ('Single-View', single, 'test', key),
             ('w/o Mask', dict.fromkeys(VIEWS, 'without_mask'), 'test', key),
             (self._rows[FULL].title, dict.fromkeys(VIEWS, FULL), 'test', key),
             (HELD, any_row, 'test', key.replace('j_', 'j_copy_')),
         ]
+        head = ['Task', 'view', *(title for title, *_ in columns)]
+        counts = [
+            ' + '.join(dict.fromkeys(self.count(name, test) for name in names.values()))
+            for _, names, test, _ in columns
+        ]
         rows = [
             [
-                title,
-                ' + '.join(dict.fromkeys(self.count(name, test) for name in names.values())),
+                task or 'Task Averaged',
+                view,
                 *(
                     self.cell(names[view], view, k, task, test=test, digits=1, factor=100.0)
-                    for task, view in columns
+                    for _, names, test, k in columns
                 ),
             ]
-            for title, names, test, k in lines
+            for task, view in lines
         ]
-        return Table(head=head, rows=rows, num_labels=2)
+        return Table(head=head, rows=[*rows, ['n', '', *counts]])
 
 
 def joined(found: Sequence[Estimate], digits: int, factor: float = 1.0) -> str:
