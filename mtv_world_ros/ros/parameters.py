@@ -82,6 +82,12 @@ class ObservationSettings(Schema):
     max_view_skew_s: float = parameter(
         0.05, 'Images of views further apart are no observation [s].', _SECONDS
     )
+    place: str = parameter(
+        '',
+        'Name of this robot cell, as in `mtv-world fit contact --place`. Where contact parameters '
+        'were fitted in another one, futures are drawn from a wide prior, and most successes stay '
+        "open. Simulated episodes are of 'simulator/PHYSICS'.",
+    )
 
 
 class NodeSettings(ObservationSettings, CheckpointSettings):
@@ -165,12 +171,6 @@ class Settings(LiveSettings, NodeSettings):
     objects: Names = parameter(
         (),
         "Names of the objects, e.g. red block; `['']` = the ones that `describer` names.",
-    )
-    place: str = parameter(
-        '',
-        'Name of this robot cell, as in `mtv-world fit contact --place`. Where contact parameters '
-        'were fitted in another one, futures are drawn from a wide prior, and most successes stay '
-        "open. Simulated episodes are of 'simulator/PHYSICS'.",
     )
     seed: int = parameter(0, 'Seed of the noise; chunk k uses seed + k.', (0, 2**31 - 1))
     num_seeds: int = parameter(

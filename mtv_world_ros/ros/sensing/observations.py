@@ -281,6 +281,7 @@ class ObservationBuffer:
             frames=np.stack(frames),
             positions=self._positions(stamp_ns, now_ns, limits),
             stamp_ns=stamp_ns,
+            place=limits.place,
         )
         return SensedScene(
             observation=observation, camera_infos=tuple(infos), source_stamp_ns=stamp_ns

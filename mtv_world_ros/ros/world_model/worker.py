@@ -417,7 +417,7 @@ class RolloutWorker:
                 return self._last, self._episode
         scene = request.scene
         begin = self._pipeline.begin if request.imagine else self._observed.begin
-        episode = begin(replace(scene.observation, place=request.settings.place), options)
+        episode = begin(scene.observation, options)
         self.camera_check = episode.camera_check
         return scene, episode
 
