@@ -67,6 +67,54 @@ def test_description_of_this_robot_and_of_another_one(start, new_client, ros):
     assert client.imagine_one(positions=bent, times=(0.2, 0.4, 0.6, 0.8))['state'] == 'done'
 
 
+def with_mesh(urdf, file):
+    """The description with a mesh as the shape of each link."""
+    shape = f'<visual><geometry><mesh filename="{file}"/></geometry></visual></link>'
+    return re.sub(r'</link>', shape, urdf)
+
+
+@pytest.mark.parametrize(
+    'file',
+    [
+        'package://of_nobody/meshes/arm.dae',
+        'file:///nowhere/arm.stl',
+        'pointer.stl',
+        'https://host/arm.glb',
+        '',
+    ],
+    ids=['package', 'missing', 'git lfs', 'other type', 'no name'],
+)
+def test_meshes_of_a_description_are_not_needed(start, new_client, ros, tmp_path, file):
+    """Lengths, offsets and limits are taken from it; shapes are the checkpoint's."""
+    client = new_client
+    if file == 'pointer.stl':
+        (tmp_path / file).write_text('version https://git-lfs.github.com/spec/v1\n')
+        file = (tmp_path / file).as_uri()
+    start()
+    client.connect_inputs(ros.INPUTS)
+    describe(client, with_mesh(URDF, file))
+    assert client.diagnostic_values()['robot_description'] == 'used'
+    assert client.imagine_one()['state'] == 'done'
+
+
+def test_speed_limits_of_a_description_hold_and_0_is_none(start, new_client, ros):
+    client = new_client
+    node = start()
+    client.connect_inputs(ros.INPUTS)
+    publisher = client.node.create_publisher(String, '/robot_description', LATCHED)
+    times, fast = (0.2, 0.4, 0.6, 0.8), np.repeat(ros.HOME[None], 4, axis=0)
+    fast[:, 0] = np.linspace(0.4, 1.6, 4)  # 2 rad/s
+    for count, (limit, state) in enumerate((('0', 'done'), ('0.5', 'rejected'), ('4.0', 'done'))):
+        described = re.sub(r'velocity="[^"]*"', f'velocity="{limit}"', URDF)
+        publisher.publish(String(data=described))
+        taken = lambda count=count: node.output().count('robot_description: robot') > count  # noqa: E731
+        client.wait(taken, 'the description')
+        end = client.imagine_one(positions=fast, times=times)
+        assert end['state'] == state, (limit, end)
+        if state == 'rejected':
+            assert end['reason'] == 'joint_speeds' and "'left_joint1'" in end['text']
+
+
 def test_descriptions_can_be_ignored(start, new_client, ros):
     client = new_client
     start('use_robot_description:=false')
