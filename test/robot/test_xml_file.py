@@ -1,4 +1,7 @@
-"""URDFs and COLLADA files that would end or stop a recursive parser are refused before it."""
+"""URDFs and COLLADA files that would end or stop a recursive parser are refused before it.
+
+Deep, long, circular and laughing ones are among the accidents of `test/robustness`.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from mtv_world_ros.importing.robot_guess import guess_robot
 from mtv_world_ros.robot.file import parse_urdf
 from mtv_world_ros.robot.mesh_pieces import load_mesh, MissingMeshError
 from mtv_world_ros.robot.xml_file import check_xml, parse_xml, root_link
-from test.robustness.accidents import chain, diamonds, entity_bomb, joint, nested, star, urdf_of
+from test.robustness.accidents import chain, entity_bomb, joint, star, urdf_of
 
 MOST_S, MOST_MB = 1.0, 100
 
@@ -28,16 +31,9 @@ def urdf(text: str) -> str:
 @pytest.mark.parametrize(
     ('text', 'reason'),
     [
-        (urdf(chain(4_000)), r'4001 links; at most 2000 .*MTV_WORLD_MAX_URDF_LINKS'),
         (urdf(chain(250)), r'a chain of the robot has 201 links; at most 200 .*CHAIN_LINKS'),
-        (urdf(star(20_000)), '20001 links; at most 2000'),
-        (urdf(diamonds(40)), "link 'd0' is the child of two joints, 'd0' and 'e0'"),
-        (urdf('<link name="b"/><link name="c"/>' + joint('b', 'c') + joint('c', 'b')), 'circle'),
         (urdf(joint('root', 'root')), "circle, among them 'root'"),
-        (urdf(nested(200_000)), 'nested in more than 64 levels .*MTV_WORLD_MAX_NESTING'),
         (urdf('<x/>' * 250_000), 'has 200001 elements; at most 200000'),
-        (entity_bomb().decode(), "declares a document type .*'<!DOCTYPE a'"),
-        ('<robot>' + '<!--' * 2_000_000, 'not well-formed'),
         ('<robot name="r"/>', 'it has no link'),
         ('<robot name="r"><x><child link="l"/></x></robot>', 'it has no link'),
     ],
@@ -99,15 +95,11 @@ def test_followers_in_a_row_are_resolved_in_time():
     assert {mimic.source for mimic in mimics} == {f'l{count - 1}'}
     by_joint = {mimic.joint: mimic.multiplier for mimic in mimics}
     assert by_joint['l0'] == pytest.approx(1.001 ** (count - 1))
-    with pytest.raises(RobotError, match="'l0' follows itself"):
-        parse_urdf(urdf(star(count, '<mimic joint="l{next}"/>', last='<mimic joint="l0"/>')), 'it')
 
 
 @pytest.mark.parametrize(
     ('name', 'content', 'reason'),
     [
-        ('a.dae', b'<COLLADA>' + nested(100_000).encode() + b'</COLLADA>', 'more than 64 levels'),
-        ('a.dae', entity_bomb(), 'document type'),
         ('a.gltf', b'[' * 100_000, r"of type '\.gltf', which is not read; convert it to one of"),
         ('a.blend', b'BLENDER', r"of type '\.blend'"),
         ('a', b'solid', "of type ''"),
