@@ -314,6 +314,31 @@ class ObjectMasks:
         if any(len(row) != len(self.names) for row in self.status):
             raise MtvWorldError(f'status has rows of other length than {len(self.names)} objects')
 
+    def last(self) -> ObjectMasks:
+        """Return the masks of the last frame (T = 1)."""
+        return ObjectMasks(names=self.names, masks=self.masks[:, :, -1:], status=self.status)
+
+    def filled_from(self, other: ObjectMasks) -> ObjectMasks:
+        """Return the masks, with those of others where none is found and the others are trusted.
+
+        Args:
+            other: masks of the same names and shape.
+        """
+        ok = np.array([[word == 'ok' for word in row] for row in other.status], np.bool_)
+        ok = ok.reshape(self.masks.shape[:2])
+        missing = ok & other.masks.any((-3, -2, -1)) & ~self.masks.any((-3, -2, -1))
+        if not missing.any():
+            return self
+        pairs = zip(self.status, missing.tolist(), strict=True)
+        return ObjectMasks(
+            names=self.names,
+            masks=np.where(missing[..., None, None, None], other.masks, self.masks),
+            status=tuple(
+                tuple('ok' if lacks else word for word, lacks in zip(row, view, strict=True))
+                for row, view in pairs
+            ),
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SuccessEstimate:

@@ -8,10 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks, Observation
 from mtv_world_ros.core.errors import RolloutPreempted
-from mtv_world_ros.core.images import resize_frames
+from mtv_world_ros.core.images import resize_frames, resize_labels
 from mtv_world_ros.physics.foreseen_motions import foreseen_of, ForeseenMotions
 from mtv_world_ros.physics.object_motion import FoundObjects, ObjectMotionModel
 from mtv_world_ros.robot.model import RobotModel
@@ -141,6 +143,15 @@ class ObjectForesight:
         doubts = tracked.doubts if self.found.is_whole else {}
         return tracked.refusal or '; '.join(dict.fromkeys(doubts.values()))
 
+    def _sharp(self, source: Observation, names: tuple[str, ...], masks: BoolArray) -> BoolArray:
+        """Return masks at the recorded size; of what is not found there, those of the model's."""
+        sharp = self.segmenter.segment(source.frames[:, None], names).masks[:, :, 0].copy()
+        height, width = sharp.shape[-2:]
+        for view, item in np.argwhere(masks.any((-2, -1)) & ~sharp.any((-2, -1))):
+            small = masks[view, item].astype(np.uint8)[None]
+            sharp[view, item] = resize_labels(small, width, height)[0] > 0
+        return sharp
+
     def _shown_before(self, shown: int) -> int:
         return shown if self.found is None else self.found.shown
 
@@ -194,7 +205,7 @@ class ObjectForesight:
             whole: the objects when nothing hid them; None = nothing hides them now.
         """
         assert self.model is not None
-        sharp = self.segmenter.segment(source.frames[:, None], names).masks[:, :, 0]
+        sharp = self._sharp(source, names, masks)
         poses = Motion.of(self.robot, source.cameras, source.positions[None]).camera_poses[:, 0]
         given = names, sharp, source.cameras, list(poses)
         if whole is None:

@@ -433,6 +433,7 @@ class Pipeline:
             memory,
             objects,
             background,
+            masks,
         )
         prediction = Prediction(
             start=start,
@@ -487,6 +488,7 @@ class Pipeline:
             memory,
             state.objects,
             background,
+            masks,
         )
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success), after
 
@@ -521,8 +523,24 @@ class Pipeline:
         return tuple(dict.fromkeys([*self.control.links, *(keeper.links if keeper else ())]))
 
     def find(self, state: RolloutState, options: RolloutOptions) -> ObjectMasks:
-        """Return masks of the frame that a chunk starts from (T = 1)."""
-        return self.segmenter.segment(state.observation.frames[:, None], options.objects)
+        """Return masks of the frame that a chunk starts from (T = 1).
+
+        What a search in that real frame does not find, such as an object that fingers half hide,
+        is followed from the frames before.
+        """
+        frames = state.observation.frames[:, None]
+        found, before = self.segmenter.segment(frames, options.objects), state.followed
+        if state.num_imagined or before is None or before.masks.names != found.names:
+            return found
+        if not (before.masks.masks.any((-2, -1)) & ~found.masks.any((-2, -1))).any():
+            return found
+        followed = self.segmenter.segment(
+            frames,
+            options.objects,
+            first_masks=before.masks.masks[:, :, 0],
+            first_frames=before.frames,
+        )
+        return found.filled_from(followed)
 
     def follow(
         self,

@@ -39,6 +39,10 @@ class ObservedChunk(NamedTuple):
     success: SuccessEstimate
 
 
+#: masks that were followed hold in a later observation up to this time after them [frames]
+_NEXT_FRAMES = 1.5
+
+
 class ChunkMaker(Protocol):
     """Imagines and judges one chunk at a time, without a state of its own; see `Pipeline`."""
 
@@ -196,7 +200,15 @@ class Rollout:
             before.objects.branch(observation),
             before.camera_check,
         )
-        return replace(self, _states=(replace(state, memory=before.memory),))
+        passed_s = 1e-9 * abs(observation.stamp_ns - before.observation.stamp_ns)
+        is_next = passed_s <= _NEXT_FRAMES / self.pipeline.spec.fps
+        state = replace(
+            state,
+            memory=before.memory,
+            scene=before.scene,
+            followed=before.followed if is_next else None,
+        )
+        return replace(self, _states=(state,))
 
     def _plan(self, trajectory: JointTrajectory | Plan) -> Plan:
         """Return the plan from where the episode stands."""

@@ -10,6 +10,7 @@ from mtv_world_ros.core.data_types import (
     CameraModel,
     FloatArray,
     History,
+    ObjectMasks,
     Observation,
     WorldModelSpec,
 )
@@ -19,6 +20,19 @@ from mtv_world_ros.physics.episode_objects import ObjectForesight
 from mtv_world_ros.rollout.scene_memory import SceneMemory
 from mtv_world_ros.success.rollout_memory import RolloutMemory
 from mtv_world_ros.vision.camera_check import CameraCheck
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Followed:
+    """Objects that were followed to a frame.
+
+    Attributes:
+        masks: masks of the objects in the frame (T = 1).
+        frames: (V, H, W, 3) uint8 RGB.
+    """
+
+    masks: ObjectMasks
+    frames: ByteArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,6 +48,7 @@ class RolloutState:
         camera_check: calibration check on the episode's first frames; its corrections are
             applied.
         scene: memory of the background; None = nothing is held.
+        followed: objects in the last frame, as they were followed there; None = nothing was.
     """
 
     observation: Observation
@@ -43,6 +58,7 @@ class RolloutState:
     num_imagined: int = 0
     camera_check: CameraCheck = CameraCheck()
     scene: SceneMemory | None = None
+    followed: Followed | None = None
 
     @classmethod
     def at(
@@ -79,6 +95,7 @@ class RolloutState:
         memory: RolloutMemory,
         objects: ObjectForesight,
         scene: SceneMemory | None = None,
+        followed: ObjectMasks | None = None,
     ) -> RolloutState:
         """Return the state at the last of the frames (V, T, H, W, 3).
 
@@ -90,6 +107,7 @@ class RolloutState:
             memory: memory of the success estimate after the chunk.
             objects: foreseen poses after the chunk.
             scene: memory of the background after the chunk.
+            followed: masks of the objects in these frames.
         """
         start = self.observation
         return replace(
@@ -102,6 +120,7 @@ class RolloutState:
             memory=memory,
             num_imagined=self.num_imagined + frames.shape[1],
             scene=scene,
+            followed=followed and Followed(masks=followed.last(), frames=frames[:, -1]),
         )
 
     def seen_by(self, cameras: tuple[CameraModel, ...] | None) -> RolloutState:

@@ -47,9 +47,11 @@ from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.observed_episode import ObservedEpisode
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.rollout.state import Followed
 from mtv_world_ros.success.calibration import Fits, load_fits
 from mtv_world_ros.success.doubts import Grounds
 from mtv_world_ros.vision.describers.describer import DescribedObject
+from mtv_world_ros.vision.jaccard import jaccard
 from test.support.small_episodes import PersistenceWorldModel
 
 SPEC = WorldModelSpec(
@@ -924,3 +926,44 @@ def test_without_foresight_the_fits_to_such_rollouts_are_used(recording, world_m
     (chunk,) = imagine(replace(whole, picture_fits=Fits()).without_foresight(), recording, 1.6)
     assert np.isnan(chunk.success.probability)
     assert 'never calibrated' in chunk.success.reasons[0]
+
+
+class FollowsOnly:
+    """Segmenter that finds the first object in no frame by itself, but follows it."""
+
+    def __init__(self, segmenter) -> None:
+        self._own, self.name = segmenter, segmenter.name
+
+    def segment(self, frames, names, first_masks=None, first_frames=None):
+        found = self._own.segment(frames, names, first_masks, first_frames)
+        if first_masks is not None:
+            return found
+        masks = np.array(found.masks)
+        masks[:, 0] = False
+        return replace(
+            found, masks=masks, status=tuple(('absent', *row[1:]) for row in found.status)
+        )
+
+
+@pytest.mark.parametrize(('later', 'is_found'), [(8, True), (14, False)])
+def test_what_a_search_misses_is_where_it_was_followed_to(pipeline, recording, later, is_found):
+    options = RolloutOptions(instruction=recording.instruction)
+    whole = pipeline.begin(observe(recording), options)
+    seen = whole.observe(recording.frames[:, 1:9], recording.positions[:9])
+    hidden = replace(pipeline, segmenter=FollowsOnly(pipeline.segmenter))
+    episode = hidden.begin(observe(recording), options)
+    episode._states = tuple(
+        replace(state, followed=Followed(masks=seen.masks.last(), frames=state.observation.frames))
+        for state in whole._states
+    )
+    now = episode.branch(
+        replace(
+            observe(recording),
+            frames=recording.frames[:, later],
+            stamp_ns=recording.stamp_ns + round(1e9 * later / SPEC.fps),
+        )
+    )
+    found = hidden.find(now._states[0], replace(options, objects=now.names))
+    assert found.masks[:, 0].any() == is_found
+    if is_found:
+        assert (jaccard(found.masks[:, 0, 0], seen.masks.masks[:, 0, -1]) > 0.9).all()

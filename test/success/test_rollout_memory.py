@@ -200,3 +200,22 @@ def test_a_grasp_counts_from_where_the_block_was_pushed_to():
     (grasp,) = remember(None, shown).grasps
     assert np.linalg.norm((grasp.points[0] - pushed)[:2]) < 0.015
     assert grasp.gaps_m[0] < 0.01
+
+
+def test_masks_are_filled_from_those_that_were_followed_where_a_search_finds_none():
+    found, followed = masks([RED], [BLUE]), masks([RED], [BLUE])
+    lost = np.array(found.masks)
+    lost[1, 0] = False
+    found = replace(found, masks=lost, status=(('ok', 'ok'), ('absent', 'ok')))
+    filled = found.filled_from(followed)
+    assert filled.status == (('ok', 'ok'), ('ok', 'ok'))
+    assert (filled.masks == followed.masks).all()
+    doubted = replace(followed, status=(('ok', 'ok'), ('lost', 'ok')))
+    assert found.filled_from(doubted) is found
+    assert followed.filled_from(found) is followed
+
+
+def test_last_masks_are_those_of_the_last_frame():
+    shown = masks(path(RED, ON_TOP), [BLUE] * 9)
+    assert (shown.last().masks[:, :, 0] == shown.masks[:, :, -1]).all()
+    assert shown.last().status == shown.status
