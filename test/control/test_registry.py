@@ -201,12 +201,16 @@ def test_any_control_trains_and_predicts(control, outside, tmp_path, robot):
     assert pipeline.object_motion is None
     recording = load_recording(episodes / 'demo', pipeline.spec, robot)
     rest = recording.positions[0]
+    goal = rest + 0.32 * np.eye(len(rest))[0]
+    for tool in robot.tools:  # a control may see nothing but the grippers
+        gripper = robot.joint_names.index(tool.gripper_joint)
+        goal[gripper] = (tool.gripper_open + tool.gripper_closed) / 2
     frames = []
-    for way in (0.0, 0.02):
+    for way in (rest, goal):
         plan = JointTrajectory(
             joint_names=robot.joint_names,
             times=np.arange(1, 17) / 5,
-            positions=rest + way * np.arange(1, 17)[:, None] * np.eye(len(rest))[0],
+            positions=rest + (way - rest) * np.arange(1, 17)[:, None] / 16,
         )
         options = RolloutOptions(instruction=recording.instruction)
         episode = pipeline.begin(recording.observation(0), options)

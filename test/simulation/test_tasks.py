@@ -27,6 +27,15 @@ from test.support.tiers import rest_slow
 WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml')))
 
 
+#: the tasks of the paper, in the order in which `--task all` has always had them
+PAPER = (
+    'bussing_table', 'collect_food', 'collect_tableware', 'collect_toy', 'move_stack_block_ab',
+    'move_stack_plate', 'move_object_two', 'place_block_a2b_left', 'place_block_a2b_right',
+    'place_block_ab2c_left', 'place_block_ab2c_right', 'place_bread_plate', 'place_cup_plate',
+    'shake_bottle', 'stack_blocks_two',
+)  # fmt: skip
+
+
 def test_unknown_task_names_the_nearest():
     with pytest.raises(SimulatorError, match="did you mean 'stack_blocks_two'"):
         task_named('stack_block_two')
@@ -48,7 +57,7 @@ def test_scenes_start_undone_with_distinct_colours_on_the_table(name):
     for seed in range(20):
         scene = draw_scene(task, np.random.default_rng(seed), WORKCELL)
         items = {item.role: item for item in scene.objects}
-        assert len(items) >= 2
+        assert set(items) >= {role.role for role in task.roles if role.probability == 1}
         words = [item.name.split()[0] for item in scene.objects]
         assert len(set(words)) == len(words) and set(words) <= set(PALETTE)
         for item in scene.objects:
@@ -56,7 +65,8 @@ def test_scenes_start_undone_with_distinct_colours_on_the_table(name):
             assert (np.asarray(shape.smallest) <= np.asarray(item.size) + 1e-12).all()
             assert (np.asarray(item.size) <= np.asarray(shape.largest) + 1e-12).all()
             assert item.position[2] == item.size[2] / 2
-        assert sum(SHAPES[item.shape].grasp is not None for item in scene.objects) >= 2
+        if name in PAPER:  # policies may take a wrong object
+            assert sum(SHAPES[item.shape].grasp is not None for item in scene.objects) >= 2
         assert not task.succeeds(start_situation(task, items, scene.goals)).any()
 
 
@@ -94,15 +104,6 @@ def test_a_scene_that_is_done_is_a_success():
     target = next(np.array(item.position) for item in scene.objects if item.role == 'b')
     done = then(task, scene, {'a': target + [-0.13, 0.0, 0.0]})
     assert task.succeeds(done).tolist() == [False, True]
-
-
-#: the tasks of the paper, in the order in which `--task all` has always had them
-PAPER = (
-    'bussing_table', 'collect_food', 'collect_tableware', 'collect_toy', 'move_stack_block_ab',
-    'move_stack_plate', 'move_object_two', 'place_block_a2b_left', 'place_block_a2b_right',
-    'place_block_ab2c_left', 'place_block_ab2c_right', 'place_bread_plate', 'place_cup_plate',
-    'shake_bottle', 'stack_blocks_two',
-)  # fmt: skip
 
 
 def test_every_file_with_a_scene_is_a_task_of_its_name():
