@@ -12,6 +12,7 @@ from pyarrow import parquet
 import pytest
 
 from mtv_world_ros.cli import main
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode import UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.importing.convert import import_dataset, read_frames
@@ -259,3 +260,44 @@ def test_one_reason_of_many_episodes_is_one_line(datasets, make_mapping, tmp_pat
     assert main(['import', 'lerobot', *arguments]) == 1
     lines = [line for line in capsys.readouterr().err.splitlines() if 'no column' in line]
     assert len(lines) == 1 and lines[0].startswith('episode 0, episode 1: ')
+
+
+#: an arm with the joints of an SO-101; its shape does not matter here
+SO101 = """
+name: so101
+dh:
+  - arm: arm
+    joints:
+      - {joint: shoulder_pan, a: 0.03, alpha: 1.57, d: 0.1, lower: -1.92, upper: 1.92}
+      - {joint: shoulder_lift, a: 0.11, alpha: 0, d: 0, lower: -1.745, upper: 1.745}
+      - {joint: elbow_flex, a: 0.13, alpha: 0, d: 0, lower: -1.69, upper: 1.69}
+      - {joint: wrist_flex, a: 0.06, alpha: 1.57, d: 0, lower: -1.658, upper: 1.658}
+      - {joint: wrist_roll, a: 0, alpha: 0, d: 0.1, lower: -2.744, upper: 2.841}
+    gripper: {joint: gripper, lower: -0.1745, upper: 1.745}
+tools: [{arm: arm, link: wrist_roll_link, gripper_joint: gripper, gripper_closed: -0.1745,
+         gripper_open: 1.745}]
+"""
+
+
+def test_the_mapping_of_an_so101_reads_degrees_and_the_share_of_the_gripper(copied, tmp_path):
+    root = copied('v3.0')
+    motors = ['shoulder_pan', 'shoulder_lift', 'elbow_flex', 'wrist_flex', 'wrist_roll', 'gripper']
+    named = {'dtype': 'float32', 'shape': [6], 'names': [f'{motor}.pos' for motor in motors]}
+    change_info(
+        root, lambda info: info['features'].update({'observation.state': named, 'action': named})
+    )
+    rows = [[10.0, -30.0 + k, 45.0, 98.0, -90.0, 5.0 * (k % 20)] for k in range(21)]
+    file = next((root / 'data').rglob('*.parquet'))
+    table = parquet.read_table(file).drop_columns(['observation.state', 'action'])
+    table = table.append_column('observation.state', [rows]).append_column('action', [rows])
+    parquet.write_table(table, file)
+    shutil.copy(share_path('config', 'datasets', 'so101.yaml'), tmp_path / 'mapping.yaml')
+    (tmp_path / 'so101.yaml').write_text(SO101)
+    summary = import_dataset(root, tmp_path / 'mapping.yaml', tmp_path / 'out', episodes=[0])
+    assert not summary.failed
+    positions = read_episode(
+        tmp_path / 'out/episode_000000', with_cameras=False
+    ).joint_states.positions
+    np.testing.assert_allclose(np.rad2deg(positions[:, :5]), np.array(rows)[:12, :5], atol=1e-4)
+    share = np.array(rows)[:12, 5] / 100
+    np.testing.assert_allclose(positions[:, 5], -0.1745 + 1.9195 * share, atol=1e-6)
