@@ -16,9 +16,10 @@ estimate, which counts frames beside the motion that was drawn into them, is com
 rollouts; physics that show the same first picture as `nominal` share it.
 
 Coverage: rollouts are grouped by their estimate, in each truth. A group is covered if its success
-rate lies within the mean 95 % interval of its estimates; or, up to its own sampling error, if the
-95 % Wilson interval of the rate reaches the mean interval. Given is the share of rollouts in covered
-groups. The picture has the groups of all truths but `nominal` together, and those of `nominal`.
+rate lies, to half a rollout, within the mean 95 % interval of its estimates; or, up to its own
+sampling error, if the 95 % Wilson interval of the rate reaches the mean interval. Given is the share
+of rollouts in covered groups. The picture has the groups of `nominal`, of `bold`, and of all truths
+but `nominal` together.
 """  # noqa: E501
 
 from __future__ import annotations
@@ -215,7 +216,7 @@ def groups(
     lines: Sequence[Line], estimates: Sequence[ShareEstimate]
 ) -> list[tuple[int, int, FloatRow]]:
     """Return successes, number, and mean (probability, low, high) of each group of estimates."""
-    values = np.array(estimates)
+    values = np.array(estimates, np.float64).reshape(-1, 3)
     real = np.array([line['final'] for line in lines], np.bool_)
     found = []
     for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
@@ -234,7 +235,12 @@ def coverage(lines: Sequence[Line], estimates: Sequence[ShareEstimate]) -> list[
     total = sum(count for _, count, _ in found)
     if not total:
         return ['0', '–', '–']
-    strict = sum(n for hits, n, (_, low, high) in found if low <= hits / n <= high)
+    # a rate of n rollouts is known to half of one: none or all of them is no rate of 0 or 1
+    strict = sum(
+        count
+        for hits, count, (_, low, high) in found
+        if low <= (hits + 0.5) / count and (hits - 0.5) / count <= high
+    )
     loose = 0
     for hits, count, (_, low, high) in found:
         bottom, top = wilson(hits, count)
@@ -250,7 +256,7 @@ def reliability(
     FigureCanvasAgg(figure)
     panels: list[tuple[str, Callable[[str], bool]]] = [
         ('nominal', lambda physics: physics == NOMINAL),
-        ('shifts that look like nominal', lambda physics: physics in SAME_PICTURE),
+        ('bold', lambda physics: physics == 'bold'),
         ('all shifts', lambda physics: physics != NOMINAL),
     ]
     styles = {
@@ -278,7 +284,7 @@ def reliability(
             axes.plot([], [], mark, color=colour, label=judge)
         axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), title=title, aspect='equal')
         axes.set_xlabel('estimate (dotted: mean 95 % interval)')
-        axes.legend(fontsize=7, loc='upper left')
+        axes.legend(fontsize=7, loc='lower right')
     figure.axes[0].set_ylabel('share that succeeded (bar: 95 % Wilson)')
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file)

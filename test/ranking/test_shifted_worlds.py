@@ -53,11 +53,15 @@ def test_numbers_fitted_in_a_physics_are_asked_there_and_flips_are_counted(
     assert {('nominal', judge) for judge in (*benchmark.IMAGINED, benchmark.RULE)} <= judges
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     said = {tuple(line['job'][::4]): line['said']['bundled'] for line in lines}
-    (_, fitted), (_, bundled) = (
-        (judge, said['bold', 'expert'][judge]['value'])
-        for judge in (benchmark.FITTED, benchmark.FORESEEN)
+    fitted, bundled, unfitted = (
+        said['bold', 'expert'][judge]['features']['foreseen']
+        for judge in (benchmark.FITTED, benchmark.AS_FITTED, benchmark.FORESEEN)
     )
-    assert fitted == 0.0 and bundled > 0.5
+    assert fitted == -1.0 and bundled > 0.0
+    # where nothing was fitted futures disagree: the verdict is open
+    assert -1.0 < unfitted < 1.0
+    (alone,) = [row for row in rows if row[:2] == ['| bold', benchmark.FORESEEN]]
+    assert alone[7] == '1 of 2'
     # in the nominal physics the expert succeeds and the loose gripper does not: a flip
     final = {tuple(line['job'][::4]): line['final'] for line in lines}
     assert final['nominal', 'expert'] and not final['nominal', FAULTY]
