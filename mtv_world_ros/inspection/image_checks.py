@@ -98,7 +98,9 @@ def _draw_axes(image: ByteArray, camera: CameraModel, T: FloatArray) -> None:
 _SAME_PICTURE = 0.05
 #: joints that move more between two frames must change the picture [rad or m]
 _MOVES = 0.02
-#: fraction of frames that repeat the last one while joints move, above which a view is suspicious
+#: time for which a picture may stay: cameras are slower than the rows of a table [s]
+_LONGEST_REPEAT_S = 0.25
+#: fraction of frames of a picture that stays while joints move, above which a view is suspicious
 _SUSPICIOUS_FROZEN_FRACTION = 0.1
 #: fraction of such frames above which a view is broken
 _BROKEN_FROZEN_FRACTION = 0.5
@@ -111,7 +113,10 @@ _MOST_FRAMES = 80
 
 
 def check_frozen(track: Track, joints: JointTrack) -> tuple[dict[str, str], list[Finding]]:
-    """Check for frames that stay the same while joints move."""
+    """Check for frames that stay the same while joints move.
+
+    A camera that is slower than the frames are stored repeats each picture for a moment.
+    """
     covered = np.flatnonzero(joints.covers(track.stamps_ns))
     count = min(len(covered), _MOST_FRAMES)
     if count < 3:
@@ -124,11 +129,19 @@ def check_frozen(track: Track, joints: JointTrack) -> tuple[dict[str, str], list
         return {}, []
     frames = [np.asarray(track.frames[int(n)])[::4, ::4].astype(np.int16) for n in chosen]
     changes = np.array([np.abs(b - a).mean() for a, b in zip(frames, frames[1:], strict=False)])
-    share = float((changes[moves] < _SAME_PICTURE).mean())
-    measures = {'frames that do not change while joints move': f'{share:.0%}'}
+    repeats = changes < _SAME_PICTURE
+    first_shown = np.maximum.accumulate(np.where(repeats, 0, np.arange(1, count)))
+    shown_s = (track.stamps_ns[chosen[1:]] - track.stamps_ns[chosen[first_shown]]) * 1e-9
+    moved = np.abs(positions[1:] - positions[first_shown]).max(axis=1) > _MOVES
+    hangs = repeats & moved & (shown_s > _LONGEST_REPEAT_S)
+    share = float(hangs.sum() / (moves | hangs).sum())
+    measures = {
+        'frames that repeat the one before while joints move': f'{repeats[moves].mean():.0%}',
+        'frames that do not change while joints move': f'{share:.0%}',
+    }
     text = (
-        f'{share:.0%} of the frames in which joints move are the same as the one before: the '
-        'camera hangs, or this is not a view of this robot'
+        f'{share:.0%} of the frames in which joints move show the same picture for more than '
+        f'{_LONGEST_REPEAT_S:g} s: the camera hangs, or this is not a view of this robot'
     )
     if share > _BROKEN_FROZEN_FRACTION:
         return measures, [broken(text)]
