@@ -36,9 +36,11 @@ from mtv_world_ros.evaluation.metrics.jaccard_scores import (
 from mtv_world_ros.evaluation.metrics.object_scores import object_scores, ObjectScores
 from mtv_world_ros.evaluation.metrics.picture_scores import (
     HELD,
+    mean_pictures,
     picture_scores,
     RECORDED,
     SHUFFLED,
+    weighted,
 )
 from mtv_world_ros.evaluation.references import Reconstruct, with_actions
 from mtv_world_ros.evaluation.results import EpisodeResult, rollout_path, stored_stretch
@@ -60,14 +62,14 @@ class EvaluationJob:
     Attributes:
         path: its folder.
         name: name of its results, unique in the evaluation.
-        donor: the episode that lends its actions, if there is one.
+        donors: episodes that may lend their actions; the first one that can be read does.
         zero_shot: what the model was not trained for in it: `view`, `task`, `object`; or empty.
         objects: names of its objects; empty = the pipeline's, or recorded, or named by the task.
     """
 
     path: Path
     name: str
-    donor: Path | None = None
+    donors: tuple[Path, ...] = ()
     zero_shot: str = ''
     objects: tuple[str, ...] = ()
 
@@ -99,6 +101,8 @@ class _Found:
     pictures: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
     scenes: list[ArmScene | None] = field(default_factory=list)
     notes: dict[str, None] = field(default_factory=dict)
+    not_imagined: dict[str, list[tuple[float, str]]] = field(default_factory=dict)
+    num_shuffled: int = 0
     chunk_seconds: list[float] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
 
@@ -151,6 +155,10 @@ class EpisodeScorer:
             if features:
                 with found.timed('features'):
                     features.add(predicted_frames(chunks), stretch.frames[:, 1:])
+        found.notes.update(dict.fromkeys(_left_out(found)))
+        if SHUFFLED in self.config.actions and donor is None:
+            why = 'no other episode can be read' if job.donors else 'there is no other episode'
+            found.notes[f'no frames were imagined with other commands: {why}'] = None
         with found.timed('storing'):
             save_rollout(rollout_path(self.out, job.name), join(found.shown))
             if features:
@@ -162,7 +170,9 @@ class EpisodeScorer:
             outcome=recording.outcome,
             rows=tuple(found.rows),
             quality=_mean_quality(found.quality),
-            pictures=_mean_quality(found.pictures),
+            pictures=mean_pictures(found.pictures),
+            num_chunks=len(found.pictures),
+            num_shuffled=found.num_shuffled,
             probability=success.probability if success else np.nan,
             reasons=success.reasons if success else (),
             interval=success.interval if success else (np.nan, np.nan),
@@ -181,12 +191,14 @@ class EpisodeScorer:
 
     def _donor(self, job: EvaluationJob) -> Recording | None:
         """Return the episode that lends its actions; None if there is none that can be read."""
-        if job.donor is None or 'shuffled' not in self.config.actions:
+        if SHUFFLED not in self.config.actions:
             return None
-        try:
-            return self._load(job.donor)
-        except MtvWorldError:  # listed with its reason when its own turn comes
-            return None
+        for path in job.donors:
+            try:
+                return self._load(path)
+            except MtvWorldError:  # listed with its reason when its own turn comes
+                continue
+        return None
 
     def _stretch(
         self,
@@ -282,10 +294,13 @@ class EpisodeScorer:
                     continue
                 chunks = self._imagine(recording, stretch, actions, truth.names, found)
             except MtvWorldError as error:
-                found.notes[f'{name} actions were not imagined: {error}'] = None
+                begun_s = float(recording.times[stretch.start])
+                found.not_imagined.setdefault(name, []).append((begun_s, str(error)))
                 continue
             frames = predicted_frames(chunks)
-            shuffled = frames if name == SHUFFLED else shuffled
+            if name == SHUFFLED:
+                shuffled = frames
+                found.num_shuffled += 1
             if moves:
                 scores[name] = self._scored(frames, truth, found)
         return scores, shuffled
@@ -357,15 +372,21 @@ def _mean_quality(
     for view in stretches[0][1]:
         names = dict.fromkeys(name for _, numbers in stretches for name in numbers[view])
         found[view] = {
-            name: _weighted(
-                [(count, numbers[view].get(name, np.nan)) for count, numbers in stretches]
-            )
+            name: weighted([(count, numbers[view]) for count, numbers in stretches], name)
             for name in names
         }
     return found
 
 
-def _weighted(values: Sequence[tuple[int, float]]) -> float:
-    known = [(count, value) for count, value in values if np.isfinite(value)]
-    total = sum(count for count, _ in known)
-    return sum(count * value for count, value in known) / total if total else float('nan')
+def _left_out(found: _Found) -> list[str]:
+    """Return which chunks were not imagined with other actions, and why, a line for each kind."""
+    lines = []
+    for name, chunks in found.not_imagined.items():
+        times = ', '.join(f'{begun_s:.1f}' for begun_s, _ in chunks)
+        reasons = '; '.join(dict.fromkeys(reason for _, reason in chunks))
+        margins = ' and have no margins' if name == SHUFFLED else ''
+        lines.append(
+            f'{name} actions: {len(chunks)} of {len(found.pictures)} chunks (from {times} s on) '
+            f'were not imagined{margins}: {reasons}'
+        )
+    return lines

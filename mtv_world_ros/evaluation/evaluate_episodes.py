@@ -40,6 +40,8 @@ from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.jaccard import mean_of_known
 
 DEFAULTS = EvaluationConfig()
+#: maximum number of episodes that are asked to lend their actions
+_MAX_DONORS = 3
 #: makes the pipeline anew, in another process
 MakePipeline = Callable[[], Pipeline]
 
@@ -144,7 +146,10 @@ def result_names(paths: Sequence[Path]) -> dict[Path, str]:
 def make_jobs(
     paths: Sequence[Path], zero_shot: Mapping[Path, str], seed: int
 ) -> list[EvaluationJob]:
-    """Return the episodes in an order in which each lends its actions to the next."""
+    """Return the episodes in an order in which each lends its actions to the next.
+
+    Where it cannot be read, the ones before it are asked.
+    """
     order = np.random.default_rng(seed).permutation(len(paths))
     shuffled = [Path(paths[index]) for index in order]
     names = result_names(paths)
@@ -152,7 +157,9 @@ def make_jobs(
         EvaluationJob(
             path=path,
             name=names[path],
-            donor=shuffled[index - 1] if len(shuffled) > 1 else None,
+            donors=tuple(
+                shuffled[index - k] for k in range(1, min(len(shuffled), 1 + _MAX_DONORS))
+            ),
             zero_shot=zero_shot.get(path, ''),
         )
         for index, path in enumerate(shuffled)
@@ -284,7 +291,7 @@ class _Run:
         return {
             **self.settings,
             'path': str(job.path),
-            'donor': str(job.donor),
+            'donor': str(job.donors[0] if job.donors else None),
             'zero_shot': job.zero_shot,
             'objects': list(job.objects),
         }

@@ -130,6 +130,8 @@ class EvaluationSummary:
             'num_episodes': len(self.results),
             'episodes': [result.episode for result in self.results],
             'num_episodes_failed': len(self.failed),
+            'num_chunks': sum(r.num_chunks for r in self.results),
+            'num_chunks_with_other_commands': sum(r.num_shuffled for r in self.results),
             'failed': self.failed,
             'notes': {r.episode: r.notes for r in self.results if r.notes},
             **self.settings,
@@ -170,7 +172,16 @@ class EvaluationSummary:
     @property
     def following(self) -> Following:
         """Verdict whether the model follows the commands, from its pictures and moving objects."""
-        return following(self.pictures[None], self.estimates(None).get('margin_moving'))
+        objects = self.estimates(None).get('margin_moving')
+        return following(self.pictures[None], objects, self.num_compared)
+
+    @property
+    def num_compared(self) -> tuple[int, int] | None:
+        """Number of chunks imagined with other commands, and of all; None = not known."""
+        if not all(result.num_chunks for result in self.results):
+            return None  # of an earlier version
+        num_chunks = sum(result.num_chunks for result in self.results)
+        return sum(result.num_shuffled for result in self.results), num_chunks
 
     @property
     def has_objects(self) -> bool:

@@ -34,7 +34,9 @@ class EpisodeResult:
         notes: defects of the recording, and rollouts that could not be imagined.
         seconds_per_chunk: mean time to imagine a chunk [s].
         seconds: seconds by stage of the episode's evaluation [s].
-        pictures: `picture_scores` by view and name, with the held frame and shuffled commands.
+        pictures: `mean_pictures` by view and name, with the held frame and shuffled commands.
+        num_chunks: number of stretches that were imagined; 0 = not known.
+        num_shuffled: number of those that were imagined with other commands, too.
         features: features of the success estimate, by name; empty if it abstained.
         observed: features of the success estimate at the end of the recorded frames, by name;
             empty if the recorded frames were not judged.
@@ -56,6 +58,8 @@ class EpisodeResult:
     has_ids: bool
     interval: tuple[float, float] = (np.nan, np.nan)
     pictures: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    num_chunks: int = 0
+    num_shuffled: int = 0
     features: Mapping[str, float] = field(default_factory=dict)
     observed: Mapping[str, float] = field(default_factory=dict)
     resumed: Mapping[str, float] = field(default_factory=dict)

@@ -10,7 +10,7 @@ from mtv_world_ros.core.documents import DASH, Table, with_interval
 from mtv_world_ros.core.files import write_json, write_whole
 from mtv_world_ros.evaluation.evaluation_summary import ALL, EvaluationSummary, Group, NOT_MEASURED
 from mtv_world_ros.evaluation.metrics.jaccard_scores import FRAME_FIELDS
-from mtv_world_ros.evaluation.metrics.picture_scores import KINDS, MEASURES
+from mtv_world_ros.evaluation.metrics.picture_scores import KINDS, MARGIN_KINDS, MEASURES
 from mtv_world_ros.evaluation.metrics.statistics import Estimate, METHOD
 
 BRACKETS = (
@@ -109,6 +109,7 @@ def markdown(summary: EvaluationSummary) -> str:
         *(of_objects if summary.has_objects else [_NO_OBJECTS, BRACKETS]),
         quality_table(summary),
         pictures_table(summary),
+        compared_line(summary),
         status_table(summary) if summary.has_objects else None,
         '\n'.join(f'- not scored: {path}: {why}' for path, why in summary.failed.items()),
         '\n'.join(f'- {r.episode}: {note}' for r in summary.results for note in r.notes),
@@ -180,16 +181,34 @@ def quality_table(summary: EvaluationSummary) -> Table | None:
 
 
 def pictures_table(summary: EvaluationSummary) -> Table | None:
-    """Return the table of picture scores and their baselines; None if there are no scores."""
+    """Return the table of picture scores, their baselines and margins; None without scores."""
     if not any(result.pictures for result in summary.results):
         return None
     rows = [
         [f'{view or "all views"} · {words}', *(cell(found.get(f'{k}{suffix}')) for k in MEASURES)]
         for view, found in summary.pictures.items()
-        for suffix, words in KINDS.items()
+        for suffix, words in {**KINDS, **MARGIN_KINDS}.items()
         if any(f'{name}{suffix}' in found for name in MEASURES)
     ]
     return Table(head=['pictures', *MEASURES.values()], rows=rows)
+
+
+def compared_line(summary: EvaluationSummary) -> str:
+    """Return over how many chunks and episodes margins are; empty if that is not known."""
+    counts, margin = summary.num_compared, summary.pictures[None].get('margin_over_held')
+    if counts is None or margin is None:
+        return ''
+    num_compared, num_chunks = counts
+    if not num_compared:
+        return (
+            f'Margins are over the held frame alone ({num_chunks} chunks): none was imagined with '
+            'other commands.'
+        )
+    return (
+        f'Margins are over the same chunks in all columns: {num_compared} of {num_chunks} were '
+        f'imagined with other commands, in {margin.num_episodes} of {len(summary.results)} '
+        'episodes. Rows that are no margins are over all the chunks they have.'
+    )
 
 
 def status_table(summary: EvaluationSummary) -> Table:

@@ -55,6 +55,7 @@ def page(evaluations: Sequence[EvaluationSummary]) -> str:
         cards=episode_cards(ones),
         has_objects=any(found.has_objects for found in evaluations),
         pictures=_each(ones, tables.pictures_table),
+        margins=[(one, line) for one in ones if (line := tables.compared_line(one.found))],
         paper=_paper_tables(ones),
         quality=_each(ones, tables.quality_table),
         tasks=[(one, table) for one in ones for table in _tables_of_numbers(one.found)],

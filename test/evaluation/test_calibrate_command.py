@@ -54,7 +54,7 @@ def test_an_episode_that_fails_is_named_and_in_the_exit_status(tmp_path, capsys)
         copy(data / name, outcome)
     for job in make_jobs(list_episodes(data), {}, seed=0):
         stored = json.loads((results / 'good0.json').read_text())
-        stored['settings'] |= {'path': str(job.path), 'donor': str(job.donor)}
+        stored['settings'] |= {'path': str(job.path), 'donor': str(job.donors[0])}
         if job.name in outcomes:
             stored['result'] |= {'episode': job.name, 'outcome': outcomes[job.name]}
             shutil.copy(results / 'good0.rollout.npz', results / f'{job.name}.rollout.npz')

@@ -7,6 +7,7 @@ import pytest
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, TrajectoryError
 from mtv_world_ros.evaluation import episode_scorer
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate
+from mtv_world_ros.evaluation.references import with_actions
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
 
@@ -236,7 +237,42 @@ def test_actions_that_cannot_be_imagined_are_noted_and_not_scored(
     assert metrics['views']['low']['j_zero_moving'] is None
     assert metrics['views']['low']['j_moving'] is not None
     (notes,) = metrics['notes'].values()
-    assert notes == ['zero actions were not imagined: out of reach'] and notes[0] in table
+    said = 'zero actions: 2 of 2 chunks (from 0.0, 0.8 s on) were not imagined: out of reach'
+    assert notes == [said] and said in table
+
+
+def test_margins_are_over_the_chunks_that_were_imagined_with_other_commands(
+    make_pipeline, episodes, oracle, tmp_path, monkeypatch
+):
+    """Other commands cannot be executed from the second chunk on: no margin is of these."""
+
+    def reached_at_first(name, recording, stretch, donor):
+        if name == 'shuffled' and stretch.index:
+            raise TrajectoryError('joints would jump')
+        return with_actions(name, recording, stretch, donor)
+
+    monkeypatch.setattr(episode_scorer, 'with_actions', reached_at_first)
+    metrics, table = run(make_pipeline(oracle), episodes, tmp_path)
+    one, every = len(episodes), metrics['num_chunks']
+    assert metrics['num_chunks_with_other_commands'] == one < every
+    assert f'{one} of {every} were imagined with other commands' in table
+    file = tmp_path / 'episodes' / f'{episodes[0].name}.json'
+    rows = json.loads(file.read_text())['result']
+    assert {'psnr_over_held', 'psnr_over_shuffled'} <= rows['pictures']['low'].keys()
+    scored = [row for row in rows['rows'] if row['view'] == 'low' and row['name']]
+    assert {row['stretch'] for row in scored if row['j_shuffled'] is not None} <= {0}
+    (note,) = rows['notes']
+    assert note.startswith(f'shuffled actions: {every // one - 1} of {every // one} chunks (')
+    assert 'were not imagined and have no margins: joints would jump' in note
+
+
+def test_an_episode_without_others_says_that_none_lends_its_commands(
+    make_pipeline, episodes, tmp_path
+):
+    metrics, table = run(make_pipeline(), episodes[:1], tmp_path)
+    ((note,),) = metrics['notes'].values()
+    assert note == 'no frames were imagined with other commands: there is no other episode'
+    assert 'Margins are over the held frame alone' in table
 
 
 def test_true_frames_score_the_segmenters_own_ceiling_against_the_simulators_masks(

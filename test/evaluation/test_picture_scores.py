@@ -7,6 +7,7 @@ import pytest
 
 from mtv_world_ros.evaluation.metrics.picture_scores import (
     following,
+    mean_pictures,
     picture_estimates,
     picture_scores,
     ssim_map,
@@ -99,6 +100,27 @@ def test_commands_are_not_followed_where_objects_are_worse_than_held(
     found = following(pictures, objects)
     assert found.word == word
     assert ('J of moving objects' in found.why) == (num_episodes >= 3)
+
+
+def test_margins_are_over_the_chunks_that_all_baselines_have():
+    """Other commands were imagined in the first chunk alone, where the model is worse."""
+    compared = {'psnr_changed': 14.0, 'psnr_changed_held': 12.0, 'psnr_changed_shuffled': 11.0,
+                'psnr': 24.0, 'psnr_held': 23.0, 'psnr_shuffled': 20.0}  # fmt: skip
+    alone = {'psnr_changed': 20.0, 'psnr_changed_held': 10.0, 'psnr': 30.0, 'psnr_held': 26.0}
+    found = mean_pictures([(8, {'low': compared}), (4, {'low': alone})])['low']
+    assert found['psnr_changed'] == pytest.approx((8 * 14 + 4 * 20) / 12)  # of all chunks
+    assert found['psnr_changed_over_held'] == 2.0  # not (8 * 2 + 4 * 10) / 12
+    assert found['psnr_changed_over_shuffled'] == 3.0
+    assert (found['psnr_over_held'], found['psnr_over_shuffled']) == (1.0, 4.0)
+    without = mean_pictures([(8, {'low': alone}), (4, {'low': alone})])['low']
+    assert without['psnr_changed_over_held'] == 10.0
+    assert 'psnr_changed_over_shuffled' not in without
+    estimates = picture_estimates([{'low': found}, {'low': without}, {'low': found}])
+    assert estimates['margin_over_held'].value == 2.0
+    assert estimates['margin_over_held'].num_episodes == 2
+    assert estimates['psnr_changed'].num_episodes == 3
+    why = following(estimates, chunks=(2, 6)).why
+    assert '2 episodes, 2 of 6 chunks' in why
 
 
 def test_without_other_commands_nothing_is_said():

@@ -336,7 +336,9 @@ MARGINS = {
 def episode_means(rows: Sequence[ScoreRow], view: str | None) -> dict[str, float]:
     """Return `MEANS` and `MARGINS` of an episode in a view (None = all); frames weigh equally.
 
-    Only rows with a J count, also in the baselines, so that the differences are paired.
+    Only rows with a J count, also in the baselines. Margins are over the rows that have all the
+    baselines, so that they are paired, and all over the same rows: where a chunk could not be
+    imagined with other commands, it has no margin over the held frame either.
     """
     kept = [row for row in rows if view in (None, row.view) and np.isfinite(row.j)]
     chosen = {
@@ -348,8 +350,11 @@ def episode_means(rows: Sequence[ScoreRow], view: str | None) -> dict[str, float
     means = {name: _mean(chosen[which], field) for name, (field, which) in MEANS.items()}
     for name, (area, edge) in BOTH.items():
         means[name] = (means[area] + means[edge]) / 2
-    for name, (minuend, subtrahend) in MARGINS.items():
-        means[name] = means[minuend] - means[subtrahend]
+    compared = [row for row in chosen['moving'] if np.isfinite(row.j_shuffled)]
+    paired = compared or chosen['moving']
+    for name, keys in MARGINS.items():
+        minuend, subtrahend = (_mean(paired, MEANS[key][0]) for key in keys)
+        means[name] = minuend - subtrahend
     return means
 
 

@@ -31,6 +31,13 @@ KINDS = {
     f'_{SHUFFLED}': 'other commands',
     f'_{RECORDED}': 'recorded',
 }
+#: baselines that an imagined rollout is compared with, in pairs
+BASELINES = (HELD, SHUFFLED)
+#: names of the rows of margins, by the suffix of a number's name
+MARGIN_KINDS = {
+    f'_over_{HELD}': 'imagined - first frame held',
+    f'_over_{SHUFFLED}': 'imagined - other commands',
+}
 #: numbers by name, and how tables call them
 MEASURES = {
     'psnr': 'PSNR [dB]',
@@ -119,15 +126,61 @@ def ssim_map(a: ByteArray, b: ByteArray) -> NDArray[np.float64]:
 PictureScores = Mapping[str, Mapping[str, float]]
 
 
+def mean_pictures(
+    chunks: Sequence[tuple[int, PictureScores]],
+) -> dict[str, dict[str, float]]:
+    """Return the means of an episode over its chunks by view, and margins over the baselines.
+
+    Frames weigh equally, NaN counts nothing. A margin, `psnr_over_held` and so on, is the mean
+    difference over the chunks that have both baselines, or the held frame alone where no chunk
+    was imagined with other commands: all margins are over the same chunks.
+
+    Args:
+        chunks: number of frames and scores of each chunk.
+    """
+    found: dict[str, dict[str, float]] = {}
+    for view in chunks[0][1]:
+        rows = [(count, scores[view]) for count, scores in chunks]
+        names = dict.fromkeys(name for _, numbers in rows for name in numbers)
+        found[view] = {name: weighted(rows, name) for name in names} | _margins(rows)
+    return found
+
+
+def _margins(rows: Sequence[tuple[int, Mapping[str, float]]]) -> dict[str, float]:
+    """Return the margins of a view over its baselines, from chunks that have all baselines."""
+    present = [
+        other for other in BASELINES if any(f'psnr_{other}' in numbers for _, numbers in rows)
+    ]
+    paired = [row for row in rows if all(f'psnr_{other}' in row[1] for other in present)]
+    found = {}
+    for name in MEASURES:
+        for other in present:
+            both = [
+                (count, {name: numbers[name] - numbers[f'{name}_{other}']})
+                for count, numbers in paired
+                if name in numbers and f'{name}_{other}' in numbers
+            ]
+            found[f'{name}_over_{other}'] = weighted(both, name)
+    return found
+
+
+def weighted(rows: Sequence[tuple[int, Mapping[str, float]]], name: str) -> float:
+    """Return the mean of a number over chunks, weighted by their frames."""
+    known = [(count, row.get(name, nan)) for count, row in rows]
+    known = [(count, value) for count, value in known if np.isfinite(value)]
+    total = sum(count for count, _ in known)
+    return sum(count * value for count, value in known) / total if total else nan
+
+
 def episode_pictures(episode: PictureScores, view: str | None) -> dict[str, float]:
     """Return an episode's numbers of a view (None = mean of all), and margins."""
     views = [numbers for name, numbers in episode.items() if view in (None, name)]
     names = dict.fromkeys(name for numbers in views for name in numbers)
     found = {name: _mean([numbers.get(name, nan) for numbers in views]) for name in names}
-    for other in (HELD, SHUFFLED):
-        key = f'psnr_changed_{other}'
-        if key in found:
-            found[f'margin_over_{other}'] = found['psnr_changed'] - found[key]
+    for other in BASELINES:
+        key, paired = f'psnr_changed_{other}', f'psnr_changed_over_{other}'
+        if key in found:  # results of earlier versions have no margins of their own
+            found[f'margin_over_{other}'] = found.get(paired, found['psnr_changed'] - found[key])
     return found
 
 
@@ -139,11 +192,19 @@ def _mean(values: Sequence[float]) -> float:
 def picture_estimates(
     episodes: Sequence[PictureScores], view: str | None = None
 ) -> dict[str, Estimate]:
-    """Return means over episodes with 95 % intervals, by name; margins are paired."""
+    """Return means over episodes with 95 % intervals, by name.
+
+    Margins are paired, and over the same episodes: where some were imagined with other commands,
+    those that were not have no margin over the held frame either.
+    """
     rows = [episode_pictures(episode, view) for episode in episodes if episode]
+    key = f'margin_over_{SHUFFLED}'
+    is_paired = [np.isfinite(row.get(key, nan)) for row in rows]
     found = {}
     for name in dict.fromkeys(name for row in rows for name in row):
         values = np.array([row.get(name, nan) for row in rows])
+        if '_over_' in name and any(is_paired):
+            values[~np.array(is_paired)] = nan
         known = np.isfinite(values)
         sums = np.where(known, values, 0.0)[:, None]
         mean, ends = mean_interval(sums, known[:, None].astype(float), low=-np.inf, high=np.inf)
@@ -168,7 +229,11 @@ class Following:
         return f'follows the commands: {self.word} ({self.why})'
 
 
-def following(estimates: Mapping[str, Estimate], objects: Estimate | None = None) -> Following:
+def following(
+    estimates: Mapping[str, Estimate],
+    objects: Estimate | None = None,
+    chunks: tuple[int, int] | None = None,
+) -> Following:
     """Decide by PSNR where the picture changes, against held frame and shuffled commands.
 
     Args:
@@ -176,8 +241,10 @@ def following(estimates: Mapping[str, Estimate], objects: Estimate | None = None
         objects: J of the moving objects minus that of the held first frame, paired within the
             episodes; None = no episode names a moving object. A model below the held frame does
             not follow the commands, whatever its pictures of the arm are like.
+        chunks: number of chunks that were imagined with other commands, and of all; None = not
+            known.
     """
-    found = _following_by_pictures(estimates)
+    found = _following_by_pictures(estimates, chunks)
     if objects is None or objects.num_episodes < MIN_EPISODES or found.word == 'no':
         return found
     why = f'{found.why}; J of moving objects {_against_held(objects)}'
@@ -193,7 +260,9 @@ def _against_held(margin: Estimate) -> str:
     return f'{margin.value:+.2f}{ends} against the held frame'
 
 
-def _following_by_pictures(estimates: Mapping[str, Estimate]) -> Following:
+def _following_by_pictures(
+    estimates: Mapping[str, Estimate], chunks: tuple[int, int] | None
+) -> Following:
     shuffled = estimates.get(f'margin_over_{SHUFFLED}')
     held = estimates.get(f'margin_over_{HELD}')
     if shuffled is None or held is None or not np.isfinite([shuffled.value, held.value]).all():
@@ -206,6 +275,8 @@ def _following_by_pictures(estimates: Mapping[str, Estimate]) -> Following:
         f'where the picture changes, {_signed(shuffled)} against other commands, '
         f'{_signed(held)} against the held frame; {shuffled.num_episodes} episodes'
     )
+    if chunks is not None:
+        why += f', {chunks[0]} of {chunks[1]} chunks'
     if min(shuffled.num_episodes, held.num_episodes) < MIN_EPISODES:
         return Following(word='cannot tell', why=f'{why}, give at least {MIN_EPISODES}')
     if shuffled.interval[0] > 0 and held.interval[0] > 0:

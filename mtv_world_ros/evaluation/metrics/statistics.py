@@ -88,12 +88,17 @@ def mean_interval(
 def summarise(episodes: Sequence[dict[str, float]]) -> dict[str, Estimate]:
     """Return the mean over episodes of every number, and the skills, with 95 % intervals.
 
-    The interval of a margin is that of differences paired within each episode. Episodes are given
+    The interval of a margin is that of differences paired within each episode, over the episodes
+    that have all margins: some may have no rollout with other commands. Episodes are given
     by their `episode_means`, and `QUALITY` where it was measured.
     """
     names = [*MEANS, *BOTH, *MARGINS, *QUALITY]
     rows = [[means.get(name, nan) for name in names] for means in episodes]
     columns = dict(zip(names, np.array(rows, np.float64).reshape(-1, len(names)).T, strict=True))
+    compared = np.isfinite(columns['margin_over_shuffled'])
+    if compared.any():
+        for name in MARGINS:
+            columns[name] = np.where(compared, columns[name], nan)
     found = {
         name: _estimate(values, np.ones_like(values), _RANGES.get(name, (0.0, 1.0)))
         for name, values in columns.items()

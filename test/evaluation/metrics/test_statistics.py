@@ -47,6 +47,22 @@ def test_unscored_rows_leave_the_baseline_too():
     assert means['j_copy_moving'] == 0.2
 
 
+def test_margins_are_over_the_rows_and_episodes_that_have_all_baselines():
+    compared = replace(row(0.6, 0.4), j_shuffled=0.1)
+    found = episode_means([compared, row(0.9, 0.1)], None)
+    assert found['j_moving'] == 0.75 and found['j_copy_moving'] == 0.25  # of all rows
+    assert found['margin_moving'] == pytest.approx(0.2)  # of the first alone
+    assert found['margin_over_shuffled'] == pytest.approx(0.5)
+    assert found['margin_of_shuffled'] == pytest.approx(-0.3)
+    alone = episode_means([row(0.9, 0.1)], None)
+    assert alone['margin_moving'] == 0.8 and np.isnan(alone['margin_over_shuffled'])
+    both = summarise([found, alone])
+    assert both['margin_moving'].num_episodes == both['margin_over_shuffled'].num_episodes == 1
+    assert both['margin_moving'].value == pytest.approx(0.2)
+    assert summarise([alone])['margin_moving'].value == 0.8
+    assert both['j_moving'].num_episodes == 2
+
+
 def test_union_row_is_no_object():
     means = episode_means([row(0.4, 0.2), row(0.9, 0.8, name='')], 'low')
     assert means['j_object_mean'] == 0.4 and means['j_union'] == 0.9
