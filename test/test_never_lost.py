@@ -191,7 +191,11 @@ def trained(tmp_path_factory) -> tuple[Path, str]:
 @pytest.mark.slow
 def test_the_evaluation_that_train_prints_runs(trained):
     out, said = trained
-    words = shlex.split(said.partition('evaluate it with: ')[2])
+    line, note = said.partition('evaluate it with: ')[2].splitlines()[:2]
+    assert note.startswith(
+        '(EPISODES: a folder of episodes that it was not trained on; it was on '
+    )
+    words = shlex.split(line.replace('EPISODES', str(EPISODE.parent)))
     assert words[:2] == ['mtv-world', 'evaluate']
     assert main([*words[1:], '--no-report', '--no-ceiling', '--actions', 'true']) == 0
     assert (out / 'evaluation_2' / 'metrics.json').is_file()

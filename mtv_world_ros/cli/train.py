@@ -192,12 +192,55 @@ def _train(arguments: argparse.Namespace) -> int:
         held_out=_held_out(arguments, paths, dtype, source),
     )
     print(f'{f"adapter for {arguments.init}" if config.lora.rank else "checkpoint"}: {folder}')
+    if not config.lora.rank and _lacks_contact(folder, config.video.robot):
+        views = ','.join(config.video.views)
+        words = [str(arguments.dataset), '--checkpoint', str(folder)]
+        words += ['--robot', str(config.video.robot), '--views', views]
+        print(
+            'where episodes have objects, first fit how they move: '
+            f'{shlex.join(["mtv-world", "fit", "contact", *words])}'
+        )
     model = [str(arguments.init), '--adapter', str(folder)] if config.lora.rank else [str(folder)]
-    dataset = str(arguments.held_out or arguments.dataset)
     out = arguments.out / f'evaluation_{Checkpoint.open(folder).card.trained_on["steps"]}'
-    words = [model[0], dataset, *model[1:], '--out', str(out)]
-    print(f'evaluate it with: {shlex.join(["mtv-world", "evaluate", *words])}')
+    print('\n'.join(_evaluation_advice(arguments, model, paths, out)))
     return 0
+
+
+#: stands for a folder that the user has to name
+UNSEEN = 'EPISODES'
+
+
+def _evaluation_advice(
+    arguments: argparse.Namespace, model: Sequence[str], trained_on: Sequence[Path], out: Path
+) -> list[str]:
+    """Return the lines that say how to evaluate a checkpoint on what it was not trained on."""
+    from mtv_world_ros.data.splits import select
+
+    dataset = arguments.held_out or arguments.dataset
+    seen = {path.resolve() for path in trained_on}
+    both = seen & {path.resolve() for path in select(dataset).paths}
+    words = [model[0], UNSEEN if both else str(dataset), *model[1:], '--out', str(out)]
+    for option in ('segmenter', 'describer', 'topics', 'calibration'):
+        value = getattr(arguments, option)
+        if value and value != 'auto':
+            words += [f'--{option}', str(value)]
+    lines = [f'evaluate it with: {shlex.join(["mtv-world", "evaluate", *words])}']
+    if both:
+        lines.append(
+            f'({UNSEEN}: a folder of episodes that it was not trained on; it was on {len(both)} '
+            f"of '{dataset}', which tells how well it remembers them)"
+        )
+    return lines
+
+
+def _lacks_contact(folder: Path, robot: Path | str) -> bool:
+    """Return whether a checkpoint draws objects, and nothing says how they move."""
+    from mtv_world_ros.model.checkpoint import Checkpoint
+    from mtv_world_ros.robot.file import load_robot, robot_path
+
+    opened = Checkpoint.open(folder)
+    control = opened.load_control(load_robot(robot_path(robot)))
+    return control.shows_objects and opened.object_motion is None
 
 
 def found_broken(report: Path, paths: Sequence[Path], views: Sequence[str]) -> dict[str, str]:

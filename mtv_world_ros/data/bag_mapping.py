@@ -39,12 +39,33 @@ def _view(value: Any) -> Any:
     return {'image': value} if isinstance(value, str) else value
 
 
+#: begins a value that is read from each recording: `key: NAME`
+_KEY = 'key:'
+
+
+def key_of(value: str) -> str:
+    """Return NAME of a value `key: NAME`, which each recording has; empty = it is for all."""
+    return value.removeprefix(_KEY).strip() if value.startswith(_KEY) else ''
+
+
+def keyed(value: Any) -> Any:
+    """Return `key: NAME` for the mapping that YAML makes of it without quotes."""
+    is_key = isinstance(value, dict) and list(value) == ['key'] and isinstance(value['key'], str)
+    return f'{_KEY} {value["key"]}' if is_key else value
+
+
+def _check_outcome(value: str) -> str:
+    return value if key_of(value) else check_outcome(value)
+
+
 class Written(Schema):
     """Description and encoding of the episodes that an import writes."""
 
     task: str = Field(default='', description='name of the task; empty = none')
-    outcome: Annotated[str, AfterValidator(check_outcome)] = Field(
-        default='unknown', description='success, failure or unknown'
+    outcome: Annotated[str, AfterValidator(_check_outcome), BeforeValidator(keyed)] = Field(
+        default='unknown',
+        description='success, failure or unknown; or `key: NAME`: each recording has its own '
+        '(videos: of the file of rows; bags: of custom_data in metadata.yaml)',
     )
     objects: ListOf[str] = Field(default=(), description='names of the objects')
     chunk_s: Seconds = Field(default=3.2, description='length of a joint trajectory message [s]')

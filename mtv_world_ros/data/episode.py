@@ -74,6 +74,38 @@ def check_outcome(outcome: str) -> str:
     return outcome
 
 
+#: words of outcomes in other people's recordings, in lower case, by the outcome that they mean
+_OUTCOME_WORDS = {
+    'success': {'success', 'succeeded', 'successful', 'true', 'yes', '1', '1.0'},
+    'failure': {'failure', 'failed', 'fail', 'false', 'no', '0', '0.0'},
+    'unknown': {'unknown', 'none', 'null', 'nan', ''},
+}
+
+
+def parse_outcome(value: Any, where: str) -> str:
+    """Return the outcome that a recorded value means, of `OUTCOMES`.
+
+    Args:
+        value: word, truth value or number 0 or 1; or a column of them, whose rows say success if
+            one does, else failure if one does.
+        where: source of the value, for error texts.
+
+    Raises:
+        EpisodeError: it means none.
+    """
+    if isinstance(value, list | tuple | np.ndarray):
+        found = {parse_outcome(one, where) for one in value}
+        return next((word for word in ('success', 'failure') if word in found), 'unknown')
+    said = str(value).strip().lower()
+    for outcome, words in _OUTCOME_WORDS.items():
+        if said in words:
+            return outcome
+    raise EpisodeError(
+        f"{where} is '{value}', which is no outcome; it must be success, failure or unknown, true "
+        'or false, 1 or 0'
+    )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeInfo:
     """Metadata of an episode.

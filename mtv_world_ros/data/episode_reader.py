@@ -69,12 +69,17 @@ from mtv_world_ros.data.stream_clocks import (
 from mtv_world_ros.data.tool_targets import joints_of_tools, ToolTrack
 from mtv_world_ros.data.transform_tree import Mount, pose_track, read_tree, TransformTree
 from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.robot.resample import nearest_rows
 
 Stamped = list[tuple[int, Any]]
 #: joints that a warning names at most
 _MOST_NAMES = 8
 #: intrinsics that differ by less of the focal length are the same
 _SAME_K = 0.005
+#: largest distance of a mask from the image that it belongs to [median period of the images]
+_MAX_MASK_OFFSET = 0.6
+#: largest share of a view's images without a mask of their time at which its masks are used
+_MAX_UNMASKED = 0.1
 #: keys of a topic map that are not views, and the topics they stand for
 STREAMS = {
     'joint_states': JOINT_STATES,
@@ -211,7 +216,10 @@ class _EpisodeReader:
         topics = self.topics
         images = {view: self._images(view, names) for view, names in topics.views.items()}
         self.seen_ns = max((int(track.stamps_ns[0]) for track in images.values()), default=0)
-        masks = {view: self._masks(names) for view, names in topics.views.items()}
+        masks = {
+            view: self._timely_masks(view, images[view], self._masks(names))
+            for view, names in topics.views.items()
+        }
         instructions = [(s, m.data) for s, m in self._take(topics.instruction, messages.STRING)]
         states = self._states()
         self._check_shared(images, states)
@@ -354,6 +362,23 @@ class _EpisodeReader:
 
     def _masks(self, names: ViewTopics) -> Track | None:
         return self._track(names.mask, to_ids) if self.with_masks else None
+
+    def _timely_masks(self, view: str, images: Track, masks: Track | None) -> Track | None:
+        """Return the masks of a view; None, with a warning, if they are of other times."""
+        if masks is None:
+            return None
+        own, stamps = masks.stamps_ns, images.stamps_ns
+        apart = np.abs(own[nearest_rows(own, stamps)] - stamps)
+        period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
+        share = float((apart > _MAX_MASK_OFFSET * period).mean())
+        if share <= _MAX_UNMASKED:
+            return masks
+        self._warn_once(
+            f"view '{view}': {share:.0%} of its {len(stamps)} images have no mask of their time "
+            f'({len(own)} masks, up to {apart.max() / NANO:.2f} s apart): its masks are not used; '
+            'import the recording again with masks of every image'
+        )
+        return None
 
     def _track(self, topic: str, decode: Callable[[Any], ByteArray]) -> Track | None:
         check = check_packet if self.types.get(topic) == FFMPEG_PACKET else check_image

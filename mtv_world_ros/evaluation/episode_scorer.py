@@ -48,6 +48,7 @@ from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.robot.shape import load_shape, RobotShape
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.prediction import Prediction
+from mtv_world_ros.success.estimator import SUCCESS_FROM
 from mtv_world_ros.viewing.scored_rollout import StoredRollout
 from mtv_world_ros.viewing.stored_rollout import join, save_rollout
 
@@ -139,7 +140,7 @@ class EpisodeScorer:
                 found.scenes += arm_scenes(recording, self.pipeline.robot, self._shape.parts)
         found.notes.update(dict.fromkeys(recording.warnings))
         features = self.instruments.features and self.instruments.features.start()
-        success, observed, resumed = None, {}, {}
+        success, observed, resumed, shown = None, {}, {}, np.nan
         names = job.objects or self.pipeline.objects or recording.names
         for stretch in stretches(recording, self.pipeline.spec, self.config.mode):
             chunks = self._stretch(recording, stretch, donor, names, found)
@@ -147,7 +148,8 @@ class EpisodeScorer:
             if self.config.observed:
                 with found.timed('segmenting'):
                     pipeline = replace(self.pipeline, objects=names)
-                    observed = observe_stretch(pipeline, recording, stretch).features
+                    real = observe_stretch(pipeline, recording, stretch)
+                    observed, shown = real.features, real.probability
                 last = last_chunk(recording, stretch, pipeline.spec)
                 if last is not None:
                     chunk = self._imagine(recording, last, recording, names, found)[-1]
@@ -156,6 +158,8 @@ class EpisodeScorer:
                 with found.timed('features'):
                     features.add(predicted_frames(chunks), stretch.frames[:, 1:])
         found.notes.update(dict.fromkeys(_left_out(found)))
+        doubt = contradiction(recording.outcome, shown)
+        found.notes.update({doubt: None} if doubt else {})
         if SHUFFLED in self.config.actions and donor is None:
             why = 'no other episode can be read' if job.donors else 'there is no other episode'
             found.notes[f'no frames were imagined with other commands: {why}'] = None
@@ -376,6 +380,27 @@ def _mean_quality(
             for name in names
         }
     return found
+
+
+#: estimates of recorded frames up to this one contradict a success [probability]
+_CLEAR_FAILURE = 0.25
+
+
+def contradiction(outcome: str, probability: float) -> str:
+    """Return what recorded frames show against the label of an episode; empty = nothing clear.
+
+    Args:
+        outcome: the label, `success`, `failure` or `unknown`.
+        probability: success estimate at the end of the recorded frames; NaN = it abstains.
+    """
+    is_against = {'success': probability <= _CLEAR_FAILURE, 'failure': probability >= SUCCESS_FROM}
+    if not is_against.get(outcome, False):
+        return ''
+    seen = 'failure' if outcome == 'success' else 'success'
+    return (
+        f'the episode is labelled a {outcome}, but its recorded frames look like a {seen} '
+        f'(estimate {probability:.2f}): look at it, and correct the label or the task'
+    )
 
 
 def _left_out(found: _Found) -> list[str]:

@@ -14,12 +14,18 @@ import yaml
 
 from mtv_world_ros.cameras.camera import camera_poses
 from mtv_world_ros.core.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.core.errors import ConfigError, EpisodeError, RobotError, TrajectoryError
+from mtv_world_ros.core.errors import (
+    ConfigError,
+    EpisodeError,
+    nearest,
+    RobotError,
+    TrajectoryError,
+)
 from mtv_world_ros.core.files import ROBOT_YAML
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
-from mtv_world_ros.data.bag_mapping import BagMapping
-from mtv_world_ros.data.episode import Episode, MASKS_BY, UNKNOWN_CAMERAS
+from mtv_world_ros.data.bag_mapping import BagMapping, key_of
+from mtv_world_ros.data.episode import Episode, MASKS_BY, parse_outcome, UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.stream_clocks import ClockBreakError, WHOLE, Window
@@ -297,10 +303,27 @@ def convert_bag(
         unknown_mount=robot.base_link,
         window=part.window,
     )
+    key_name = key_of(mapping.outcome)
+    if key_name:
+        outcome = _outcome(episode, key_name)
+        mapping = mapping.replace(outcome='unknown')
+        episode = replace(episode, info=replace(episode.info, outcome=outcome))
     if part.number:
         mapping = mapping.replace(outcome='unknown')
         episode = replace(episode, info=replace(episode.info, outcome='unknown'))
     return write_imported(episode, part.bag.name, out, mapping, robot, key, stage)
+
+
+def _outcome(episode: Episode, name: str) -> str:
+    """Return the outcome that a bag has under a key of its custom_data."""
+    known = episode.info.metadata
+    if name not in known:
+        raise EpisodeError(
+            f"'{episode.info.path}' has no outcome '{name}' in custom_data of metadata.yaml"
+            f'{nearest(name, known)}; it has {", ".join(known) or "no key"} (ros2 bag record '
+            '--custom-data KEY=VALUE writes one)'
+        )
+    return parse_outcome(known[name], f"'{episode.info.path}': outcome '{name}'")
 
 
 def write_imported(

@@ -90,11 +90,25 @@ class BoxedObjects:
         examples: how the objects look.
         starts: by recording and view the first frame (H, W, 3) uint8 RGB and the masks (H, W) of
             the objects that have a box in it.
+        missing: recordings that have boxes and are not among those of the import.
     """
 
     boxes: ObjectBoxes
     examples: ObjectExamples
     starts: Mapping[str, Mapping[str, tuple[ByteArray, Mapping[str, BoolArray]]]]
+    missing: tuple[str, ...] = ()
+
+    @property
+    def note(self) -> str:
+        """Line on the boxes that are not used; empty = all are."""
+        if not self.missing:
+            return ''
+        rest = len(self.missing) - _LISTED
+        names = ', '.join(self.missing[:_LISTED]) + (f' and {rest} more' if rest > 0 else '')
+        return (
+            f'objects: boxes of {len(self.missing)} of {len(self.boxes.recordings)} recordings '
+            f'are not used, as they are not in the folder: {names}'
+        )
 
 
 def learn_objects(
@@ -104,20 +118,25 @@ def learn_objects(
 
     Args:
         boxes: as drawn.
-        found: the recordings of the import by name; others of the file are an error.
+        found: the recordings of the import by name; boxes of others are not used.
         read: reads a recording.
 
     Raises:
-        ConfigError: a recording or view is not there, or a box lies outside of the frame or time.
+        ConfigError: none of the recordings, or a view, is there, or a box lies outside of the
+            frame or time.
     """
+    missing = tuple(name for name in boxes.recordings if name not in found)
+    if len(missing) == len(boxes.recordings):
+        raise ConfigError(
+            f"objects: there is no recording '{missing[0]}'{nearest(missing[0], found)}, nor any "
+            f'other that has boxes; there are {", ".join(list(found)[:_LISTED])}'
+            f'{", ..." if len(found) > _LISTED else ""}'
+        )
     frames: list[tuple[ByteArray, dict[str, Box]]] = []
     starts: dict[str, dict[str, tuple[ByteArray, Mapping[str, BoolArray]]]] = {}
     for name in boxes.recordings:
-        if name not in found:
-            raise ConfigError(
-                f"objects: there is no recording '{name}'{nearest(name, found)}; there are "
-                f'{", ".join(list(found)[:_LISTED])}{", ..." if len(found) > _LISTED else ""}'
-            )
+        if name in missing:
+            continue
         episode = read(found[name])
         for view, rows in boxes.boxes.items():
             by_frame = _by_frame(episode, name, view, rows.get(name, {}))
@@ -128,7 +147,9 @@ def learn_objects(
                 if index == 0:
                     masks = {n: _whole_mask(n, frame, box) for n, box in drawn.items()}
                     starts.setdefault(name, {})[view] = frame, masks
-    return BoxedObjects(boxes=boxes, examples=ObjectExamples.of(frames), starts=starts)
+    return BoxedObjects(
+        boxes=boxes, examples=ObjectExamples.of(frames), starts=starts, missing=missing
+    )
 
 
 def _by_frame(

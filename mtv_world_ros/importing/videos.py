@@ -16,8 +16,8 @@ from mtv_world_ros.cameras.camera import unknown_camera
 from mtv_world_ros.core.config import read_yaml, validated, wrong
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest
-from mtv_world_ros.data.bag_mapping import BagMapping, ViewSource, Written
-from mtv_world_ros.data.episode import Episode, EpisodeInfo, JointStates, Track
+from mtv_world_ros.data.bag_mapping import BagMapping, key_of, keyed, ViewSource, Written
+from mtv_world_ros.data.episode import Episode, EpisodeInfo, JointStates, parse_outcome, Track
 from mtv_world_ros.data.joint_plans import following
 from mtv_world_ros.data.measured_joints import mend_rows
 from mtv_world_ros.data.stream_clocks import check_row_times
@@ -69,7 +69,9 @@ class VideoMapping(Written):
         description='`video` = frames keep the times of the video, from the first row on; `rows` '
         '= frame k belongs to row k; `auto` = what number, rate and duration tell',
     )
-    instruction: str = Field(default='', description='text, or `key: NAME` of the JSON file')
+    instruction: Annotated[str, BeforeValidator(keyed)] = Field(
+        default='', description='text, or `key: NAME` of the file of rows'
+    )
     _robot_file: Path = PrivateAttr(default=Path())
 
     @property
@@ -84,8 +86,12 @@ class VideoMapping(Written):
         return {key for key in _LATER if getattr(self, key) == fields[key].default}
 
     def written(self) -> BagMapping:
-        """Return the task, outcome and quality of the episodes that are written."""
+        """Return task, outcome and quality of the episodes that are written.
+
+        An outcome that each recording has is that of what `read_recording` returns.
+        """
         given = {name: getattr(self, name) for name in Written.model_fields}
+        given |= {'outcome': 'unknown'} if key_of(self.outcome) else {}
         return BagMapping(**given, views={view: ViewSource(image=view) for view in self.views})
 
 
@@ -223,7 +229,11 @@ def read_recording(
     states = JointStates(
         stamps_ns=stamps, joint_names=mapping.robot.joint_names, positions=positions
     )
-    info = EpisodeInfo(path=path, instruction=_instruction(table.keys, mapping, path))
+    info = EpisodeInfo(
+        path=path,
+        instruction=_instruction(table.keys, mapping),
+        outcome=_outcome(table.keys, mapping, path),
+    )
     return Episode(
         info=info,
         views=tuple(mapping.views),
@@ -298,9 +308,22 @@ def _times(table: NumberTable, mapping: VideoMapping) -> tuple[FloatArray, list[
     return times - times[0], notes
 
 
-def _instruction(keys: Mapping[str, Any], mapping: VideoMapping, path: Path) -> str:
-    word, _, name = mapping.instruction.partition('key:')
-    if word or not name:
+def _outcome(keys: Mapping[str, Any], mapping: VideoMapping, path: Path) -> str:
+    """Return the outcome of a recording: the mapping's, or that of its own key or column."""
+    name = key_of(mapping.outcome)
+    if not name:
+        return mapping.outcome
+    if name not in keys:
+        raise EpisodeError(
+            f"'{path}' has no outcome '{name}'{nearest(name, keys)}; it has {', '.join(keys)}"
+        )
+    return parse_outcome(keys[name], f"'{path}': outcome '{name}'")
+
+
+def _instruction(keys: Mapping[str, Any], mapping: VideoMapping) -> str:
+    """Return the text for the robot: the mapping's, or that of the recording's key or column."""
+    name = key_of(mapping.instruction)
+    if not name:
         return mapping.instruction
-    value = keys.get(name.strip(), '')
+    value = keys.get(name, '')
     return str(value[0]) if isinstance(value, list) and value else str(value)

@@ -80,6 +80,7 @@ class EpisodeStart:
         instruction: text for the robot; empty = not known.
         origin: task, scene and recording, for policies that use them in place of pictures.
         robot: the robot as it describes itself; None = the pipeline's.
+        stored_objects: names of the objects that are stored with the recorded episode.
     """
 
     source: str
@@ -87,6 +88,7 @@ class EpisodeStart:
     instruction: str
     origin: EpisodeOrigin
     robot: RobotModel | None = None
+    stored_objects: tuple[str, ...] = ()
 
 
 def recorded_start(path: Path, pipeline: Pipeline, start_s: float = 0.0) -> EpisodeStart:
@@ -109,6 +111,7 @@ def recorded_start(path: Path, pipeline: Pipeline, start_s: float = 0.0) -> Epis
         source=str(path),
         observation=observation,
         instruction=info.instruction,
+        stored_objects=info.objects,
         origin=EpisodeOrigin(
             task=info.task,
             scene_seed=-1 if info.seed is None else info.seed,
@@ -255,6 +258,7 @@ class _EpisodeRun:
 
             options = RolloutOptions(
                 instruction=instruction,
+                stored_objects=self._start.stored_objects,
                 num_inference_steps=self._options.num_inference_steps,
                 limits=LIMITS,
                 should_stop=self._is_late,

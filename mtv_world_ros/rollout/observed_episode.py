@@ -105,9 +105,9 @@ class ObservedEpisode:
         return rollout
 
 
-def _task(options: RolloutOptions) -> tuple[str, tuple[str, ...]]:
+def _task(options: RolloutOptions) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
     """The options that another episode differs in."""
-    return options.instruction, options.objects
+    return options.instruction, options.objects, options.stored_objects
 
 
 def _look_at(episode: Rollout, observations: Sequence[Observation]) -> None:

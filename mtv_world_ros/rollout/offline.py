@@ -117,7 +117,6 @@ def replay_offline(
     if not episode.trajectories:
         raise EpisodeError(f"'{episode_path}' holds no joint_trajectory message to imagine")
     summary = ReplaySummary(out=Path(out), warnings=episode.warnings)
-    stored = episode.info.objects if pipeline.describer is None else ()
     observed = ObservedEpisode(pipeline)
     starts = [stamp for stamp, _ in episode.trajectories]
     bar = tqdm(total=len(starts), unit='trajectory', disable=None if show_progress else True)
@@ -132,7 +131,7 @@ def replay_offline(
                 text = instruction_at(episode, stamp)
                 options = RolloutOptions(
                     instruction=text,
-                    objects=stored,
+                    stored_objects=episode.info.objects,
                     seed=seed + 1000 * index,
                     num_inference_steps=num_inference_steps,
                 )
@@ -205,6 +204,9 @@ def _seen_between(
 def judge(pipeline: Pipeline, recording: Recording) -> SuccessEstimate:
     """Return the success estimate at the end of a recorded episode.
 
+    Its objects are those that the pipeline names, else its describer, else those stored with the
+    episode, else those that the instruction names by colour.
+
     Args:
         pipeline: finds the objects and judges; see `Pipeline.load`.
         recording: V views on the model's clock, e.g. of `load_recording(path, pipeline.spec,
@@ -222,6 +224,6 @@ def judge(pipeline: Pipeline, recording: Recording) -> SuccessEstimate:
             f"'{recording.path}' cannot be judged: it lasts {seconds:.2f} s, has a gap or fewer "
             f'than two frames at {spec.fps:g} Hz; record images without a break'
         )
-    options = RolloutOptions(instruction=recording.instruction)
+    options = RolloutOptions(instruction=recording.instruction, stored_objects=recording.objects)
     episode = pipeline.begin(recording.observation(0), options)
     return episode.observe(recording.frames[:, rows[1:]], recording.positions[rows]).success

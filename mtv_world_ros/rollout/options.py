@@ -26,7 +26,8 @@ class RolloutOptions:
     Attributes:
         instruction: text for the robot; names the objects unless they are given.
         objects: names of the objects; empty = the pipeline's, else its describer's, which is
-            asked once for each instruction, else those of the instruction.
+            asked once for each instruction, else `stored_objects`, else those of the instruction.
+        stored_objects: names of the objects that are stored with the recorded episode.
         seed: seed of the noise; chunk k of seed r uses `seed + k + r * SEED_STEP`.
         num_seeds: number of rollouts with different noise, whose mean the estimate is; the run
             time grows linearly.
@@ -39,6 +40,7 @@ class RolloutOptions:
 
     instruction: str = ''
     objects: tuple[str, ...] = ()
+    stored_objects: tuple[str, ...] = ()
     seed: int = 0
     num_seeds: int = 1
     num_inference_steps: int = 0
@@ -48,6 +50,7 @@ class RolloutOptions:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'objects', tuple(self.objects))
+        object.__setattr__(self, 'stored_objects', tuple(self.stored_objects))
         if self.num_seeds < 1 or self.num_inference_steps < 0:
             raise ConfigError(
                 f'{self.num_seeds} seeds and {self.num_inference_steps} denoising steps: give at '

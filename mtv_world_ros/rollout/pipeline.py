@@ -352,7 +352,8 @@ class Pipeline:
         """Return the names of the objects of a rollout.
 
         Args:
-            options: may name them; else the pipeline does, its describer, or the instruction.
+            options: may name them; else the pipeline does, its describer, the recorded episode,
+                or the instruction.
             first_frame: returns the first real frame (H, W, 3) uint8 RGB, for the describer.
 
         Raises:
@@ -363,6 +364,7 @@ class Pipeline:
             given=options.objects or self.objects,
             describer=self.describer,
             first_frame=first_frame,
+            stored=options.stored_objects,
         )
 
     def imagine(

@@ -148,11 +148,17 @@ class TaskSpec(Schema):
             held.append(grippers_open(openings))
         return np.all(held, axis=0)
 
-    def bind(self, instruction: str) -> dict[str, str] | None:
-        """Return the placeholders' objects if the instruction fits a template, else None."""
+    def bind(self, instruction: str, *, with_articles: bool = True) -> dict[str, str] | None:
+        """Return the placeholders' objects if the instruction fits a template, else None.
+
+        Args:
+            instruction: text for the robot.
+            with_articles: articles have to be as in the template; those of a task with
+                `phrasings` never have to.
+        """
         said = ' '.join(instruction.lower().split()).rstrip('.! ')
         templates = [template.lower() for template in self.templates]
-        if self.phrasings:
+        if self.phrasings or not with_articles:
             said, templates = _bare(said), [_bare(template) for template in templates]
         found = (self._bound(said, template) for template in templates)
         return next((bound for bound in found if bound is not None), None)
@@ -195,11 +201,16 @@ def match_task(
 ) -> tuple[TaskSpec, dict[str, str]] | None:
     """Return the task whose template the instruction fits, and its objects.
 
-    Where several fit, the one that says most about its objects' nouns, then the first.
+    Where several fit, the one that says most about its objects' nouns, then the first. Where none
+    fits, articles of instruction and templates do not count.
     """
-    bound = [(task, task.bind(instruction)) for task in tasks]
-    found = [(task, objects) for task, objects in bound if objects is not None]
-    return max(found, key=lambda pair: len(pair[0].nouns), default=None)
+    known = list(tasks)
+    for with_articles in (True, False):
+        bound = [(task, task.bind(instruction, with_articles=with_articles)) for task in known]
+        found = [(task, objects) for task, objects in bound if objects is not None]
+        if found:
+            return max(found, key=lambda pair: len(pair[0].nouns))
+    return None
 
 
 def ever_and_final(success: BoolArray, held: int = HELD_SAMPLES) -> tuple[bool, bool]:

@@ -11,6 +11,7 @@ import yaml
 
 from mtv_world_ros.core.errors import CalibrationError, EpisodeError, MtvWorldError
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
+from mtv_world_ros.data.episode_writer import EpisodeWriter
 
 START_NS, PERIOD_NS, FRAMES = 1_700_000_000_000_000_000, 100_000_000, 8
 
@@ -174,3 +175,26 @@ def test_a_damaged_file_never_ends_in_another_error(seed, episode_path, tmp_path
     with contextlib.suppress(MtvWorldError):
         episode = read_episode(tmp_path / 'episode')
         assert all(np.asarray(track.frames).ndim == 4 for track in episode.images.values())
+
+
+@pytest.mark.parametrize(('every', 'is_used'), [(1, True), (4, False)])
+def test_masks_of_another_rate_than_the_images_are_not_used_and_said(tmp_path, every, is_used):
+    """A mask of every fourth image stood for the three that follow."""
+    path = tmp_path / 'e'
+    with EpisodeWriter(
+        path, task='', instruction='lift', robot='franka', objects=('cup',)
+    ) as writer:
+        for k in range(12):
+            stamp = START_NS + k * 2 * 10**8
+            writer.write_image('door', stamp, np.zeros((24, 32, 3), np.uint8))
+            if k % every == 0:
+                writer.write_mask('door', stamp, np.ones((24, 32), np.uint8))
+    episode = read_episode(path, with_cameras=False)
+    assert (episode.masks is not None) == is_used
+    said = [text for text in episode.warnings if 'no mask of their time' in text]
+    assert len(said) == (not is_used)
+    if said:
+        assert (
+            "view 'door': 75% of its 12 images have no mask of their time (3 masks, up to "
+            in (said[0])
+        )

@@ -318,3 +318,22 @@ def test_time_of_an_episode_is_split_by_stage(held):
     stages = {'reading', 'imagining', 'segmenting', 'scoring', 'features', 'storing'}
     assert set(seconds) == stages
     assert seconds['imagining'] > 0 and seconds['segmenting'] > 0
+
+
+@pytest.mark.parametrize(
+    ('outcome', 'probability', 'seen'),
+    [
+        ('success', 0.1, 'failure'),
+        ('failure', 0.9, 'success'),
+        ('success', 0.4, ''),
+        ('failure', 0.6, ''),
+        ('unknown', 0.01, ''),
+        ('success', float('nan'), ''),
+    ],
+)
+def test_a_label_that_recorded_frames_clearly_contradict_is_named(outcome, probability, seen):
+    said = episode_scorer.contradiction(outcome, probability)
+    assert (f'labelled a {outcome}, but its recorded frames look like a {seen} ' in said) == bool(
+        seen
+    )
+    assert bool(said) == bool(seen)

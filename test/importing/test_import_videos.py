@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from mtv_world_ros.cli import main
-from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.viewing.video import encode_video
 
@@ -90,6 +90,48 @@ def test_frame_k_belongs_to_row_k_and_the_camera_is_marked(tmp_path, franka, pos
     assert main(['import', 'videos', str(tmp_path / 'raw'), '--mapping', str(file),
                  '--out', str(out)]) == 0  # fmt: skip
     assert '0 made, 2 kept' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ('values', 'outcomes'),
+    [
+        ((1, 0), ('success', 'failure')),
+        ((True, None), ('success', 'unknown')),
+        (('Success', 'failed'), ('success', 'failure')),
+        (([0.0] * (ROWS - 1) + [1.0], [0.0] * ROWS), ('success', 'failure')),
+    ],
+)
+@pytest.mark.parametrize('written', ['key: success', {'key': 'success'}])
+def test_each_recording_has_its_own_outcome(
+    tmp_path, franka, positions, capsys, values, outcomes, written
+):
+    for name, value in zip('ab', values, strict=True):
+        write_raw(tmp_path / 'raw', name, positions, success=value)
+    more = {'outcome': written, 'instruction': {'key': 'texts'}}
+    file = mapping(tmp_path / 'm.yaml', franka, range(7), 7, **more)
+    out = tmp_path / 'data'
+    command = ['import', 'videos', str(tmp_path / 'raw'), '--mapping', str(file)]
+    assert main([*command, '--out', str(out)]) == 0
+    found = [read_info(out / name) for name in 'ab']
+    assert tuple(info.outcome for info in found) == outcomes
+    assert {info.instruction for info in found} == {'lift it'}
+
+
+def test_an_outcome_that_is_none_and_one_that_is_not_there_are_named(
+    tmp_path, franka, positions, capsys
+):
+    write_raw(tmp_path / 'raw', 'a', positions, success='perhaps')
+    write_raw(tmp_path / 'raw', 'b', positions, sucess=1)
+    file = mapping(tmp_path / 'm.yaml', franka, range(7), 7, outcome='key: success')
+    out = tmp_path / 'data'
+    command = ['import', 'videos', str(tmp_path / 'raw'), '--mapping', str(file)]
+    assert main([*command, '--out', str(out)]) == 1
+    said = capsys.readouterr().err
+    assert "a.json': outcome 'success' is 'perhaps', which is no outcome" in said
+    assert "b.json' has no outcome 'success' (did you mean 'sucess'?)" in said
+    file = mapping(tmp_path / 'm.yaml', franka, range(7), 7, outcome='perhaps')
+    assert main([*command, '--out', str(out)]) == 1
+    assert "outcome 'perhaps' is not one of success" in capsys.readouterr().err
 
 
 def test_a_csv_file_has_times_and_names(tmp_path, franka, positions):

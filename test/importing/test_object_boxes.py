@@ -111,6 +111,31 @@ def test_other_boxes_leave_what_was_imported_with_the_first_ones(raw, capsys):
     assert not (raw / 'data' / 'b').exists()
 
 
+def test_boxes_of_recordings_that_are_not_in_the_folder_are_said_and_not_used(raw, capsys):
+    """The same file serves a part of the recordings, say those that are imported again."""
+    file = boxes(raw)
+    values = yaml.safe_load(file.read_text())
+    for name in ('gone', 'held_out'):
+        values['boxes']['front'][name] = {'mug': [[0.0, 28, 58, 56, 82]]}
+    file.write_text(yaml.safe_dump(values))
+    assert import_videos(raw) == 0
+    said = 'boxes of 2 of 3 recordings are not used, as they are not in the folder: gone, held_out'
+    assert said in capsys.readouterr().err
+    assert j_of(raw / 'data' / 'a', 30).min() > 0.8
+
+
+def test_a_second_import_with_a_calibration_takes_the_same_boxes(raw, capsys):
+    boxes(raw)
+    assert import_videos(raw) == 0
+    pose = {'mount_link': 'table', 'position': [0.5, 0.0, 0.8], 'quaternion_xyzw': [1, 0, 0, 0]}
+    view = {'width': 160, 'height': 120, 'K': [130.0, 130.0, 79.5, 59.5], **pose}
+    (raw / 'cameras.yaml').write_text(yaml.safe_dump({'views': {'front': view}}))
+    shutil.move(raw / 'raw' / 'rows' / 'b.csv', raw / 'b.csv')  # of `a` alone this time
+    assert import_videos(raw, 'again', '--calibration', str(raw / 'cameras.yaml')) == 0
+    assert read_episode(raw / 'again' / 'a').cameras['front'].K[0, 0] == 130
+    assert j_of(raw / 'again' / 'a', 30).min() > 0.8
+
+
 def test_boxes_for_episodes_without_objects_leave_nothing_behind(raw, capsys):
     main(['import', 'videos', str(raw / 'raw'), '--mapping', str(raw / 'lab.yaml'),
           '--out', str(raw / 'data')])  # fmt: skip

@@ -22,7 +22,7 @@ from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.episode import JointStates
-from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.data.stream_clocks import ClockBreakError
 from mtv_world_ros.robot.file import load_robot
 from test.support.bags import STORE
@@ -145,6 +145,21 @@ def test_a_plain_recording_is_imported_without_a_word(record, run):
     assert status == 0
     assert 'bag: 4.0 s; frames: front 40, side 40' in said
     assert len([line for line in said.splitlines() if line.startswith(("'", '/'))]) == 0, said
+
+
+def test_the_outcome_of_each_bag_is_read_from_its_custom_data(record, run, tmp_path):
+    for name, word in (('good', 'true'), ('bad', 'failed')):
+        bag = record(name=name)
+        file = bag / 'metadata.yaml'
+        values = yaml.safe_load(file.read_text())
+        values['rosbag2_bagfile_information']['custom_data'] = {'success': word}
+        file.write_text(yaml.safe_dump(values))
+        status, said = run(bag, outcome='key: success')
+        assert status == 0, said
+    outcomes = [read_info(tmp_path / 'out' / name).outcome for name in ('good', 'bad')]
+    assert outcomes == ['success', 'failure']
+    status, said = run(record(name='silent'), outcome='key: success')
+    assert status == 1 and "no outcome 'success' in custom_data" in said, said
 
 
 @pytest.mark.parametrize(

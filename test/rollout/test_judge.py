@@ -10,6 +10,8 @@ import mtv_world_ros
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
+from mtv_world_ros.vision.describers.describer import objects_from_instruction
+from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 
 
 @pytest.fixture(scope='module')
@@ -33,6 +35,30 @@ def test_a_recorded_success_is_judged_as_one_and_its_beginning_is_not(pipeline, 
         positions=recording.positions[early],
     )
     assert mtv_world_ros.judge(pipeline, cut).probability < 0.5
+
+
+def test_objects_stored_with_the_episode_are_judged_unless_others_are_named(pipeline, recording):
+    """The instruction names objects by colour; the episode has them under other names."""
+    seen = []
+
+    class Watched(ColourSegmenter):
+        def segment(self, frames, names, **more):
+            seen.append(tuple(names))
+            return super().segment(frames, names, **more)
+
+    watching = replace(pipeline, segmenter=Watched())
+    short = replace(
+        recording, times=recording.times[:12], frames=recording.frames[:, :12],
+        positions=recording.positions[:12], objects=('red block', 'green block'),
+    )  # fmt: skip
+    mtv_world_ros.judge(watching, short)
+    assert set(seen) == {('red block', 'green block')}
+    seen.clear()
+    mtv_world_ros.judge(replace(watching, objects=('blue block',)), short)
+    assert set(seen) == {('blue block',)}
+    seen.clear()
+    mtv_world_ros.judge(watching, replace(short, objects=()))
+    assert set(seen) == {objects_from_instruction(short.instruction)}
 
 
 def test_a_recording_with_a_gap_is_refused(pipeline, recording):

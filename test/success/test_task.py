@@ -221,6 +221,14 @@ def test_benchmark_decides_what_it_knows(bundled, put_on):
     assert list(names.values()) == ['stack_blocks_two', 'put_on']
 
 
+def test_articles_do_not_count_where_no_task_has_them_as_said(tmp_path):
+    task = load_task(write(tmp_path, LEFT))
+    for said in ('place cup to the left of the plate', 'Place a cup to left of plate.'):
+        matched = match_task([task], said)
+        assert matched is not None and matched[1] == {'a': 'cup', 'b': 'plate'}
+    assert match_task([task], 'fold the towel') is None
+
+
 @pytest.mark.parametrize(
     ('name', 'meant'),
     [

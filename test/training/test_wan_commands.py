@@ -58,8 +58,9 @@ def test_the_history_of_the_preset_goes_through_import_and_training(recipe):
 
 
 @pytest.mark.slow
-def test_the_printed_evaluation_of_the_adapter_runs(recipe):
-    words = shlex.split(recipe['said.txt'].read_text().partition('evaluate it with: ')[2])
+def test_the_printed_evaluation_of_the_adapter_runs(recipe, episode):
+    line = recipe['said.txt'].read_text().partition('evaluate it with: ')[2].splitlines()[0]
+    words = shlex.split(line.replace('EPISODES', str(episode.parent)))
     more = ['--steps', '1', '--no-report', '--no-ceiling', '--actions', 'true', *SMALL]
     assert main([*words[1:], *more]) == 0
     out = Path(words[words.index('--out') + 1])

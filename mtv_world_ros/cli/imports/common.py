@@ -87,6 +87,8 @@ def object_stage(
             '--objects finds and names the objects; leave --segmenter and --describer out'
         )
     boxed = learn_objects(load_object_boxes(arguments.objects), found, read)
+    if boxed.note:
+        print(boxed.note, file=sys.stderr)
     file = arguments.out / 'objects.safetensors'
     _refuse_others(arguments.out, file, boxed.examples, found)
     boxed.examples.save(file)
