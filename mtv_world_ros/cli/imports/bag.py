@@ -7,25 +7,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.imports.common import (
-    add_object_options,
-    import_status,
-    object_stage,
-    write_boxes_page,
+    add_common_options,
+    import_parser,
+    ImportJob,
+    MakeStage,
+    Progress,
+    run_import,
 )
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.bag_mapping import BagMapping
     from mtv_world_ros.data.episode import Episode
+    from mtv_world_ros.importing.convert import ImportSummary
 
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Add the command."""
-    parser = commands.add_parser(
+    parser = import_parser(
+        commands,
         'bag',
-        help="convert a robot's own rosbag2 recordings into episodes",
-        epilog='config/datasets/bag.yaml describes the mapping file; without one, views are all '
-        'image topics. OUT also gets robot/ and mapping.yaml, which --topics takes elsewhere. '
-        'Call it again to continue: finished episodes are kept. Exit status: 1 if a bag failed.',
+        "convert a robot's own rosbag2 recordings into episodes",
+        'config/datasets/bag.yaml describes the mapping file; without one, views are all image '
+        'topics. OUT also gets robot/ and mapping.yaml, which --topics takes elsewhere.',
+        'a bag',
     )
     parser.add_argument(
         'bags', type=Path, nargs='+', metavar='BAG', help='a bag, or a folder of bags'
@@ -41,28 +45,23 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="topic of the commands, or 'state': the measured positions that follow; default: the "
         "mapping's, or joint_trajectory",
     )
-    parser.add_argument(
-        '--calibration',
-        type=Path,
-        help="calibration of the cameras; default: the bags' TF and CameraInfo",
+    add_common_options(
+        parser,
+        _import_bag,
+        calibration="calibration of the cameras; default: the bags' TF and CameraInfo",
     )
-    parser.add_argument('--out', type=Path, required=True, help='folder of the episodes')
-    add_object_options(parser)
-    parser.set_defaults(handler=_import_bag)
 
 
 def _import_bag(arguments: argparse.Namespace) -> int:
-    from tqdm import tqdm
     import yaml
 
-    from mtv_world_ros.core.files import ROBOT_YAML, write_whole
+    from mtv_world_ros.core.files import write_whole
     from mtv_world_ros.data.bag_mapping import BagMapping, load_bag_mapping
     from mtv_world_ros.data.episode_reader import read_episode
     from mtv_world_ros.importing.bags import (
         episode_name,
         find_bags,
         import_bags,
-        summary_line,
         with_guessed_views,
     )
 
@@ -75,31 +74,33 @@ def _import_bag(arguments: argparse.Namespace) -> int:
     def frames(bag: Path) -> Episode:
         return read_episode(bag, views=list(mapping.views), mapping=mapping, with_cameras=False)
 
-    found = {episode_name(bag): bag for bag in bags}
-    if arguments.click:
-        return write_boxes_page(arguments, found, frames, mapping.objects)
-    robot = _robot_of_bags(arguments, mapping, bags[0])
-    summary = import_bags(
-        bags,
-        arguments.out,
-        mapping,
-        robot,
-        calibration=arguments.calibration,
-        stage=object_stage(arguments, found, frames),
-        progress=lambda paths: tqdm(paths, unit='bag', disable=None),
+    def convert(stage: MakeStage, progress: Progress) -> ImportSummary:
+        summary = import_bags(
+            bags,
+            arguments.out,
+            mapping,
+            _robot_of_bags(arguments, mapping, bags[0]),
+            calibration=arguments.calibration,
+            stage=stage(),
+            progress=progress,
+        )
+        values = mapping.replace(robot='robot/robot.yaml').model_dump(
+            mode='json', exclude_defaults=True
+        )
+        write_whole(arguments.out / 'mapping.yaml', yaml.safe_dump(values, sort_keys=False))
+        for view, row in mapping.views.items():
+            print(f'view {view}: {mapping.topic(row.image)}')
+        return summary
+
+    job = ImportJob(
+        found={episode_name(bag): bag for bag in bags},
+        read=frames,
+        objects=mapping.objects,
+        convert=convert,
+        episode=lambda part: part.name,
+        unit='bag',
     )
-    values = mapping.replace(robot='robot/robot.yaml').model_dump(
-        mode='json', exclude_defaults=True
-    )
-    write_whole(arguments.out / 'mapping.yaml', yaml.safe_dump(values, sort_keys=False))
-    for view, row in mapping.views.items():
-        print(f'view {view}: {mapping.topic(row.image)}')
-    for part in summary.made:
-        place = arguments.out / part.name
-        print(summary_line(place, objects=bool(arguments.segmenter or arguments.objects)))
-    status = import_status(summary, str)
-    print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
-    return status
+    return run_import(arguments, job)
 
 
 def _robot_of_bags(arguments: argparse.Namespace, mapping: BagMapping, bag: Path) -> Path:

@@ -1,15 +1,23 @@
-"""Parts that the imports share: object masks and boxes, and the exit status."""
+"""Parts that the imports share: their parsers, and the way from recordings to episodes."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import add_options
 from mtv_world_ros.core.errors import ConfigError
+
+#: folder of the robot in OUT
+ROBOT_FOLDER = 'robot'
+#: wraps recordings in a progress bar
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
+#: makes the stage that names and segments the objects of recordings
+MakeStage = Callable[[], 'ObjectStage']
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.episode import Episode
@@ -18,10 +26,91 @@ if TYPE_CHECKING:
     from mtv_world_ros.vision.segmenters.examples import ObjectExamples
 
 
-def add_object_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of object masks and boxes to an import."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImportJob:
+    """An import, from its recordings to the lines about its episodes.
+
+    Attributes:
+        found: recordings by the names of their episodes.
+        read: reads the frames of a recording, to draw and find objects in.
+        objects: names of the objects, for the page on which boxes are drawn.
+        convert: converts the recordings; gets what makes the stage that names and segments
+            objects, and what wraps the recordings in a progress bar.
+        unit: a recording in the progress bar.
+        episode: returns the folder of a converted recording, in OUT.
+        label: returns the name of a recording in messages.
+    """
+
+    found: Mapping[str, Any]
+    read: Callable[[Any], Episode]
+    objects: Sequence[str]
+    convert: Callable[[MakeStage, Progress], ImportSummary[Any]]
+    episode: Callable[[Any], str]
+    label: Callable[[Any], str] = str
+    unit: str = 'ep'
+
+
+def import_parser(
+    commands: argparse._SubParsersAction, name: str, purpose: str, mapping: str, one: str
+) -> argparse.ArgumentParser:
+    """Return the parser of an import.
+
+    Args:
+        commands: commands of `mtv-world import`.
+        name: its word.
+        purpose: what it does, for the help.
+        mapping: sentences on the mapping file, for the help.
+        one: a recording, e.g. `a bag`.
+    """
+    return commands.add_parser(
+        name,
+        help=purpose,
+        epilog=f'{mapping} Call it again to continue: finished episodes are kept. Exit status: 1 '
+        f'if {one} failed.',
+    )
+
+
+def add_common_options(
+    parser: argparse.ArgumentParser,
+    run: Callable[[argparse.Namespace], int],
+    *,
+    calibration: str,
+) -> None:
+    """Add the options that all imports have, and what runs one.
+
+    Args:
+        parser: of the import.
+        run: runs it and returns the exit status.
+        calibration: help of `--calibration`.
+    """
+    parser.add_argument('--calibration', type=Path, help=calibration)
+    parser.add_argument('--out', type=Path, required=True, help='folder of the episodes')
     _add_masks(parser)
     _add_boxes(parser)
+    parser.set_defaults(handler=run)
+
+
+def run_import(arguments: argparse.Namespace, job: ImportJob) -> int:
+    """Convert the recordings, or write the page of `--click`; return the exit status."""
+    from tqdm import tqdm
+
+    from mtv_world_ros.core.files import ROBOT_YAML
+    from mtv_world_ros.importing.bags import summary_line
+
+    if arguments.click:
+        return _write_boxes_page(arguments, job)
+    summary = job.convert(
+        lambda: _object_stage(arguments, job.found, job.read),
+        lambda recordings: tqdm(recordings, unit=job.unit, disable=None),
+    )
+    has_objects = bool(arguments.segmenter or arguments.objects)
+    for one in summary.made:
+        print(summary_line(arguments.out / job.episode(one), objects=has_objects))
+    status = _import_status(summary, job.label)
+    robot = arguments.out / ROBOT_FOLDER / ROBOT_YAML
+    if robot.is_file():
+        print(f'robot: {robot}')
+    return status
 
 
 def _add_masks(parser: argparse.ArgumentParser) -> None:
@@ -52,19 +141,14 @@ def _add_boxes(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def write_boxes_page(
-    arguments: argparse.Namespace,
-    found: Mapping[str, Any],
-    read: Callable[[Any], Episode],
-    names: Sequence[str],
-) -> int:
+def _write_boxes_page(arguments: argparse.Namespace, job: ImportJob) -> int:
     """Write the page on which boxes are drawn; nothing is imported."""
     from mtv_world_ros.core.files import write_whole
     from mtv_world_ros.importing.boxes_page import boxes_page
 
     if arguments.objects is not None:
         raise ConfigError('--click writes the page that makes the file for --objects; give one')
-    write_whole(arguments.click, boxes_page(found, read, names))
+    write_whole(arguments.click, boxes_page(job.found, job.read, job.objects))
     print(
         f'page: {arguments.click}\nopen it in a browser, draw, save, and give what it saves as '
         '--objects; nothing was imported'
@@ -72,7 +156,7 @@ def write_boxes_page(
     return 0
 
 
-def object_stage(
+def _object_stage(
     arguments: argparse.Namespace, found: Mapping[str, Any], read: Callable[[Any], Episode]
 ) -> ObjectStage:
     """Return the stage that names and segments objects, by boxes where there are any."""
@@ -134,7 +218,7 @@ def _stage_without_boxes(arguments: argparse.Namespace) -> ObjectStage:
     )
 
 
-def import_status(summary: ImportSummary[Any], name: Callable[[Any], str]) -> int:
+def _import_status(summary: ImportSummary[Any], name: Callable[[Any], str]) -> int:
     """Print what came of an import, with the names of its recordings; return the exit status."""
     recordings: dict[str, list[str]] = {}  # by warning
     for one, lines in summary.warnings.items():

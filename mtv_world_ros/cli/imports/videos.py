@@ -7,41 +7,39 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.imports.common import (
-    add_object_options,
-    import_status,
-    object_stage,
-    write_boxes_page,
+    add_common_options,
+    import_parser,
+    ImportJob,
+    MakeStage,
+    Progress,
+    run_import,
 )
 
 if TYPE_CHECKING:
-    pass
+    from mtv_world_ros.importing.convert import ImportSummary
 
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Add the command."""
-    parser = commands.add_parser(
+    parser = import_parser(
+        commands,
         'videos',
-        help='convert video files with tables of joints or tool poses into episodes',
-        epilog='config/datasets/videos.yaml describes the mapping file. Call it again to '
-        'continue: finished episodes are kept. Exit status: 1 if one failed.',
+        'convert video files with tables of joints or tool poses into episodes',
+        'config/datasets/videos.yaml describes the mapping file.',
+        'one',
     )
     parser.add_argument('folder', type=Path, help='folder of the files that the mapping names')
     parser.add_argument(
         '--mapping', type=Path, required=True, help='which file is which view, which column what'
     )
-    parser.add_argument(
-        '--calibration', type=Path, help='calibration of the cameras; default: marked as not known'
+    add_common_options(
+        parser,
+        _import_videos,
+        calibration='calibration of the cameras; default: marked as not known',
     )
-    parser.add_argument('--out', type=Path, required=True, help='folder of the episodes')
-    add_object_options(parser)
-    parser.set_defaults(handler=_import_videos)
 
 
 def _import_videos(arguments: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
-    from mtv_world_ros.core.files import ROBOT_YAML
-    from mtv_world_ros.importing.bags import summary_line
     from mtv_world_ros.importing.videos import (
         find_recordings,
         import_videos,
@@ -50,22 +48,23 @@ def _import_videos(arguments: argparse.Namespace) -> int:
     )
 
     mapping = load_video_mapping(arguments.mapping)
-    found = {one.name: one for one in find_recordings(arguments.folder, mapping)}
-    if arguments.click:
-        return write_boxes_page(
-            arguments, found, lambda one: read_recording(one, mapping), mapping.objects
+
+    def convert(stage: MakeStage, progress: Progress) -> ImportSummary:
+        return import_videos(
+            arguments.folder,
+            arguments.out,
+            mapping,
+            calibration=arguments.calibration,
+            stage=stage(),
+            progress=progress,
         )
-    summary = import_videos(
-        arguments.folder,
-        arguments.out,
-        mapping,
-        calibration=arguments.calibration,
-        stage=object_stage(arguments, found, lambda one: read_recording(one, mapping)),
-        progress=lambda recordings: tqdm(recordings, unit='ep', disable=None),
+
+    job = ImportJob(
+        found={one.name: one for one in find_recordings(arguments.folder, mapping)},
+        read=lambda one: read_recording(one, mapping),
+        objects=mapping.objects,
+        convert=convert,
+        episode=lambda one: one.name,
+        label=lambda one: one.name,
     )
-    for one in summary.made:
-        looked = bool(arguments.segmenter or arguments.objects)
-        print(summary_line(arguments.out / one.name, objects=looked))
-    status = import_status(summary, lambda one: one.name)
-    print(f'robot: {arguments.out / "robot" / ROBOT_YAML}')
-    return status
+    return run_import(arguments, job)
