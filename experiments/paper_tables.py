@@ -55,6 +55,7 @@ from mtv_world_ros.evaluation.evaluation_summary import (
 from mtv_world_ros.evaluation.metrics.frechet_features import clip_features, frame_features
 from mtv_world_ros.evaluation.metrics.statistics import Estimate, mean_interval
 from mtv_world_ros.model.card import read_card
+from mtv_world_ros.model.runtime import check_device
 from mtv_world_ros.reports.read_back import read_evaluations
 from mtv_world_ros.success.task import load_tasks
 from mtv_world_ros.training.training_config import load_training_config
@@ -239,6 +240,7 @@ class PaperTables:
     def _check_before(self) -> None:
         """Refuse what would fail after hours: weights of another network, missing packages."""
         options = self.options
+        check_device(options.device)
         for row in self.rows:
             control_class(row.control)
         if options.fid_weights is not None:
@@ -400,7 +402,8 @@ class PaperTables:
         words = [
             'train', str(dataset), '--out', str(self.folder(row, seed) / 'training'), '--preset',
             str(self.options.preset), '--seed', str(seed), '--cache', str(self.out / 'cache'),
-            '--threads', str(self.options.threads), '--split', EVERY if row.is_real else 'train',
+            '--device', self.options.device, '--threads', str(self.options.threads),
+            '--split', EVERY if row.is_real else 'train',
         ]  # fmt: skip
         if row.is_real:
             words += self._real_segmenter()
@@ -415,8 +418,9 @@ class PaperTables:
         options = self.options
         words = [
             'evaluate', f'{row.name}={checkpoint}', str(dataset), '--split', EVERY, '--actions',
-            'true,shuffled', '--no-ceiling', '--no-report', '--seed', str(seed), '--threads',
-            str(options.threads), '--workers', str(options.workers), '--out', str(out),
+            'true,shuffled', '--no-ceiling', '--no-report', '--seed', str(seed),
+            '--device', options.device, '--threads', str(options.threads),
+            '--workers', str(options.workers), '--out', str(out),
         ]  # fmt: skip
         for name in ('fid', 'fvd'):
             file = getattr(options, f'{name}_weights')
@@ -983,6 +987,7 @@ def parser() -> argparse.ArgumentParser:
     add('--real-segmenter', type=Path, help='objects.safetensors of the import')
     add('--preset', default='paper', help='name or YAML file')
     add('--set', action='append', default=[], metavar='SECTION.KEY=VALUE', help='of all rows')
+    add('--device', default='cpu', help='of trainings and tests, e.g. cuda')
     add('--threads', type=int, default=1, help='CPU threads')
     add('--workers', type=int, default=1, help='processes that make and score episodes')
     add('--fid-weights', type=Path, help='Inception-v3 of 2015-12-05, state dict')

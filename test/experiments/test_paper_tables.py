@@ -332,6 +332,16 @@ def test_weights_of_another_network_are_refused_before_anything_is_trained(
     assert nothing.commands == []
 
 
+def test_a_device_that_is_not_there_is_refused_before_anything_is_trained(
+    tables: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    nothing = Recorder(lambda words: 1)
+    words = words_of(tmp_path / 'out', data, ROWS, '--device', 'cuda:99')
+    assert tables.main(words, nothing) == 1
+    assert "device 'cuda:99' cannot be used" in capsys.readouterr().err
+    assert nothing.commands == []
+
+
 def test_a_control_whose_package_is_missing_is_named_before_anything_is_trained(
     tables: ModuleType,
     data: Path,
@@ -353,12 +363,13 @@ def test_all_rows_have_the_same_budget_and_differ_in_what_they_are_named_after(
     """The words of every training: clips over the batch's size, control, views and mask."""
     options = tables.parser().parse_args(
         ['--out', str(tmp_path), '--data', str(data), '--clips', '8000', '--real', str(data),
-         '--real-view', 'ext1']
+         '--real-view', 'ext1', '--device', 'cuda']
     )  # fmt: skip
     run = tables.PaperTables(options, Recorder(lambda words: 1))
     found = {row.name: ' '.join(run._training(row, 0, 8000)) for row in run.rows}
     assert len(found) == len(tables.ROWS)
     assert all('optimizer.steps=4000' in words for words in found.values())
+    assert all('--device cuda ' in words for words in found.values())
     for control in ('policy2vec', 'ee_mlp', 'fast_tokens'):
         assert [n for n, words in found.items() if f'video.control={control}' in words] == [
             row.name for row in tables.ROWS if row.control == control
