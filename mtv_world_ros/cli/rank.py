@@ -281,7 +281,7 @@ def _jobs(
     )
     from mtv_world_ros.simulation.expert.expert import Expert
     from mtv_world_ros.simulation.faults.catalogue import policies_of
-    from mtv_world_ros.simulation.tasks import tasks_named
+    from mtv_world_ros.simulation.tasks import bundled_tasks_named
 
     policies, names = DEFAULT_POLICIES, DEFAULT_TASKS
     if listed:
@@ -291,7 +291,7 @@ def _jobs(
         policies = policies_named(arguments.policies)
     elif arguments.faults is not None:
         policies, names = policies_of(arguments.faults), BENCHMARK_TASKS
-    tasks = [task.name for task in tasks_named(arguments.tasks or ','.join(names))]
+    tasks = [task.name for task in bundled_tasks_named(arguments.tasks or ','.join(names))]
     check_tasks(listed, tasks)
     expert = Expert(robot, physics=arguments.physics)
     jobs = make_jobs(policies, tasks, arguments.episodes, arguments.seed, expert)

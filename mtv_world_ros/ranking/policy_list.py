@@ -23,7 +23,7 @@ from mtv_world_ros.ranking.server_process import PORT, ServerProcess
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
-from mtv_world_ros.simulation.tasks import tasks_named
+from mtv_world_ros.simulation.tasks import bundled_tasks_named
 
 #: names are parts of file names
 _NAME = r'^[A-Za-z0-9][A-Za-z0-9._-]*$'
@@ -129,7 +129,7 @@ def _listed(entry: PolicyEntry, path: Path, robot: RobotModel) -> ListedPolicy:
         config=config,
         command=entry.command,
         start_timeout_s=entry.start_timeout_s,
-        tasks=tuple(task.name for name in entry.tasks for task in tasks_named(name)),
+        tasks=tuple(task.name for name in entry.tasks for task in bundled_tasks_named(name)),
         definition=hashlib.sha256(text.encode()).hexdigest()[:16],
     )
 

@@ -15,7 +15,7 @@ from mtv_world_ros.simulation.collect.episode_jobs import episode_seed
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
 from mtv_world_ros.simulation.faults.catalogue import EXPERT, parse_variant
-from mtv_world_ros.simulation.tasks import tasks_named
+from mtv_world_ros.simulation.tasks import bundled_tasks_named
 from mtv_world_ros.success.estimator import verdict
 
 #: NaN is null in a file
@@ -268,7 +268,7 @@ def make_jobs(
     """
     if num_episodes < 1:
         raise ConfigError(f'--episodes is {num_episodes}; it must be at least 1')
-    names = [task.name for task in tasks_named(','.join(tasks))]
+    names = [task.name for task in bundled_tasks_named(','.join(tasks))]
     if len(set(names)) != len(names) or not names:
         raise ConfigError(f"--tasks is '{','.join(tasks)}'; give at least one task, each once")
     return [

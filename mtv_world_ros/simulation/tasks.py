@@ -58,6 +58,8 @@ TABLE = 'table'
 ANY_SIZE = (0.0, 1.0)
 #: names of tasks are parts of file names
 _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
+#: ends of the names of task files
+_YAML = ('.yaml', '.yml')
 #: page that describes a task's file
 _PAGE = 'docs/tasks.md'
 
@@ -367,12 +369,27 @@ def tasks_named(text: str) -> tuple[Task, ...]:
     if text.strip() == 'all':
         return tuple(task for task in TASKS.values() if not task.zero_shot)
     words = [word.strip() for word in text.split(',') if word.strip()]
-    tasks = tuple(_read_task(w) if w.endswith(('.yaml', '.yml')) else task_named(w) for w in words)
+    tasks = tuple(_read_task(w) if w.endswith(_YAML) else task_named(w) for w in words)
     by_name: dict[str, Task] = {}
     for task in tasks:
         if by_name.setdefault(task.name, task) != task:
             raise ConfigError(f"'{text}' has two different tasks of the name '{task.name}'")
     return tasks
+
+
+def bundled_tasks_named(text: str) -> tuple[Task, ...]:
+    """Return tasks by name alone, for what knows a task by its name in several processes.
+
+    Raises:
+        SimulatorError: unknown name, or a file.
+    """
+    files = [word for word in text.split(',') if word.strip().endswith(_YAML)]
+    if files:
+        raise SimulatorError(
+            f"'{files[0].strip()}' is a file: a ranking takes bundled tasks by name; put the file "
+            f"into '{share_path('config', 'tasks')}' first ({_PAGE})"
+        )
+    return tasks_named(text)
 
 
 def _read_task(word: str) -> Task:

@@ -11,6 +11,7 @@ from mtv_world_ros.simulation.randomize import draw_scene, instruction_of, start
 from mtv_world_ros.simulation.shapes import SHAPES
 from mtv_world_ros.simulation.tasks import (
     _check_old_table,
+    bundled_tasks_named,
     Shake,
     Task,
     task_named,
@@ -206,6 +207,13 @@ def test_a_task_of_ones_own_is_chosen_by_its_file(tmp_path):
     assert (own.name, own.zero_shot) == ('own', False)
     assert bundled is TASKS['stack_blocks_two']
     assert [move.rest for move in own.moves] == ['on']
+
+
+def test_a_ranking_says_where_a_task_of_ones_own_belongs(tmp_path):
+    path = written(tmp_path, SCENE)
+    with pytest.raises(SimulatorError, match=r"own.yaml' is a file: a ranking takes bundled tas"):
+        bundled_tasks_named(f'stack_blocks_two, {path}')
+    assert bundled_tasks_named('stack_blocks_two') == (TASKS['stack_blocks_two'],)
 
 
 def test_a_task_without_a_scene_can_be_judged_but_not_simulated(tmp_path):
