@@ -31,7 +31,7 @@ from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.core.transforms import looking_along
 from mtv_world_ros.data.episode import JointStates, Track
-from mtv_world_ros.inspection.camera_pose import CameraEstimate, difference, moved
+from mtv_world_ros.inspection.camera_pose import CameraEstimate, difference, displaced_pose
 from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
 from mtv_world_ros.inspection.cameras.wrist_camera import follow_scene, WristCamera
 from mtv_world_ros.inspection.clocks import JointTrack
@@ -142,7 +142,7 @@ class Recording:
             *shift * 0.05 / np.linalg.norm(shift),
         ]
         T = camera.T_mount_camera
-        return replace(camera, T_mount_camera=moved(T, np.array(change), T[:3, 3]))
+        return replace(camera, T_mount_camera=displaced_pose(T, np.array(change), T[:3, 3]))
 
 
 def estimates(

@@ -141,7 +141,7 @@ def _largest_box(mask: BoolArray) -> tuple[int, int]:
     return int(largest[cv2.CC_STAT_WIDTH]), int(largest[cv2.CC_STAT_HEIGHT])
 
 
-def lean(
+def axis_lean(
     cameras: Sequence[CameraModel], T_base_camera: Sequence[FloatArray], masks: Sequence[BoolArray]
 ) -> FloatArray:
     """Return the horizontal part (2,) of the unit vector along an object's long axis, upwards.

@@ -49,10 +49,10 @@ from mtv_world_ros.data.episode import (
 )
 from mtv_world_ros.data.joint_plans import (
     complete_plans,
-    following,
     hold_at_stops,
     join_streams,
     read_plan,
+    trajectories_to,
 )
 from mtv_world_ros.data.measured_joints import merge_joint_states
 from mtv_world_ros.data.stream_clocks import (
@@ -485,7 +485,7 @@ class _EpisodeReader:
         except ValueError as error:
             raise EpisodeError(f"'{self.path}': {error}") from error
         self.warnings += warnings
-        return following(led, self.mapping.chunk_s, self.seen_ns)
+        return trajectories_to(led, self.mapping.chunk_s, self.seen_ns)
 
     def _tool_poses(self, arm: str, tool: ToolTopic, robot: RobotModel) -> ToolTrack:
         topic = self.mapping.topic(tool.topic)
@@ -518,13 +518,17 @@ class _EpisodeReader:
     def _joint_commands(self, states: JointStates | None) -> Stamped:
         topic = self.topics.joint_trajectory
         if self.mapping.action == STATE:
-            return [] if states is None else following(states, self.mapping.chunk_s, self.seen_ns)
+            return (
+                []
+                if states is None
+                else trajectories_to(states, self.mapping.chunk_s, self.seen_ns)
+            )
         if self.types.get(topic) == messages.JOINT_STATE:
             taken = self._take(topic, messages.JOINT_STATE)
             leader = merge_joint_states(topic, taken, self.warnings, renamed=self._renamed)
             if leader is None:
                 return []
-            return following(leader, self.mapping.chunk_s, self.seen_ns)
+            return trajectories_to(leader, self.mapping.chunk_s, self.seen_ns)
         plan = self._plan if states is None else self._plan_or_stop
         plans = self._parsed(topic, messages.JOINT_TRAJECTORY, plan)
         if states is not None:

@@ -90,7 +90,7 @@ def _rows(names: Sequence[str], points: Iterable[Any], field: str) -> FloatArray
     return values
 
 
-def following(states: JointStates, chunk_s: float, start_ns: int) -> list[Plan]:
+def trajectories_to(states: JointStates, chunk_s: float, start_ns: int) -> list[Plan]:
     """Return trajectories that reach measured positions at the stamps of their measurement.
 
     Args:
@@ -185,7 +185,7 @@ def join_streams(plans: Sequence[Plan], chunk_s: float) -> tuple[list[Plan], int
             joint_names=run[0][1].joint_names,
             positions=np.concatenate([rows[:1], rows[is_new]]),
         )
-        joined += following(states, chunk_s, start_ns)
+        joined += trajectories_to(states, chunk_s, start_ns)
     return joined, count
 
 
@@ -292,7 +292,7 @@ class _Measured:
             return [(stamp_ns, whole)]
         stamps = stamp_ns + np.round(rest * NANO).astype(np.int64)
         between = JointStates(stamps_ns=stamps, joint_names=names, positions=held)
-        return [(stamp_ns, whole), *following(between, chunk_s, int(stamps[0]))]
+        return [(stamp_ns, whole), *trajectories_to(between, chunk_s, int(stamps[0]))]
 
 
 def _union(times: FloatArray, more: FloatArray) -> FloatArray:

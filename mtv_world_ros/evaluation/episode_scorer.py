@@ -50,7 +50,7 @@ from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.prediction import Prediction
 from mtv_world_ros.success.estimator import SUCCESS_FROM
 from mtv_world_ros.viewing.scored_rollout import StoredRollout
-from mtv_world_ros.viewing.stored_rollout import join, save_rollout
+from mtv_world_ros.viewing.stored_rollout import join_stretches, save_rollout
 
 #: stages whose run time is measured
 STAGES = ('reading', 'imagining', 'segmenting', 'scoring', 'features', 'storing')
@@ -164,7 +164,7 @@ class EpisodeScorer:
             why = 'no other episode can be read' if job.donors else 'there is no other episode'
             found.notes[f'no frames were imagined with other commands: {why}'] = None
         with found.timed('storing'):
-            save_rollout(rollout_path(self.out, job.name), join(found.shown))
+            save_rollout(rollout_path(self.out, job.name), join_stretches(found.shown))
             if features:
                 features.save(feature_path(self.out, job.name))
         return EpisodeResult(

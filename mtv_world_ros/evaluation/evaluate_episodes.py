@@ -22,9 +22,9 @@ from mtv_world_ros.data.recordings import described_objects
 from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, EvaluationJob, Instruments
 from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, Group
 from mtv_world_ros.evaluation.metrics.feature_store import (
-    distances,
     feature_path,
     FeatureTaker,
+    frechet_distances,
     load_features,
 )
 from mtv_world_ros.evaluation.metrics.frechet_features import clip_features, frame_features
@@ -207,7 +207,7 @@ def _distances(
     if config.fid_weights is None and config.fvd_weights is None:
         return {}
     return {
-        (group, view): distances(
+        (group, view): frechet_distances(
             [
                 load_features(feature_path(summary.folder, result.episode))
                 for result in summary.chosen(Group(zero_shot=group))

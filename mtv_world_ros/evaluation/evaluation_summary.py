@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.core.data_types import WorldModelSpec
-from mtv_world_ros.evaluation.metrics.horizon import by_chunk, Curve, curve
+from mtv_world_ros.evaluation.metrics.horizon import by_chunk, Curve, horizon_curve
 from mtv_world_ros.evaluation.metrics.jaccard_scores import (
     DISTANCES,
     FRAME_FIELDS,
@@ -235,7 +235,7 @@ class EvaluationSummary:
         episodes = [result.rows for result in self.chosen(group)]
         found: dict[str, Any] = {}
         for name in FRAME_FIELDS:
-            drawn = curve(episodes, view, name, min_share=0)
+            drawn = horizon_curve(episodes, view, name, min_share=0)
             key = f'{name.removesuffix("_frames")}_moving_by_frame'
             found[key], found[f'{key}_interval'] = drawn.values, drawn.band
         if self.num_chunks > 1:

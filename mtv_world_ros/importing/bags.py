@@ -32,7 +32,7 @@ from mtv_world_ros.data.stream_clocks import ClockBreakError, WHOLE, Window
 from mtv_world_ros.importing.convert import (
     import_each,
     ImportSummary,
-    jumps,
+    joints_too_fast,
     MAPPING_KEY,
     unknown_camera_note,
 )
@@ -357,7 +357,7 @@ def write_imported(
         camera_poses(camera, robot, np.zeros((1, len(robot.joint_names))))
     stamps, positions = _measured(episode, robot, mapping)
     commands = _commands(episode, robot, mapping)
-    warnings = [*episode.warnings, *jumps([t for _, t in commands], robot)]
+    warnings = [*episode.warnings, *joints_too_fast([t for _, t in commands], robot)]
     unknown = episode.unknown.items()
     warnings += [unknown_camera_note(out.parent, view, what) for view, what in unknown]
     instruction = mapping.instruction or episode.info.instruction

@@ -274,7 +274,14 @@ def convert_episode(
     shown = {view: dataset.video_note(entry, row.feature) for view, row in mapping.views.items()}
     turned = [f"view '{view}': {note}" for view, note in shown.items() if note]
     turned += [unknown_camera_note(out.parent, view, 'pose and intrinsics') for view in unknown]
-    return *paused, *mended, *odd, *notes, *turned, *jumps(commands.values(), mapping.robot)
+    return (
+        *paused,
+        *mended,
+        *odd,
+        *notes,
+        *turned,
+        *joints_too_fast(commands.values(), mapping.robot),
+    )
 
 
 def _stream_features(mapping: DatasetMapping) -> tuple[str, ...]:
@@ -417,7 +424,7 @@ def unknown_camera_note(folder: Path, view: str, what: str) -> str:
 _JUMP = 2.0
 
 
-def jumps(commands: Iterable[JointTrajectory], robot: RobotModel) -> list[str]:
+def joints_too_fast(commands: Iterable[JointTrajectory], robot: RobotModel) -> list[str]:
     """Return joints whose commands are faster than they can move, and how often."""
     counts, limits = np.zeros(len(robot.joint_names), int), joint_speeds(robot)
     for trajectory in commands:

@@ -18,7 +18,7 @@ from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest
 from mtv_world_ros.data.bag_mapping import BagMapping, key_of, keyed, ViewSource, Written
 from mtv_world_ros.data.episode import Episode, EpisodeInfo, JointStates, parse_outcome, Track
-from mtv_world_ros.data.joint_plans import following
+from mtv_world_ros.data.joint_plans import trajectories_to
 from mtv_world_ros.data.measured_joints import mend_rows
 from mtv_world_ros.data.stream_clocks import check_row_times
 from mtv_world_ros.importing.bags import write_imported
@@ -240,7 +240,7 @@ def read_recording(
         cameras=cameras,
         images=images,
         joint_states=states,
-        trajectories=following(states, mapping.chunk_s, int(stamps[0])),
+        trajectories=trajectories_to(states, mapping.chunk_s, int(stamps[0])),
         masks=None,
         instructions=[],
         unknown=unknown,

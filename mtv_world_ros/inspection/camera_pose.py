@@ -40,7 +40,7 @@ class CameraEstimate:
     match: float = float('nan')
 
 
-def moved(T: FloatArray, parameters: FloatArray, centre: FloatArray) -> FloatArray:
+def displaced_pose(T: FloatArray, parameters: FloatArray, centre: FloatArray) -> FloatArray:
     """Return a pose (4, 4) turned about a point by (3,) [rad] and shifted by (3,) [m].
 
     Turns and shifts are along the pose's own axes. Turned about what a camera looks at, its
@@ -54,7 +54,7 @@ def moved(T: FloatArray, parameters: FloatArray, centre: FloatArray) -> FloatArr
     return middle @ change @ np.linalg.inv(middle) @ T
 
 
-def aligned(
+def refine_pose(
     T: FloatArray,
     errors: Callable[[FloatArray], NDArray[np.floating]],
     centre: FloatArray | None = None,
@@ -81,7 +81,7 @@ def aligned(
         middle = T[:3, 3] if centre is None else centre
         if slopes is None:  # a step that was refused changes nothing
             slopes = np.stack(
-                [(errors(moved(T, s, middle)) - errors(moved(T, -s, middle))) / 2
+                [(errors(displaced_pose(T, s, middle)) - errors(displaced_pose(T, -s, middle))) / 2
                  for s in np.diag(UNITS)]
             )  # fmt: skip
             weighted = slopes / (1 + (now / outlier) ** 2)
@@ -89,7 +89,7 @@ def aligned(
         damped = normal + damping * np.diag(np.diag(normal)) + 1e-9 * np.eye(6)
         step = -np.linalg.solve(damped, gradient)
         step *= min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-9))
-        tried = moved(T, np.asarray(step * UNITS, np.float64), middle)
+        tried = displaced_pose(T, np.asarray(step * UNITS, np.float64), middle)
         there = errors(tried)
         if cost(there) < cost(now):
             T, now, damping, slopes = tried, there, damping / 3, None
@@ -105,14 +105,14 @@ def with_pose(camera: CameraModel, T_mount_camera: FloatArray) -> CameraModel:
     return replace(camera, T_mount_camera=T_mount_camera)
 
 
-def shrunk(camera: CameraModel, width: int) -> CameraModel:
+def shrunk_camera(camera: CameraModel, width: int) -> CameraModel:
     """Return the camera for images of at most a width."""
     if camera.width <= width:
         return camera
     return scaled(camera, width, max(1, round(camera.height * width / camera.width)))
 
 
-def grey(frame: ByteArray, camera: CameraModel) -> ByteArray:
+def grey_image(frame: ByteArray, camera: CameraModel) -> ByteArray:
     """Return the grey image (H, W) uint8 at the camera's size."""
     size = (camera.width, camera.height)
     return np.asarray(
@@ -149,7 +149,7 @@ def left_out(total: FloatArray, normal: FloatArray, gradient: FloatArray) -> Flo
     return np.asarray(np.linalg.solve(total - normal + ridge, gradient) * UNITS, np.float64)
 
 
-def spread(changes: FloatArray) -> tuple[float, float]:
+def jackknife_errors(changes: FloatArray) -> tuple[float, float]:
     """Jackknife standard errors [mm, degrees] of changes (G, 6): turns [rad], shifts [m].
 
     Each change is by leaving out one of G groups.

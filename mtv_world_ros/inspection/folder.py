@@ -16,7 +16,7 @@ from mtv_world_ros.core.transforms import inverse
 from mtv_world_ros.data.episode import Episode, MASKS_BY
 from mtv_world_ros.inspection.inspect import Inspector
 from mtv_world_ros.inspection.inspection_report import (
-    aligned,
+    aligned_rows,
     broken,
     Finding,
     Inspection,
@@ -24,7 +24,7 @@ from mtv_world_ros.inspection.inspection_report import (
     Section,
     suspicious,
     VERDICTS,
-    worst,
+    worst_verdict,
 )
 from mtv_world_ros.inspection.places import background, CameraPlaces, find_places
 
@@ -66,7 +66,7 @@ class FolderInspection:
         """The worst of all."""
         found = [inspection.verdict for inspection in self.episodes.values()]
         found += ['broken'] * bool(self.failed)
-        return worst([*found, *(finding.verdict for finding in self.findings)])
+        return worst_verdict([*found, *(finding.verdict for finding in self.findings)])
 
     def place(self, view: str, name: str) -> str:
         """Return the place of an episode's camera, in a word."""
@@ -301,7 +301,7 @@ def broken_parts(found: FolderInspection) -> dict[str, dict[str, str]]:
 
 def folder_text(found: FolderInspection) -> str:
     """Return the table as text, with what concerns all episodes below."""
-    return '\n'.join([*aligned(table(found)), *_conclusions(found)])
+    return '\n'.join([*aligned_rows(table(found)), *_conclusions(found)])
 
 
 def folder_markdown(found: FolderInspection, picture: str) -> str:

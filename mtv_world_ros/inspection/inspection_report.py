@@ -57,7 +57,7 @@ def broken(text: str) -> Finding:
     return Finding(verdict='broken', text=text)
 
 
-def worst(verdicts: Sequence[str]) -> str:
+def worst_verdict(verdicts: Sequence[str]) -> str:
     """Return the worst of some verdicts; `ok` if there is none."""
     return max(verdicts, key=VERDICTS.index, default='ok')
 
@@ -83,7 +83,7 @@ class Section:
     @property
     def verdict(self) -> str:
         """The worst of the findings."""
-        return worst([finding.verdict for finding in self.findings])
+        return worst_verdict([finding.verdict for finding in self.findings])
 
     @property
     def wrong(self) -> list[str]:
@@ -136,7 +136,7 @@ class Inspection:
     @property
     def verdict(self) -> str:
         """The worst of all sections."""
-        return worst([section.verdict for section in self.sections])
+        return worst_verdict([section.verdict for section in self.sections])
 
 
 def to_markdown(inspection: Inspection, pictures: Mapping[str, str]) -> str:
@@ -169,7 +169,7 @@ def to_text(inspection: Inspection) -> str:
     """Return a table, a row a view with its numbers, and a line for each finding and note."""
     head = ['view', 'verdict', *(name for name, _ in NUMBERS.values())]
     rows = [[s.name, s.verdict, *s.cells()] for s in inspection.sections]
-    lines = aligned([head, *rows])
+    lines = aligned_rows([head, *rows])
     for section in inspection.sections:
         lines += [f'{section.name}: {f.verdict}: {f.text}' for f in section.findings]
         lines += [f'{section.name}: note: {note}' for note in section.notes]
@@ -197,7 +197,7 @@ def to_json(
     return episodes
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+def aligned_rows(rows: Sequence[Sequence[str]]) -> list[str]:
     """Return the rows of a table as lines; the last column is not filled up."""
     widths = [max(len(row[n]) for row in rows) for n in range(len(rows[0]) - 1)]
     lines = [

@@ -16,7 +16,7 @@ from mtv_world_ros.cameras.camera import camera_poses
 from mtv_world_ros.cameras.silhouettes import project_part
 from mtv_world_ros.core.data_types import CameraModel, FloatArray
 from mtv_world_ros.data.episode import Track
-from mtv_world_ros.inspection.camera_pose import shrunk
+from mtv_world_ros.inspection.camera_pose import shrunk_camera
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import fill, LinkShape, moving_links
@@ -126,7 +126,7 @@ def measure_residual(
         return MotionResidual(
             reason=f'no two frames {_STEP_S:g} s apart with joint states and motion'
         )
-    small, coarse = shrunk(camera, _WIDTH_PX), shrunk(camera, _COARSE_WIDTH_PX)
+    small, coarse = shrunk_camera(camera, _WIDTH_PX), shrunk_camera(camera, _COARSE_WIDTH_PX)
     some, changed = pairs[::3], _changes(coarse, search)
     seen = _seen_motion(track, some, coarse) if changed or len(search.lags_s) > 1 else []
 

@@ -28,7 +28,7 @@ BASE_FILE = 'base.json'
 _PEFT_FILE = 'adapter_model.safetensors'
 
 
-def beside(transformer: MultiViewWanTransformer) -> dict[str, Tensor]:
+def fully_trained_weights(transformer: MultiViewWanTransformer) -> dict[str, Tensor]:
     """Return the weights that are trained whole and saved with an adapter, by name."""
     return {n: p for n, p in transformer.named_parameters() if n.startswith(BESIDE)}
 
@@ -67,7 +67,9 @@ class Adapters:
         self._transformer = transformer
         #: the weights without the adapter, by module
         self._under: dict[str, Tensor] = {}
-        self._beside = {n: p.detach().clone() for n, p in beside(transformer).items()}
+        self._beside = {
+            n: p.detach().clone() for n, p in fully_trained_weights(transformer).items()
+        }
         self._held = _NONE
         self._lock = Lock()
 
@@ -112,7 +114,7 @@ class Adapters:
     def _exchange(self, adapter: Adapter) -> None:
         """Remove the previous adapter from the weights and add another one, in place."""
         whole = {**self._beside, **adapter.whole}
-        for name, parameter in beside(self._transformer).items():
+        for name, parameter in fully_trained_weights(self._transformer).items():
             parameter.copy_(whole[name])
         for name in self._under.keys() - adapter.factors.keys():
             restored: Any = self._transformer.get_submodule(name)

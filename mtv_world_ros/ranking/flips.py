@@ -12,7 +12,7 @@ from mtv_world_ros.core.data_types import BoolArray, ByteArray
 from mtv_world_ros.core.images import encode_png
 from mtv_world_ros.ranking.judges import is_contact
 from mtv_world_ros.ranking.rollout_jobs import Result
-from mtv_world_ros.simulation.collect.contact_sheet import titled
+from mtv_world_ros.simulation.collect.contact_sheet import titled_picture
 from mtv_world_ros.simulation.faults.catalogue import EXPERT
 
 #: suffix of pictures with object masks
@@ -109,8 +109,8 @@ def flip_sheet(
         scene = f'{result.task} {result.index}'
         word = 'imagined' if flips[result.name] else 'not imagined'
         blocks = [
-            titled(f'{scene}, expert: {_word(expert)}', _picture(expert, folder)),
-            titled(f'{result.policy}: {_word(result)}; {word}', _picture(result, folder)),
+            titled_picture(f'{scene}, expert: {_word(expert)}', _picture(expert, folder)),
+            titled_picture(f'{result.policy}: {_word(result)}; {word}', _picture(result, folder)),
         ]
         gap = np.full((len(blocks[0]), _GAP_PX, 3), 255, np.uint8)
         row = np.concatenate([blocks[0], gap, blocks[1]], axis=1)

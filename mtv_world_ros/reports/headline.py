@@ -11,7 +11,7 @@ import numpy as np
 
 from mtv_world_ros.core.documents import with_interval
 from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, NOT_MEASURED
-from mtv_world_ros.evaluation.metrics.horizon import curve
+from mtv_world_ros.evaluation.metrics.horizon import horizon_curve
 from mtv_world_ros.evaluation.metrics.statistics import Estimate, mean_interval, MIN_EPISODES
 from mtv_world_ros.evaluation.tables import chunk_table
 from mtv_world_ros.reports.charts import ChartLine, Dot, dot_chart, line_chart
@@ -218,7 +218,7 @@ def _lines(one: Marked, view: str, fps: float, count: int) -> list[ChartLine]:
     clock = fps / one.found.spec.fps
     lines = []
     for field, word in _FIELDS.items():
-        drawn = curve(rows, view, field)
+        drawn = horizon_curve(rows, view, field)
         if not drawn.values:
             continue
         lines.append(

@@ -16,7 +16,7 @@ from mtv_world_ros.ros.messages.conversions import has_header, message_class, re
 from mtv_world_ros.ros.qos_profiles import best_offer, QosWatch
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.viewing import rerun_log
-from mtv_world_ros.viewing.streams import shown_as, Streams, take
+from mtv_world_ros.viewing.streams import add_message, shown_as, Streams
 from mtv_world_ros.viewing.viewer_process import PageAddress
 
 #: new topics are looked for this often [s]
@@ -80,7 +80,7 @@ class LiveViewer(Node):
         self._begin_ns = self._begin_ns or stamp_ns
         self._last_ns = stamp_ns
         taken = Streams()
-        take(
+        add_message(
             taken,
             BagMessage(
                 topic=topic, msgtype=msgtype, stamp_ns=stamp_ns, data=data, publish_ns=stamp_ns

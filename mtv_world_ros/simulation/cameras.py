@@ -99,7 +99,7 @@ TRAINING_MOVES = (
 )
 
 
-def moved(
+def moved_camera(
     spec: AnyCameraSpec, moves: CameraMoves, generator: np.random.Generator
 ) -> AnyCameraSpec:
     """Return a camera that stands elsewhere and looks at the same point; one on a link stays."""

@@ -98,7 +98,7 @@ def rotation_of(item: SceneObject) -> FloatArray:
     return rotation((0.0, 0.0, np.sin(item.yaw / 2), np.cos(item.yaw / 2)))
 
 
-def corners(item: SceneObject) -> FloatArray:
+def box_corners(item: SceneObject) -> FloatArray:
     """Return the (8, 3) corners of the object's bounding box in the base frame [m]."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     local = signs * np.asarray(item.size) / 2
@@ -116,7 +116,7 @@ def check_cameras(scene: Scene, base_link: str) -> None:
         SimulatorError: names the camera and the objects outside its image.
     """
     for camera in (one for one in scene.cameras if one.mount_link == base_link):
-        hidden = [item.name for item in scene.objects if not _inside(camera, corners(item))]
+        hidden = [item.name for item in scene.objects if not _inside(camera, box_corners(item))]
         if hidden:
             raise SimulatorError(
                 f"camera '{camera.view}' does not see {', '.join(hidden)} as a whole; move its "

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from mtv_world_ros.core.errors import nearest, SimulatorError
-from mtv_world_ros.simulation.cameras import CameraMoves, moved
+from mtv_world_ros.simulation.cameras import CameraMoves, moved_camera
 from mtv_world_ros.simulation.randomize import RandomizationConfig
 from mtv_world_ros.simulation.shapes import SHAPES
 from mtv_world_ros.simulation.tasks import (
@@ -91,7 +91,7 @@ def with_moved_cameras(
     randomization: RandomizationConfig, moves: CameraMoves, rng: np.random.Generator
 ) -> RandomizationConfig:
     """Return the randomisation with every fixed camera moved; its cameras must be known."""
-    cameras = tuple(moved(spec, moves, rng) for spec in randomization.cameras or ())
+    cameras = tuple(moved_camera(spec, moves, rng) for spec in randomization.cameras or ())
     return replace(randomization, cameras=cameras)
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mtv_world_ros.cameras.camera import project
-from mtv_world_ros.cameras.mask_geometry import centroids, lean, locate_all
+from mtv_world_ros.cameras.mask_geometry import axis_lean, centroids, locate_all
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.core.data_types import BoolArray, CameraModel, FloatArray, ObjectMasks
 
@@ -287,5 +287,7 @@ def _leans(footage: Footage, frame: int) -> FloatArray:
     for item in map(int, np.flatnonzero(known.any(0))):
         views = np.flatnonzero(known[:, item])
         cameras = [footage.cameras[int(view)] for view in views]
-        leans[item] = lean(cameras, list(footage.poses[views, frame]), list(masks[views, item]))
+        leans[item] = axis_lean(
+            cameras, list(footage.poses[views, frame]), list(masks[views, item])
+        )
     return leans

@@ -16,7 +16,13 @@ from mtv_world_ros.control.registry import save_control
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import whole_folder
 from mtv_world_ros.model.card import CheckpointCard
-from mtv_world_ros.model.lora import ADAPTER, BASE_FILE, base_of, beside, BESIDE_FILE
+from mtv_world_ros.model.lora import (
+    ADAPTER,
+    BASE_FILE,
+    base_of,
+    BESIDE_FILE,
+    fully_trained_weights,
+)
 from mtv_world_ros.model.lora_file import METADATA
 from mtv_world_ros.model.tensor_files import disk_errors
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
@@ -47,7 +53,7 @@ def add_adapter(transformer: MultiViewWanTransformer, rank: int = 32, alpha: flo
     transformer.requires_grad_(False)
     config: Any = LoraConfig(r=rank, lora_alpha=alpha, target_modules=TARGETS)  # type: ignore[arg-type]
     transformer.add_adapter(config, adapter_name=_NAME)
-    for parameter in beside(transformer).values():
+    for parameter in fully_trained_weights(transformer).values():
         parameter.requires_grad_(True)
 
 
@@ -77,7 +83,10 @@ def save_adapter(
     factors = get_peft_model_state_dict(transformer, tensors, adapter_name=_NAME)
     with whole_folder(folder) as partial:
         _save(factors, partial / ADAPTER, config)
-        _save({name: tensors[name] for name in beside(transformer)}, partial / BESIDE_FILE)
+        _save(
+            {name: tensors[name] for name in fully_trained_weights(transformer)},
+            partial / BESIDE_FILE,
+        )
         (partial / BASE_FILE).write_text(json.dumps(base_of(transformer), indent=2) + '\n')
         if card is not None:
             card.write(partial)

@@ -177,7 +177,7 @@ class BatchSource:
             inputs=ControlBatch.of([s.inputs for s in samples]),
             object_ids=_stacked([s.object_ids for s in samples]),
             lead_ins=tuple(s.lead_in for s in samples),
-            **pasts([s.past for s in samples]),
+            **history_fields([s.past for s in samples]),
         )
 
     def _clip(self, step: int, number: int) -> _Sample:
@@ -231,7 +231,7 @@ class BatchSource:
         return pool[rng.integers(len(pool))]
 
 
-def pasts(given: Sequence[Past | None]) -> dict[str, Tensor]:
+def history_fields(given: Sequence[Past | None]) -> dict[str, Tensor]:
     """Return fields of a batch: anchors and histories of its clips."""
     known = [past for past in given if past is not None]
     if not known:

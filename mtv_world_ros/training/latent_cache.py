@@ -30,7 +30,7 @@ from mtv_world_ros.data.recordings import cut_clip
 from mtv_world_ros.model.conditioning import Conditioning, ControlBatch, pad_rows, start_slot
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.training.base_checkpoint import Base
-from mtv_world_ros.training.batches import BatchSource, ClipBatch, pasts
+from mtv_world_ros.training.batches import BatchSource, ClipBatch, history_fields
 from mtv_world_ros.training.clip_controls import ControlMaker, draw_past, history_before
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.encoding import encode_batch, EncodedBatch, Encoders
@@ -270,7 +270,7 @@ def read_clip(
         start_frame=_alone(cut.frames[:, 0]),
         inputs=ControlBatch.of([inputs]),
         object_ids=None if cut.object_ids is None else _alone(cut.object_ids),
-        **pasts([past]),  # type: ignore[arg-type]
+        **history_fields([past]),  # type: ignore[arg-type]
     )
 
 
@@ -278,7 +278,7 @@ def _alone(array: np.ndarray) -> Tensor:
     return torch.from_numpy(np.array(array))[None]
 
 
-def fill(
+def encode_missing_clips(
     cache: LatentCache,
     clips: Sequence[CachedClip],
     read: Callable[[CachedClip], ClipBatch],
@@ -344,7 +344,7 @@ def _shares(batch: ClipBatch, shape: Sequence[int]) -> Tensor:
     return (torch.stack(parts, dim=1) * 255).round().to(torch.uint8)
 
 
-def cached(
+def cached_batches(
     source: BatchSource,
     root: Path,
     config: TrainingConfig,
@@ -371,7 +371,7 @@ def cached(
     clips = list_clips(source.starts)
     for note in [*cache.notes, *_changed(cache, clips)]:
         tqdm.write(f'latent cache: {note}')
-    steps = fill(
+    steps = encode_missing_clips(
         cache,
         clips,
         lambda clip: read_clip(clip, spec, controls, config.history),

@@ -45,7 +45,7 @@ from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.fit_control import fitted_control
-from mtv_world_ros.training.latent_cache import cached, CachedSource
+from mtv_world_ros.training.latent_cache import cached_batches, CachedSource
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.mapped_arrays import read_mapped
 from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
@@ -124,7 +124,7 @@ def load_recordings(
         else:
             recordings.append(recording)
     if not recordings:
-        reasons = '; '.join(counted(skipped) or ['none given'])
+        reasons = '; '.join(reason_lines(skipped) or ['none given'])
         raise TrainingError(f'no usable episode: {_other_robot(paths, robot)}{reasons}')
     return recordings, skipped
 
@@ -262,7 +262,7 @@ def train(
         )
     if run.latent_cache is not None:
         with processes.main_first():
-            source = cached(
+            source = cached_batches(
                 source,
                 run.latent_cache,
                 config,
@@ -301,8 +301,8 @@ def train(
             f'gaps; {"resumed at" if resumed else "starting from"} step {trainer.step}; '
             f'{processes.count} processes'
         )
-        left_out = [f'left out: {line}' for line in counted(skipped)]
-        told = notes(trainer.config, recordings, None if resumed else run.initial)
+        left_out = [f'left out: {line}' for line in reason_lines(skipped)]
+        told = training_notes(trainer.config, recordings, None if resumed else run.initial)
         for line in [*left_out, *told]:
             tqdm.write(line)
     ideal = None
@@ -330,7 +330,7 @@ def _save_robot(
             save_calibration(folder / CAMERAS, {camera.view: camera for camera in cameras})
 
 
-def notes(
+def training_notes(
     config: TrainingConfig, recordings: Sequence[Recording], initial: Checkpoint | None = None
 ) -> list[str]:
     """Return notes on a training for the user, before it runs.
@@ -498,7 +498,7 @@ def check_clips(recording: Recording, spec: WorldModelSpec) -> None:
     )
 
 
-def counted(skipped: Mapping[str, str]) -> list[str]:
+def reason_lines(skipped: Mapping[str, str]) -> list[str]:
     """Return a line for each reason with the names of its first episodes, the frequent first.
 
     Args:

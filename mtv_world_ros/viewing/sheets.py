@@ -44,7 +44,7 @@ def write_pictures(bags: Sequence[Path], out: Path, *, has_video: bool = True) -
         EpisodeError: nothing was imagined.
     """
     streams = read_streams(bags)
-    comparison = compared(streams)
+    comparison = comparison_frames(streams)
     instructions = [t for _, t in streams.words if t.startswith('instruction: ')]
     estimates = ', '.join(
         'abstains' if np.isnan(value) else f'{value:.2f}' for _, value in streams.success
@@ -56,12 +56,12 @@ def write_pictures(bags: Sequence[Path], out: Path, *, has_video: bool = True) -
         return [out / SHEET]
     period = float(np.median(np.diff(comparison.times))) if len(comparison.times) > 1 else 0.2
     stride = ceil(len(comparison.times) / MAX_VIDEO_FRAMES)
-    frames = side_by_side(every(comparison, stride))
+    frames = side_by_side(every_nth_frame(comparison, stride))
     write_video(out / VIDEO, frames, 1 / (period * stride), max_bytes=MAX_VIDEO_BYTES)
     return [out / SHEET, out / VIDEO]
 
 
-def every(comparison: Comparison, stride: int) -> Comparison:
+def every_nth_frame(comparison: Comparison, stride: int) -> Comparison:
     """Return every `stride`-th frame, the first among them."""
     return replace(
         comparison,
@@ -71,7 +71,7 @@ def every(comparison: Comparison, stride: int) -> Comparison:
     )
 
 
-def compared(streams: Streams) -> Comparison:
+def comparison_frames(streams: Streams) -> Comparison:
     """Return imagined frames and the other kinds of frames at their times; missing ones are grey.
 
     Kinds without any frame at these times are not shown.

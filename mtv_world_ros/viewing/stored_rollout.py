@@ -30,7 +30,7 @@ MAX_FRAMES = 600
 _CRF = 10
 
 
-def join(stretches: Sequence[StoredRollout]) -> StoredRollout:
+def join_stretches(stretches: Sequence[StoredRollout]) -> StoredRollout:
     """Return the stretches of an episode in a row.
 
     Raises:

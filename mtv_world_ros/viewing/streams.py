@@ -78,7 +78,7 @@ def read_streams(bags: Sequence[Path]) -> Streams:
     for bag in bags:
         for message in BagReader(bag).messages():
             try:
-                take(streams, message)
+                add_message(streams, message)
             except MtvWorldError as error:
                 raise EpisodeError(f"'{bag}', topic {message.topic}: {error}") from error
     if not streams.images:
@@ -114,7 +114,7 @@ def shown_as(topic: str, msgtype: str) -> tuple[str, ...] | None:
     return None
 
 
-def take(streams: Streams, message: BagMessage) -> None:
+def add_message(streams: Streams, message: BagMessage) -> None:
     """Add what a message shows.
 
     Raises:

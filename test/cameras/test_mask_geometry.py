@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.cameras.camera import project
-from mtv_world_ros.cameras.mask_geometry import lean, upright_extents
+from mtv_world_ros.cameras.mask_geometry import axis_lean, upright_extents
 from mtv_world_ros.core.data_types import CameraModel
 from mtv_world_ros.core.transforms import looking_along
 
@@ -38,7 +38,7 @@ def make_mask(camera, pose, axis):
 def seen_lean(axis, *positions):
     cameras, poses = zip(*[make_camera(np.array(p)) for p in positions], strict=True)
     masks = [make_mask(c, pose, axis) for c, pose in zip(cameras, poses, strict=True)]
-    return lean(cameras, poses, masks)
+    return axis_lean(cameras, poses, masks)
 
 
 LOW, SIDE, ABOVE = (0.0, -0.4, 0.3), (0.9, 0.3, 0.4), (0.1, 0.1, 0.9)
@@ -68,7 +68,7 @@ def test_a_round_mask_tells_nothing():
     camera, pose = make_camera(np.array(ABOVE))
     mask = np.zeros((96, 128), np.uint8)
     cv2.circle(mask, (60, 50), 9, 1, -1)
-    assert np.abs(lean([camera], [pose], [mask.astype(bool)])).max() < 0.02
+    assert np.abs(axis_lean([camera], [pose], [mask.astype(bool)])).max() < 0.02
 
 
 def drawn_box(camera, pose, size, yaw):

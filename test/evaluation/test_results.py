@@ -9,7 +9,12 @@ from mtv_world_ros.evaluation.evaluate_episodes import evaluate
 from mtv_world_ros.evaluation.results import rollout_path
 from mtv_world_ros.viewing import stored_rollout
 from mtv_world_ros.viewing.scored_rollout import StoredRollout
-from mtv_world_ros.viewing.stored_rollout import join, load_rollout, MAX_SIDE, save_rollout
+from mtv_world_ros.viewing.stored_rollout import (
+    join_stretches,
+    load_rollout,
+    MAX_SIDE,
+    save_rollout,
+)
 
 VIDEOS = ('real', 'trajectory', 'imagined')
 
@@ -88,13 +93,13 @@ def test_rollout_without_objects_survives_the_disk(tmp_path):
 
 
 def test_stretches_are_joined_in_order():
-    joined = join([rollout(stretch=0), rollout(frames=3, stretch=1)])
+    joined = join_stretches([rollout(stretch=0), rollout(frames=3, stretch=1)])
     assert joined.stretches.tolist() == [0] * 6 + [1] * 3
     assert joined.real.shape[1] == joined.masks.shape[2] == 9
     with pytest.raises(EpisodeError, match='differ in views'):
-        join([rollout(), rollout(objects=('red block',))])
+        join_stretches([rollout(), rollout(objects=('red block',))])
     with pytest.raises(EpisodeError, match='at least one'):
-        join([])
+        join_stretches([])
 
 
 def test_parts_that_do_not_fit_each_other_are_refused():

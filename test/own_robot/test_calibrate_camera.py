@@ -12,7 +12,7 @@ from mtv_world_ros.cameras.silhouettes import draw_silhouettes
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import CalibrationError
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.inspection.camera_pose import difference, moved, spread
+from mtv_world_ros.inspection.camera_pose import difference, displaced_pose, jackknife_errors
 from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
 from mtv_world_ros.inspection.cameras.wrist_camera import follow_scene, WristCamera
 from mtv_world_ros.inspection.clocks import JointTrack
@@ -24,7 +24,9 @@ from test.support.crane import load, make_cameras, make_positions, write_episode
 def test_a_fixed_camera_is_found_from_a_guess_in_a_part_of_the_recording(tmp_path, capsys):
     robot = load(tmp_path)
     door = replace(make_cameras()['door'], mount_link='world')
-    change = moved(np.eye(4), np.array([0.05, -0.04, 0.08, 0.04, 0.03, -0.05]), np.zeros(3))
+    change = displaced_pose(
+        np.eye(4), np.array([0.05, -0.04, 0.08, 0.04, 0.03, -0.05]), np.zeros(3)
+    )
     guess = replace(door, T_mount_camera=door.T_mount_camera @ change)
     far_mm, far_deg = difference(door.T_mount_camera, guess.T_mount_camera)
     assert far_mm > 60 and far_deg > 5
@@ -70,7 +72,7 @@ def test_a_guess_from_round_the_corner_ends_where_the_camera_is(tmp_path):
         return FixedCamera(images, camera, robot, parts, joints)
 
     circled = np.array([0, 0.3, 0, 0, 0, 0])
-    T = moved(door.T_mount_camera, circled, estimator(door).centre)
+    T = displaced_pose(door.T_mount_camera, circled, estimator(door).centre)
     assert difference(door.T_mount_camera, T)[0] > 400
     found = estimator(replace(door, T_mount_camera=T)).estimate()
     mm, degrees = difference(door.T_mount_camera, found.camera.T_mount_camera)
@@ -88,7 +90,9 @@ def test_shadows_on_the_table_do_not_move_the_camera(tmp_path):
     soft = np.stack([cv2.GaussianBlur(one.astype(np.float32), (0, 0), 6) for one in aside])
     frames *= 1 - 0.2 * np.where(arm, 0, soft)[..., None]
     shaded = track._replace(frames=frames.astype(np.uint8))
-    change = moved(np.eye(4), np.array([0.05, -0.04, 0.08, 0.04, 0.03, -0.05]), np.zeros(3))
+    change = displaced_pose(
+        np.eye(4), np.array([0.05, -0.04, 0.08, 0.04, 0.03, -0.05]), np.zeros(3)
+    )
     guess = replace(door, T_mount_camera=door.T_mount_camera @ change)
     found = FixedCamera(shaded, guess, robot, parts, joints).estimate()
     mm, degrees = difference(door.T_mount_camera, found.camera.T_mount_camera)
@@ -116,7 +120,9 @@ def wrist(tmp_path_factory):
     folder = tmp_path_factory.mktemp('wrist')
     robot = load(folder)
     palm = make_cameras()['palm']
-    change = moved(np.eye(4), np.array([0.06, -0.05, 0.07, 0.02, 0.015, -0.02]), np.zeros(3))
+    change = displaced_pose(
+        np.eye(4), np.array([0.06, -0.05, 0.07, 0.02, 0.015, -0.02]), np.zeros(3)
+    )
     guess = replace(palm, T_mount_camera=palm.T_mount_camera @ change)
     path = write_episode(
         folder / 'episode', robot, {'palm': palm}, make_positions(8.0, seed=2, speed=0.5),
@@ -190,4 +196,4 @@ def test_the_jackknife_has_the_textbook_value():
     changes = np.zeros((4, 6))
     changes[:, 3] = [0.0, 0.001, 0.002, 0.003]
     # sqrt(3/4 * ((1.5^2 + 0.5^2) * 2)) mm
-    assert spread(changes) == pytest.approx((np.sqrt(0.75 * 5.0), 0.0))
+    assert jackknife_errors(changes) == pytest.approx((np.sqrt(0.75 * 5.0), 0.0))

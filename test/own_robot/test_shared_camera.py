@@ -12,7 +12,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.core.data_types import CameraModel
 from mtv_world_ros.core.errors import CalibrationError
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.inspection.camera_pose import moved
+from mtv_world_ros.inspection.camera_pose import displaced_pose
 from mtv_world_ros.inspection.cameras import joint_camera
 from mtv_world_ros.inspection.places import background, find_places, turn_between
 from test.support.crane import (
@@ -36,11 +36,11 @@ def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp('shared')
     robot = load(folder)
     door = make_cameras()['door']
-    turn = moved(np.eye(4), np.array([0.01, 0.04, 0.0, 0.0, 0.0, 0.0]), np.zeros(3))
+    turn = displaced_pose(np.eye(4), np.array([0.01, 0.04, 0.0, 0.0, 0.0, 0.0]), np.zeros(3))
     true = [door, door, replace(door, T_mount_camera=door.T_mount_camera @ turn)]
     K = door.K.copy()
     K[:2, :2] *= 1.15
-    off = moved(np.eye(4), np.array([0.03, -0.02, 0.04, 0.03, 0.02, -0.04]), np.zeros(3))
+    off = displaced_pose(np.eye(4), np.array([0.03, -0.02, 0.04, 0.03, 0.02, -0.04]), np.zeros(3))
     paths = []
     for number, camera in enumerate(true):
         guess = replace(camera, K=K, T_mount_camera=camera.T_mount_camera @ off)

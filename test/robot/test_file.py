@@ -7,7 +7,7 @@ import yaml
 from mtv_world_ros.cli.robot import describe
 from mtv_world_ros.core.data_types import JointTrajectory
 from mtv_world_ros.core.errors import ConfigError, RobotError, TrajectoryError
-from mtv_world_ros.importing.convert import jumps
+from mtv_world_ros.importing.convert import joints_too_fast
 from mtv_world_ros.robot.file import described_robot, load_robot, save_robot
 from mtv_world_ros.robot.plan_limits import check_speeds
 
@@ -135,7 +135,7 @@ def test_a_speed_limit_of_zero_is_none_everywhere(tmp_path):
         positions=np.array([[0, 0.2], [0, 0.4], [0, 0.6]]),
     )
     check_speeds(robot, plan, np.zeros(2))
-    assert jumps([plan], robot) == []
+    assert joints_too_fast([plan], robot) == []
     fast = JointTrajectory(
         joint_names=robot.joint_names,
         times=np.array([0.1, 0.12]),
@@ -143,7 +143,7 @@ def test_a_speed_limit_of_zero_is_none_everywhere(tmp_path):
     )
     with pytest.raises(TrajectoryError, match='elbow'):
         check_speeds(robot, fast, np.zeros(2))
-    (said,) = jumps([fast], robot)
+    (said,) = joints_too_fast([fast], robot)
     assert said.startswith("commands of joint 'elbow' jump 1 times (over 2 times 10 a second")
 
 

@@ -13,7 +13,7 @@ from mtv_world_ros.simulation.arm import actuators_of
 from mtv_world_ros.simulation.cameras import camera_model
 from mtv_world_ros.simulation.opengl import load_mujoco, missing_opengl
 from mtv_world_ros.simulation.randomize import draw_scene
-from mtv_world_ros.simulation.scene import check_cameras, corners, scene_xml
+from mtv_world_ros.simulation.scene import box_corners, check_cameras, scene_xml
 from mtv_world_ros.simulation.shapes import SHAPES
 from mtv_world_ros.simulation.simulator import SimEpisode
 from mtv_world_ros.simulation.tasks import TASKS
@@ -88,7 +88,7 @@ def test_projected_block_corners_bound_the_rendered_mask(robot, expert, opengl):
         frame = sim.reset(seed, 'place_block_a2b_left')
         for camera in sim.scene.cameras:
             for number, item in enumerate(sim.scene.objects, 1):
-                pixels, _ = project(camera, camera.T_mount_camera, corners(item))
+                pixels, _ = project(camera, camera.T_mount_camera, box_corners(item))
                 ys, xs = np.nonzero(frame.masks[camera.view] == number)
                 drawn = [xs.min(), ys.min(), xs.max(), ys.max()]
                 np.testing.assert_allclose(

@@ -29,7 +29,7 @@ from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.training.resume import DiskError
 from mtv_world_ros.training.training_config import TrainingRun
-from mtv_world_ros.training.training_run import load_recordings, notes, train
+from mtv_world_ros.training.training_run import load_recordings, train, training_notes
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 from test.support.sources import make_source, make_trainer
 
@@ -138,10 +138,10 @@ def test_a_report_of_other_episodes_is_refused(report):
 
 def test_weights_that_know_other_drawings_are_told(tiny, recording):
     bundled = checkpoint_folder('bundled')
-    said = ' '.join(notes(tiny, [recording], bundled))
+    said = ' '.join(training_notes(tiny, [recording], bundled))
     assert 'rendering.object_motion=true' in said and 'rendering.finger_width_m=0.008' in said
     alike = tiny.replace(rendering=TrajectoryVideoConfig(**read_card(bundled).rendering))
-    assert 'starts from' not in ' '.join(notes(alike, [recording], bundled))
+    assert 'starts from' not in ' '.join(training_notes(alike, [recording], bundled))
 
 
 def test_episodes_of_other_cameras_than_most_are_named(tiny, recording):
@@ -151,9 +151,9 @@ def test_episodes_of_other_cameras_than_most_are_named(tiny, recording):
     moved = replace(
         recording, path=Path('moved'), cameras=(replace(first, T_mount_camera=pose), *rest)
     )
-    said = ' '.join(notes(tiny, [recording, moved, recording]))
+    said = ' '.join(training_notes(tiny, [recording, moved, recording]))
     assert 'other calibrations than most: 1 (moved)' in said
-    assert 'other calibrations' not in ' '.join(notes(tiny, [recording, recording]))
+    assert 'other calibrations' not in ' '.join(training_notes(tiny, [recording, recording]))
 
 
 def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(tiny, source, tmp_path):

@@ -14,7 +14,7 @@ from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.training.fit_control import fitted_control
 from mtv_world_ros.training.training_config import load_training_config, TrainingRun
-from mtv_world_ros.training.training_run import notes
+from mtv_world_ros.training.training_run import training_notes
 
 CONFIG = load_training_config('small')
 DEMO = share_path('resource', 'demo_episode')
@@ -45,7 +45,7 @@ def test_its_card_is_read_once(read, tmp_path):
     robot = load_robot(robot_path('yam_bimanual'))
     recording = load_recording(DEMO, CONFIG.spec, robot)
     fitted_control(tmp_path, CONFIG, [recording], robot, initial=run.initial)
-    notes(CONFIG, [recording], run.initial)
+    training_notes(CONFIG, [recording], run.initial)
     assert read == [opened.folder]
 
 

@@ -18,7 +18,7 @@ from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagMessage
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.viewing import sheets
-from mtv_world_ros.viewing.streams import read_streams, Streams, take
+from mtv_world_ros.viewing.streams import add_message, read_streams, Streams
 
 EPISODE = share_path('resource', 'demo_episode')
 START_NS = 1_700_000_000_000_000_000
@@ -51,7 +51,7 @@ def test_raw_images_of_16_bits_are_shown_whatever_the_order_of_their_bytes(is_bi
         data=np.array([0x1234, 0xFF00], order).view(np.uint8),
     )  # fmt: skip
     streams, data = Streams(), messages.serialize(messages.IMAGE, message)
-    take(streams, BagMessage('/low/image_raw', messages.IMAGE, 1, data))
+    add_message(streams, BagMessage('/low/image_raw', messages.IMAGE, 1, data))
     ((_, frame),) = streams.images['real', 'low']
     assert frame[0, :, 0].tolist() == [0x12, 0xFF]
 
@@ -146,18 +146,18 @@ def test_without_the_extra_one_line_says_so(tmp_path, capsys, monkeypatch):
 
 
 def test_pictures_show_what_there_is_and_grey_where_there_is_nothing(tmp_path):
-    from mtv_world_ros.viewing.sheets import compared, write_pictures
+    from mtv_world_ros.viewing.sheets import comparison_frames, write_pictures
     from mtv_world_ros.viewing.video import decode_video
 
     predictions = write_predictions(tmp_path / 'predictions')
-    alone = compared(read_streams([predictions]))
+    alone = comparison_frames(read_streams([predictions]))
     assert alone.views == ('low',) and alone.times.tolist() == [0.0, 0.2, 0.4]
     assert (alone.real == 225).all() and abs(alone.imagined.astype(int) - 90).max() < 4
-    both = compared(read_streams([EPISODE, predictions]))
+    both = comparison_frames(read_streams([EPISODE, predictions]))
     assert both.real.shape == (1, 3, 72, 96, 3) and both.real.std() > 20
     sheet, video = write_pictures([EPISODE, predictions], predictions)
     assert sheet.stat().st_size > 5000 and len(decode_video(video.read_bytes())) == 3
     # the bag can still be read with the pictures beside it
     assert read_streams([predictions]).kinds == ('trajectory', 'imagined')
     with pytest.raises(EpisodeError, match='no imagined frames'):
-        compared(read_streams([EPISODE]))
+        comparison_frames(read_streams([EPISODE]))

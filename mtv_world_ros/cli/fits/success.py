@@ -209,13 +209,13 @@ def _horizon(
     runs: Sequence[Sequence[EpisodeResult]], summary: EvaluationSummary, made: dict[str, str]
 ) -> HorizonCurve | None:
     """Return J of the objects that move against the horizon; None = nothing moves."""
-    from mtv_world_ros.evaluation.metrics.horizon import curve
+    from mtv_world_ros.evaluation.metrics.horizon import horizon_curve
     from mtv_world_ros.success.calibration import HorizonCurve
 
     rows: dict[str, list] = {}
     for result in (result for run in runs for result in run):
         rows.setdefault(result.episode, []).extend(result.rows)
-    found = curve(list(rows.values()), None, 'j_frames')
+    found = horizon_curve(list(rows.values()), None, 'j_frames')
     if not found.values:
         return None
     return HorizonCurve(

@@ -15,7 +15,7 @@ import numpy as np
 from mtv_world_ros.cameras.silhouettes import draw_silhouettes
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, CameraModel, FloatArray
 from mtv_world_ros.data.recording import Recording
-from mtv_world_ros.evaluation.metrics.picture_scores import changed
+from mtv_world_ros.evaluation.metrics.picture_scores import changed_pixels
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import LinkShape, moving_links
 
@@ -48,7 +48,7 @@ class ArmMasks:
             drawn = arm & self.compared
             if drawn.mean() < _LEAST_ARM:
                 continue
-            seen = changed(frame, self.scene) & self.compared
+            seen = changed_pixels(frame, self.scene) & self.compared
             found.append(float((drawn & seen).sum() / (drawn | seen).sum()))
         return float(np.mean(found)) if found else nan
 

@@ -170,7 +170,7 @@ def load_features(path: Path) -> dict[str, FloatArray]:
         ) from error
 
 
-def distances(episodes: Sequence[dict[str, FloatArray]], view: str) -> dict[str, Estimate]:
+def frechet_distances(episodes: Sequence[dict[str, FloatArray]], view: str) -> dict[str, Estimate]:
     """Return FID and FVD of a view, if measured, from the `load_features` of each episode."""
     found = {}
     for name in DISTANCES:

@@ -32,7 +32,7 @@ class Curve:
         return (self.values[index], self.band[index]) if reached else (None, None)
 
 
-def curve(
+def horizon_curve(
     episodes: Sequence[Sequence[ScoreRow]],
     view: str | None,
     field: str,

@@ -10,7 +10,11 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, FloatArray, ObjectMasks
 from mtv_world_ros.evaluation.imagined_stretches import Stretch
-from mtv_world_ros.evaluation.metrics.object_scores import moves, object_scores, ObjectScores
+from mtv_world_ros.evaluation.metrics.object_scores import (
+    moving_objects,
+    object_scores,
+    ObjectScores,
+)
 from mtv_world_ros.vision.jaccard import held_masks
 from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, Segmenter
 
@@ -154,11 +158,11 @@ def true_masks(
     masks = keep_doubts(first, masks)
     ids = stretch.object_ids
     if ids is None:
-        moving = moves(masks.masks, first.masks[:, :, 0])
+        moving = moving_objects(masks.masks, first.masks[:, :, 0])
         return Truth(first=first, first_frames=start, masks=masks, moving=moving)
     true_first = masks_from_ids(ids[:, :1], objects, names)
     true = masks_from_ids(ids[:, 1:], objects, names)
-    moving = moves(true.masks, true_first.masks[:, :, 0])
+    moving = moving_objects(true.masks, true_first.masks[:, :, 0])
     if stretch.points is not None:
         moving &= ~_stay(stretch.points, objects, names)
     if use_ids:
@@ -235,7 +239,7 @@ def score_rows(
         masks: masks in the predicted frames; None = what is imagined to move is not known.
     """
     first = truth.first.masks[:, :, 0]
-    imagined = np.zeros_like(truth.moving) if masks is None else moves(masks.masks, first)
+    imagined = np.zeros_like(truth.moving) if masks is None else moving_objects(masks.masks, first)
     scores = {**others, 'copy': object_scores(held_masks(first, truth.masks), truth.masks)}
     rows = []
     for v, view in enumerate(views):

@@ -119,7 +119,7 @@ def _boundary(mask: BoolArray) -> BoolArray:
     return found
 
 
-def moves(true: BoolArray, first: BoolArray) -> BoolArray:
+def moving_objects(true: BoolArray, first: BoolArray) -> BoolArray:
     """Return (V, O) whether an object moves in the recording.
 
     It moves if in some frame its mask and its first mask share less than half of the smaller of

@@ -80,7 +80,7 @@ def picture_scores(frames: ByteArray, real: ByteArray, first: ByteArray) -> dict
 def _frame_scores(frame: ByteArray, real: ByteArray, first: ByteArray) -> dict[str, float]:
     error = (frame.astype(np.float64) - real) ** 2
     similar = ssim_map(frame, real)
-    changes, imagined = changed(real, first), changed(frame, first)
+    changes, imagined = changed_pixels(real, first), changed_pixels(frame, first)
     scores = dict.fromkeys((name for name in MEASURES if name != 'j_arm'), nan)
     scores |= {'psnr': _psnr(error), 'ssim': float(similar.mean())}
     if changes.mean() < _LEAST_CHANGED:
@@ -101,7 +101,7 @@ def _psnr(error: NDArray[np.float64]) -> float:
     return float(10 * np.log10(255.0**2 / max(float(error.mean()), 0.25 / error.size)))
 
 
-def changed(frame: ByteArray, first: ByteArray) -> NDArray[np.bool_]:
+def changed_pixels(frame: ByteArray, first: ByteArray) -> NDArray[np.bool_]:
     """Return (H, W) whether a pixel differs between two frames (H, W, 3)."""
     apart = np.abs(frame.astype(np.float32) - first.astype(np.float32)).max(axis=-1)
     return np.asarray(cv2.GaussianBlur(apart, (0, 0), 0.8) > _CHANGED)

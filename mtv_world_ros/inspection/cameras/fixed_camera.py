@@ -23,13 +23,13 @@ from mtv_world_ros.core.errors import CalibrationError
 from mtv_world_ros.core.transforms import looking_along
 from mtv_world_ros.data.episode import Track
 from mtv_world_ros.inspection.camera_pose import (
-    aligned,
     CameraEstimate,
     covered_frames,
+    displaced_pose,
+    jackknife_errors,
     left_out,
-    moved,
-    shrunk,
-    spread,
+    refine_pose,
+    shrunk_camera,
     UNITS,
     with_pose,
 )
@@ -247,7 +247,7 @@ class FixedCamera:
 
     def changes(self, width: int, blur: float, reading: Reading) -> Changes:
         """Return the changed pixels of all pairs, in images of a width and blur [px]."""
-        small = shrunk(self.camera, width)
+        small = shrunk_camera(self.camera, width)
         size = small.width, small.height
         colours = [
             cv2.resize(frame, size, interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -295,7 +295,7 @@ class FixedCamera:
 
         Pixels that differ much, e.g. shadows and parts of the background's colour, count less.
         """
-        return aligned(T, lambda pose: self.errors(pose, changes).ravel(), self.centre,
+        return refine_pose(T, lambda pose: self.errors(pose, changes).ravel(), self.centre,
                        outlier=_OUTLIER)  # fmt: skip
 
     def errors(self, T: FloatArray, changes: Changes) -> NDArray[np.float32]:
@@ -325,7 +325,7 @@ class FixedCamera:
             less = np.asarray(weighted @ slopes[:, part].T, np.float64)
             gradient = np.asarray(weighted @ errors[part], np.float64)
             without.append(moves @ left_out(normal, less, gradient))
-        mm, degrees = spread(np.array(without)) if len(without) > 1 else (0.0, 0.0)
+        mm, degrees = jackknife_errors(np.array(without)) if len(without) > 1 else (0.0, 0.0)
         return (
             float(np.hypot(1000 * np.sqrt(shift), mm)),
             float(np.hypot(np.degrees(np.sqrt(turn)), degrees)),
@@ -337,8 +337,8 @@ class FixedCamera:
         """Return errors (N,), their weights (N,), and their change by each of `UNITS` (6, N)."""
         errors = self.errors(T, changes).ravel()
         slopes = np.stack(
-            [(self.errors(moved(T, row, self.centre), changes)
-              - self.errors(moved(T, -row, self.centre), changes)).ravel() / 2
+            [(self.errors(displaced_pose(T, row, self.centre), changes)
+              - self.errors(displaced_pose(T, -row, self.centre), changes)).ravel() / 2
              for row in np.diag(UNITS)]
         )  # fmt: skip
         return errors, 1 / (1 + (errors / _OUTLIER) ** 2), slopes
@@ -376,7 +376,7 @@ class FixedCamera:
         `steps` (6, 6) are the first ones, in rows [rad, m].
         """
         result = minimize(
-            lambda p: -self.fit(moved(T, p @ steps, self.centre), changes),
+            lambda p: -self.fit(displaced_pose(T, p @ steps, self.centre), changes),
             np.zeros(6),
             method='Nelder-Mead',
             options={
@@ -387,7 +387,7 @@ class FixedCamera:
                 'adaptive': True,
             },
         )
-        return moved(T, np.asarray(result.x) @ steps, self.centre)
+        return displaced_pose(T, np.asarray(result.x) @ steps, self.centre)
 
     def _search(
         self, seed: int, progress: Callable[[Sequence[Any]], Iterable[Any]] = iter
@@ -398,7 +398,7 @@ class FixedCamera:
         reach = float(np.linalg.norm(self.points.reshape(-1, 3) - self.centre, axis=1).max())
         narrowest = min(self.camera.width / self.camera.K[0, 0],
                         self.camera.height / self.camera.K[1, 1])  # fmt: skip
-        rough = [roughened(one) for one in changes.values()]
+        rough = [coarse_changes(one) for one in changes.values()]
         tried = []
         for _ in progress(range(_NUM_CANDIDATES)):
             away = reach / narrowest * generator.uniform(0.7, 3.5)
@@ -434,7 +434,7 @@ class FixedCamera:
         return [float((differs * seen).sum() / norm) for seen in rough]
 
 
-def roughened(changes: Changes) -> NDArray[np.float32]:
+def coarse_changes(changes: Changes) -> NDArray[np.float32]:
     """Return (P, cells) seen changes of a part of the size, without their means, of length 1."""
     pairs, height, width = changes.seen.shape
     height, width = height // _ROUGH, width // _ROUGH

@@ -16,15 +16,15 @@ from scipy.optimize import least_squares
 
 from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.core.data_types import CameraModel, FloatArray
-from mtv_world_ros.inspection.camera_pose import moved, UNITS
+from mtv_world_ros.inspection.camera_pose import displaced_pose, UNITS
 from mtv_world_ros.inspection.cameras.fixed_camera import (
     best_apart,
     Changes,
+    coarse_changes,
     FixedCamera,
     random_camera,
     Reading,
     READINGS,
-    roughened,
 )
 from mtv_world_ros.inspection.places import CameraPlaces, turn_between
 
@@ -68,7 +68,7 @@ LEAST_POINTS = 8
 LEAST_REACH = 0.25
 
 
-def through(camera: CameraModel, lens: FloatArray) -> CameraModel:
+def with_lens(camera: CameraModel, lens: FloatArray) -> CameraModel:
     """Return the camera with another lens.
 
     Args:
@@ -299,7 +299,7 @@ class JointCamera:
         self, number: int, T: FloatArray, lens: FloatArray, places: CameraPlaces
     ) -> JointState:
         """Return the state with a recording's pose, the others turned as their backgrounds say."""
-        focal = through(self._recordings[0].camera, lens).K[[0, 1], [0, 1]]
+        focal = with_lens(self._recordings[0].camera, lens).K[[0, 1], [0, 1]]
         poses = {}
         for other, place in enumerate(self._places):
             if place not in poses:
@@ -330,7 +330,7 @@ class JointCamera:
         members = members[:_NUM_SEARCHED]
         chosen = [self._recordings[n] for n in members]
         changes = [{r: self._changes(n, _SEARCH_STAGE, r) for r in READINGS} for n in members]
-        rough = [[roughened(found) for found in each.values()] for each in changes]
+        rough = [[coarse_changes(found) for found in each.values()] for each in changes]
         points = np.concatenate([one.points.reshape(-1, 3) for one in chosen])
         reach = float(np.linalg.norm(points - self._centre, axis=1).max())
         camera = changes[0][READINGS[0]].camera
@@ -423,7 +423,7 @@ class JointCamera:
     def _point_errors(self, place: int, T: FloatArray, lens: FloatArray) -> FloatArray:
         """(N, 2) how far points are drawn from where they were seen [standard deviations]."""
         points = self._points[place]
-        camera = through(self._recordings[points[0].recording].camera, lens)
+        camera = with_lens(self._recordings[points[0].recording].camera, lens)
         positions = np.stack([point.position for point in points])
         apart = project(camera, T, positions)[0] - np.stack([point.pixel for point in points])
         return np.nan_to_num(apart / (_POINT_STD * camera.width), nan=_BEHIND)
@@ -451,7 +451,8 @@ class JointCamera:
     ) -> NDArray[np.floating]:
         """(6 + L, N) change of errors by a unit of the pose and of what is free of the lens."""
         turns = [
-            errors(moved(T, row, self._centre), lens) - errors(moved(T, -row, self._centre), lens)
+            errors(displaced_pose(T, row, self._centre), lens)
+            - errors(displaced_pose(T, -row, self._centre), lens)
             for row in np.diag(UNITS)
         ]
         bends = [
@@ -511,7 +512,7 @@ class JointCamera:
             of_view = step_of_all[self._shared_rows(place, size)]
             own_step = (-gain[:, :-1] @ of_view - gain[:, -1]).clip(-4, 4)
             change = of_view[:6] + own_step
-            poses[place] = moved(poses[place], change * UNITS, self._centre)
+            poses[place] = displaced_pose(poses[place], change * UNITS, self._centre)
             own_steps[place] = state.own(place) + own_step
         lens = state.lens.copy()
         lens[free] += step_of_all[-num:] * _LENS_UNITS[free]
@@ -524,4 +525,4 @@ class JointCamera:
 
 
 def _through(changes: Changes, lens: FloatArray) -> Changes:
-    return replace(changes, camera=through(changes.camera, lens))
+    return replace(changes, camera=with_lens(changes.camera, lens))

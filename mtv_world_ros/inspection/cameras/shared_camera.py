@@ -21,7 +21,7 @@ from mtv_world_ros.inspection.cameras.joint_camera import (
     JointCamera,
     JointState,
     SeenPoint,
-    through,
+    with_lens,
 )
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.inspection.motion_residual import (
@@ -205,7 +205,8 @@ def _view(
     cameras = [_on_base(episode.cameras[view], robot) for episode in episodes]
     focal = float(np.median([camera.K[0, 0] for camera in cameras]))
     cameras = [
-        through(camera, np.array([np.log(focal / camera.K[0, 0]), 0.0, 0.0])) for camera in cameras
+        with_lens(camera, np.array([np.log(focal / camera.K[0, 0]), 0.0, 0.0]))
+        for camera in cameras
     ]
     recordings = [
         FixedCamera(
@@ -335,7 +336,7 @@ def _judged(
 
     def placed(found: JointState) -> list[CameraModel]:
         return [
-            replace(through(camera, found.lens), T_mount_camera=found.poses[place])
+            replace(with_lens(camera, found.lens), T_mount_camera=found.poses[place])
             for camera, place in zip(view.cameras, view.numbers, strict=True)
         ]
 

@@ -22,14 +22,14 @@ from mtv_world_ros.core.errors import CalibrationError
 from mtv_world_ros.core.transforms import inverse
 from mtv_world_ros.data.episode import Track
 from mtv_world_ros.inspection.camera_pose import (
-    aligned,
     CameraEstimate,
     covered_frames,
-    grey,
+    displaced_pose,
+    grey_image,
+    jackknife_errors,
     left_out,
-    moved,
-    shrunk,
-    spread,
+    refine_pose,
+    shrunk_camera,
     UNITS,
     with_pose,
 )
@@ -231,7 +231,7 @@ class WristCamera:
     def _refined(self, T: FloatArray) -> tuple[FloatArray, float]:
         """Return the pose nearby at which the points fit best, and their median distance [px]."""
         for outlier in (10.0, 2.0, 0.7):
-            T = aligned(T, lambda pose: self._errors(pose).clip(-1e3, 1e3).ravel(),
+            T = refine_pose(T, lambda pose: self._errors(pose).clip(-1e3, 1e3).ravel(),
                         outlier=outlier, iterations=15)  # fmt: skip
         return T, float(np.median(np.linalg.norm(self._errors(T), axis=-1)))
 
@@ -240,8 +240,8 @@ class WristCamera:
         step = 1e-2
         slopes = np.stack(
             [
-                (self._errors(moved(T, step * row, T[:3, 3]))
-                 - self._errors(moved(T, -step * row, T[:3, 3]))) / (2 * step)
+                (self._errors(displaced_pose(T, step * row, T[:3, 3]))
+                 - self._errors(displaced_pose(T, -step * row, T[:3, 3]))) / (2 * step)
                 for row in np.diag(UNITS)
             ],
             axis=-1,
@@ -258,7 +258,7 @@ class WristCamera:
         ]
         variance = float((weights[..., None] * errors[..., None] ** 2).sum()) / _NUM_INDEPENDENT
         shared = np.sqrt(variance * np.diag(np.linalg.pinv(total))) * UNITS
-        mm, degrees = spread(np.stack(without))
+        mm, degrees = jackknife_errors(np.stack(without))
         return (
             float(np.hypot(mm, 1000 * np.linalg.norm(shared[3:]))),
             float(np.hypot(degrees, np.degrees(np.linalg.norm(shared[:3])))),
@@ -321,7 +321,7 @@ def follow_scene(
         CalibrationError: too little moves, or too few points can be tracked.
     """
     indices = covered_frames(track, joints)
-    small = shrunk(camera, _WIDTH)
+    small = shrunk_camera(camera, _WIDTH)
     starts = np.unique(np.linspace(0, len(indices) - 3, _TRACKING.num_stretches).astype(int))
     found = [
         stretch
@@ -409,13 +409,13 @@ def _tracked(track: Track, chosen: np.ndarray, camera: CameraModel) -> FloatArra
 
     It ends where too few are left.
     """
-    before = grey(np.asarray(track.frames[int(chosen[0])]), camera)
+    before = grey_image(np.asarray(track.frames[int(chosen[0])]), camera)
     corners = cv2.goodFeaturesToTrack(before, _TRACKING.max_points, 0.01, 8)
     if corners is None:
         return np.zeros((0, 1, 2))
     paths = _on_corner(before, corners).reshape(-1, 1, 2).astype(np.float64)
     for index in chosen[1:]:
-        after = grey(np.asarray(track.frames[int(index)]), camera)
+        after = grey_image(np.asarray(track.frames[int(index)]), camera)
         start = paths[:, -1].astype(np.float32).reshape(-1, 1, 2)
         ahead, back, ok = _there_and_back(before, after, start)
         kept = ok & (np.linalg.norm((back - start).reshape(-1, 2), axis=1) < _LOST_PX)

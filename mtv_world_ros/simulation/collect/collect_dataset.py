@@ -105,7 +105,7 @@ def collect(
     else:
         num_missed = 0 if config.kinds else failures_of_ten
         jobs = jobs_of(chosen, num_episodes, seed, out, num_missed, config.policies)
-    with locked(out):
+    with dataset_lock(out):
         data_set = _DataSet(out, ZERO_SHOT_SET if kinds else TASKS_SET, seed, config, jobs)
         data_set.make(jobs, workers, config, progress=progress)
         data_set.describe(sheets=sheets)
@@ -117,7 +117,7 @@ def _maker(config: CollectConfig) -> Callable[[CollectJob], None]:
 
 
 @contextmanager
-def locked(out: Path) -> Iterator[None]:
+def dataset_lock(out: Path) -> Iterator[None]:
     """Hold the data set's lock, which ends with the process however that ends.
 
     Raises:

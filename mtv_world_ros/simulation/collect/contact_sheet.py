@@ -50,7 +50,7 @@ def _small(frame: ByteArray, width: int) -> ByteArray:
     return np.pad(small, ((0, 2), (0, 2), (0, 0)), constant_values=_BACKGROUND).astype(np.uint8)
 
 
-def titled(text: str, picture: ByteArray) -> ByteArray:
+def titled_picture(text: str, picture: ByteArray) -> ByteArray:
     """Return a picture (H, W, 3) with a line of text above it."""
     line = np.full((_LINE_PX, picture.shape[1], 3), _BACKGROUND, np.uint8)
     cv2.putText(line, text, (2, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _TEXT_COLOUR, 1, cv2.LINE_AA)
@@ -65,7 +65,7 @@ def _row(out: Path, pair: Sequence[CardEntry | None], num_frames: int, width: in
     strips = [entry and film_strip(out / entry.name, num_frames, width) for entry in pair]
     shape = next(strip.shape for strip in strips if strip is not None)
     blocks = [
-        titled(
+        titled_picture(
             f'{entry.name}: {entry.instruction} ({entry.outcome})' if entry else f'no {outcome}',
             np.full(shape, 235, np.uint8) if strip is None else strip,
         )

@@ -49,7 +49,7 @@ def episode_seed(
     return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
 
-def misses(
+def misses_grasp(
     seed: int, task: str, index: int, zero_shot: str | None = None, num_of_ten: int = NUM_MISSED
 ) -> bool:
     """Return whether this episode is one of the `num_of_ten` whose grasp misses."""
@@ -130,7 +130,7 @@ def _job(
         task=task,
         index=index,
         seed=seed,
-        miss=misses(seed, task.name, index, kind, num_of_ten),
+        miss=misses_grasp(seed, task.name, index, kind, num_of_ten),
         path=out / (name if kind is None else f'{kind}_{name}'),
         zero_shot=kind,
     )

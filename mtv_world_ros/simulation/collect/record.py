@@ -200,7 +200,7 @@ def as_published(commands: JointTrajectory, config: RecordConfig) -> JointTrajec
     """
     num = len(commands.times) - 1
     starts = np.arange(0, num, round(config.chunk_s / CONTROL_PERIOD_S)) * CONTROL_PERIOD_S
-    whole = stitch([(round(s * 1e9), chunk(commands, s, config)) for s in starts], 0)
+    whole = stitch([(round(s * 1e9), action_chunk(commands, s, config)) for s in starts], 0)
     until = 1 + int(np.searchsorted(whole.times, num * CONTROL_PERIOD_S - 1e-9))
     times = np.arange(round(whole.times[:until][-1] / CONTROL_PERIOD_S) + 1) * CONTROL_PERIOD_S
     at = np.minimum(np.arange(len(times)), num)
@@ -213,7 +213,9 @@ def as_published(commands: JointTrajectory, config: RecordConfig) -> JointTrajec
     )
 
 
-def chunk(commands: JointTrajectory, start_s: float, config: RecordConfig) -> JointTrajectory:
+def action_chunk(
+    commands: JointTrajectory, start_s: float, config: RecordConfig
+) -> JointTrajectory:
     """Return the action chunk that starts at `start_s`; past the end the arms hold still."""
     stride = round(config.point_period_s / CONTROL_PERIOD_S)
     num = round(config.chunk_s / config.point_period_s)
@@ -285,7 +287,7 @@ def write_take(
                 _write_frame(writer, sim, take.observations[frame], stamp)
                 frame += 1
             if k % chunk_every == 0 and k < last:
-                commands = chunk(take.commands, k * CONTROL_PERIOD_S, config)
+                commands = action_chunk(take.commands, k * CONTROL_PERIOD_S, config)
                 writer.write_trajectory(stamp, commands)
 
 

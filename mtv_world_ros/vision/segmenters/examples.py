@@ -21,7 +21,7 @@ from mtv_world_ros.core.files import write_whole
 from mtv_world_ros.vision.jaccard import jaccard
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 from mtv_world_ros.vision.segmenters.segmenter import check_request, resize_masks
-from mtv_world_ros.vision.segmenters.tracking import judge, track, TrackingConfig
+from mtv_world_ros.vision.segmenters.tracking import judge_tracks, track, TrackingConfig
 
 #: left, top, right, bottom [px]
 Box = tuple[float, float, float, float]
@@ -379,7 +379,7 @@ class _Follower:
             if first is None or status != 'ok':
                 return masks, status
         self._continue(frames[begun:], taken[begun:], first, start, masks[begun:])
-        return masks, judge(masks, first, _TRACKING) if masks.any() else 'lost'
+        return masks, judge_tracks(masks, first, _TRACKING) if masks.any() else 'lost'
 
     def _find(self, frame: ByteArray, taken: BoolArray) -> tuple[BoolArray, str]:
         """Return the mask (H, W) in a frame without a previous mask, and a status."""

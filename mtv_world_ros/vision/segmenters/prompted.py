@@ -12,7 +12,7 @@ import numpy as np
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks
 from mtv_world_ros.core.errors import ModelMemoryError
 from mtv_world_ros.vision.segmenters.segmenter import check_request
-from mtv_world_ros.vision.segmenters.tracking import judge, TrackingConfig
+from mtv_world_ros.vision.segmenters.tracking import judge_tracks, TrackingConfig
 
 Tensor = Any  # torch is imported where it is used
 
@@ -233,4 +233,4 @@ def _status(doubt: str, first: BoolArray, masks: BoolArray, config: TrackingConf
     """Return the finder's doubt, else the tracker's."""
     if doubt != 'ok':
         return doubt
-    return judge(masks, first, config) if first.any() else 'absent'
+    return judge_tracks(masks, first, config) if first.any() else 'absent'

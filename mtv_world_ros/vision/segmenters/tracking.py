@@ -119,7 +119,7 @@ def track(
     return ObjectTrack(masks=masks, status=state.status)
 
 
-def judge(masks: BoolArray, first: BoolArray, config: TrackingConfig) -> str:
+def judge_tracks(masks: BoolArray, first: BoolArray, config: TrackingConfig) -> str:
     """Return the status of masks that another method tracked.
 
     Args:
@@ -338,5 +338,5 @@ def with_part(
     status = found.status
     if status == 'ok':
         start = next((m for m in (first, *masks) if m is not None and m.any()), None)
-        status = 'ok' if start is None else judge(masks, start, config)
+        status = 'ok' if start is None else judge_tracks(masks, start, config)
     return ObjectTrack(masks=masks, status=status)

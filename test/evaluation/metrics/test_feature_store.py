@@ -5,7 +5,11 @@ import pytest
 
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate
-from mtv_world_ros.evaluation.metrics.feature_store import distances, FeatureTaker, load_features
+from mtv_world_ros.evaluation.metrics.feature_store import (
+    FeatureTaker,
+    frechet_distances,
+    load_features,
+)
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 
 
@@ -36,19 +40,19 @@ def taken(tmp_path):
 
 
 def test_shifted_features_are_at_the_square_of_the_shift(taken):
-    found = distances(taken, 'low')
+    found = frechet_distances(taken, 'low')
     assert found['fid'].value == pytest.approx(2 * 10**2)
     assert found['fid'].num_episodes == 2
 
 
 def test_clips_are_whole_and_what_is_left_over_is_none(taken):
     assert [features['fvd/low/real'][:, 0].tolist() for features in taken] == [[2.0], [2.0, 2.0]]
-    assert distances(taken, 'low')['fvd'].value == pytest.approx(0)
+    assert frechet_distances(taken, 'low')['fvd'].value == pytest.approx(0)
 
 
 def test_view_that_was_not_measured_has_no_distance(taken):
-    assert distances(taken, 'high') == {}
-    assert distances(taken[:1], 'low').keys() == {'fid'}  # one clip has no covariance
+    assert frechet_distances(taken, 'high') == {}
+    assert frechet_distances(taken[:1], 'low').keys() == {'fid'}  # one clip has no covariance
 
 
 def test_broken_file_is_an_error_and_a_missing_one_is_not_measured(tmp_path):

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.evaluation.metrics.jaccard_scores import keep_doubts
-from mtv_world_ros.evaluation.metrics.object_scores import boundary_f, moves, object_scores
+from mtv_world_ros.evaluation.metrics.object_scores import (
+    boundary_f,
+    moving_objects,
+    object_scores,
+)
 from test.support.square_masks import objects, square
 
 
@@ -61,8 +65,8 @@ def test_hiding_an_object_is_no_motion_but_displacing_it_is():
     a, hidden, gone = square(0, 0), square(0, 0), square(40, 20)
     hidden[10:] = False
     true = np.array([[[a, hidden], [a, gone]]])
-    assert moves(true, np.array([[a, a]])).tolist() == [[False, True]]
-    assert not moves(np.array([[[a]]]), np.array([[hidden]])).any()
+    assert moving_objects(true, np.array([[a, a]])).tolist() == [[False, True]]
+    assert not moving_objects(np.array([[[a]]]), np.array([[hidden]])).any()
 
 
 def counted_f(pred, true):

@@ -17,8 +17,8 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import EpisodeError, MtvWorldError, SimulatorError
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode_reader import read_episode, read_info
-from mtv_world_ros.simulation.collect.collect_dataset import collect, locked
-from mtv_world_ros.simulation.collect.episode_jobs import episode_seed, jobs_of, misses
+from mtv_world_ros.simulation.collect.collect_dataset import collect, dataset_lock
+from mtv_world_ros.simulation.collect.episode_jobs import episode_seed, jobs_of, misses_grasp
 from mtv_world_ros.simulation.collect.episode_maker import CollectConfig
 from mtv_world_ros.simulation.collect.record import RecordConfig
 from mtv_world_ros.simulation.randomize import RandomizationConfig
@@ -261,7 +261,10 @@ def test_asking_for_a_part_leaves_the_rest_in_the_card(data_set, tmp_path):
 
 
 def test_two_commands_do_not_write_into_one_set(data_set, tmp_path):
-    with locked(tmp_path), pytest.raises(SimulatorError, match='another `collect` is writing'):
+    with (
+        dataset_lock(tmp_path),
+        pytest.raises(SimulatorError, match='another `collect` is writing'),
+    ):
         _collect(tmp_path)
     assert not _names(tmp_path)
 
@@ -343,7 +346,7 @@ def test_card_counts_and_splits_the_episodes(data_set):
 
 def test_two_of_ten_episodes_miss_one_in_each_split():
     for seed in range(20):
-        chosen = [index for index in range(30) if misses(seed, 'stack_blocks_two', index)]
+        chosen = [index for index in range(30) if misses_grasp(seed, 'stack_blocks_two', index)]
         assert len(chosen) == 6
         assert sorted((index // 10, index % 2) for index in chosen) == [
             (block, split) for block in range(3) for split in range(2)

@@ -4,7 +4,12 @@ import pytest
 from mtv_world_ros.core.errors import SimulatorError, TrajectoryError
 from mtv_world_ros.robot.arm_solver import ArmSolver
 from mtv_world_ros.robot.model import check_positions
-from mtv_world_ros.simulation.collect.record import chunk, expert_generator, RecordConfig, simulate
+from mtv_world_ros.simulation.collect.record import (
+    action_chunk,
+    expert_generator,
+    RecordConfig,
+    simulate,
+)
 from mtv_world_ros.simulation.expert.expert import top_down
 from mtv_world_ros.simulation.simulator import SimEpisode
 from mtv_world_ros.simulation.tasks import TASKS
@@ -109,7 +114,7 @@ def test_chunks_join_to_the_whole_trajectory(sim, expert):
     sim.reset(1, 'stack_blocks_two')
     plan = expert.plan(sim.task, sim.scene, expert_generator(1), miss=False)
     config = RecordConfig()
-    first, second, late = (chunk(plan, start, config) for start in (0.0, 3.2, 6.4))
+    first, second, late = (action_chunk(plan, start, config) for start in (0.0, 3.2, 6.4))
     assert first.times[0] == pytest.approx(0.1) and first.times[-1] == pytest.approx(3.2)
     np.testing.assert_array_equal(first.positions[-1], plan.positions[160])
     np.testing.assert_array_equal(second.positions[0], plan.positions[165])

@@ -19,7 +19,7 @@ from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.training.base_checkpoint import Base, load_base
 from mtv_world_ros.training.batches import BatchSource
 from mtv_world_ros.training.distributed import Processes
-from mtv_world_ros.training.latent_cache import cached, CachedSource
+from mtv_world_ros.training.latent_cache import cached_batches, CachedSource
 from mtv_world_ros.training.objective import pixel_weights, pooled_weights
 from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
 from test.support.sources import make_source, with_batch_size
@@ -69,7 +69,9 @@ def root(tmp_path_factory) -> Path:
 
 def fill(source: BatchSource, root: Path, config: TrainingConfig, base: Base) -> CachedSource:
     processes = Processes('cpu')
-    return cached(source, root, config, base, seed=0, dtype=torch.float32, processes=processes)
+    return cached_batches(
+        source, root, config, base, seed=0, dtype=torch.float32, processes=processes
+    )
 
 
 def test_a_batch_is_what_encoding_the_recorded_clips_gives(source, tmp_path, config, base, capsys):
