@@ -19,9 +19,11 @@ import numpy as np
 import pytest
 import yaml
 
+from mtv_world_ros import judge, Pipeline
 from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.inspection.cameras import joint_camera
 from mtv_world_ros.physics.fitting import contact_fit
 from mtv_world_ros.robot.file import load_robot
@@ -33,7 +35,7 @@ from test.support.crane import FPS, load, make_cameras, make_positions, render, 
 PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'your_robot.md'
 #: names on the page, and those of the test's robot
 NAMES = {'my_robot': 'crane', 'first_bag': 'wave', 'front,side': 'door,palm'}
-VIDEO_NAMES = {'my_robot': 'crane', 'front,side': 'door,window'}
+VIDEO_NAMES = {'my_robot': 'crane', 'front,side': 'door,window', '0001': 'one'}
 #: keep the commands small
 SMALL = {
     'train': ['--threads', '1', *TINY],
@@ -163,6 +165,11 @@ def of_ros(words):
     return words[0] == 'world_model' or words[1] == 'imagine' or '--lock-step' in words
 
 
+def is_route(words):
+    """Whether a line runs an episode: offline, imagined or through the node."""
+    return of_ros(words) or '--offline' in words
+
+
 @pytest.mark.slow
 def test_the_page_leads_from_a_urdf_to_predictions(at_the_desk, capsys):
     done = []
@@ -222,7 +229,7 @@ def test_the_page_leads_from_videos_to_a_contact_sheet(lab, monkeypatch, capsys)
     monkeypatch.setattr(joint_camera, '_STAGES', joint_camera._STAGES[:2])  # the last is finer
     fit = contact_fit.ContactFitSettings(num_draws=8, num_rounds=1)
     monkeypatch.setattr(contact_fit, '_FIT', fit)
-    told = lines(of_videos=True)
+    told = [words for words in lines(of_videos=True) if not is_route(words)]
     assert len(told) <= 8
     for words in told:
         more = FIRST_TRY if words[1] == 'train' else []
@@ -251,6 +258,36 @@ def test_the_page_leads_from_videos_to_a_contact_sheet(lab, monkeypatch, capsys)
             )
             assert np.median(np.linalg.norm(apart, axis=1)) < 4.0  # of 320
             assert abs(found[view].K[0, 0] / camera.K[0, 0] - 1) < 0.07
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec('rclpy') is None, reason='rclpy is not installed')
+def test_recordings_of_videos_run_offline_imagined_judged_and_through_the_node(
+    lab, monkeypatch, capfd
+):
+    """Goes on from what the test above has trained: every route of the page."""
+    folder, _ = lab
+    checkpoint = folder / 'runs' / 'lab' / 'checkpoint'
+    if not checkpoint.is_dir():
+        pytest.skip('the page was not run until here')
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    routes = [words for words in lines(of_videos=True) if is_route(words)]
+    offline, imagine, serve, play = routes
+    for words in (offline, imagine):
+        status = main([*words[1:], *(SMALL['imagine'] if words is imagine else ['--threads=1'])])
+        said = ''.join(capfd.readouterr())
+        assert status == 0, f'{words}: {said}'
+    pipeline = Pipeline.load(checkpoint, segmenter='colour', num_threads=1)
+    recording = load_recording(folder / 'data' / 'lab' / 'one', pipeline.spec, pipeline.robot)
+    assert judge(pipeline, recording).reasons  # why it abstains: a wave is no task
+    node = Node(serve, folder / 'node.log')
+    try:
+        said = run_in_process([*play, *PATIENT])
+    finally:
+        status = node.stop()
+    assert status == 0 and ' done' in said and 'rejected' not in said, said + node.log.read_text()
 
 
 @pytest.mark.slow
