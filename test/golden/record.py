@@ -1,18 +1,22 @@
-"""Digests of what must not change while code moves: plans, bags, results, weights, interfaces.
+"""Records of what must not change while code moves: plans, bags, results, weights, interfaces.
 
     python test/golden/record.py [--only plans,help] [--check [--part K/N]]
 
 writes `test/golden/SECTION.json`, or with `--check` prints the differences from what is there and
 exits with 1 where there are any. It uses the commands and looks modules up by their last name,
-so that a moved module is found. One thread; seeds are fixed. What comes of floating-point numbers
-is equal on the same machine with the same packages; plans are rounded to a microradian.
+so that a moved module is found. One thread; seeds are fixed.
+
+Texts, counts and stamps are equal on every machine; plans are, to a microradian. Pictures and
+what is computed from them are not: processors and packages differ in the last bits of rendering,
+JPEG and bfloat16. Of these the record has coarse pictures, means and deviations, and `TOLERANCES`
+says how far they may be apart.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import contextlib
 import difflib
 from functools import cache
@@ -46,6 +50,20 @@ SEEDS, ONE_ARM = (0, 1), 'franka'
 TASKS = 'place_bread_plate,shake_bottle'
 #: of plans and kinds: from which policy on, and every which
 PART = [1, 1]
+#: numbers that are compared with a tolerance, by their keys: absolute, and relative to the record
+TOLERANCES = (
+    (re.compile(r'(replay|collect): .*joints'), (0.002, 0.0)),  # [rad or m]
+    (re.compile(r'(replay|collect): .*images'), (0.02, 0.0)),  # 5 of 255 grey levels
+    (re.compile(r'(replay|collect): .*masks'), (0.003, 0.0)),  # fraction of the pixels
+    (re.compile(r'(replay|collect): .*success'), (0.03, 0.0)),  # probability
+    (re.compile(r'(evaluate|rank): '), (0.03, 0.05)),
+    (re.compile(r'train: '), (1e-5, 0.01)),
+)
+#: sections with such numbers
+_APPROXIMATE = ('replay', 'collect', 'evaluate', 'rank', 'train')
+#: width and height of a coarse picture
+_COARSE = (8, 6)
+_NUMBER = re.compile(r'[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?')
 #: keys of results that differ from run to run, and texts with a path or a time in them
 _RUN_KEYS = re.compile(
     r'(^|_)(seconds|s|date|time|times|created|path|version|machine|host|commit)$'
@@ -111,21 +129,59 @@ def lasting(value: Any) -> Any:
     return _RUN_TEXT.sub('PATH', value) if isinstance(value, str) else value
 
 
-def results(out: Path) -> dict[str, str]:
-    """Return digests of all JSON files under a folder, without what differs from run to run."""
-    texts = {
-        str(path.relative_to(out)): json.dumps(lasting(json.loads(path.read_text())))
+def results(out: Path) -> dict[str, Any]:
+    """Return a summary of all JSON files under a folder, without what differs from run to run."""
+    return {
+        str(path.relative_to(out)): summary(lasting(json.loads(path.read_text())))
         for path in sorted(out.rglob('*.json'))
     }
-    return {name: digest(text) for name, text in texts.items()}
 
 
-def weights(out: Path) -> dict[str, str]:
-    """Return digests of all tensor files of a checkpoint."""
-    paths = sorted(out.rglob('*.safetensors'))
-    return {
-        str(p.relative_to(out)): digest(p.read_bytes()) for p in paths if 'state' not in str(p)
-    }
+def summary(value: Any) -> dict[str, Any]:
+    """Return the numbers of a result by key, lists as count, mean and deviation; texts by shape.
+
+    Numbers inside of texts are left out: they are those of the results, rounded.
+    """
+    numbers, texts = defaultdict(list), defaultdict(set)
+
+    def add(key: str, one: Any) -> None:
+        if isinstance(one, dict):
+            for name, inner in one.items():
+                add(f'{key}.{name}' if key else name, inner)
+        elif isinstance(one, list):
+            for inner in one:
+                add(f'{key}[]', inner)
+        elif isinstance(one, (int, float)) and not isinstance(one, bool):
+            numbers[key].append(float(one))
+        else:
+            texts[key].add(_NUMBER.sub('#', str(one)))
+
+    add('', value)
+    found: dict[str, Any] = {key: spread(values) for key, values in sorted(numbers.items())}
+    return found | {f'{key} (text)': digest('|'.join(sorted(t))) for key, t in texts.items()}
+
+
+def spread(values: Any) -> list[float]:
+    """Return count, mean and standard deviation of the finite numbers, to six digits."""
+    import numpy as np
+
+    kept = np.asarray(values, np.float64).ravel()
+    kept = kept[np.isfinite(kept)]
+    mean, deviation = (kept.mean(), kept.std()) if len(kept) else (0.0, 0.0)
+    return [len(kept), float(f'{mean:.6g}'), float(f'{deviation:.6g}')]
+
+
+def weights(out: Path) -> dict[str, Any]:
+    """Return count, mean and deviation of the numbers in each tensor file of a checkpoint."""
+    import numpy as np
+
+    load = import_module('safetensors.torch').load_file
+    found = {}
+    for path in sorted(out.rglob('*.safetensors')):
+        if 'state' not in str(path):
+            tensors = [t.float().numpy().ravel() for t in load(path).values()]
+            found[str(path.relative_to(out))] = spread(np.concatenate(tensors))
+    return found
 
 
 def plans() -> dict[str, Any]:
@@ -250,31 +306,50 @@ def node() -> dict[str, Any]:
         running.wait(30)
 
 
-def replay() -> dict[str, str]:
-    """All messages of the demo episode's offline replay, by topic, without seconds."""
-    from mcap.reader import make_reader
-
-    out, by_topic = folder() / 'replay', defaultdict(sha256)
-    demo = ROOT / 'resource' / 'demo_episode'
+def replay() -> dict[str, Any]:
+    """Contents of the demo episode's offline replay by topic: stamps, pictures, numbers, texts."""
+    out, demo = folder() / 'replay', ROOT / 'resource' / 'demo_episode'
     command('replay', '--offline', demo, '--out', out, '--threads', 1)
-    with next(out.rglob('*.mcap')).open('rb') as file:
-        for _, channel, message in make_reader(file).iter_messages():
-            data = message.data
-            if channel.topic.endswith('/report'):
-                texts = re.findall(rb'[ -~]{3,}', data)
-                pairs = zip([b'', *texts], texts, strict=False)
-                data = b'\n'.join(t for key, t in pairs if not key.startswith(b'stage_s'))
-            by_topic[channel.topic].update(data)
-    return {topic: whole.hexdigest() for topic, whole in sorted(by_topic.items())}
+    return contents(out)
 
 
-def collect() -> dict[str, str]:
+def contents(bag: Path) -> dict[str, Any]:
+    """Return what a bag shows: stamps exactly, levels of pictures [0..1] and numbers as spread."""
+    shown = module('streams').read_streams([bag])
+    found: dict[str, Any] = {}
+    for name, streams in (('images', shown.images), ('masks', shown.masks)):
+        for (kind, view), frames in sorted(streams.items()):
+            found[f'{name} {kind} {view}'] = {
+                'stamps': digest(str([stamp for stamp, _ in frames])),
+                'shape': str(frames[0][1].shape),
+                **{at: _levels(frames[k][1]) for at, k in (('first', 0), ('last', -1))},
+            }
+    for kind in sorted({one[0] for one in shown.joints}):
+        rows = [positions for of, _, _, positions in shown.joints if of == kind]
+        columns = zip(*rows, strict=True)
+        found[f'joints {kind}'] = [spread(column) for column in columns]
+    found['success'] = [float(f'{value:.4g}') for _, value in shown.success]
+    words = [_NUMBER.sub('#', text) for _, text in shown.words if 'stage_s' not in text]
+    return found | {'words': sorted(set(words))}
+
+
+def _levels(frame: Any) -> list[float]:
+    """Return the grey levels [0..1] of a coarse picture, or the area of each object in a mask."""
+    import numpy as np
+
+    if frame.ndim == 2:
+        return [round(count / frame.size, 5) for count in np.bincount(frame.ravel())]
+    small = module('images').resize_frames(frame[None], *_COARSE)
+    return (small.mean(axis=-1).ravel() / 255).round(3).tolist()
+
+
+def collect() -> dict[str, Any]:
     """Recordings of simulated episodes."""
-    paths = sorted(episodes().rglob('*.mcap'))
-    return {p.name: digest(p.read_bytes()) for p in paths}
+    bags = sorted(path.parent for path in episodes().rglob('*.mcap'))
+    return {bag.name: contents(bag) for bag in bags}
 
 
-def evaluate() -> dict[str, str]:
+def evaluate() -> dict[str, Any]:
     """Scores of the bundled model on two episodes, and its calibration on all."""
     fixed = ('--workers', 1, '--threads', 1, '--steps', 1, '--split', 'all', '--out')
     more = {'evaluate': ('--no-report', '--episodes', 2), 'calibrate': ('--no-store',)}
@@ -284,7 +359,7 @@ def evaluate() -> dict[str, str]:
     return results(folder() / 'results')
 
 
-def rank() -> dict[str, str]:
+def rank() -> dict[str, Any]:
     """A ranking of three policies in two tasks."""
     out, policies = folder() / 'ranking', 'expert,expert-high-0.06,expert-stop-0.3'
     command('rank', '--policies', policies, '--tasks', TASKS, '--episodes', 2, '--out', out,
@@ -292,7 +367,7 @@ def rank() -> dict[str, str]:
     return results(out)
 
 
-def train() -> dict[str, str]:
+def train() -> dict[str, Any]:
     """Weights after twenty steps of `train`."""
     out = folder() / 'trained'
     command('train', episodes(), '--out', out / 'world', '--preset', 'small', '--threads', 1,
@@ -309,7 +384,42 @@ SECTIONS: dict[str, Callable[[], dict[str, Any]]] = {
 def _text(name: str, found: dict[str, Any]) -> str:
     if name == 'kinds':  # a line each
         return json.dumps(found).replace('], "', '],\n "') + '\n'
-    return json.dumps(found, indent=1, ensure_ascii=False) + '\n'
+    text = json.dumps(found, indent=1, ensure_ascii=False) + '\n'
+    if name not in _APPROXIMATE:
+        return text
+    return re.sub(r'\[[^\[\]{}"]*\]', lambda found: ' '.join(found[0].split()), text)
+
+
+def differences(name: str, recorded: Any, now: Any) -> list[str]:
+    """Return how a section differs from its record; some numbers may be off by a tolerance."""
+    if name in _APPROXIMATE:
+        return list(_apart(f'{name}: ', recorded, now))
+    texts = (_text(name, one).split('\n') for one in (recorded, now))
+    return list(difflib.unified_diff(*texts, 'recorded', 'now', n=1))
+
+
+def _apart(key: str, one: Any, other: Any) -> Iterator[str]:
+    """Yield the keys at which two records differ by more than the tolerance."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        for name in sorted({*one, *other}):
+            if name in one and name in other:
+                yield from _apart(f'{key}{name}. ', one[name], other[name])
+            else:
+                yield f'{key}{name}: {"recorded" if name in one else "now"} alone'
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        for number, pair in enumerate(zip(one, other, strict=True)):
+            yield from _apart(f'{key}{number}. ', *pair)
+    elif not _is_close(key, one, other):
+        yield f'{key}{one} recorded, {other} now'
+
+
+def _is_close(key: str, one: Any, other: Any) -> bool:
+    """Return whether two values are equal, or two numbers within the tolerance of their key."""
+    if not (isinstance(one, int | float) and isinstance(other, int | float)):
+        return one == other
+    least, share = next((t for keys, t in TOLERANCES if keys.match(key)), (0.0, 0.0))
+    are_none = one != one and other != other
+    return are_none or one == other or abs(one - other) <= least + share * abs(one)
 
 
 def main() -> int:
@@ -335,8 +445,7 @@ def main() -> int:
         before = json.loads(path.read_text())
         if PART != [1, 1]:
             before = {key: value for key, value in before.items() if key in found}
-        recorded, now = (_text(name, one).split('\n') for one in (before, found))
-        lines = list(difflib.unified_diff(recorded, now, 'recorded', 'now', n=1))
+        lines = differences(name, before, json.loads(_text(name, found)))
         differs |= bool(lines)
         print(f'{name}: {"differs" if lines else "equal"}', *lines, sep='\n')
     return int(differs)
