@@ -10,7 +10,7 @@ from rosbags.typesys import get_typestore, Stores
 from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.data_types import CameraModel, JointTrajectory
-from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.errors import CalibrationError, EpisodeError
 from mtv_world_ros.core.files import content_digest
 from mtv_world_ros.data import episode_cameras
 from mtv_world_ros.data.bag.reader import BagReader
@@ -209,3 +209,23 @@ def test_apply_leaves_the_bag_of_a_users_own_recording_and_says_what_makes_an_ep
     command[2] = str(tmp_path / 'e' / 'e_0.mcap')
     assert main(command) == 1
     assert 'import bag' in capsys.readouterr().err
+
+
+def test_camera_info_is_of_the_videos_size_whatever_size_the_calibration_is_for(tmp_path, capsys):
+    path = write(tmp_path / 'e')
+    save_calibration(path / 'calibration.yaml', {'door': camera('door', 140.0, size=(128, 96))})
+    calibration = (path / 'calibration.yaml').read_bytes()
+    command = ['fit', 'camera', str(path), '--view', 'door', '--apply']
+    assert main(command) == 0
+    infos = [row for _, row in found_by_rosbags(path, '/door/camera_info')]
+    assert {(row.width, row.height) for row in infos} == {SIZE}
+    assert (path / 'calibration.yaml').read_bytes() == calibration  # kept as it was
+    read = read_episode(path, views=['door'])
+    np.testing.assert_allclose(infos[0].k.reshape(3, 3), read.cameras['door'].K)
+    np.testing.assert_allclose(read.cameras['door'].K[0, 0], 70.0)
+    assert not [text for text in read.warnings if "the file's are used" in text]
+    save_calibration(path / 'calibration.yaml', {'door': camera('door', size=(128, 72))})
+    with pytest.raises(CalibrationError, match=r'64x48.*128x72'):
+        read_episode(path, views=['door'])
+    assert main(command) == 1
+    assert '128x72' in capsys.readouterr().err

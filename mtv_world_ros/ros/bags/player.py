@@ -27,7 +27,7 @@ from mtv_world_ros.core.errors import (
     TrajectoryError,
 )
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
-from mtv_world_ros.data.episode import CALIBRATION_FILE
+from mtv_world_ros.data.episode import CALIBRATION_FILE, METADATA_NAME, parse_info
 from mtv_world_ros.data.episode_cameras import views_without_info
 from mtv_world_ros.ros.messages.conversions import (
     has_header,
@@ -169,6 +169,7 @@ class Player(Node):
         self._unpublished: set[tuple[str, str]] = set()
         self.create_subscription(DiagnosticArray, options.report_topic, self._on_report, 100)
         self._hint = self._describe_cameras(types)
+        self._say_objects(types)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         self._peers = Peers(self)
@@ -252,6 +253,22 @@ class Player(Node):
         )
         self.get_logger().warning(text)
         return text
+
+    def _say_objects(self, types: dict[str, str]) -> None:
+        """Say which objects the episode has: no topic carries their names to the node."""
+        if TRAJECTORY not in {types[topic] for topic in self._outputs}:
+            return
+        values = self._reader.metadata.get(METADATA_NAME, {})
+        try:
+            names = parse_info(self._options.episode, values).objects
+        except EpisodeError as error:  # which keeps no topic from being played
+            self.get_logger().warning(str(error))
+            return
+        if names:
+            self.get_logger().info(
+                'the objects of this episode have names: world_model takes them with -p '
+                f'"objects:={list(names)}", else from its describer or the instruction'
+            )
 
     def _offer(self, msgtype: str, topic: str) -> Publisher:
         is_state = topic.rsplit('/', 1)[-1] in _STATES

@@ -53,6 +53,7 @@ def write_episode(folder, ros, *, has_infos=True):
         task='stack_blocks_two',
         instruction='stack the red block on the blue block',
         robot='yam_bimanual',
+        objects=('red block', 'blue block'),
         cameras=list(cameras.values()),
     ) as writer:
         writer.write_instruction(START_NS)
@@ -187,7 +188,10 @@ def test_stamps_are_moved_to_now_but_stay_in_step(episode, launch, ros):
         client.wait(lambda: len(client.received['/plan']) == 2, 'two plans')
         client.wait(lambda: len(client.received['/joint_states']) == NUM_STEPS, 'joint states')
         client.wait(lambda: len(client.received[IMAGE]) == NUM_STEPS, 'images')
-        assert finish(player)[0] == 0
+        code, said = finish(player)
+        assert code == 0, said
+        assert """-p "objects:=['red block', 'blue block']\"""" in said
+        assert 'world_model takes them with -p calibration_file:=FILE' in said
         stamps = {
             topic: np.array([to_ns(m.header.stamp) for m in messages])
             for topic, messages in client.received.items()
