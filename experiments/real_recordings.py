@@ -18,6 +18,7 @@ all, PSNR, and J of moving objects, with and without the memory of the backgroun
 from __future__ import annotations
 
 import argparse
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from math import isnan, nan
@@ -33,6 +34,7 @@ from mtv_world_ros.core.data_types import FloatArray, WorldModelSpec
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import load_recording, Recording
+from mtv_world_ros.data.recordings import commands_until
 from mtv_world_ros.evaluation.imagined_stretches import (
     imagine_stretch,
     predicted_frames,
@@ -132,7 +134,7 @@ def compare_carried(arguments: argparse.Namespace) -> None:
             for score in _foreseen(replace(held, objects=recording.names), recording, stretch)
         ]
         scores = np.array(found).reshape(-1, 2)
-        rows.append((recording.path.name, len(scores), *_means(scores)))
+        rows.append((recording.path.name, str(len(scores)), *_means(scores)))
     print(table(('recording', 'view-objects that move', 'J foreseen', 'J held'), rows))
 
 
@@ -150,9 +152,10 @@ def _foreseen(
         rows = np.arange(stretch.start + 1)
         episode.observe(recording.frames[:, rows[1:]], recording.positions[rows])
         episode = episode.branch(recording.observation(stretch.start))
-    imagined = list(episode.extend(recording.commands_from(stretch)))
-    del imagined
-    objects = episode.state.objects.found
+    seconds = stretch.num_frames / pipeline.spec.fps
+    deque(episode.extend(commands_until(recording, stretch.start, seconds)), maxlen=0)
+    objects = episode.objects
+    assert objects is not None
     truth = true_masks(
         stretch, pipeline.segmenter, recording.names, recording.objects, use_ids=True
     )

@@ -20,6 +20,7 @@ from mtv_world_ros.core.data_types import (
 )
 from mtv_world_ros.core.errors import RolloutPreempted
 from mtv_world_ros.core.images import resize_frames
+from mtv_world_ros.physics.object_motion import FoundObjects
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import ChunkPlan, Plan
 from mtv_world_ros.rollout.options import RolloutOptions
@@ -107,6 +108,11 @@ class Rollout:
     def camera_check(self) -> CameraCheck:
         """Calibration check on the first frames; its corrections are applied."""
         return self._states[0].camera_check
+
+    @property
+    def objects(self) -> FoundObjects | None:
+        """Objects that are foreseen, and how they moved; None = nothing is foreseen so far."""
+        return self._states[0].objects.found
 
     @property
     def names(self) -> tuple[str, ...]:
