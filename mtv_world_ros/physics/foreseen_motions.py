@@ -32,6 +32,7 @@ class ForeseenMotions:
         is_fitted: contact parameters were fitted in this robot cell; False = they are drawn from
             the prior, and each motion may be the one that this robot makes every time.
         shown: index of the motion that the pictures show.
+        tools: (A, N, 3) where the tools are commanded to be [m]; None = not known.
     """
 
     names: tuple[str, ...]
@@ -44,6 +45,7 @@ class ForeseenMotions:
     is_begun: bool = True
     is_fitted: bool = True
     shown: int = 0
+    tools: FloatArray | None = None
 
     def at_frames(self, plan: ChunkPlan) -> FloatArray:
         """Return centres (K, 1 + T, O, 3) at the start and the frames kept of a chunk [m].
@@ -78,4 +80,5 @@ def foreseen_of(
         is_begun=is_begun,
         is_fitted=objects.tracked.is_fitted,
         shown=objects.shown,
+        tools=robot.tool_poses(objects.positions[kept])[..., :3, 3],
     )

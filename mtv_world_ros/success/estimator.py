@@ -26,7 +26,7 @@ from mtv_world_ros.success.foreseen import (
 from mtv_world_ros.success.relations import Margin
 from mtv_world_ros.success.rollout_memory import Footage, remember, RolloutMemory
 from mtv_world_ros.success.share_fit import ShareEstimate, ShareFit
-from mtv_world_ros.success.situation import grippers_open, OPEN_SHARE
+from mtv_world_ros.success.situation import grippers_open, grippers_released
 from mtv_world_ros.success.task import load_tasks, match_task, object_called, TaskSpec
 from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
@@ -102,8 +102,6 @@ def capped(probability: float, features: Mapping[str, float]) -> float:
     return min(probability, UNDONE_PROBABILITY) if closed or left else probability
 
 
-#: distance of a tool from an object's centre beyond which it does not hold the object [m]
-AWAY_M = 0.1
 #: reason against an estimate while a gripper has not let go, by `TaskSpec.gripper`
 _STILL_CLOSED = {
     'open': 'a gripper is still closed (a task with `gripper: released` allows it away from what '
@@ -398,10 +396,8 @@ def _released(task: TaskSpec, views: Views, subjects: Sequence[int]) -> float:
         return nan
     if task.gripper == 'open' or footage.tools is None:
         return float(grippers_open(footage.openings)[-1])
-    holding = footage.tools[footage.openings[:, -1] <= OPEN_SHARE, -1]
-    points = views.memory.points[subjects, -1]
-    away = np.linalg.norm(holding[:, None] - points[None], axis=-1)
-    return float((away > AWAY_M).all())  # NaN = not seen, which may be held
+    points = views.memory.points[subjects, -1:]
+    return float(grippers_released(footage.openings[:, -1:], footage.tools[:, -1:], points)[-1])
 
 
 def _check_views(task: TaskSpec, footage: Footage) -> None:

@@ -53,6 +53,12 @@ class ImaginedScene:
     sigmas: dict[str, float] = field(default_factory=dict)
     _ends: dict[str, Location] = field(default_factory=dict)
 
+    @property
+    def tools(self) -> FloatArray | None:
+        """See `Situation`; those of the last frame."""
+        tools = self.views.footage.tools
+        return None if tools is None else tools[:, -1:]
+
     def item(self, role: str) -> int:
         """Return the index of a placeholder's object."""
         return self.views.index(self.bound[role])

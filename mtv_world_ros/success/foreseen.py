@@ -135,6 +135,9 @@ def _is_done(
     turns = np.concatenate([turns[:1], turns])
     openings = motions.openings[number]
     openings = np.concatenate([openings[:, :1], openings], axis=1)
+    tools = motions.tools
+    if tools is not None:
+        tools = np.concatenate([tools[:, :1], tools], axis=1)
     sizes = {
         role: _size(motions.sizes[number, item], task.sizes_m.get(role))
         for role, item in items.items()
@@ -144,6 +147,7 @@ def _is_done(
         rotations={role: turns[:, item] for role, item in items.items()},
         sizes=sizes,
         openings=openings,
+        tools=tools,
     )
     return ever_and_final(task.holds(poses, openings))[1]
 

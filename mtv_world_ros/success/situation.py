@@ -14,6 +14,8 @@ from mtv_world_ros.core.errors import CannotTell
 
 #: minimum opening of an open gripper [fraction of its range]
 OPEN_SHARE = 0.8
+#: distance of a tool from an object's centre beyond which it does not hold the object [m]
+AWAY_M = 0.1
 
 
 class Situation(Protocol):
@@ -23,6 +25,11 @@ class Situation(Protocol):
     table. A situation may know where objects are only at the end; then T = 1. Every method raises
     CannotTell where the answer is not known.
     """
+
+    @property
+    def tools(self) -> FloatArray | None:
+        """Positions (A, T, 3) of the tools [m]; None = not known."""
+        ...
 
     def centres(self, role: str) -> FloatArray:
         """Return the object's centre (T, 3) [m]."""
@@ -68,6 +75,7 @@ class TruePoses:
         openings: (A, T) gripper openings in 0..1.
         goals: role -> (3,) where the object's centre is to be [m]; of tasks whose goal is drawn
             with the scene.
+        tools: (A, T, 3) where the tools are [m]; None = not known.
     """
 
     positions: Mapping[str, FloatArray]
@@ -75,6 +83,7 @@ class TruePoses:
     sizes: Mapping[str, tuple[float, float, float]]
     openings: FloatArray
     goals: Mapping[str, FloatArray] = field(default_factory=dict)
+    tools: FloatArray | None = None
 
     def centres(self, role: str) -> FloatArray:
         """See `Situation`."""
@@ -120,3 +129,20 @@ class TruePoses:
 def grippers_open(openings: FloatArray) -> BoolArray:
     """Return (T,) where every gripper of (A, T) `openings` is open."""
     return np.all(np.asarray(openings) > OPEN_SHARE, axis=0)
+
+
+def grippers_released(
+    openings: FloatArray, tools: FloatArray | None, centres: FloatArray
+) -> BoolArray:
+    """Return (T,) where every gripper is open, or away from the objects that it was to move.
+
+    Args:
+        openings: (A, T) of the grippers, 0 closed to 1 open.
+        tools: (A, T, 3) where they are [m]; None = not known, so that only open ones count.
+        centres: (M, T, 3) of the objects [m], NaN = not known, which may be held.
+    """
+    is_free = np.asarray(openings) > OPEN_SHARE
+    if tools is not None and len(centres):
+        away = np.linalg.norm(tools[:, None] - centres[None], axis=-1)
+        is_free = is_free | (away > AWAY_M).all(1)
+    return np.all(is_free, axis=0)

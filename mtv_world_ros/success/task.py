@@ -14,7 +14,7 @@ from mtv_world_ros.core.config import expected, ListOf, read_yaml, Schema, valid
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import ConfigError, nearest
 from mtv_world_ros.success.relations import EXPECTED, KINDS, Length, Lengths3, Relation
-from mtv_world_ros.success.situation import grippers_open, Situation
+from mtv_world_ros.success.situation import grippers_open, grippers_released, Situation
 from mtv_world_ros.vision.describers.describer import ends_phrase
 
 GRIPPERS = ('open', 'released', 'any')
@@ -144,8 +144,11 @@ class TaskSpec(Schema):
             for margin in relation.margins(at)
             if margin.is_required
         ]
-        if self.gripper != 'any':  # poses alone do not say how far away a gripper is
+        if self.gripper == 'open':
             held.append(grippers_open(openings))
+        elif self.gripper == 'released':
+            centres = np.stack([at.centres(role) for role in self.movers])
+            held.append(grippers_released(openings, at.tools, centres))
         return np.all(held, axis=0)
 
     def bind(self, instruction: str, *, with_articles: bool = True) -> dict[str, str] | None:

@@ -348,3 +348,23 @@ def test_resting_on_something_depends_on_its_size(size, offset, succeeds):
     rests = RestsOn(kind='rests_on', subject='a', target='b')
     at = situation({'a': B + [offset], 'b': B}, sizes={'a': (0.05, 0.05, 0.05), 'b': size})
     assert bool(holds(rests, at)[0]) is succeeds
+
+
+@pytest.mark.parametrize(
+    ('openings', 'away', 'released'),
+    [([1.0, 1.0], 0.0, True), ([0.3, 1.0], 0.0, False), ([0.3, 1.0], 0.2, True)],
+)
+def test_a_gripper_that_is_shut_away_from_what_it_moved_has_released_it(openings, away, released):
+    task = TaskSpec(
+        name='t',
+        instruction='{a} {b}',
+        relations=(RestsOn(kind='rests_on', subject='a', target='b'),),
+        gripper='released',
+    )
+    shut = np.array([[openings[0]], [openings[1]]])
+    at = situation({'a': B + [[0, 0, 0.05]], 'b': B}, openings=shut)
+    tools = np.array([B + [[0, 0, 0.06 + away]], B + [[0.4, 0, 0.3]]])
+    assert task.holds(replace(at, tools=tools), shut).tolist() == [released]
+    # where the tools are not known, only open grippers have let go
+    assert task.holds(at, shut).tolist() == [min(openings) == 1.0]
+    assert task.replace(gripper='any').holds(at, shut).tolist() == [True]
