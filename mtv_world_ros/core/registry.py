@@ -18,13 +18,13 @@ class Registry:
     """Named classes of one kind; one is imported when it is chosen.
 
     Attributes:
-        kind: what the classes are, for error texts, e.g. `control`.
+        kind: kind of the classes, for error texts, e.g. `control`.
         bundled: name -> `module:Class` of the package.
-        group: entry points by which other packages add some.
+        group: group of the entry points of other packages.
         setting: option or key that chooses one, e.g. `video.control`.
-        required: names that a class must have.
-        made_required: names that an instance must have, see `create`.
-        protocol: where those are described.
+        required: attributes that a class must have.
+        made_required: attributes that an instance must have, see `create`.
+        protocol: name of the protocol that describes these names.
         others: further valid values of the setting, for error texts; empty = there are none.
         extras: package that a class imports -> extra of this package that installs it.
     """

@@ -83,11 +83,11 @@ _OUTCOME_WORDS = {
 
 
 def parse_outcome(value: Any, where: str) -> str:
-    """Return the outcome that a recorded value means, of `OUTCOMES`.
+    """Return the entry of `OUTCOMES` that a recorded value means.
 
     Args:
-        value: word, truth value or number 0 or 1; or a column of them, whose rows say success if
-            one does, else failure if one does.
+        value: word, truth value or number 0 or 1; or a column of values, which is a success if
+            one row is, else a failure if one row is.
         where: source of the value, for error texts.
 
     Raises:

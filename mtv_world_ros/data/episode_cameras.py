@@ -43,7 +43,7 @@ def is_imported(path: Path) -> bool:
 
 
 def views_without_info(path: Path, topics: Collection[str]) -> list[str]:
-    """Return the calibrated views of an episode whose images have no CameraInfo beside them.
+    """Return the calibrated views of an episode whose images have no CameraInfo.
 
     Args:
         path: folder of the episode.
@@ -101,10 +101,10 @@ def write_cameras(
 
 @dataclass(slots=True)
 class _Content:
-    """What a bag holds of some views.
+    """Images and CameraInfos of some views in a bag.
 
     Attributes:
-        reader: its reader, after a whole pass.
+        reader: reader of the bag, after a whole pass.
         topics: topic of the images that are used, by view.
         num_images: number of images, by view.
         infos: serialised CameraInfos of each view without their headers, each value once.

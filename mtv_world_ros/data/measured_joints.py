@@ -46,18 +46,18 @@ class ReachSettings:
     still: float = 1e-3
     #: maximum number of publishers that are distinguished
     num_publishers: int = 32
-    #: a fast step belongs to a motion if a step beside it has the same sign and this fraction of
+    #: a fast step belongs to a motion if a neighbouring step has the same sign and this fraction of
     #: its speed
     smooth_ratio: float = 0.2
     #: fraction of a joint's steps up to which fast ones are taken as motion; of a wrong unit more
     #: are
     fast_ratio: float = 0.3
-    #: time between two steps of a joint that are beside each other [s]
+    #: time between two neighbouring steps of a joint [s]
     beside_s: float = 0.2
     #: longest time for which a sample repeats the joint's last measurement [s]
     repeated_s: float = 0.25
-    #: live: newest samples of a joint that are looked at, and how many of them must be out of
-    #: reach for two publishers
+    #: live: number of newest samples of a joint that are tested, and number of jumps among
+    #: these samples that means two publishers
     window: int = 64
     least_turns: int = 4
 
@@ -157,7 +157,7 @@ class JointReach:
             given = np.isfinite(positions[:, joint])
             values, seconds = positions[given, joint], times[given]
             gaps = np.diff(seconds[1:][np.diff(values) != 0])
-            if len(gaps):  # rests make some of them longer
+            if len(gaps):  # some gaps are longer for rests
                 held_s = min(float(np.quantile(gaps, 0.25)), self.settings.repeated_s)
                 other.noise[joint] += self.speed[joint] * max(held_s - period, 0.0)
         return other
@@ -387,7 +387,7 @@ def _steady_speeds(times: FloatArray, positions: FloatArray, reach: JointReach) 
     """Return (J,) the speeds of joints that move steadily beyond their reach; 0 = they do not.
 
     A glitch or another publisher goes forth and back, and a changed zero is a single step. The
-    steps of a motion have others of their sign beside them. Repeated positions are left out:
+    steps of a motion have neighbours of the same sign. Repeated positions are left out:
     tables may have more rows than the joint has measurements.
     """
     settings, found = reach.settings, np.zeros(positions.shape[1])

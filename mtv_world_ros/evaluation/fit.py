@@ -127,7 +127,7 @@ def samples_of(
     Args:
         runs: runs of the same episodes, one run a seed.
         kinds: faults of the policies that acted, by episode; episodes may be missing.
-        physics: names of the simulated physics, likewise.
+        physics: names of the simulated physics, by episode; episodes may be missing.
     """
     known_kinds, known_physics = kinds or {}, physics or {}
     by_name = [{result.episode: result for result in run} for run in runs]

@@ -103,7 +103,7 @@ class CameraSource(Schema):
 
     @property
     def is_known(self) -> bool:
-        """Whether the mapping states the camera."""
+        """True if the mapping states the camera."""
         return self.calibration is not None or self.camera is not None
 
     @property

@@ -153,7 +153,7 @@ class ContactSettings(Schema):
     def as_prior(self) -> ContactSettings:
         """Return the settings with the wide prior of the parameters in place of their fit.
 
-        It is the prior with which `mtv-world fit contact` begins: log-normal around these
+        It is the initial prior of `mtv-world fit contact`: log-normal around these
         settings, within `RANGES`. The first future keeps the settings.
         """
         factors = [getattr(self, name) if name in FACTORS else 1.0 for name in RANGES]

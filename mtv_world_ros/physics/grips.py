@@ -21,7 +21,7 @@ from mtv_world_ros.robot.model import RobotModel
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GripSettings:
-    """What counts as a grip.
+    """Definition of a grip.
 
     Attributes:
         max_opening: largest opening of a gripper that holds something [fraction of its range].

@@ -111,7 +111,7 @@ class Rollout:
 
     @property
     def objects(self) -> FoundObjects | None:
-        """Objects that are foreseen, and how they moved; None = nothing is foreseen so far."""
+        """Objects that are foreseen, and how they moved; None = nothing is foreseen."""
         return self._states[0].objects.found
 
     @property

@@ -209,7 +209,7 @@ class SceneKeeper:
     def _after_contact(
         self, memory: SceneMemory, robot: BoolArray, found: BoolArray
     ) -> SceneMemory:
-        """Return the memory with the objects that the robot comes near to in all views.
+        """Return the memory with the objects that the robot approaches in all views.
 
         A view in which the robot stays away from an object shows that it does not touch it.
         """

@@ -83,7 +83,7 @@ class NodeEvents(SensingEvents, Protocol):
         ...
 
     def give_up(self, rollout: int, text: str) -> None:
-        """Pre-empts one plan, by the number of its rollout, for a reason in words."""
+        """Pre-empt one plan, by the number of its rollout, for a reason in words."""
         ...
 
 

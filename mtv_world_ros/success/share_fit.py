@@ -17,8 +17,10 @@ from mtv_world_ros.core.data_types import FloatArray
 PSEUDO_COUNT = 1.0
 #: coverage of intervals
 COVERAGE = 0.95
-#: quantiles of the share, and of the logistic, over which an interval is computed
-_NUM_SHARES, _NUM_FITS = 199, 19
+#: number of quantiles of the share over which an interval is computed
+_NUM_SHARES = 199
+#: number of quantiles of the logistic over which an interval is computed
+_NUM_FITS = 19
 #: distance of an object between the imagined frames and the drawn motion beyond which the frames
 #: contradict the motion, where no calibration states one [m]
 MAX_PICTURE_GAP_M = 0.06
@@ -33,7 +35,7 @@ class ShareEstimate(NamedTuple):
 
 
 def shrunk_share(share: float, num_futures: float) -> float:
-    """Return the posterior mean of a success rate of which a share of futures was drawn."""
+    """Return the posterior mean of the success rate, given a share of successful futures."""
     return (share * num_futures + PSEUDO_COUNT) / (num_futures + 2 * PSEUDO_COUNT)
 
 

@@ -16,8 +16,10 @@ from mtv_world_ros.core.bounded_input import check_limit, read_arrays
 
 #: arrays of fewer bytes are read: a mapping takes whole pages
 MAPPED_BYTES = 1 << 16
-#: size of the fixed part of a member's header in a zip file, place of two lengths in it [bytes]
-_HEADER_BYTES, _LENGTHS_AT = 30, 26
+#: size of the fixed part of a member's header in a zip file [bytes]
+_HEADER_BYTES = 30
+#: place of the two lengths in that header [bytes]
+_LENGTHS_AT = 26
 #: bytes from which the header of an array is read; NumPy writes 128
 _ARRAY_HEADER_BYTES = 4096
 

@@ -136,7 +136,7 @@ def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
 
 
 def result_physics(paths: Sequence[Path]) -> dict[str, str]:
-    """Returns the physics of simulated episodes, by what their results are called."""
+    """Return the physics of simulated episodes, by the names of their results."""
     from mtv_world_ros.data.episode_reader import read_info
     from mtv_world_ros.evaluation.evaluate_episodes import result_names
 

@@ -52,7 +52,7 @@ def copy_metadata(reader: BagReader, writer: BagWriter) -> None:
 
 
 def copy_companions(source: Path, folder: Path) -> None:
-    """Copy what lies beside the messages in a bag's folder, such as its calibration."""
+    """Copy the other files of a bag's folder, such as its calibration."""
     if source.is_file():
         return
     for path in source.iterdir():

@@ -1,8 +1,8 @@
 """EXIF orientation of JPEG and PNG files.
 
 Decoders differ. ROS's (`compressed_image_transport`, OpenCV with IMREAD_UNCHANGED) and Pillow
-show pixels as they are stored. Hugging Face's `datasets`, with which LeRobot reads images, and
-OpenCV by default turn them.
+show pixels as they are stored. Hugging Face's `datasets` (LeRobot's reader) and OpenCV by
+default turn them.
 """
 
 from __future__ import annotations

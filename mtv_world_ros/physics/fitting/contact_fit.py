@@ -617,7 +617,7 @@ def _joint_draws(
 ) -> tuple[ContactDraw, ...]:
     """Return `MAX_MOTIONS` equally likely joint samples of draws (N, P) with weights (N,).
 
-    Their order is that of a van der Corput sequence along `_HOLD`, so that the first few of them
+    Their order is that of a van der Corput sequence along `_HOLD`, so that the first few
     are spread evenly over what decides whether things slip.
     """
     order = np.argsort(logs @ [_HOLD.get(name, 0) for name in RANGES], kind='stable')

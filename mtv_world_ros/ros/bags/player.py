@@ -125,7 +125,7 @@ class PlayedPlan:
 
     @property
     def is_open(self) -> bool:
-        """Whether an answer is waited for."""
+        """True while an answer is waited for."""
         return not self.state
 
 

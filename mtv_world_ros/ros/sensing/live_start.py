@@ -105,13 +105,13 @@ def _observe(
 
 
 class LiveObserver(Node):
-    """A node that makes one observation of cameras, joint states, description and TF.
+    """Node that makes one observation of cameras, joint states, description and TF.
 
-    Images may be raw or compressed; a view of which both are published is taken raw.
+    Images may be raw or compressed; raw images are preferred where both are published.
 
     Args:
         spec: spec of the world model; names the views.
-        robot: the checkpoint's.
+        robot: robot of the checkpoint.
         cameras_file: poses of the views where neither `calibration_file` nor TF has them.
         context: ROS context of the node.
 
@@ -306,7 +306,7 @@ class LiveObserver(Node):
         return [raw] if self.count_publishers(raw) else [raw, compressed]
 
     def _problem(self, why: str) -> str:
-        """Why there is no observation, in words that name the topics."""
+        """Return the reason why there is no observation, with the topics."""
         either = {self._image_names(view)[0]: self._image_topics(view) for view in self._views}
         silent, unheard = [], []
         for subscription in self._observations:

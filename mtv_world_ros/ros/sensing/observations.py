@@ -120,7 +120,7 @@ class ObservationBuffer:
 
     @property
     def awaits_first(self) -> bool:
-        """Whether images of a view, or states of a joint, never came; refused ones did."""
+        """True if images of a view, or states of a joint, never came; refused ones did."""
         samples = (*self._images.values(), *self._joints.values())
         return any(not one and not one.refusal for one in samples)
 

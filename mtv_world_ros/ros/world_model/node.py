@@ -98,7 +98,7 @@ class WorldModelNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Pre-empts the plan that runs and refuses others."""
+        """Pre-empt the plan that runs and refuse others."""
         assert self._rollouts is not None
         self._rollouts.deactivate()
         return TransitionCallbackReturn.SUCCESS
@@ -110,7 +110,7 @@ class WorldModelNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Pre-empts the plan that runs; the model is freed once its end was reported."""
+        """Pre-empt the plan that runs; the model is freed once its end was reported."""
         if self._rollouts is not None:
             self._rollouts.deactivate()
         return TransitionCallbackReturn.SUCCESS

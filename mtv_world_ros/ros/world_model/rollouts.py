@@ -369,7 +369,7 @@ class Rollouts:
         self._results.trigger()
 
     def give_up(self, rollout: int, text: str) -> None:
-        """Pre-empts one plan if it still runs or waits."""
+        """Pre-empt one plan if it still runs or waits."""
         self._worker.give_up(rollout, text)
 
     def on_image(self, view: str, message: Image | CompressedImage) -> None:

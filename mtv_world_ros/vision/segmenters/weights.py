@@ -28,12 +28,12 @@ WEIGHTS_VARIABLE = 'MTV_WORLD_WEIGHTS'
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SegmenterOptions:
-    """What a segmenter is created for.
+    """Options of a segmenter: name, weights, device.
 
     Attributes:
         name: name by which it was chosen.
         weights: folder of public weights, at any depth up to two; None = there is none.
-        device: of the models: `cpu`, `cuda`, ...
+        device: device of the models: `cpu`, `cuda`, ...
     """
 
     name: str
