@@ -46,8 +46,8 @@ class ReachSettings:
     still: float = 1e-3
     #: maximum number of publishers that are distinguished
     num_publishers: int = 32
-    #: a fast step belongs to a motion if a neighbouring step has the same sign and this fraction of
-    #: its speed
+    #: a fast step belongs to a motion if a neighbouring step has the same sign and this
+    #: fraction of its speed
     smooth_ratio: float = 0.2
     #: fraction of a joint's steps up to which fast ones are taken as motion; of a wrong unit more
     #: are

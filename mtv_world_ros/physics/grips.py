@@ -29,8 +29,8 @@ class GripSettings:
         max_step: largest change of the opening between two rows of fingers that have stopped
             [fraction of the range].
         opens_by: increase of the opening at which a gripper lets go [fraction of its range].
-        reach_m: largest distance of the tool point from the outline of what it holds, by which
-            cameras may be off [m].
+        reach_m: largest distance of the tool point from the outline of what it holds: the error of
+            the cameras [m].
         max_width_ratio: largest narrow side of what fits between the fingers [widest opening].
     """
 

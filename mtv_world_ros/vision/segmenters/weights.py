@@ -31,7 +31,7 @@ class SegmenterOptions:
     """Options of a segmenter: name, weights, device.
 
     Attributes:
-        name: name by which it was chosen.
+        name: name that the user chose.
         weights: folder of public weights, at any depth up to two; None = there is none.
         device: device of the models: `cpu`, `cuda`, ...
     """
