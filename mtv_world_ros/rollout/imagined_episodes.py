@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, cycle, islice
 import json
 from math import isfinite, nan
 from pathlib import Path
+from queue import Empty, SimpleQueue
 import shutil
+from threading import Thread
 import time
 from typing import Any
 
@@ -298,10 +299,15 @@ class _EpisodeRun:
         try:
             policy = make(self._start.origin)
             self._policy = policy.name
-            run = run_policy(
-                _NamedErrors(policy), world, seed=self._seed, max_chunks=self._options.max_chunks
-            )
+            with _PolicyThread(policy, self._left_s) as asked:
+                run = run_policy(
+                    asked, world, seed=self._seed, max_chunks=self._options.max_chunks
+                )
             self._how, self._text = _HOW[run.end], ''
+        except _NoAnswerError:
+            limit = self._options.max_seconds
+            self._how = 'max_seconds'
+            self._text = f'the policy had not answered when {limit:g} s were over'
         except RolloutPreempted:
             limit = self._options.max_seconds
             self._how, self._text = 'max_seconds', f'it took longer than {limit:g} s'
@@ -316,8 +322,12 @@ class _EpisodeRun:
         finally:
             self._num_chunks = world.num_answers
 
+    def _left_s(self) -> float:
+        """Time that is left of the episode's longest time on the wall [s]."""
+        return self._begun_s + self._options.max_seconds - time.monotonic()
+
     def _is_late(self) -> bool:
-        return time.monotonic() - self._begun_s > self._options.max_seconds
+        return self._left_s() < 0
 
 
 class _RecordedWorld(ImaginedWorld):
@@ -355,29 +365,58 @@ class _RecordedWorld(ImaginedWorld):
         self.is_recording_broken = False
 
 
-class _NamedErrors:
-    """A policy whose errors of any kind are `PolicyError`s."""
+class _NoAnswerError(PolicyError):
+    """The policy did not answer in time."""
 
-    def __init__(self, policy: Policy) -> None:
-        self._policy, self.name = policy, policy.name
+
+class _PolicyThread:
+    """A policy that is asked in a thread of its own, so that one that hangs ends the episode.
+
+    Its errors of any kind are `PolicyError`s.
+
+    Args:
+        policy: the policy; all its calls come from one thread.
+        left_s: returns the time that it may take now [s].
+    """
+
+    def __init__(self, policy: Policy, left_s: Callable[[], float]) -> None:
+        self._policy, self._left_s, self.name = policy, left_s, policy.name
+        self._questions = SimpleQueue[Callable[[], JointTrajectory | None] | None]()
+        self._answers = SimpleQueue[JointTrajectory | None | BaseException]()
+
+    def __enter__(self) -> _PolicyThread:
+        # a daemon: one that hangs does not keep the process from ending
+        Thread(target=self._run, name='policy', daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._questions.put(None)
 
     def reset(self, *, seed: int) -> None:
         """Begin an episode."""
-        with _policy_errors():
-            self._policy.reset(seed=seed)
+        self._ask(lambda: self._policy.reset(seed=seed))
 
     def act(self, observation: Observation, instruction: str) -> JointTrajectory | None:
         """Return the policy's answer."""
-        with _policy_errors():
-            return self._policy.act(observation, instruction)
+        return self._ask(lambda: self._policy.act(observation, instruction))
 
+    def _ask(self, question: Callable[[], JointTrajectory | None]) -> JointTrajectory | None:
+        self._questions.put(question)
+        try:
+            answer = self._answers.get(timeout=max(self._left_s(), 0.0))
+        except Empty:
+            raise _NoAnswerError(f"policy '{self.name}' has not answered") from None
+        if isinstance(answer, PolicyError):
+            raise answer
+        if isinstance(answer, Exception):  # a policy is a user's code
+            raise PolicyError(f'{type(answer).__name__}: {answer}') from answer
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
 
-@contextmanager
-def _policy_errors() -> Iterator[None]:
-    """Turn what a policy raises into a `PolicyError`."""
-    try:
-        yield
-    except PolicyError:
-        raise
-    except Exception as error:  # a policy is a user's code
-        raise PolicyError(f'{type(error).__name__}: {error}') from error
+    def _run(self) -> None:
+        while (question := self._questions.get()) is not None:
+            try:
+                self._answers.put(question())
+            except BaseException as error:
+                self._answers.put(error)
