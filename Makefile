@@ -1,6 +1,6 @@
 # `make` installs into .venv; nothing here needs root. `make help` lists the targets.
 .DEFAULT_GOAL := install
-.PHONY: help install demo test test-all fast-tests slow-tests tiers style types fuzz kills soak attacks lint format docs clean distclean upstream
+.PHONY: help install demo test test-all fast-tests slow-tests tiers style types fuzz kills soak attacks lint format docs clean distclean upstream lerobot-tests
 
 # .venv has its own ROS: a native one that is sourced, or wheels of another environment, would load
 # in its place.
@@ -85,6 +85,19 @@ attacks: $(STAMP)  ## plans at 10 Hz, clients in default settings, lifecycle cyc
 	$(BIN)/python -m test.robustness.listeners
 	$(BIN)/python -m test.robustness.hostile_peer
 	MTV_WORLD_ATTACKS=all $(BIN)/python -m pytest -q test/robustness/test_commands.py test/robustness/test_examples.py
+
+# LeRobot needs older versions of some packages: an environment that has them first, then those of .venv
+LEROBOT := .venv/lerobot
+$(LEROBOT)/.installed: requirements/lerobot_reader.txt $(STAMP)
+	@rm -rf $(LEROBOT) && $(BIN)/python -m venv $(LEROBOT)
+	@$(LEROBOT)/bin/python -m pip install --quiet --no-deps --requirement $<
+	@site=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))') && \
+		own=$$($(LEROBOT)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))') && \
+		echo "import site; site.addsitedir('$$site')" > $$own/packages_of_venv.pth
+	@touch $@
+
+lerobot-tests: $(LEROBOT)/.installed  ## LeRobot's own reader and writer against ours (a minute)
+	OMP_NUM_THREADS=1 $(LEROBOT)/bin/python -m pytest -q -rs -p no:cacheprovider test/importing/test_lerobot_reader.py
 
 upstream:  ## show what libraries do otherwise than documented, and which work-around of ours each guards (minutes)
 	@for script in test/upstream/*.sh; do echo "== $$script"; bash $$script || failed="$$failed $$script"; done; \

@@ -1,7 +1,10 @@
 """LeRobot's own reader opens what `export lerobot` writes; what LeRobot writes is imported.
 
-Both need LeRobot: `pip install lerobot`, in an environment of its own with this package.
+Both need LeRobot: `make lerobot-tests` installs it in an environment of its own.
 """
+
+from importlib.util import find_spec
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,12 +22,33 @@ VIEW = 'observation.images.side'
 JOINTS = ('shoulder', 'elbow', 'gripper')
 
 
+def define_operators() -> None:
+    """Define the operators that torchvision describes where its own library cannot be loaded.
+
+    Wheels of the registry are built for CUDA; reading data sets uses none of the operators.
+    """
+    import torch
+
+    spec = find_spec('torchvision')
+    if spec is None or spec.origin is None:
+        return
+    try:
+        torch.ops.load_library(Path(spec.origin).with_name('_C.so'))
+    except OSError:
+        for name in ('nms', 'qnms'):
+            if not hasattr(torch.ops.torchvision, name):
+                schema = '(Tensor dets, Tensor scores, float iou_threshold) -> Tensor'
+                torch.library.define(f'torchvision::{name}', schema)
+
+
 @pytest.fixture
 def lerobot(tmp_path, monkeypatch):
     """LeRobot's module of data sets, which may not ask its hub."""
     monkeypatch.setenv('HF_HUB_OFFLINE', '1')
     monkeypatch.setenv('HF_HOME', str(tmp_path / 'home'))
-    reason = 'lerobot is not installed (pip install lerobot, in an environment of its own)'
+    reason = 'lerobot is not installed (make lerobot-tests)'
+    pytest.importorskip('lerobot', reason=reason)
+    define_operators()
     return pytest.importorskip('lerobot.datasets.lerobot_dataset', reason=reason)
 
 
