@@ -80,6 +80,11 @@ class Registry:
             found: Any = import_module(module)
             for part in filter(None, attribute.split('.')):
                 found = getattr(found, part)
+        except SystemExit as error:
+            raise ConfigError(
+                f"{self.kind} '{name}' cannot be imported: '{module}' is a script that ends the "
+                "program; put what it runs under if __name__ == '__main__'"
+            ) from error
         except Exception as error:  # a third-party module may raise anything
             raise ConfigError(
                 f"{self.kind} '{name}' cannot be imported: {error or type(error).__name__}"

@@ -103,6 +103,14 @@ def test_a_segmenter_that_cannot_be_used_is_refused_with_the_reason(choice, said
         choose_segmenter(choice)
 
 
+def test_a_script_that_runs_when_it_is_imported_is_refused(tmp_path, monkeypatch):
+    text = 'import argparse\nargparse.ArgumentParser().parse_args(["--unknown"])\n'
+    (tmp_path / 'my_script.py').write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError, match="'my_script' is a script that ends the program; put"):
+        choose_segmenter('my_script:Mine')
+
+
 @pytest.mark.parametrize('name', SEGMENTERS)
 def test_every_segmenter_of_the_package_finds_nothing_in_an_empty_picture(name):
     frames = np.full((2, 3, 24, 32, 3), 128, np.uint8)
