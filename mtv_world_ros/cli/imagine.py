@@ -35,7 +35,8 @@ def add_replay(commands: argparse._SubParsersAction) -> None:
         'replay',
         help='play an episode into ROS topics, or imagine it offline (MCAP to MCAP)',
         epilog='Without --offline it takes the options of the ROS player (--rate, --loop, '
-        '--clock, --lock-step, ...): see python -m mtv_world_ros.ros.bags.player --help.',
+        '--clock, --lock-step, ...): see python -m mtv_world_ros.ros.bags.player --help. '
+        'Exit status: 1 if a plan was rejected, failed or got no answer.',
         allow_abbrev=False,
     )
     parser.add_argument('episode', type=Path, help='folder of the episode')
@@ -76,7 +77,13 @@ def _replay(arguments: argparse.Namespace) -> int:
     pictures = write_pictures([out], out)
     print(summary)
     print(f'written: {" ".join(map(str, pictures))}')
-    return 0
+    if summary.rejected:
+        num_plans = len(summary.rejected) + summary.num_trajectories
+        sys.stderr.write(
+            f'mtv-world: {len(summary.rejected)} of {num_plans} plans were not imagined, the '
+            f'first: {summary.rejected[0][1]}\n'
+        )
+    return int(bool(summary.rejected))
 
 
 def _play(arguments: argparse.Namespace) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import json
 import os
 from pathlib import Path
@@ -12,8 +13,11 @@ import cv2
 import numpy as np
 import pytest
 
-from mtv_world_ros.cli import main
+from mtv_world_ros.cli import imagine, main
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.rollout import offline
+from mtv_world_ros.rollout.offline import ReplaySummary
+from mtv_world_ros.viewing import sheets
 
 
 def run(*arguments: str, cwd: Path, timeout: float = 300) -> subprocess.CompletedProcess[str]:
@@ -185,3 +189,29 @@ def test_memory_that_does_not_suffice_is_told_in_a_line(monkeypatch, capsys, err
     assert main(['view', 'x']) == 1
     said = capsys.readouterr().err
     assert said.startswith(f'mtv-world: {error}') and 'the memory does not suffice' in said
+
+
+@pytest.mark.parametrize('num_rejected', [0, 2])
+def test_an_offline_replay_fails_if_plans_were_rejected_and_says_the_first(
+    num_rejected, tmp_path, monkeypatch, capsys
+):
+    """The predictions of the others are written all the same."""
+
+    @dataclass(frozen=True)
+    class AnyPipeline:
+        describer: object = None
+
+    rejected = [(10**9 * k, f'joints would jump at {k} s') for k in range(num_rejected)]
+    summary = ReplaySummary(out=tmp_path, num_trajectories=4, rejected=rejected)
+    monkeypatch.setattr(imagine, 'open_checkpoints', lambda *_: (None,))
+    monkeypatch.setattr(imagine, 'pipeline_of', lambda _: AnyPipeline())
+    monkeypatch.setattr(offline, 'replay_offline', lambda *_, **__: summary)
+    monkeypatch.setattr(sheets, 'write_pictures', lambda *_: ())
+    out = str(tmp_path / 'out')
+    status = main(['replay', str(tmp_path), '--offline', '--out', out])
+    said = capsys.readouterr()
+    assert status == int(num_rejected > 0)
+    assert '4 trajectories' in said.out
+    if num_rejected:
+        first = '2 of 6 plans were not imagined, the first: joints would jump at 0 s'
+        assert said.err == f'mtv-world: {first}\n'
