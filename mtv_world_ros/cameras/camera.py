@@ -230,8 +230,8 @@ def triangulate(
     Both are NaN where the rays are parallel or meet behind a camera.
 
     Args:
-        cameras: V >= 2 cameras.
-        T_base_camera: their poses (4, 4).
+        cameras: two or more cameras (V).
+        T_base_camera: poses (4, 4) of the cameras.
         pixels: (V, 2), the same point in each view.
 
     Raises:

@@ -28,7 +28,7 @@ class Intrinsics:
         width: width of the full resolution [px]; 0 = not given, then it is that of the images.
         height: height of the full resolution [px]; 0 = not given.
         matrix: the nine entries of K, or of rectified images those of P's left part [px].
-        distortion_model: as in the message.
+        distortion_model: distortion model as in the message.
         distortion: coefficients.
         window: region of interest and binning.
     """

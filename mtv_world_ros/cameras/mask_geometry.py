@@ -115,7 +115,7 @@ def upright_extents(
         cameras: cameras of the V views.
         T_base_camera: pose of each camera, (4, 4) [m].
         masks: masks of the object in each view, (V, H, W); empty = not seen.
-        point: (3,) its centre [m].
+        point: (3,) centre of the object [m].
     """
     shown = []
     for camera, pose, mask in zip(cameras, T_base_camera, masks, strict=True):

@@ -183,7 +183,7 @@ class Observation:
     """Camera frames and joint positions at one instant.
 
     Attributes:
-        cameras: V calibrated views, in the model's order, for the size of `frames`.
+        cameras: calibrated cameras of the V views, in the model's order, for the size of `frames`.
         frames: (V, H, W, 3) uint8 RGB.
         positions: (J,) positions in the robot's joint order [rad or m].
         stamp_ns: time of the frames [ns].
@@ -246,8 +246,8 @@ class History:
         """Return the history of the next chunk, which starts from the last predicted frame.
 
         Args:
-            start_frame: (V, H, W, 3) where the chunk started.
-            predicted: (V, T, H, W, 3) its frames.
+            start_frame: (V, H, W, 3) frame that the chunk started from.
+            predicted: (V, T, H, W, 3) frames of the chunk.
             num_kept: most frames to keep.
         """
         newest = predicted[:, max(predicted.shape[1] - 1 - num_kept, 0) : -1]
@@ -271,7 +271,7 @@ class MultiViewVideo:
     """Observed, trajectory or predicted frames of all views on one clock.
 
     Attributes:
-        views: V names.
+        views: names of the V views.
         times: (T,) [s], relative to the observation the video belongs to.
         frames: (V, T, H, W, 3) uint8 RGB.
     """
@@ -291,7 +291,7 @@ class ObjectMasks:
     """Masks of named objects in a video.
 
     Attributes:
-        names: O names.
+        names: names of the O objects.
         masks: (V, O, T, H, W) bool.
         status: V tuples of O words: `ok`, or why the mask is not to be trusted: never seen
             (`absent`), seen and then missing (`lost`; `out_of_view` from the image's edge on),

@@ -33,7 +33,7 @@ class Stopped(KeyboardInterrupt):
     """A signal asks the process to stop.
 
     Attributes:
-        signum: its number.
+        signum: number of the signal.
     """
 
     def __init__(self, signum: int) -> None:

@@ -61,7 +61,7 @@ class EvaluationJob:
     """One episode to score.
 
     Attributes:
-        path: its folder.
+        path: folder of the episode.
         name: name of its results, unique in the evaluation.
         donors: episodes that may lend their actions; the first one that can be read does.
         zero_shot: what the model was not trained for in it: `view`, `task`, `object`; or empty.

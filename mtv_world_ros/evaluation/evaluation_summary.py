@@ -36,7 +36,7 @@ class Group:
     """Episodes that are summed up together; None = any.
 
     Attributes:
-        task: their task.
+        task: task of the episodes.
         zero_shot: `seen`, or what the model was not trained for in them.
     """
 

@@ -32,7 +32,7 @@ class Stretch:
     """Recorded stretch of an episode that one rollout is compared with.
 
     Attributes:
-        index: its number in the episode.
+        index: number of the stretch in the episode.
         start: recorded frame it starts from.
         frames: (V, 1 + T, H, W, 3) recorded frames on the model's clock, frame 0 the start.
         object_ids: (V, 1 + T, H, W) true masks as identities, None where not recorded.

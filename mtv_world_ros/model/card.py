@@ -163,7 +163,7 @@ def check_same_model(card: CheckpointCard, adapter: Path) -> None:
 
     Args:
         card: card of the checkpoint.
-        adapter: its folder; one without a card of its own is not checked.
+        adapter: folder of the adapter; one without a card of its own is not checked.
 
     Raises:
         CheckpointError: the adapter was trained for another model.

@@ -29,14 +29,14 @@ class Conditioning:
     Attributes:
         control: (B, V, C, F, h, w) of the control's video, in step with the denoised latents;
             zero where the control feeds none.
-        start_control: (B, V, C, h, w) of its frame 0.
+        start_control: (B, V, C, h, w) latents of the control's frame 0.
         start: (B, V, C, F, h, w) the start image's channel slot.
-        reference: (B, V, C, h, w) of the start image.
+        reference: (B, V, C, h, w) latents of the start image.
         text: (B, 512, text_dim) umT5 tokens of the prompt, in models with text.
         negative_text: tokens of the text that guidance leads away from; None = no guidance.
         image: (B, V * 257, image_dim) CLIP tokens of the start image.
-        anchor: (B, V, C, h, w) of the rollout's first frame, where reference tokens show that.
-        history: (B, V, C, P, h, w) of what was seen before, in models that take it.
+        anchor: (B, V, C, h, w) latents of the rollout's first frame, if reference tokens show it.
+        history: (B, V, C, P, h, w) latents of earlier frames, in models that take them.
         history_sigmas: (B,) noise levels of the history, 1 = there is none.
         context: (B, L) indices or (B, L, size) vectors of the control, where it feeds them.
         frame: (B, 1 + T, size) vectors of the control, where it feeds them.

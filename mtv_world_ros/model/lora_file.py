@@ -97,7 +97,7 @@ class PeftSettings(Schema):
 
         Args:
             module: name of the module in the file.
-            rank: rank of its factors.
+            rank: rank of the module's factors.
 
         Raises:
             ConfigError: another rank than the settings say, or no alpha.

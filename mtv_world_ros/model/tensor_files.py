@@ -28,8 +28,8 @@ class StoredTensor:
     """A tensor that has not been read.
 
     Attributes:
-        shape: its shape.
-        dtype: its number format in safetensors' words, e.g. `BF16`.
+        shape: shape of the tensor.
+        dtype: number format in safetensors' words, e.g. `BF16`.
         read: reads it.
     """
 

@@ -141,7 +141,7 @@ class PartReport:
         source: file or folder they came from.
         loaded: tensors written.
         parameters: numbers in them.
-        dtypes: their number formats.
+        dtypes: number formats of the tensors.
         new: tensors that the source lacks, zero now.
         unused: tensors that were left out, and why.
     """

@@ -44,9 +44,9 @@ def flow_of(transformer: MultiViewWanTransformer, out: Tensor, noisy: Tensor, si
     """Return the flow (noise - clean) whatever the transformer predicts.
 
     Args:
-        transformer: its `config.prediction` says what `out` is.
-        out: (B, V, C, F, h, w) its output.
-        noisy: (B, V, C, F, h, w) its input.
+        transformer: transformer; its `config.prediction` says what `out` is.
+        out: (B, V, C, F, h, w) output of the transformer.
+        noisy: (B, V, C, F, h, w) input of the transformer.
         sigma: noise level of `noisy`, broadcastable to it, > 0.
     """
     if transformer.prediction == 'flow':

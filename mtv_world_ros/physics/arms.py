@@ -85,11 +85,11 @@ class Arms:
 
     Args:
         robot: robot with any number of arms; its base stands still.
-        response: how its joints follow their commands; None = nothing was found yet.
+        response: fitted response of the joints to their commands; None = not fitted yet.
 
     Attributes:
-        robot: the same, with inertias for all of its bodies.
-        response: as given.
+        robot: robot with inertias for all of its bodies.
+        response: response of the joints.
         notes: assumptions about the robot, as text.
         drives: drives of its joints, with the numbers of free air.
 

@@ -26,7 +26,7 @@ def load_foresight(folder: Path, robot: RobotModel, threads: int = 1) -> SolidFo
     """Read the files of `fit contact`; None = no foresight, verdicts rest on frames alone.
 
     Args:
-        folder: that it wrote.
+        folder: folder that the fit wrote.
         robot: robot of the same joints.
         threads: number of computing threads.
 

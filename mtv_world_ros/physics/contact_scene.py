@@ -53,7 +53,7 @@ class _Piece:
 
     Attributes:
         size: half extents (3,) of a box; radius, half height and 0 of a cylinder [m].
-        at: (3,) its middle in the solid [m].
+        at: (3,) middle of the piece in the solid [m].
         mass: [kg].
         yaw: about z [rad].
         is_round: a cylinder.
@@ -94,10 +94,10 @@ class CompiledScene:
         arms: arms of the robot.
         kinds: O kinds of solids, see `kind_of`.
         model: the `MjModel`, whose numbers are replaced.
-        arm_qpos: (D,) where the arms' positions are.
-        arm_dofs: (D,) where their velocities are.
-        solid_qpos: (O,) where the solids' positions begin.
-        solid_dofs: (O,) where their velocities begin.
+        arm_qpos: (D,) indices of the arms' positions in qpos.
+        arm_dofs: (D,) indices of the arms' velocities in qvel.
+        solid_qpos: (O,) first indices of the solids' positions in qpos.
+        solid_dofs: (O,) first indices of the solids' velocities in qvel.
     """
 
     arms: Arms
@@ -151,7 +151,7 @@ class CompiledScene:
 
         Args:
             settings: settings of contact.
-            solids: O.
+            solids: the O solids.
             data: data of a model of this scene, which is written to; None = new data.
         """
         model = copy(self.model)

@@ -75,7 +75,7 @@ class ArmsState:
     """State of the arms, had they touched no solid.
 
     Attributes:
-        physics: of MuJoCo's full physics, of a scene of the arms and the table.
+        physics: MuJoCo's full physics state of a scene of the arms and the table.
         ways: (2, D) set points of the fingers, and their speeds.
         commands: (J,) the last ones [rad or m].
     """

@@ -84,11 +84,11 @@ class BatchState:
     """State of K futures, between two parts of a plan.
 
     Attributes:
-        physics: (K, N) of MuJoCo's full physics.
+        physics: (K, N) MuJoCo's full physics states.
         arms: state of the arms in free space, as if they had touched nothing.
         last: the course before; None = the arms rested.
         still: (K,) rows for which all was at rest.
-        lost: why futures no longer count, by their number.
+        lost: reasons why futures were dropped, by number of the future.
         grips: of each future, what measured fingers hold (`ContactSettings.grips_hold`).
     """
 
@@ -229,7 +229,7 @@ class Batch:
         Args:
             commands: (1 + T * every, J), `PERIOD_S` apart [rad or m].
             every: periods between two rows.
-            state: where they are; None = where they begin.
+            state: present states of the futures; None = their start.
             should_stop: asked after every row, and within one that takes long.
 
         Raises:

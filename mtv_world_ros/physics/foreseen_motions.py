@@ -32,7 +32,7 @@ class ForeseenMotions:
         is_fitted: contact parameters were fitted in this robot cell; False = they are drawn from
             the prior, and each motion may be the one that this robot makes every time.
         shown: index of the motion that the pictures show.
-        tools: (A, N, 3) where the tools are commanded to be [m]; None = not known.
+        tools: (A, N, 3) commanded positions of the tools [m]; None = not known.
     """
 
     names: tuple[str, ...]

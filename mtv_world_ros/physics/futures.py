@@ -50,7 +50,7 @@ def draw_futures(
     Args:
         settings: settings of contact. Futures after the first take the joint samples of their
             `draws` in turn; without them each parameter differs by its `spread`.
-        solids: O, as found.
+        solids: the O solids as found.
         drives: drives of the arms.
     """
     return tuple(

@@ -66,10 +66,10 @@ class GripCourse:
 
     Attributes:
         tools: (A, S, 4, 4) T_base_tool [m].
-        openings: (A, S) of the grippers, 0 closed to 1 open.
+        openings: (A, S) openings of the grippers, 0 closed to 1 open.
         stopped: (A, S) whether fingers stand still on something.
         widths: (A,) widest distance of the fingers [m].
-        settings: what counts as a grip.
+        settings: definition of a grip.
     """
 
     tools: FloatArray
@@ -109,7 +109,7 @@ class GripCourse:
             row: the row.
             grips: number of a solid -> its grip at the row before.
             poses: (O, 4, 4) T_base_solid where nothing but contact holds the solids [m].
-            solids: O, as found.
+            solids: the O solids as found.
         """
         kept = {item: grip for item, grip in grips.items() if not self._lets_go(grip, row)}
         poses = poses.copy()

@@ -38,8 +38,8 @@ class ObjectMotion:
     """Rigid motions of objects from a reference on.
 
     Attributes:
-        reference: (O, 3) where their centres were at the reference [m]; NaN = not known.
-        points: (T, O, 3) where they are [m].
+        reference: (O, 3) centres of the objects at the reference [m]; NaN = not known.
+        points: (T, O, 3) centres of the objects [m].
         rotations: (T, O, 3, 3) rotations from the reference.
         openings: (T, A) openings of the grippers, 0 closed to 1 open, which what they touch may
             stop; None = not foreseen.
@@ -144,7 +144,7 @@ class TrackedObjects(Protocol):
         the error of the masks. Row 0 is the present.
 
         Args:
-            positions: (1 + T * `commands_a_step`, J) that are commanded [rad or m].
+            positions: (1 + T * `commands_a_step`, J) commanded positions [rad or m].
             should_stop: True ends the computation; called often.
 
         Raises:
@@ -262,7 +262,7 @@ class FoundObjects:
         """Return the index of the medoid motion: its end is closest to those of all.
 
         Args:
-            among: (K,) which motions it may be, one or more; None = all.
+            among: (K,) mask of the motions to choose from, one or more; None = all.
         """
         weights = [motion.weight for motion in self.motions]
         unlike = _apart(self.motions).sum(-1) @ np.array(weights)
@@ -354,8 +354,8 @@ def moved_pictures(
     at rest keep their picture.
 
     Args:
-        cuts: (V, O, H, W, 4) of the reference, see `cut_outs`.
-        motion: T frames.
+        cuts: (V, O, H, W, 4) cut-outs of the reference frame, see `cut_outs`.
+        motion: motion of T frames.
         cameras: V cameras at the pictures' size.
         reference_poses: (V, O or 1, 4, 4) T_base_camera at the reference.
         poses: (V, T, 4, 4) T_base_camera.

@@ -106,7 +106,7 @@ class SolidForesight:
             names: names of the O objects; the name of a vessel makes it hollow.
             masks: masks of one frame.
             cameras: V cameras at the masks' size.
-            poses: V of T_base_camera (4, 4).
+            poses: T_base_camera (4, 4) of each view.
         """
         given, unknown = (names, masks, cameras, poses), [None] * len(names)
         if self.settings.table_varies:
@@ -278,7 +278,7 @@ class TrackedSolids:
         foreseen is NaN.
 
         Args:
-            positions: (1 + T * `commands_a_step`, J) that are commanded [rad or m].
+            positions: (1 + T * `commands_a_step`, J) commanded positions [rad or m].
             should_stop: asked all the time.
 
         Raises:

@@ -72,10 +72,10 @@ class Solid:
         centre: (3,) centre of its bounding box [m].
         size: (3,) along its own x, y and z [m].
         yaw: rotation about z [rad].
-        is_round: it is a cylinder.
-        is_open: it is hollow, and open at the top.
+        is_round: whether the solid is a cylinder.
+        is_open: whether the solid is hollow and open at the top.
         is_hidden: something hid a part of it when it was found again.
-        fills: (V,) how much of its outline its mask fills in each view, 0 = not seen.
+        fills: (V,) fraction of the outline that the mask fills in each view; 0 = not seen.
         error_px: root mean square distance of its outline from those of the masks.
     """
 
@@ -121,11 +121,11 @@ def bottom_of(
 
     Args:
         masks: see `fit_solid`; so are the others.
-        point: (3,) where it is, roughly [m].
-        cameras: V.
-        poses: V of T_base_camera (4, 4).
+        point: (3,) approximate position of the solid [m].
+        cameras: the V cameras at the masks' size.
+        poses: T_base_camera (4, 4) of each view.
         name: name of the object.
-        floor: where it may stand [m]; a fit is drawn to it.
+        floor: height of a surface below it [m]; the fit is drawn to it.
         fits: each is drawn to where the one before ended.
     """
     for _ in range(fits):
@@ -154,7 +154,7 @@ def fit_solid(
         masks: (V, H, W) masks of the object in one frame.
         point: (3,) approximate position of the object [m].
         cameras: V cameras at the masks' size.
-        poses: V of T_base_camera (4, 4).
+        poses: T_base_camera (4, 4) of each view.
         floor: height of the surface on which most objects stand [m].
         is_open: see `Solid`.
         is_box: whether the object is known to be no cylinder.
@@ -216,7 +216,7 @@ def find_solid(
         point: (3,) the middle of that; NaN = not known, as of one view: then where it would look
             as large as it does there [m].
         cameras: V cameras at the masks' size.
-        poses: V of T_base_camera (4, 4).
+        poses: T_base_camera (4, 4) of each view.
         floor: height under which nothing is [m].
 
     Returns:
@@ -323,7 +323,7 @@ class _Outlines:
 
     Attributes:
         views: camera and T_base_camera of each.
-        reach: (N,) how far they reach along each direction in each view [px].
+        reach: (N,) extent of the outlines along each direction in each view [px].
     """
 
     views: tuple[tuple[CameraModel, FloatArray], ...]

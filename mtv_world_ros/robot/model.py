@@ -32,8 +32,8 @@ class Tool:
         link: link that carries the tool.
         T_link_tool: (4, 4) pose of the tool centre point in the link [m].
         gripper_joint: joint that opens the gripper, or None.
-        gripper_closed: its value when closed [rad or m].
-        gripper_open: its value when open [rad or m].
+        gripper_closed: position of the gripper joint when closed [rad or m].
+        gripper_open: position of the gripper joint when open [rad or m].
         finger_travel_m: how far each finger is from the tool point along the tool's y axis when
             the gripper is open [m]; None = fingers are not drawn, and taken to be 40 mm away.
     """

@@ -82,7 +82,7 @@ class Plan:
         Args:
             trajectory: joints in any order; those that the robot lacks are dropped.
             robot: the robot.
-            observation: where the robot stands; its joints in the robot's order.
+            observation: observation that the plan starts from; joints in the robot's order.
             limits: limits that the plan is held to.
             stamp_ns: stamp that the trajectory's times count from [ns]; None = the observation's.
 

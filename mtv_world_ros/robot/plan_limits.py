@@ -54,8 +54,8 @@ def check_speeds(
     Args:
         robot: the robot.
         plan: its joints in its order, in their limits; times count from now [s].
-        start_positions: (J,) where the joints are now [rad or m].
-        tolerance: how far outside the limits points are still accepted [rad or m].
+        start_positions: (J,) present positions of the joints [rad or m].
+        tolerance: distance outside the limits up to which points are accepted [rad or m].
 
     Raises:
         PlanError: names the joint, its speed or the end of its swing, and the limit.

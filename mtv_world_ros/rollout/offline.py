@@ -37,7 +37,7 @@ class ReplaySummary:
         model_s: time spent in the pipeline [s].
         video_s: time the written frames cover [s].
         probabilities: success estimate at the end of each trajectory; NaN = abstains.
-        rejected: (stamp [ns], reason) of trajectories that were not imagined.
+        rejected: stamps [ns] and reasons of trajectories that were not imagined.
         warnings: problems of the episode.
     """
 

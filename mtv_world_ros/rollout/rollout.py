@@ -175,7 +175,7 @@ class Rollout:
                 any size.
             positions: (1 + T, J) measured [rad or m]; row 0 where the robot stood before. So a
                 gripper that something holds apart is not taken to be open.
-            cameras: as they are at the last frame, at the model's size; None = as before.
+            cameras: cameras at the last frame, at the model's size; None = as before.
         """
         spec = self.pipeline.spec
         frames = np.stack([resize_frames(view, spec.width, spec.height) for view in frames])

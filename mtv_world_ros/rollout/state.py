@@ -40,7 +40,7 @@ class RolloutState:
     """The state of one seed's rollout, which its next chunk starts from.
 
     Attributes:
-        observation: its last frame, at the model's size.
+        observation: last frame of the episode, at the model's size.
         history: the frames before that one.
         objects: foreseen poses of the named objects.
         memory: memory of the success estimate; None before the first chunk.
@@ -127,7 +127,7 @@ class RolloutState:
         """Return the state at a real frame, from which objects are looked for anew.
 
         Args:
-            cameras: as they are at that frame, at the model's size; None = as before.
+            cameras: cameras at that frame, at the model's size; None = as before.
         """
         observation = self.observation
         if cameras is not None:

@@ -34,8 +34,8 @@ def parameter(default: Any, text: str, within: Span | None = None) -> Any:
     """Return the field of a parameter that can be set at any time.
 
     Args:
-        default: its default.
-        text: its meaning, in Markdown.
+        default: default of the parameter.
+        text: meaning of the parameter, in Markdown.
         within: least and greatest value.
     """
     low, high = within or (None, None)
@@ -323,7 +323,7 @@ def declare_one(
     Args:
         node: owner.
         name: name of the parameter.
-        default: its default, which says the type.
+        default: default of the parameter, which gives the type.
         described: range and meaning.
         within: range, in words.
         empty: value that `[]` stands for, which rclpy takes as "not set"; None = it is refused.

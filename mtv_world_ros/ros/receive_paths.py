@@ -129,7 +129,7 @@ def resolved_topics(arguments: Sequence[str], node: str, topics: Sequence[str]) 
     Args:
         arguments: command line with `--ros-args -r FROM:=TO`.
         node: name of the node.
-        topics: their names in the program; `SERVICES` stays.
+        topics: names of topics in the program; `SERVICES` stays.
     """
     rules = _remap_rules(arguments)
     name = next((to for scope, source, to in rules if _renames(scope, source, node)), node)

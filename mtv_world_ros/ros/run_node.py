@@ -134,7 +134,7 @@ def init_ros(
 
     Args:
         args: command line with the program's name; default: the process' own.
-        context: is initialised; default: the process' own.
+        context: ROS context to initialise; default: the process' own.
         signals: signals that rclpy handles; default: all in the process' own context, else none.
 
     Raises:

@@ -30,8 +30,8 @@ class StatusPublisher:
 
     Args:
         node: owner of the publishers and the logger.
-        subject: what a report is about.
-        reports_kept: for a subscriber that is busy.
+        subject: subject of the reports.
+        reports_kept: number of reports kept for a busy subscriber.
     """
 
     def __init__(self, node: Node, subject: str = 'episode', reports_kept: int = 100) -> None:

@@ -59,7 +59,7 @@ class ArmScene:
 
     Attributes:
         picture: (H, W, 3) uint8 RGB, the median of a recording.
-        known: (H, W) where the arm stands in less than half of the recording.
+        known: (H, W) pixels that the arm covers in less than half of the recording.
         camera: the still camera.
         robot: kinematics of the arm.
         parts: shapes of the arm's links.

@@ -41,19 +41,19 @@ class ScoreRow:
     """J of one object in one view over one stretch; NaN = not scored.
 
     Attributes:
-        stretch: its number in the episode.
-        num_frames: T, frames that were predicted.
+        stretch: number of the stretch in the episode.
+        num_frames: number of predicted frames, T.
         view: name.
         name: name of the object; empty for the union of the scored objects.
         status: `ok`, or why it is not scored, or why to doubt it.
         moving: whether it really moves (see `MOVING_RULE`).
         j: mean over frames.
         j_visible: mean over the frames that really show it.
-        j_copy: of the first frame held.
-        j_shuffled: with the actions of another episode.
-        j_zero: with the joints held where they were.
-        j_ceiling: of recorded frames that went through the autoencoder.
-        j_self: of the recorded frames themselves, through the same path.
+        j_copy: J of the first frame held.
+        j_shuffled: J with the actions of another episode.
+        j_zero: J with the joints held where they were.
+        j_ceiling: J of recorded frames that went through the autoencoder.
+        j_self: J of the recorded frames themselves, segmented in the same way.
         j_frames: (T,) J per frame.
         j_copy_frames: J per frame of the held first frame.
         j_shuffled_frames: J per frame with the actions of another episode; empty = not imagined.
@@ -145,7 +145,7 @@ def true_masks(
     Args:
         stretch: recorded frames.
         segmenter: finds the masks, as it will in the predicted frames.
-        names: O objects to score.
+        names: names of the O objects to score.
         objects: names that the recorded identities number, from 1.
         use_ids: score against the recorded identities instead, where there are any. Which
             objects move is read from them in any case.
@@ -232,7 +232,7 @@ def score_rows(
 
     Args:
         stretch: the imagined stretch.
-        views: V names.
+        views: names of the V views.
         truth: masks of the recorded frames.
         predicted: scores of the prediction.
         others: scores by name, of `OTHERS`; those that are missing were not measured.

@@ -23,7 +23,7 @@ class ObjectScores:
     """J of one video against another; NaN is 'not scored', with the reason in `status`.
 
     Attributes:
-        names: O names.
+        names: names of the O objects.
         frames: (V, O, T) J per frame.
         visible: (V, O) mean J over the frames in which the true mask is not empty.
         objects: (V, O) mean J over frames, both-empty frames counted as 1 (DAVIS).

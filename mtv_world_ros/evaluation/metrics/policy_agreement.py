@@ -367,7 +367,7 @@ def powered_mean(
     Args:
         true: n true values.
         predicted: n predictions of these values.
-        more: N predictions for other samples of the same population.
+        more: predictions for N other samples of the same population.
         weight: lambda; 1 = plain PPI (arXiv 2301.09633), None = the value with the shortest
             interval (PPI++, arXiv 2311.01453, example 6.1: cov(Y, f) / ((1 + n/N) var f)).
 

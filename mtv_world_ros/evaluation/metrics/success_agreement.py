@@ -20,9 +20,9 @@ class Judgement:
     """Estimate at the end of an episode, and its outcome.
 
     Attributes:
-        probability: of success; NaN = abstained.
+        probability: probability of success; NaN = abstained.
         outcome: `success`, `failure` or `unknown`.
-        interval: of the probability; NaN = not known.
+        interval: interval of the probability; NaN = not known.
     """
 
     probability: float
@@ -99,7 +99,7 @@ class Bin:
 
     Attributes:
         middle: middle of the probabilities that belong here.
-        estimate: their mean.
+        estimate: mean of the estimates.
         came_true: share, with its interval.
         interval: 95 % Wilson interval of the share.
         count: number of estimates.

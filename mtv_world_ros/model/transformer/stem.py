@@ -72,7 +72,7 @@ class ConvStem(nn.Module):
         Args:
             x: (N, in_channels, h, w), frames in the order B, V, F.
             temb: (B, D) time embedding.
-            views: V.
+            views: number of views, V.
         """
         fine = self.block1(self.conv_in(x), temb)
         half = self.block2(self.down1(fine), temb)

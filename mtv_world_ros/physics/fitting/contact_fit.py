@@ -290,7 +290,7 @@ class FittedNumber:
         spread: standard deviation if the other numbers are as found, of factors that of the
             logarithm.
         count: recordings, or objects, that say something of it.
-        of: that were looked at.
+        of: number of recordings that were looked at.
         counted: what `count` and `of` are.
         apart: its interval is hardly wider than if the other numbers were known.
     """
@@ -397,8 +397,8 @@ def fit_contact(
     """Return likely settings with their spread, and what was found with intervals.
 
     Args:
-        recordings: E episodes.
-        arms: how the recorded robot follows its commands.
+        recordings: the E recorded episodes.
+        arms: response of the recorded robot to its commands.
         first: numbers that were found before, where the search begins; None = it begins with
             `first_settings`, and with fingers as `fit_fingers` finds them.
         threads: CPU threads of the engine.

@@ -119,7 +119,7 @@ def to_sample(message: JointState, joints: Collection[str] | None = None) -> Joi
 
     Args:
         message: message of one or several joints.
-        joints: those that matter; None = all.
+        joints: names of the joints that are read; None = all.
 
     Raises:
         Rejection: no positions, or not one a name.

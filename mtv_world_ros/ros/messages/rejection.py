@@ -60,7 +60,7 @@ def rejected_as(reason: Reason) -> Iterator[None]:
     """Turn a user error or an exceeded limit into a `Rejection`.
 
     Args:
-        reason: what it counts under; what is wrong with a plan counts under its own fault.
+        reason: reason that is counted; a faulty plan counts under its own fault.
     """
     try:
         yield

@@ -178,7 +178,7 @@ class PolicyLoop:
         spec: spec of the world model.
         joint_names: J names, in the robot's order.
         actor: asks the policy.
-        frames: gets what the world model publishes.
+        frames: store of what the world model publishes.
         outputs: see there.
     """
 

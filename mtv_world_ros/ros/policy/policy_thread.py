@@ -23,7 +23,7 @@ class PolicyAnswer:
     Attributes:
         ticket: ticket of the question.
         trajectory: the commands; None where the episode is over, or the question was a reset.
-        error: why there is no answer; empty where there is one.
+        error: reason why there is no answer; empty if there is one.
         seconds: duration of the policy's answer [s].
     """
 

@@ -36,7 +36,7 @@ class RobotDescription:
     """Compares `robot_description` with the robot that the checkpoint was trained on.
 
     Attributes:
-        problem: what is wrong with the description; empty = nothing.
+        problem: fault of the description; empty = none.
 
     Args:
         node: owner of the subscription.
@@ -154,7 +154,7 @@ class Extrinsics:
 
         Args:
             view: name of the view.
-            frame: its optical frame, as images or CameraInfo name it.
+            frame: optical frame of the camera, as images or CameraInfo name it.
             stamp_ns: stamp of the image [ns].
 
         Raises:

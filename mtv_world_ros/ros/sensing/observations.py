@@ -155,7 +155,7 @@ class ObservationBuffer:
 
         Args:
             view: name of the view.
-            message: its CameraInfo.
+            message: CameraInfo of the view.
             is_rectified: whether the view's images are; their intrinsics are P.
 
         Raises:
@@ -406,7 +406,7 @@ class Intrinsics:
     """The cameras as their CameraInfo describes them.
 
     Attributes:
-        notes: by view, the assumption about images that its info does not settle.
+        notes: assumptions about images that CameraInfo does not settle, by view.
 
     Args:
         cameras: calibrated cameras of the V views; their poses are used.

@@ -68,7 +68,7 @@ class Samples(Generic[Value]):
     than `RESTART_S` begins the stream anew.
 
     Attributes:
-        refusal: why the last sample was not taken; empty = it was.
+        refusal: reason why the last sample was refused; empty if it was taken.
 
     Args:
         length: number of samples that are kept.

@@ -42,7 +42,7 @@ class Inputs:
         node: owner of the subscriptions.
         views: names of the views; parameters give each its camera topic.
         compressed: whether images come as JPEG or PNG.
-        buffer: gets images, camera infos and joint states.
+        buffer: buffer of images, camera infos and joint states.
         events: takes instructions and plans.
 
     Raises:
@@ -129,7 +129,7 @@ def subscribe_observations(
         node: owner of the subscriptions.
         topics: camera topic of each view; `image_raw` and `camera_info` lie below.
         compressed: views whose images come as JPEG or PNG.
-        buffer: gets images, camera infos and joint states.
+        buffer: buffer of images, camera infos and joint states.
         guarded: returns a handler as a callback that no message makes raise.
     """
     newest: list[tuple[Any, str, Handler, int]] = []
@@ -165,7 +165,7 @@ class MatchedSubscription:
         node: owner.
         kind: message type.
         topic: relative or absolute name.
-        callback: gets the messages; a callback of two arguments, rclpy's information, too.
+        callback: receiver of the messages; with two arguments also of rclpy's information.
         depth: messages kept.
         default: `match`, or `reliable`, `best_effort` for a plain subscription.
     """

@@ -61,7 +61,7 @@ class ScoredChunk:
 
     Attributes:
         chunk: the imagined chunk.
-        names: O names.
+        names: names of the O objects.
         jaccard: (V, O) mean J over the compared frames, NaN = not scored.
         copy: (V, O) J of the chunk's first masks, held.
         num_frames: number of compared frames.

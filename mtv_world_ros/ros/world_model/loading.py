@@ -49,7 +49,7 @@ class AdapterSwitch:
 
     Args:
         node: has the parameter.
-        world_model: is to take it.
+        world_model: model that takes the adapter.
         run_between: runs a job between rollouts.
 
     Raises:

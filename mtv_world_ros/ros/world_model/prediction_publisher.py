@@ -98,7 +98,7 @@ class Sent:
     Attributes:
         publish_s: time spent on publishing [s].
         out_s: (N,) when each frame that was published went out [s], of `time.monotonic`.
-        leads_s: (N,) how long before its stamp that was [s], by the node's clock.
+        leads_s: (N,) lead of publishing a frame before its stamp [s], by the node's clock.
     """
 
     publish_s: float = 0.0

@@ -167,7 +167,7 @@ class _Arrived(NamedTuple):
     Attributes:
         received_s: when it came [s], of `time.monotonic`.
         plan: plan of the topic or the action.
-        transport_s: how long it was under way [s].
+        transport_s: time between publishing and arrival [s].
     """
 
     received_s: float

@@ -43,7 +43,7 @@ class Request:
         settings: the parameters when it came in. In imagine mode the seed counts one up with
             every chunk after a reset, over requests too.
         received_s: when it came in [s], of `time.monotonic`.
-        received_ns: the same by the node's clock [ns].
+        received_ns: time of arrival by the node's clock [ns].
     """
 
     rollout: int
@@ -117,7 +117,7 @@ class RolloutWorker:
     """Runs one request at a time in its own thread.
 
     Attributes:
-        camera_check: what the newest episode's first pictures say about the cameras.
+        camera_check: result of the camera check on the newest episode's first frames.
         doubt: returns why the fitted physics does not hold here; empty = it may hold.
 
     Args:
@@ -240,8 +240,8 @@ class RolloutWorker:
         """Give up what runs and waits, drop chunks not taken, forget the last frames.
 
         Args:
-            state: how it ended, for `Ended`.
-            text: why, in words.
+            state: state of the ended plan, for `Ended`.
+            text: reason in words.
         """
         with self._changed:
             self._results = deque(r for r in self._results if isinstance(r, Ended))
