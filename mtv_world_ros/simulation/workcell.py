@@ -96,7 +96,7 @@ class Workcell:
 
 @lru_cache(maxsize=8)
 def workcell_of(robot: RobotModel) -> Workcell:
-    """Return the workcell of a robot, `config/robots/<its name>/workcell.yaml`.
+    """Return the workcell of a robot: `workcell.yaml` in its folder, else in `config/robots/NAME`.
 
     Raises:
         SimulatorError: there is none for this robot, or it is for other arms.
@@ -104,10 +104,13 @@ def workcell_of(robot: RobotModel) -> Workcell:
     """
     folder = share_path('config', 'robots')
     path = folder / robot.name / WORKCELL_YAML
+    if robot.file is not None and (robot.file.parent / WORKCELL_YAML).is_file():
+        path = robot.file.parent / WORKCELL_YAML
     if not path.is_file():
         known = ', '.join(sorted(file.parent.name for file in folder.glob(f'*/{WORKCELL_YAML}')))
         raise SimulatorError(
-            f"robot '{robot.name}' has no workcell in the simulator; there are some for {known}"
+            f"robot '{robot.name}' has no workcell in the simulator; there are some for {known}; "
+            f'one of your own stands in {WORKCELL_YAML} in the folder of its robot.yaml'
         )
     file = validated(WorkcellFile, read_yaml(path, 'workcell file', 'robot'), str(path))
     arms = [tool.arm for tool in robot.tools]

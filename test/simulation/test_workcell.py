@@ -1,4 +1,5 @@
 from dataclasses import replace
+import shutil
 
 import numpy as np
 import pytest
@@ -90,6 +91,18 @@ def test_default_calibration_is_that_of_the_workcell(name):
         assert stored[spec.view].mount_link == camera.mount_link
         np.testing.assert_allclose(stored[spec.view].K, camera.K)
         np.testing.assert_allclose(stored[spec.view].T_mount_camera, camera.T_mount_camera)
+
+
+def test_a_robot_of_ones_own_has_its_workcell_in_its_folder(tmp_path):
+    folder = shutil.copytree(share_path('config', 'robots', 'franka'), tmp_path / 'mine')
+    file = folder / 'robot.yaml'
+    file.write_text(file.read_text().replace('name: franka', 'name: mine'))
+    robot, bundled_one = load_robot(file), workcell_of(bundled('franka'))
+    assert workcell_of(robot).cameras == bundled_one.cameras
+    assert workcell_of(robot).placement == bundled_one.placement
+    (folder / 'workcell.yaml').unlink()
+    with pytest.raises(SimulatorError, match=r"'mine' has no workcell.* stands in workcell.yaml"):
+        workcell_of(load_robot(file))
 
 
 @pytest.mark.slow
