@@ -91,7 +91,7 @@ def arm_pictures(
         real = None if seen_frame is None else _real_source(parts, numbers, seen_frame, view)
         whole = _mean_colour(frame, now.seen > 0, np.full(3, _GREY))
         for number in range(len(links)):
-            mine = np.flatnonzero(numbers == number)
+            mine = np.flatnonzero(numbers == number).tolist()
             source = now
             if real is not None and real.shows(number) > _SHARP_SHARE * now.shows(number):
                 source = real

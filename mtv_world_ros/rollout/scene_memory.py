@@ -216,7 +216,7 @@ class SceneKeeper:
         if found.shape[1] != len(memory.touched):
             touched = np.ones(found.shape[1], np.bool_)
             return replace(memory, masks=found[:, :, 0], touched=touched)
-        seen = memory.masks.any((-2, -1))
+        seen = np.asarray(memory.masks.any((-2, -1)))
         reach = self._near(robot, self._settings.object_margin)
         near = (reach[:, None] & memory.masks[:, :, None]).any((-2, -1))  # (V, O, T)
         may_touch = (near | ~seen[..., None]).all(0).any(-1)
@@ -229,7 +229,8 @@ class SceneKeeper:
         wander off into smears.
         """
         which = memory.touched
-        now, were = found[:, which].any(1), memory.masks[:, which].any(1)[:, None]
+        now = np.asarray(found[:, which].any(1))
+        were = np.asarray(memory.masks[:, which].any(1))[:, None]
         if drawn is not None:
             were = were | (drawn[..., 3] > 0)
             now &= self._near(were, self._settings.arm_margin)
