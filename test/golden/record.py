@@ -394,8 +394,8 @@ def differences(name: str, recorded: Any, now: Any) -> list[str]:
     """Return how a section differs from its record; some numbers may be off by a tolerance."""
     if name in _APPROXIMATE:
         return list(_apart(f'{name}: ', recorded, now))
-    texts = (_text(name, one).split('\n') for one in (recorded, now))
-    return list(difflib.unified_diff(*texts, 'recorded', 'now', n=1))
+    before, after = (_text(name, one).split('\n') for one in (recorded, now))
+    return list(difflib.unified_diff(before, after, 'recorded', 'now', n=1))
 
 
 def _apart(key: str, one: Any, other: Any) -> Iterator[str]:
