@@ -92,7 +92,7 @@ def read_camera_info(view: str, info: Any, *, is_rectified: bool = False) -> Int
     """Return the intrinsics of a sensor_msgs/CameraInfo, of rclpy's or rosbags' class.
 
     Args:
-        view: for texts.
+        view: name of the view, for error texts.
         info: the message.
         is_rectified: whether the images are; they have P's left part as K and no distortion.
 

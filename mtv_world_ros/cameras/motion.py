@@ -25,7 +25,7 @@ class Motion:
 
     Attributes:
         robot: the robot that moves.
-        cameras: V calibrated views.
+        cameras: calibrated cameras of the V views.
         positions: (N, J) joint positions [rad or m].
         links: (N, 4, 4) T_base_link of each link that was asked for, by its name [m].
         arm_points: for each arm (P, N, 3) its joints' origins and its tool centre point [m].
@@ -66,7 +66,7 @@ class Motion:
 
         Args:
             robot: gives the kinematics.
-            cameras: V calibrated views, fixed or carried by a link.
+            cameras: calibrated cameras of the V views, fixed or carried by a link.
             positions: (N, J) [rad or m].
             links: names of further links whose poses are wanted, e.g. to draw them.
 

@@ -142,7 +142,7 @@ def left_out(total: FloatArray, normal: FloatArray, gradient: FloatArray) -> Flo
 
     Args:
         total: (6, 6) normal matrix of all measurements, in `UNITS`.
-        normal: (6, 6) that of those left out.
+        normal: (6, 6) normal matrix of those left out.
         gradient: (6,) theirs.
     """
     ridge = 1e-6 * np.trace(total) * np.eye(6)

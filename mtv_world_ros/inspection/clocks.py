@@ -109,7 +109,7 @@ def check_commands(
 
     Args:
         commands: all of the recording, in the robot's order; None where there are none.
-        origin_ns: their time zero.
+        origin_ns: time zero of the commands [ns].
         frames_ns: frames of the first view.
         joints: measured.
     """

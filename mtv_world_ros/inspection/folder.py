@@ -47,8 +47,8 @@ class FolderInspection:
 
     Attributes:
         episodes: one of each, by name.
-        failed: why an episode could not be inspected, by name.
-        places: where each view's camera stands in `members`, by view.
+        failed: reasons why episodes could not be inspected, by name.
+        places: places of each view's camera in `members`, by view.
         members: names of the episodes that have the view, by view.
         findings: about all episodes.
         notes: other things to know of all episodes.

@@ -102,8 +102,8 @@ class Inspector:
 
     Args:
         robot: the robot.
-        shape: what it looks like.
-        search: what is tried to measure the residual.
+        shape: shapes of the robot's links.
+        search: search range of the residual.
     """
 
     def __init__(

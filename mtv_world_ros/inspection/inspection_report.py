@@ -117,7 +117,7 @@ class Inspection:
     """The inspection of a whole recording.
 
     Attributes:
-        episode: its path.
+        episode: path of the episode.
         robot: name of the robot it was checked against.
         views: a section for each view.
         recording: findings that concern all views.
@@ -183,7 +183,7 @@ def to_json(
 
     Args:
         inspections: one of each episode, by name.
-        failed: why an episode could not be inspected, by name.
+        failed: reasons why episodes could not be inspected, by name.
     """
     episodes: dict[str, Any] = {}
     for name, inspection in inspections.items():

@@ -71,14 +71,14 @@ class MotionResidual:
         shift_px: (x, y) from the drawn robot to the moving pixels, in pixels of the recorded
             images; NaN where it could not be measured.
         match: mean correlation of drawn and seen motion there, -1 .. 1.
-        match_here: the same where the robot is drawn.
-        contrast: by how many standard deviations that stands out from other shifts.
+        match_here: correlation where the robot is drawn.
+        contrast: z-score of the best shift among all shifts.
         lag_s: delay of the images against the joint states at which the motions fit best [s].
         lag_gain: how much better they fit there than without a delay, as a share, in that half
             of the recording in which it is less; below zero where a half fits worse.
         best_change: change of the camera that fits best among those tried, and its match.
         num_pairs: pairs of frames in which the robot moves.
-        reason: why it could not be measured; empty where it was.
+        reason: reason why it could not be measured; empty if it was.
     """
 
     shift_px: tuple[float, float] = (float('nan'), float('nan'))
@@ -110,11 +110,11 @@ def measure_residual(
 
     Args:
         track: frames of a camera that stands still.
-        camera: its calibration, at the size of the frames.
+        camera: calibration of the camera at the size of the frames.
         robot: gives the links' poses.
         shapes: shapes of the links.
         joints: measured positions.
-        search: what is tried.
+        search: search range.
     """
     if camera.mount_link in moving_links(robot):
         return MotionResidual(

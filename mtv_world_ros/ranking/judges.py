@@ -29,7 +29,7 @@ class Judge:
     """Estimator of the success of a rollout.
 
     Attributes:
-        title: its row in the table of what a picture is worth.
+        title: heading of its row in the table of what a picture is worth.
         column: head of its column in the optimism table; empty = it has none.
         episodes: what it judges, in the ranking's own tables; empty = it is not there.
     """

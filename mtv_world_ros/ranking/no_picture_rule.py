@@ -40,10 +40,10 @@ class Thing:
     """An object as the first frame shows it.
 
     Attributes:
-        name: its name in the instruction.
+        name: name of the object in the instruction.
         centre: (3,) [m].
         size: full extents (x, y, z) [m].
-        is_rim_held: it is taken by its rim, not across the middle.
+        is_rim_held: whether it is taken by its rim, not across the middle.
     """
 
     name: str

@@ -72,7 +72,7 @@ class ListedPolicy:
     """A policy of the file, ready to be made.
 
     Attributes:
-        name: under which its results are listed.
+        name: name under which its results are listed.
         config: the policy's configuration.
         command: starts its server; empty = it has none, or it runs already.
         start_timeout_s: longest wait until the server listens [s].

@@ -190,8 +190,8 @@ class Result:
         num_imagined: answers executed in imagination.
         is_over: something else than the limit ended the episode, in both.
         seconds: time by stage [s].
-        end: why the simulated episode ended; empty = not known.
-        imagined_end: why the imagined one ended.
+        end: reason why the simulated episode ended; empty = not known.
+        imagined_end: reason why the imagined episode ended.
         course: commands, overlaps and estimates over time in both worlds; None = not known.
         files: files of the rollout in base64 by suffix; empty once they are written to disk.
     """

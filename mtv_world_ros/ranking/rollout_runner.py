@@ -218,7 +218,7 @@ class SimulatedRollout:
         instruction: the language instruction.
         run: number of answers, end and time of the episode.
         ever: the task was done at some time.
-        final: it was done at the end.
+        final: whether the task was done at the end.
     """
 
     policy: Policy

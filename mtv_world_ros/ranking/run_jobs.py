@@ -31,7 +31,7 @@ class RankedCheckpoint:
     Attributes:
         make_pipeline: called once in every process; has to be picklable for more than one.
         out: results go into its folder `rollouts`.
-        settings: what the results depend on, e.g. which checkpoint.
+        settings: settings that the results depend on, e.g. the checkpoint.
     """
 
     make_pipeline: Callable[[], Pipeline]
@@ -61,7 +61,7 @@ def run_jobs(
         checkpoints: one or more checkpoints.
         config: denoising steps, limits and physics of the episodes.
         workers: number of processes; with Ray, the most that run at once.
-        ray_address: of a Ray cluster, empty = the one at hand or a new one here; None = no Ray.
+        ray_address: address of a Ray cluster; empty = a running or a new one; None = no Ray.
         overwrite: replace results of other settings.
         show_progress: draw a progress bar, on a terminal.
         watch: is called with the first checkpoint's results, those of an earlier run at first,

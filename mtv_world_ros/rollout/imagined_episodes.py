@@ -184,7 +184,7 @@ def imagine_episodes(
     Args:
         pipeline: imagines and judges.
         options: policy, number of episodes and limits.
-        starts: where the episodes start; asked once for each.
+        starts: sources of the episodes' starts; asked once for each.
         out: folder of the results.
         overwrite: remove the episodes of an earlier run from it, once the first start is there.
         on_start: called at the start of each episode.
@@ -221,7 +221,7 @@ class _EpisodeRun:
         pipeline: imagines and judges.
         options: policy and limits.
         number: number of the episode.
-        start: where it starts.
+        start: start of the episode.
         bag: folder of its bag.
     """
 

@@ -330,8 +330,8 @@ class Pipeline:
         """Return an episode that begins at an observation (V views, any image size).
 
         Args:
-            observation: where it begins.
-            options: what is asked for, and how it is computed.
+            observation: observation that the rollout begins at.
+            options: instruction, objects, seed and other options of the rollout.
             keywords: options one by one, as version 0.1.0 took them; deprecated.
 
         Raises:

@@ -58,8 +58,8 @@ class SceneMemory:
 
     Attributes:
         pictures: (V, H, W, 3) uint8 RGB.
-        known: (V, H, W) where it was seen.
-        masks: (V, O, H, W) of the objects in the last real frame.
+        known: (V, H, W) pixels that were seen.
+        masks: (V, O, H, W) masks of the objects in the last real frame.
         touched: (O,) whether the robot may have moved an object since.
         last: the last real frame.
     """
@@ -108,9 +108,9 @@ class SceneKeeper:
 
         Args:
             memory: before them; None = nothing was seen.
-            motion: T states of the robot with `links`.
+            motion: motion of the robot with `links`, T states.
             frames: (V, T, H, W, 3) uint8 RGB at these states.
-            masks: of the objects in them.
+            masks: masks of the objects in these frames.
         """
         arms = self._near(self._drawn(motion), self._settings.arm_margin)
         poses = motion.camera_poses[:, -1]
@@ -143,10 +143,10 @@ class SceneKeeper:
         """Return imagined frames with the background of the memory, and the memory after them.
 
         Args:
-            memory: of the background.
-            motion: T states of the robot with `links`, at the frames.
+            memory: memory of the background.
+            motion: motion of the robot with `links` at the frames, T states.
             frames: (V, T, H, W, 3) uint8 RGB as the model predicts them.
-            masks: of the objects in them.
+            masks: masks of the objects in these frames.
             drawn: (V, T, H, W, 4) the objects where they are foreseen; None = not foreseen.
         """
         robot, found = self._drawn(motion), masks.masks
@@ -170,7 +170,7 @@ class SceneKeeper:
         there without it: robot and objects as they are drawn, else the background.
 
         Args:
-            memory: of the background.
+            memory: memory of the background.
             frames: (V, T, H, W, 3) uint8 RGB as the model predicts them.
             drawn: (V, T, H, W, 3) the trajectory video.
             unmarked: (V, T, H, W, 4) what it shows, without marks.

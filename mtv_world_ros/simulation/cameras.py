@@ -40,9 +40,9 @@ class WristCameraSpec:
     Attributes:
         view: name of the view.
         link: name of the link that carries it.
-        position: (x, y, z) in the link [m].
+        position: position (x, y, z) in the link [m].
         target: (x, y, z) the point looked at, in the link [m].
-        right: (x, y, z) in the link, about the direction of the image's x.
+        right: approximate direction (x, y, z) of the image's x axis in the link.
         visible_width: width of the view's plane through the target [m].
     """
 

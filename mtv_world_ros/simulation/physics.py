@@ -95,7 +95,7 @@ class Physics(Schema):
         Args:
             model: the nominal `MjModel`.
             mujoco: the module.
-            change: which of its parts are objects and grippers.
+            change: parts of the model that are objects and grippers.
         """
         pads = model.geom_priority == _PAD_PRIORITY
         model.geom_friction *= np.where(pads, self.grip_friction, self.table_friction)[:, None]

@@ -54,7 +54,7 @@ def recorded_scene(path: Path, workcell: Workcell) -> tuple[Task, Scene]:
     """Return task and scene of a simulated episode.
 
     Args:
-        path: its folder.
+        path: folder of the episode.
         workcell: workcell of the robot that it was recorded with.
 
     Raises:

@@ -27,12 +27,12 @@ class SceneObject:
     """A free object on the table.
 
     Attributes:
-        role: its part in the task, e.g. `a`.
-        name: what the instruction calls it, e.g. `red block`.
+        role: placeholder of the object in the task, e.g. `a`.
+        name: name in the instruction, e.g. `red block`.
         shape: key of `SHAPES`.
         size: full extents (x, y, z) of its bounding box [m].
         rgb: (3,) rgb in 0..1.
-        position: (x, y, z) of its centre in the base frame [m].
+        position: centre (x, y, z) of the object in the base frame [m].
         yaw: about z [rad].
     """
 
@@ -67,7 +67,7 @@ class Scene:
         objects: the instance id of `objects[i]` is i + 1.
         cameras: cameras in the order of the views.
         look: table and light.
-        goals: where the subject of each of the task's moves should come to rest [m].
+        goals: goal position of the subject of each of the task's moves [m].
         table_m: height of the table [m].
     """
 

@@ -42,7 +42,7 @@ def second_engine(
         scene: whose objects these are.
         robot: robot from a URDF with inertias.
         actuators: actuators of its joints.
-        home: (J,) where they rest [rad or m].
+        home: (J,) rest positions of the joints [rad or m].
 
     Raises:
         SimulatorError: DART is not installed.

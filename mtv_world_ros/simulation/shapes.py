@@ -43,7 +43,7 @@ class Grasp:
 
         Args:
             size: size of the object [m].
-            side: on which a rim is held, -1 left, 1 right.
+            side: side on which a rim is held, -1 left, 1 right.
         """
         if self.rim_m is None:
             return 0.0
@@ -62,7 +62,7 @@ class Shape:
         geoms: name of the macro of `config/mjcf/shapes.xml.j2` that draws it.
         smallest: full extents (x, y, z) of the smallest one [m].
         largest: of the largest one; sizes in between keep to the line from one to the other.
-        grasp: how a gripper holds it; None = it is never moved.
+        grasp: grasp by a gripper; None = the object is never moved.
         colours: words of the palette that it comes in.
         step: turn about z after which it looks the same to a gripper [rad].
         hollow: objects placed on it rest on its inner floor.

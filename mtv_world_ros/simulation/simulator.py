@@ -83,7 +83,7 @@ class SimEpisode:
     Args:
         robot: one that has a workcell.
         home: (J,) joint positions at reset [rad or m].
-        config: what is randomised, and the image size; default: the workcell's.
+        config: randomised quantities and image size; default: the workcell's.
         rendering: False runs physics alone, without OpenGL; images are then empty.
         physics: physics of the episode, a key of `config/physics.yaml`.
 

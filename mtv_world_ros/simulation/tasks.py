@@ -78,7 +78,7 @@ class ObjectRole(Schema):
     """An object that a task asks for.
 
     Attributes:
-        role: its part in the task; the placeholder of the task's instruction and relations.
+        role: placeholder of the object in the task's instruction and relations.
         shapes: names of shapes (`simulation/shapes.py`); one is drawn and is the noun of the
             object's name (`red block`).
         size_share: range of sizes, from the shape's smallest (0) to its largest (1).

@@ -37,7 +37,7 @@ class PlacementConfig:
 
     Attributes:
         clearance: least gap between the objects' outlines, room for a finger [m].
-        reach: how far from an arm's base its tool is sent, top-down, over the table [m].
+        reach: largest distance of a tool from its arm's base, top-down, over the table [m].
         reach_above: the same where it is higher, over or in another object [m].
         max_x: goals are at most this far from the table's middle line, in all views [m].
     """
@@ -69,7 +69,7 @@ class Workcell:
         bases: arm -> (x, y) of its first joint [m].
         home_tools: arm -> (3,) position of its tool at rest, pointing down [m].
         home_joints: arm -> joint positions near that pose, without the gripper [rad].
-        finger_width_m: of a finger tip, across the fingers' travel.
+        finger_width_m: width of a finger tip, across the fingers' travel.
         finger_thickness_m: along it.
         placement: limits of its scenes.
         cameras: nominal ones, in the order of the views.

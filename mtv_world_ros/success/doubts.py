@@ -42,7 +42,7 @@ def unforeseen(foreseen: FloatArray, real: FloatArray) -> float:
 
     Args:
         foreseen: (K, 1 + T, O, 3) centres of objects from a chunk's start on [m].
-        real: (1 + T, O, 3) where masks show them [m], NaN = not known.
+        real: (1 + T, O, 3) positions that masks show [m], NaN = not known.
     """
     ahead = foreseen[:, -1] - foreseen[:, 0]
     came = real[-1] - real[0]
@@ -130,7 +130,7 @@ def doubted(
     Args:
         estimate: estimate of pictures and foreseen motions.
         notes: remarks for the reader, one line each.
-        refusal: why there is no verdict; empty = there may be one.
+        refusal: reason why there is no verdict; empty = there may be one.
     """
     if refusal:
         return replace(

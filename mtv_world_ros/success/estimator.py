@@ -45,8 +45,8 @@ def verdict(probability: float, interval: tuple[float, float] = (nan, nan)) -> f
     the interval reaches the opposite verdict.
 
     Args:
-        probability: of success; NaN = abstained.
-        interval: of the probability; NaN = not known.
+        probability: probability of success; NaN = abstained.
+        interval: interval of the probability; NaN = not known.
     """
     low, high = interval
     if probability >= SUCCESS_FROM:
@@ -118,8 +118,8 @@ def estimate_of_futures(
     Frames count where they contradict the drawn motion: the estimate is then less sure.
 
     Args:
-        fit: of the share of futures that succeed.
-        features: of an estimate: `foreseen`, `futures`, `released` and `picture_gap`.
+        fit: fit of the share of futures that succeed.
+        features: features of an estimate: `foreseen`, `futures`, `released` and `picture_gap`.
         is_fitted: contact parameters were fitted in this robot cell.
     """
     share, number = (1 + features['foreseen']) / 2, features['futures']

@@ -187,7 +187,7 @@ def gather(views: Views, task: TaskSpec, bound: Mapping[str, str]) -> Evidence:
 
     Args:
         views: the rollout.
-        task: its relations are evaluated.
+        task: task whose relations are evaluated.
         bound: placeholder -> name of its object.
 
     Raises:

@@ -121,7 +121,7 @@ class FittedTo(Setting):
         """Return how a setting differs; empty = it does not.
 
         Args:
-            setting: where the estimate is made.
+            setting: setting of the estimate.
             cameras: cameras that the estimate is made from.
             is_foreseen: the estimate rests on foreseen motions.
         """

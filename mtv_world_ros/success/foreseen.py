@@ -59,9 +59,9 @@ def foreseen_ends(
 
     Args:
         motions: motions of the objects, in several futures.
-        task: its relations are evaluated.
+        task: task whose relations are evaluated.
         bound: placeholder -> name of its object.
-        starts: (O, 3) where the objects were when the rollout began [m], NaN = as row 0.
+        starts: (O, 3) positions of the objects at the rollout's start [m], NaN = as row 0.
     """
     if not set(bound.values()) <= set(motions.names):
         return None
@@ -82,8 +82,8 @@ class PictureGap:
     """Largest distance of an object between the imagined frames and the drawn motion.
 
     Attributes:
-        name: of the object.
-        distance_m: at the end of the chunk [m].
+        name: name of the object.
+        distance_m: distance at the end of the chunk [m].
     """
 
     name: str
@@ -103,7 +103,7 @@ def picture_gap(views: Views, motions: ForeseenMotions, names: Sequence[str]) ->
 
     Args:
         views: masks of the imagined frames up to the end of the motions.
-        motions: of the objects; the one that was shown counts.
+        motions: motions of the objects; the one that was shown counts.
         names: objects that are compared.
 
     Returns:

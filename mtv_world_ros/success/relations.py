@@ -295,7 +295,7 @@ class Inside(Relation):
         half_size_m: how far the subject's centre may be from the target's along the target's
             sides; not given = half the target's size.
         whole: the whole subject is inside, not only its centre; without `half_size_m`.
-        rise_m: as in `Within`.
+        rise_m: height range, as in `Within`.
     """
 
     target: str

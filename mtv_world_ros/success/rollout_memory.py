@@ -38,7 +38,7 @@ class Footage:
         start_masks: start masks of the frame before them (T = 1).
         cameras: V cameras at the masks' size.
         poses: (V, 1 + T, 4, 4) T_base_camera.
-        tools: (A, 1 + T, 3) where the tools are commanded to be [m]; None = not known.
+        tools: (A, 1 + T, 3) commanded positions of the tools [m]; None = not known.
         openings: (A, 1 + T) openings of the grippers, 0 closed to 1 open; None = not known.
     """
 
@@ -82,13 +82,13 @@ class ObservedGrasp(NamedTuple):
     """A gripper that closed.
 
     Attributes:
-        arm: its index.
-        closed_at: (3,) where the tool was [m].
+        arm: index of the arm.
+        closed_at: (3,) position of the tool when it closed [m].
         gaps_m: (O,) how far outside an object's last unhidden mask it was [m]; negative =
             inside, NaN = not known. The largest over the views.
         points: (O, 3) where the objects were last seen unhidden, or now if that is clearly
             elsewhere [m].
-        released_at: (3,) where it let go [m]; None = it has not.
+        released_at: (3,) position of the tool when it opened [m]; None = it has not.
     """
 
     arm: int
@@ -108,7 +108,7 @@ class RolloutMemory:
         leans: (O, N, 2) x and y of unit vectors along the objects' long axes, NaN where no view
             knows one.
         seen_masks: (V, O, H, W) last masks in which an object was not hidden.
-        seen_points: (O, 3) where it was then [m].
+        seen_points: (O, 3) positions of the objects then [m].
         largest: (V, O) largest area of each mask in these frames [px].
         grasps: grasps in order.
         levels: (A,) opening since which a gripper's closing or opening counts.

@@ -56,7 +56,7 @@ class ShareFit(Schema):
     Attributes:
         bias: logit at even odds.
         slope: logit per log odds of the share.
-        covariance: of bias and slope: variance, covariance, variance.
+        covariance: covariance of bias and slope: variance, covariance, variance.
         num_episodes: number of episodes behind it; 0 = it is stated.
         max_picture_gap_m: distance of an object between the imagined frames and the drawn motion
             beyond which the frames contradict the motion [m].

@@ -75,7 +75,7 @@ class TruePoses:
         openings: (A, T) gripper openings in 0..1.
         goals: role -> (3,) where the object's centre is to be [m]; of tasks whose goal is drawn
             with the scene.
-        tools: (A, T, 3) where the tools are [m]; None = not known.
+        tools: (A, T, 3) positions of the tools [m]; None = not known.
     """
 
     positions: Mapping[str, FloatArray]
@@ -137,9 +137,9 @@ def grippers_released(
     """Return (T,) where every gripper is open, or away from the objects that it was to move.
 
     Args:
-        openings: (A, T) of the grippers, 0 closed to 1 open.
-        tools: (A, T, 3) where they are [m]; None = not known, so that only open ones count.
-        centres: (M, T, 3) of the objects [m], NaN = not known, which may be held.
+        openings: (A, T) openings of the grippers, 0 closed to 1 open.
+        tools: (A, T, 3) positions of the tools [m]; None = not known: only open ones count.
+        centres: (M, T, 3) centres of the objects that may be held [m], NaN = not known.
     """
     is_free = np.asarray(openings) > OPEN_SHARE
     if tools is not None and len(centres):

@@ -189,7 +189,7 @@ def object_called(name: str, names: Sequence[str]) -> str | None:
     """Return the one of several objects that a name means; None = none, or more than one.
 
     Args:
-        name: as an instruction says it, e.g. `towel`.
+        name: name as an instruction says it, e.g. `towel`.
         names: names of the objects, e.g. `green towel`.
     """
     if name in names:

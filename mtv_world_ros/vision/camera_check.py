@@ -92,7 +92,7 @@ class _Outline(NamedTuple):
     Attributes:
         pixels: (N, 2).
         normals: (N, 2) unit, outwards.
-        points: (N, 3) that are seen there, in the optical frame [m].
+        points: (N, 3) points that are seen there, in the optical frame [m].
     """
 
     pixels: FloatArray
@@ -165,7 +165,7 @@ class CameraChecker:
 
     Args:
         robot: the one whose joint states are given.
-        shape: its links.
+        shape: shapes of the robot's links.
     """
 
     def __init__(self, robot: RobotModel, shape: RobotShape) -> None:

@@ -110,9 +110,9 @@ class Changes:
     """Changed pixels of pairs of frames, at one image size.
 
     Attributes:
-        camera: its intrinsics at that size.
+        camera: intrinsics of the camera at that size.
         pairs: (P, 2) rows of the frames.
-        seen: (P, H, W) how much each pixel changed, 0 .. 1.
+        seen: (P, H, W) change of each pixel, 0 to 1.
         blur: standard deviation [px].
         deviation: length of `seen` without its mean.
     """
@@ -128,8 +128,8 @@ class FixedCamera:
     """Estimator of the camera pose of one view.
 
     Args:
-        track: its frames.
-        camera: its intrinsics; the pose is the guess, where there is one.
+        track: frames of the view.
+        camera: intrinsics of the camera; its pose is the guess, if there is one.
         robot: gives the links' poses.
         shapes: shapes of the links.
         joints: measured positions.
@@ -188,7 +188,7 @@ class FixedCamera:
 
         Args:
             guess: start from the camera's pose; False = from cameras all around the robot.
-            seed: of those.
+            seed: seed of the cameras that are tried.
             progress: wraps what is tried, e.g. in a progress bar.
 
         Raises:

@@ -94,7 +94,7 @@ class SeenPoint:
         recording: number of the recording.
         seconds: after its first joint state [s].
         position: (3,) position of the tool point, by the joint states, in the base link [m].
-        pixel: (2,) where it was seen [px].
+        pixel: (2,) pixel at which it was seen [px].
     """
 
     recording: int

@@ -78,7 +78,7 @@ class SharedEstimate:
 
     Attributes:
         cameras: cameras of each recording, (R,).
-        places: which recordings share one.
+        places: recordings that share a place.
         measures: the doctor's measure of each recording.
         guess_measures: the same of the guess; empty where there was none.
         kept_guess: whether the guess fits better and is what `cameras` has.
@@ -162,7 +162,7 @@ def estimate_shared(
     Args:
         episodes: episodes with cameras of the views, whose intrinsics and, with `guess`, poses are
             starts.
-        views: V views that share their focal length.
+        views: names of the V views that share their focal length.
         robot: robot of the recordings.
         shapes: shapes of its links.
         guess: start from the poses of the recordings.

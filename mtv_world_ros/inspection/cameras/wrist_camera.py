@@ -112,7 +112,7 @@ class SceneTracks:
 
     Attributes:
         rays: (M, L, 3) unit rays in the optical frame.
-        stretch: (M,) which stretch each is of, 0 .. S - 1, by time.
+        stretch: (M,) number of the stretch of each track, 0 to S - 1, by time.
         positions: (S, L, J) positions of the joints.
         turns: (S, K, 3) ways in which the camera may have turned over a stretch, in its first
             optical frame [rad]; NaN where there are fewer than K.
@@ -131,7 +131,7 @@ class WristCamera:
 
     Args:
         tracks: points seen by it.
-        camera: its intrinsics and `mount_link`; the pose is the guess, where there is one.
+        camera: intrinsics and `mount_link`; the pose is the guess, if there is one.
         robot: gives the link's poses.
     """
 
@@ -313,7 +313,7 @@ def follow_scene(
 
     Args:
         track: frames of the camera.
-        camera: its intrinsics.
+        camera: intrinsics of the camera.
         robot: whose joints are meant.
         joints: measured positions.
 

@@ -103,7 +103,7 @@ def contact_sheet(
 
     Args:
         out: folder of the data set.
-        entries: its episodes, at least one.
+        entries: episodes of the data set, at least one.
         pairs: rows per task, each a success and a failure.
         num_frames: number of frames of each episode.
         width: width of a frame [px].

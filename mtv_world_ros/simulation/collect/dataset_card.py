@@ -35,7 +35,7 @@ class CardEntry:
     """One episode of a data set, as its MCAP file describes it.
 
     Attributes:
-        name: its folder.
+        name: folder of the episode.
         task: name of the task.
         index: number within the task, in a zero-shot set within its kind and task.
         split: `train` (even index) or `test` (odd index, and all of a zero-shot set).

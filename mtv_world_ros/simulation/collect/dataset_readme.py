@@ -157,7 +157,7 @@ def readme(out: Path, card: Mapping[str, Any], entries: Sequence[CardEntry]) -> 
     Args:
         out: folder of the data set.
         card: see `card_of`.
-        entries: its episodes, at least one.
+        entries: episodes of the data set, at least one.
     """
     first = out / min(entry.name for entry in entries)
     bag = BagReader(first)

@@ -79,7 +79,7 @@ def jobs_of(
         tasks: the tasks to carry out.
         num_episodes: number of episodes of each.
         seed: the data set's random seed.
-        out: its folder.
+        out: folder of the data set.
         num_of_ten: number of grasps of the expert in ten that miss.
         policies: scripted policies that take turns in every task, where each task begins further
             down the list, so that many policies all come up in few episodes; none = the expert.

@@ -75,7 +75,7 @@ class Take:
     """A simulated episode in memory: T frames, C control samples.
 
     Attributes:
-        observations: T, one a frame.
+        observations: T observations, one a frame.
         control_positions: (C, J) measured joints at every control period.
         commands: the commanded trajectory.
         ever: True if the task was done in at least one frame.
@@ -123,7 +123,7 @@ def simulate(
     """Run the expert, or a faulty variant of it, open loop on the episode of a seed.
 
     Args:
-        sim: is reset.
+        sim: simulator; it is reset.
         expert: the scripted expert, which plans.
         task: the task to carry out.
         seed: the episode's random seed.

@@ -94,8 +94,8 @@ class RigidBodies:
 
     Args:
         robot: robot from a URDF whose base link is its root.
-        response: how its joints follow; all have a compliance.
-        solids: O, on the table.
+        response: response of the joints; all have a compliance.
+        solids: the O solids on the table.
         settings: settings of contact.
         step_s: step of the engine.
         pose: (J,) near which the arms work [rad or m].

@@ -32,11 +32,11 @@ class SteppedWorld:
 
     Args:
         robot: robot from a URDF with inertias.
-        response: how its joints follow; all have a compliance.
+        response: response of the joints; all have a compliance.
         settings: settings of contact.
-        solids: O, on the table.
+        solids: the O solids on the table.
         masses: (O,) [kg].
-        home: (J,) where the joints rest at first [rad or m].
+        home: (J,) initial rest positions of the joints [rad or m].
 
     Raises:
         RobotError: the robot cannot be a tree of rigid bodies.

@@ -52,7 +52,7 @@ class Pick:
         position: position of the tool at the grasp (3,) [m].
         yaw: yaw of the tool [rad].
         opening: opening of the gripper on the way down, 0..1.
-        released: its opening when the object is let go, 0..1.
+        released: opening of the gripper when the object is let go, 0..1.
     """
 
     arm: str
@@ -102,7 +102,7 @@ class ExpertConfig:
         least_s: shortest move between way points, before scaling.
         motion_s: time from first to last motion of a task of one move, range; scaled to it.
         motions_s: the same for each move of a task of several.
-        overlap_s: how long before a move ends the other arm may start its own.
+        overlap_s: time before the end of a move at which the other arm may start [s].
         picking: gaps between fingers and objects.
     """
 
@@ -191,10 +191,10 @@ class Expert:
 
         Args:
             task: the task to carry out.
-            scene: where everything is at the start, and the goals.
+            scene: start poses of all objects, and the goals.
             rng: draws heights, tempo and the size of a miss.
             miss: displace one grasp so that the gripper closes on nothing.
-            faults: what goes wrong with the way points of one move.
+            faults: faults of the way points of one move.
 
         Raises:
             SimulatorError: a way point is out of the arm's reach.

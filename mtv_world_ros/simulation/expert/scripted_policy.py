@@ -49,10 +49,10 @@ class ScriptedPolicy:
     the episode's first one. The same variant, scene and seed give the same plan.
 
     Args:
-        variant: what is wrong with it.
+        variant: faults of the policy.
         expert: the scripted expert, which plans.
         task: the task to carry out.
-        scene: where everything is.
+        scene: scene with the poses of all objects.
         hold_s: time from the end of the plan to the end of the episode [s].
     """
 
@@ -269,7 +269,7 @@ def policy_of_recording(
     """Return the policy of a name, for the scene of a simulated episode.
 
     Args:
-        name: as in `scripted_policy`.
+        name: name of the policy, as in `scripted_policy`.
         recording: the episode's folder.
         expert: the scripted expert, which plans.
         hold_s: time from the end of the plan to the end of the episode [s].

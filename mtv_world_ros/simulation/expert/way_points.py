@@ -50,7 +50,7 @@ class Draws:
         openings: (N,) the same of openings.
         play: draws anew for every plan that is tried.
         objects: (3,) centre of every object of the scene [m].
-        other_home: (3,) where another arm's tool rests [m].
+        other_home: (3,) rest position of another arm's tool [m].
     """
 
     yaw: float

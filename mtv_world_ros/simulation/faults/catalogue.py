@@ -78,7 +78,7 @@ class FaultKind(Schema):
         alias: another name, which earlier recordings have.
         family: group of kinds, e.g. `timing` or `release`.
         split: `train`, `calibrate` or `test`.
-        size: its typical, largest and ranked sizes.
+        size: typical, largest and ranked sizes of the fault.
         text: meaning of the size, in words.
         contact: whether its failures are failures of contact, which do not show in the arm's path
             alone.

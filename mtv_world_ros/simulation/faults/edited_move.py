@@ -38,7 +38,7 @@ class EditedMove:
     """A move under edit: its way points, and what a program refers to by name.
 
     Attributes:
-        stops: its way points.
+        stops: way points of the move.
         size: the fault's size.
         draws: random draws for the move.
         end: behind the way points that were inserted last.

@@ -69,7 +69,7 @@ def changed(
         weight: factor of the lengths in `by` and of angles that are added.
         place: name of the place that it is moved to.
         by: displacement, as lengths by direction [m].
-        phase: its phase.
+        phase: phase of the move.
         seconds: it takes; the name of a way point = as long as that.
         **shape: `opening`, `yaw` and `lean`.
     """

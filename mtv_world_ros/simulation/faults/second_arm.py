@@ -32,7 +32,7 @@ class SecondArm(Schema):
     Attributes:
         to: name of the place that it visits.
         share: fraction of the path to that place.
-        level: it goes less far in the plane alone.
+        level: whether the share shortens its way in the plane alone.
         like: way point of the first arm that it is like; empty = as it rests.
         but: changes of that way point.
         rows: its way points, as differences from that.
@@ -42,7 +42,7 @@ class SecondArm(Schema):
         late: time from there [s].
         waits: the first arm waits at its first way point if the second one takes longer.
         roams: through places near objects, as many as the size says.
-        follows: it goes to the first arm's places.
+        follows: whether it goes to the first arm's places.
     """
 
     to: str = ''

@@ -61,7 +61,7 @@ class WayPointFaults:
         Args:
             yaw: yaw of its grasp [rad]; the fingers travel along it.
             objects: (3,) centre of every object of the scene [m].
-            other_home: (3,) where another arm's tool rests [m].
+            other_home: (3,) rest position of another arm's tool [m].
         """
         return Draws(yaw=yaw, objects=objects, other_home=other_home, **self._drawn)
 
@@ -97,7 +97,7 @@ def with_faults(
 
     Args:
         plan: equally spaced.
-        variant: its faults of commands are applied.
+        variant: variant whose faults of commands are applied.
         robot: the robot that these joints belong to.
         rng: generator that draws the noise.
 

@@ -28,7 +28,7 @@ class DescribedObject:
         id: unique in the scene.
         name: noun phrase of at most `MAX_WORDS` words, unique in the scene; what a segmenter
             looks for.
-        colour: its main colour.
+        colour: main colour of the object.
         category: kind of object, e.g. `block`.
         role: one of `ROLES`: what is moved, what things stand on, what things go into.
         box: left, top, right, bottom in thousandths of the image's width and height.

@@ -70,7 +70,7 @@ class Example:
     Attributes:
         name: name of the object.
         frame: (h, w, 3) uint8 RGB, the object and what surrounds it.
-        mask: (h, w) of the object.
+        mask: (h, w) mask of the object.
         size: (2,) width and height of the whole frame [px].
     """
 
@@ -244,7 +244,7 @@ class _Look:
     """Colours of one object, and whether they tell it from everything else.
 
     Attributes:
-        colours: (bins,) its histogram.
+        colours: (bins,) colour histogram of the object.
         wide: (bins,) bool, colours that are the object's anywhere in a frame.
         near: (bins,) bool, those that are the object's where it is known to be about.
         stands_out: whether `wide` finds it in its own examples.

@@ -159,7 +159,7 @@ class MMGroundingDino:
 
         Args:
             frame: (H, W, 3) uint8 RGB.
-            names: O object names.
+            names: names of the O objects.
 
         Raises:
             ConfigError: the names are longer than the model's text.
@@ -198,8 +198,8 @@ def choose_boxes(
 
     Args:
         boxes: (Q, 4) corners of candidates [px].
-        scores: (Q, O) how well each fits each name, in [0, 1].
-        names: O names.
+        scores: (Q, O) score of each box for each name, in [0, 1].
+        names: names of the O objects.
         config: score thresholds of detections.
     """
     owner = scores.argmax(1)

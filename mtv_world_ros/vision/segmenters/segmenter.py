@@ -35,7 +35,7 @@ class Segmenter(Protocol):
 
         Args:
             frames: (V, T, H, W, 3) uint8 RGB.
-            names: O object names.
+            names: names of the O objects.
             first_masks: (V, O, H, W) masks just before the first frame, where known.
             first_frames: (V, H, W, 3) uint8 RGB, the frames that `first_masks` belong to.
 

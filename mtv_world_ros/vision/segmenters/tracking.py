@@ -101,7 +101,7 @@ def track(
 
     Args:
         pixels: (T, H, W) pixels of the object's colour.
-        first: (H, W) its mask just before frame 0, where known.
+        first: (H, W) mask of the object just before frame 0, if known.
         config: thresholds for joining and tracking pieces of a colour.
         taken: (T, H, W) pixels that another object of the same colour holds.
         out: (T, H, W) all False, takes the masks; None = a new array.
@@ -123,7 +123,7 @@ def judge_tracks(masks: BoolArray, first: BoolArray, config: TrackingConfig) -> 
     """Return the status of masks that another method tracked.
 
     Args:
-        masks: (T, H, W) as tracked.
+        masks: (T, H, W) tracked masks.
         first: (H, W) the mask they were tracked from, not empty.
         config: when to doubt.
     """
@@ -144,8 +144,8 @@ class _Patch(NamedTuple):
 
     Attributes:
         pixels: (h, w) bool; a view.
-        top: its first row in the frame.
-        left: its first column.
+        top: first row of the patch in the frame.
+        left: first column of the patch in the frame.
         shape: (H, W) shape of the frame.
     """
 
@@ -317,7 +317,7 @@ def with_part(
         found: the object by its main colour.
         pixels: (T, H, W) pixels of the part's colour.
         others: (T, H, W) masks of the other objects.
-        first: (H, W) its mask just before frame 0, where known.
+        first: (H, W) mask of the object just before frame 0, if known.
         config: when to doubt the sum.
     """
     free = pixels & ~np.any(others, axis=0) if others else pixels

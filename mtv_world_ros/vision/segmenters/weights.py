@@ -93,7 +93,7 @@ def load_vision_model(folder: Path, kind: str, device: str) -> Any:
     """Return a model of `transformers`, float32, in evaluation mode.
 
     Args:
-        folder: as `hf download <name> --local-dir <folder>` leaves it.
+        folder: folder as `hf download <name> --local-dir <folder>` leaves it.
         kind: the `model_type` that its config.json must have, a key of `VISION_MODELS`.
         device: `cpu`, `cuda`, ...
 
