@@ -26,7 +26,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--robot',
         default='yam_bimanual',
-        help='a robot with a workcell in the simulator: yam_bimanual, franka or ur5e_pair',
+        help='a robot with a workcell in the simulator: yam_bimanual, franka, ur5e_pair, or the '
+        'folder of your own',
     )
     parser.add_argument(
         '--episodes',
