@@ -12,6 +12,7 @@ from mtv_world_ros.cameras.silhouettes import draw_silhouettes
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import CalibrationError
 from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.inspection.camera_pose import difference, displaced_pose, jackknife_errors
 from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
 from mtv_world_ros.inspection.cameras.wrist_camera import follow_scene, WristCamera
@@ -159,6 +160,23 @@ def test_a_camera_without_any_calibration_is_found(wrist, tmp_path):
         palm.T_mount_camera, load_calibration(out)['palm'].T_mount_camera
     )  # fmt: skip
     assert mm < 15 and degrees < 0.6, (mm, degrees)
+
+
+@pytest.mark.parametrize('mount', [[], ['--mount-link', 'find']], ids=['fixed', 'on the arm'])
+def test_one_recording_without_intrinsics_is_not_searched_with_made_up_ones(
+    tmp_path, capsys, mount
+):
+    robot = load(tmp_path)
+    path = tmp_path / 'episode'
+    with EpisodeWriter(path, task='', instruction='move', robot=robot.name) as writer:
+        for k, row in enumerate(make_positions(0.5)):
+            writer.write_joint_states(10**9 + k * 10**8, robot.joint_names, row)
+            writer.write_image('palm', 10**9 + k * 10**8, np.full((48, 64, 3), k, np.uint8))
+    command = ['fit', 'camera', str(path), '--view', 'palm', '--robot', str(robot.file)]
+    assert main([*command, '--no-guess', *mount, '--out', str(tmp_path / 'a.yaml')]) == 1
+    said = capsys.readouterr().err
+    assert "the intrinsics of view 'palm' are not known" in said and '--calibration' in said
+    assert not (tmp_path / 'a.yaml').exists()
 
 
 def test_a_guess_is_of_the_recorded_link(wrist, tmp_path, capsys):

@@ -201,6 +201,12 @@ def estimate_camera(
             f"'{episode.info.path}': the camera of view '{arguments.view}' moves by itself, with "
             'the poses of /tf; one that stands still or is on the arm can be estimated'
         )
+    if 'intrinsics' in episode.unknown.get(arguments.view, ''):
+        raise CalibrationError(
+            f"'{episode.info.path}': the intrinsics of view '{arguments.view}' are not known, and "
+            'one recording does not tell them: give a calibration file with K (--calibration), '
+            'or, for a camera that stands still, the folder of the recordings'
+        )
     states = episode.joint_states
     if arguments.between is not None:
         start, end = arguments.between
