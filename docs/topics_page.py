@@ -117,7 +117,6 @@ def page(
 
 def _described(node: Node, views: tuple[str, ...]) -> Iterator[str]:
     is_world_model = isinstance(node, WorldModelNode)
-    yield from ('| direction | topic | type | |', '|---|---|---|---|')
     own = node.get_name(), node.get_namespace()
     found = {
         ('in', name): kind
@@ -129,9 +128,12 @@ def _described(node: Node, views: tuple[str, ...]) -> Iterator[str]:
     if is_world_model:
         found |= OPTIONAL_TOPICS
     order = list(TOPICS)
-    for (way, name), kind in sorted(found.items(), key=lambda f: (f[0][0], order.index(f[0][1]))):
-        yield f'| {way} | `{name}` | {kind} | {TOPICS[name]} |'
-    yield from ('', '| service | type | |', '|---|---|---|')
+    for heading, way in (('subscribed topic', 'in'), ('published topic', 'out')):
+        yield from (f'| {heading} | type | |', '|---|---|---|')
+        for name in sorted((n for w, n in found if w == way), key=order.index):
+            yield f'| `{name}` | {found[way, name]} | {TOPICS[name]} |'
+        yield ''
+    yield from ('| service | type | |', '|---|---|---|')
     services = dict(_named(node.get_service_names_and_types_by_node(*own), node, views))
     for name in sorted(services, key=list(SERVICES).index):
         yield f'| `{name}` | {services[name]} | {SERVICES[name]} |'
