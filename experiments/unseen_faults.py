@@ -35,6 +35,7 @@ from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 import numpy as np
 from page import parse_arguments, publish, ROOT, table
 from shifted_worlds import (
@@ -281,10 +282,13 @@ def reliability(
                 axes.plot([x, x], [bottom, top], color=colour, lw=1.2)
                 axes.plot([low, high], [hits / count] * 2, color=colour, lw=0.8, ls=':')
                 axes.plot(x, hits / count, mark, color=colour, ms=4 + min(count, 100) ** 0.5 / 2)
-            axes.plot([], [], mark, color=colour, label=judge)
         axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), title=title, aspect='equal')
         axes.set_xlabel('estimate (dotted: mean 95 % interval)')
-        axes.legend(fontsize=7, loc='lower right')
+    marks = [
+        Line2D([], [], color=colour, marker=mark, ls='', label=judge)
+        for judge, (colour, mark) in styles.items()
+    ]
+    figure.legend(handles=marks, loc='outside lower center', ncols=len(marks), fontsize=8)
     figure.axes[0].set_ylabel('share that succeeded (bar: 95 % Wilson)')
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file)
