@@ -23,8 +23,7 @@ from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.inspection.inspection_report import BROKEN
-from mtv_world_ros.model.card import read_card
-from mtv_world_ros.model.checkpoint import Checkpoint, checkpoint_folder
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.training.resume import DiskError
@@ -137,10 +136,10 @@ def test_a_report_of_other_episodes_is_refused(report):
 
 
 def test_weights_that_know_other_drawings_are_told(tiny, recording):
-    bundled = checkpoint_folder('bundled')
+    bundled = Checkpoint.open('bundled')
     said = ' '.join(training_notes(tiny, [recording], bundled))
     assert 'rendering.object_motion=true' in said and 'rendering.finger_width_m=0.008' in said
-    alike = tiny.replace(rendering=TrajectoryVideoConfig(**read_card(bundled).rendering))
+    alike = tiny.replace(rendering=TrajectoryVideoConfig(**bundled.card.rendering))
     assert 'starts from' not in ' '.join(training_notes(alike, [recording], bundled))
 
 
