@@ -86,7 +86,7 @@ def test_without_joint_actions_the_measured_rows_are_the_commands(
 
 @pytest.mark.parametrize('kind', KINDS)
 def test_boxes_teach_from_the_frame_in_which_they_are_drawn(
-    kind, datasets, make_mapping, tmp_path
+    kind, datasets, make_mapping, tmp_path, capsys
 ):
     """`--objects`, and the page with the first frame of each episode."""
     mapping, page = make_mapping(), tmp_path / 'boxes.html'
@@ -104,7 +104,10 @@ def test_boxes_teach_from_the_frame_in_which_they_are_drawn(
     assert episode.info.objects == ('thing',) and episode.masks is not None
     values['boxes']['front']['episode_000007'] = {'thing': [box]}
     (tmp_path / 'objects.yaml').write_text(json.dumps(values))
-    assert main([*command, str(tmp_path / 'other'), *more]) == 1
+    capsys.readouterr()
+    assert main([*command, str(tmp_path / 'other'), *more]) == 0
+    printed = capsys.readouterr()
+    assert 'episode_000007' in printed.out + printed.err  # of another folder: said, not refused
 
 
 def test_words_outcome_and_source_are_kept(datasets, make_mapping, tmp_path):
