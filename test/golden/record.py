@@ -158,7 +158,8 @@ def summary(value: Any) -> dict[str, Any]:
 
     add('', value)
     found: dict[str, Any] = {key: spread(values) for key, values in sorted(numbers.items())}
-    return found | {f'{key} (text)': digest('|'.join(sorted(t))) for key, t in texts.items()}
+    words = {f'{key} (text)': digest('|'.join(sorted(t)))[:12] for key, t in texts.items()}
+    return found | words
 
 
 def spread(values: Any) -> list[float]:
