@@ -61,6 +61,8 @@ TOLERANCES = (
 )
 #: sections with such numbers
 _APPROXIMATE = ('replay', 'collect', 'evaluate', 'rank', 'train')
+#: folders with a file for each episode
+_SINGLE = {'episodes', 'rollouts', 'seed_0'}
 #: width and height of a coarse picture
 _COARSE = (8, 6)
 _NUMBER = re.compile(r'[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?')
@@ -130,10 +132,15 @@ def lasting(value: Any) -> Any:
 
 
 def results(out: Path) -> dict[str, Any]:
-    """Return a summary of all JSON files under a folder, without what differs from run to run."""
+    """Return a summary of the JSON files under a folder, without what differs from run to run.
+
+    Files of single episodes are left out: their numbers are in those of the whole.
+    """
+    files = {path.relative_to(out): path for path in sorted(out.rglob('*.json'))}
     return {
-        str(path.relative_to(out)): summary(lasting(json.loads(path.read_text())))
-        for path in sorted(out.rglob('*.json'))
+        str(name): summary(lasting(json.loads(path.read_text())))
+        for name, path in files.items()
+        if not _SINGLE & {*name.parts}
     }
 
 
