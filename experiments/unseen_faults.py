@@ -85,7 +85,7 @@ Line = dict[str, Any]
 
 
 def more(parser: argparse.ArgumentParser) -> None:
-    """Adds options."""
+    """Add options."""
     shifted_options(parser)
     parser.set_defaults(
         physics='nominal,bold,mass_triple,camera_off,joint_zeros_1deg,objects_small,dart',
@@ -102,7 +102,7 @@ def more(parser: argparse.ArgumentParser) -> None:
 
 
 def of_seed(options: argparse.Namespace, seed: int) -> argparse.Namespace:
-    """Returns the options of `shifted_worlds` for a seed."""
+    """Return the options of `shifted_worlds` for a seed."""
     chosen = copy.copy(options)
     chosen.seed, chosen.faults = seed, f'drawn:{seed}'
     chosen.log = options.logs / f'{seed}.jsonl'
@@ -112,7 +112,7 @@ def of_seed(options: argparse.Namespace, seed: int) -> argparse.Namespace:
 def estimates_of(
     options: argparse.Namespace, pipelines: dict[str, Pipeline], lines: Sequence[Line]
 ) -> dict[tuple[str, str], tuple[list[Line], list[ShareEstimate]]]:
-    """Returns rollouts and estimates by physics and judge."""
+    """Return rollouts and estimates by physics and judge."""
     (name, pipeline), found, scenes = *pipelines.items(), {}, Scenes(pipelines, options)
     for physics in options.physics.split(','):
         chosen = [line for line in lines if line['job'][0] == physics]
@@ -129,7 +129,7 @@ def estimates_of(
 def before(
     calibration: Calibration, lines: Sequence[Line], name: str
 ) -> dict[tuple[str, str], tuple[list[Line], list[ShareEstimate]]]:
-    """Returns what the estimate was that counted frames beside the drawn motion.
+    """Return what the estimate was that counted frames beside the drawn motion.
 
     Of physics whose rollouts begin with the same picture as those of `nominal`, thus have the same
     estimate: bodies differ, not pictures.
@@ -176,7 +176,7 @@ def _before(calibration: Calibration, said: Line) -> ShareEstimate:
 
 
 def block(rows: Sequence[Row], num_scenes: int, seeds: str, count: int) -> str:
-    """Returns the table of README.md."""
+    """Return the table of README.md."""
     lines = []
     for judge in (BOTH, FORESEEN, AS_FITTED, RULE):
         of = [r for r in rows if r.judge == judge]
@@ -231,7 +231,7 @@ FloatRow = Any
 
 
 def coverage(lines: Sequence[Line], estimates: Sequence[ShareEstimate]) -> list[str]:
-    """Returns cells: estimates, and shares of them in groups that are covered."""
+    """Return cells: estimates, and shares of them in groups that are covered."""
     found = groups(lines, estimates)
     total = sum(count for _, count, _ in found)
     if not total:
@@ -252,7 +252,7 @@ def coverage(lines: Sequence[Line], estimates: Sequence[ShareEstimate]) -> list[
 def reliability(
     found: dict[tuple[str, str], tuple[list[Line], list[ShareEstimate]]], file: Path
 ) -> None:
-    """Writes the reliability diagram: nominal and all shifts, before and after."""
+    """Write the reliability diagram: nominal and all shifts, before and after."""
     figure = Figure(figsize=(11, 4.4), dpi=110, layout='constrained')
     FigureCanvasAgg(figure)
     panels: list[tuple[str, Callable[[str], bool]]] = [
@@ -295,7 +295,7 @@ def reliability(
 
 
 def main() -> None:
-    """Runs what is missing, and prints and writes the tables."""
+    """Run what is missing, and print and write the tables."""
     options = parse_arguments(__doc__, 1, more)
     pipelines = {
         name: Pipeline.load(name, camera_check=not options.no_camera_check)

@@ -22,7 +22,7 @@ def checkpoint(tmp_path, ros, monkeypatch):
 
 @pytest.fixture
 def observe(checkpoint, tmp_path, ros):
-    """Returns a start, and the line that was said of it."""
+    """Return a start, and the line that was said of it."""
     said = []
 
     def observe(*words, timeout_s=30.0):
