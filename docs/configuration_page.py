@@ -237,7 +237,7 @@ def _title(kind: type[Schema]) -> str:
     name = re.sub(r'(Config|Settings|Entry)$', '', kind.__name__).replace('LeRobot', 'Lerobot')
     first, *rest = re.findall(r'[A-Z]+(?![a-z])|[A-Z][a-z0-9]*', name)
     words = [first, *(word if word.isupper() else word.lower() for word in rest)]
-    return ' '.join(_NAMES.get(word, word) for word in words)
+    return ' '.join(_NAMES.get(word) or word for word in words)
 
 
 def _first_line(kind: type[Schema]) -> str:

@@ -91,7 +91,7 @@ class Clips:
             dtype=torch.bfloat16,
             trained_on={},
         )
-        made.start_from(self.checkpoint.folder)
+        made.start_from(self.checkpoint)
         return made
 
 

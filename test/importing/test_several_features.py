@@ -267,6 +267,7 @@ def test_images_with_an_exif_orientation_are_turned_upright_and_it_is_said(
 
     def lying(path, data):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
         image[:10] = 250  # the upper edge
         exif, file = Image.Exif(), io.BytesIO()
         exif[0x0112] = 6  # to be turned by 90 degrees clockwise

@@ -139,6 +139,7 @@ def serve(port: int) -> None:
 
 def policy_server(folder: Path, one: Signal) -> None:
     """A policy of a ranking is asked until its server is hit; then it is to answer again."""
+    from mtv_world_ros.policies.policy import EpisodeOrigin
     from mtv_world_ros.ranking.policy_list import GuardedPolicy, load_policy_list
     from mtv_world_ros.robot.file import load_robot, robot_path
 
@@ -146,8 +147,9 @@ def policy_server(folder: Path, one: Signal) -> None:
     entry = {'name': 'fine', 'policy': 'openpi', 'command': command}
     entry['change'] = {'timeout_s': TIMEOUT_S}
     (folder / 'list.yaml').write_text(yaml.safe_dump({'policies': [entry]}))
-    (listed,) = load_policy_list(folder / 'list.yaml', load_robot(robot_path('yam_bimanual')))
-    policy = GuardedPolicy(listed, folder)
+    robot = load_robot(robot_path('yam_bimanual'))
+    (listed,) = load_policy_list(folder / 'list.yaml', robot)
+    policy = GuardedPolicy(listed, folder, EpisodeOrigin(), robot)
     try:
         while not one.late():
             try:

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from mtv_world_ros.core.errors import ConfigError, TrainingError
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.training.trainer import learning_rate
@@ -188,7 +189,7 @@ def test_a_run_may_start_from_the_weights_of_a_checkpoint(tiny, source, tmp_path
     losses_of(first, source)
     first.export(tmp_path / 'checkpoint', dtype=torch.float32)
     second = make_trainer(tiny, tmp_path / 'second', seed=1)
-    second.start_from(tmp_path / 'checkpoint')
+    second.start_from(Checkpoint.open(tmp_path / 'checkpoint'))
     assert second.step == 0
     for averaged, weight, worker in zip(
         first.weights.ema.shadow_params,
@@ -209,7 +210,7 @@ def test_the_object_motion_network_comes_along_to_the_same_robot_alone(
     (tmp_path / 'checkpoint' / 'object_motion' / 'config.json').write_text('{}')
     tiny = tiny.replace(rendering=tiny.rendering.replace(object_motion=True))
     second = make_trainer(tiny.replace(video=tiny.video.replace(robot=name)), tmp_path / 'second')
-    second.start_from(tmp_path / 'checkpoint')
+    second.start_from(Checkpoint.open(tmp_path / 'checkpoint'))
     second.export(tmp_path / 'exported')
     is_same = tiny.video.robot == name
     assert (tmp_path / 'exported' / 'object_motion').is_dir() == is_same
@@ -222,7 +223,7 @@ def test_a_model_that_is_shown_no_foreseen_objects_keeps_no_physics(tiny, source
     (tmp_path / 'checkpoint' / 'object_motion').mkdir()
     second = make_trainer(tiny, tmp_path / 'second')
     assert not tiny.rendering.object_motion
-    second.start_from(tmp_path / 'checkpoint')
+    second.start_from(Checkpoint.open(tmp_path / 'checkpoint'))
     second.export(tmp_path / 'exported')
     assert not (tmp_path / 'exported' / 'object_motion').exists()
 
@@ -234,7 +235,9 @@ def test_weights_of_another_architecture_are_refused(tiny, source, tmp_path):
     deeper = tiny.replace(transformer={**tiny.transformer, 'num_layers': layers})
     said = f'num_layers is {layers - 1} there and {layers} here. Give --preset'
     with pytest.raises(TrainingError, match=re.escape(said)):
-        make_trainer(deeper, tmp_path / 'second').start_from(tmp_path / 'checkpoint')
+        make_trainer(deeper, tmp_path / 'second').start_from(
+            Checkpoint.open(tmp_path / 'checkpoint')
+        )
 
 
 def test_failed_episodes_are_drawn_as_often_as_asked(recording, tiny, robot):
