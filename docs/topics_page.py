@@ -30,6 +30,8 @@ view's name, or the parameter `camera_topics.<view>`. With `compressed_input` im
 and their quality of service, is on the page of [the node](node.md). This page is written by
 `python docs/topics_page.py`.
 """
+#: namespace of the nodes while names are read; the page leaves it out
+_NAMESPACE = f'/topics_page_{os.getpid()}'
 #: names that every ROS 2 node has
 _EVERY_NODE = ('parameter', 'rosout', 'type_description', 'transition_event')
 #: meaning by name; a name without one is an error
@@ -99,7 +101,10 @@ def page(
     """
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     context = rclpy.Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    # ROS finds nodes by name: another '/world_model' in this domain must not answer
+    remapped = ['--ros-args', '-r', f'__ns:={_NAMESPACE}']
+    options = SignalHandlerOptions.NO
+    rclpy.init(args=remapped, context=context, signal_handler_options=options)
     world_model = WorldModelNode(load_model, context)
     policy = PolicyNode(load_policy, context)
     views = Checkpoint.open('bundled').card.views
@@ -148,6 +153,7 @@ def _named(
     for name, kinds in entries:
         if any(word in name for word in _EVERY_NODE) or '/_action/' in name:
             continue
+        name = name.removeprefix(_NAMESPACE)
         for view in views:
             name = name.replace(f'/{view}/', '/<view>/')
         name = name.replace(f'/{node.get_name()}/', '~/')

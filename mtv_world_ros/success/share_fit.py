@@ -66,7 +66,7 @@ class ShareFit(Schema):
     slope: Annotated[Number, Field(ge=0)] = 1.0
     covariance: ListOf[Number] = (0.0, 0.0, 0.0)
     num_episodes: Annotated[int, Field(ge=0)] = 0
-    max_picture_gap_m: Annotated[float, Field(gt=0)] = MAX_PICTURE_GAP_M
+    max_picture_gap_m: Annotated[Number, Field(gt=0)] = MAX_PICTURE_GAP_M
 
     @model_validator(mode='after')
     def _is_a_covariance(self) -> Self:

@@ -153,6 +153,7 @@ def test_yaml_in_the_pages_can_be_used(block, tmp_path, monkeypatch):
         monkeypatch.syspath_prepend(tmp_path)
         robot = load_robot(robot_path('yam_bimanual'))
         assert policy_settings(file, robot).make(EpisodeOrigin(), robot).name == name
+        sys.modules.pop(name)
     elif 'kind' in values:
         robot = load_robot(ROOT / 'config' / 'robots' / 'yam_bimanual' / 'robot.yaml')
         load_policy_config(file, robot)

@@ -132,7 +132,7 @@ def inspected(folder):
     ('name', 'verdict', 'said'),
     [
         ('degrees', 'broken', 'outside its limits'),
-        ('frozen', 'broken', 'the same as the one before'),
+        ('frozen', 'broken', 'show the same picture for more than'),
         ('longer', 'suspicious', 'after the last frame'),
         ('mirrored', 'broken', 'mirror'),
         ('slow', 'suspicious', '1 frames a second'),

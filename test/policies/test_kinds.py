@@ -74,6 +74,7 @@ class Shifting:
 
 @pytest.fixture(autouse=True)
 def client(tmp_path, monkeypatch):
+    sys.modules.pop('my_client', None)  # the one of docs/policies.md has the same name
     (tmp_path / 'my_client.py').write_text(CLIENT)
     monkeypatch.syspath_prepend(tmp_path)
     yield

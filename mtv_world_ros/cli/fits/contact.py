@@ -131,4 +131,4 @@ def _place_of(paths: Sequence[Path]) -> str:
             f'the recordings are of {len(places)} robot cells ({"; ".join(places)}), whose '
             'contact parameters may differ; fit those of one, or name the cell (--place)'
         )
-    return places[0]
+    return places[0] if places else ''

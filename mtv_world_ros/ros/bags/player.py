@@ -169,7 +169,7 @@ class Player(Node):
         self._unpublished: set[tuple[str, str]] = set()
         self.create_subscription(DiagnosticArray, options.report_topic, self._on_report, 100)
         self._hint = self._describe_cameras(types)
-        self._say_objects(types)
+        self._say_parameters(types)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         self._peers = Peers(self)
@@ -254,20 +254,26 @@ class Player(Node):
         self.get_logger().warning(text)
         return text
 
-    def _say_objects(self, types: dict[str, str]) -> None:
-        """Say which objects the episode has: no topic carries their names to the node."""
+    def _say_parameters(self, types: dict[str, str]) -> None:
+        """Say what the node is told of the episode by parameters: no topic carries it."""
         if TRAJECTORY not in {types[topic] for topic in self._outputs}:
             return
         values = self._reader.metadata.get(METADATA_NAME, {})
         try:
-            names = parse_info(self._options.episode, values).objects
+            info = parse_info(self._options.episode, values)
         except EpisodeError as error:  # which keeps no topic from being played
             self.get_logger().warning(str(error))
             return
-        if names:
+        if info.objects:
             self.get_logger().info(
                 'the objects of this episode have names: world_model takes them with -p '
-                f'"objects:={list(names)}", else from its describer or the instruction'
+                f'"objects:={list(info.objects)}", else from its describer or the instruction'
+            )
+        if info.place:
+            self.get_logger().info(
+                f"this episode was recorded in the robot cell '{info.place}': world_model is told "
+                f"with -p 'place:={info.place}'; in a cell where contact was not fitted, verdicts "
+                'are given more seldom'
             )
 
     def _offer(self, msgtype: str, topic: str) -> Publisher:

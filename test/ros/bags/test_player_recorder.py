@@ -19,6 +19,7 @@ from trajectory_msgs.msg import JointTrajectory
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.core.data_types import JointTrajectory as Trajectory
 from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.episode import PLACE
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.importing.recover import find_damaged, recover
 from mtv_world_ros.ros.messages.conversions import NANO, to_ns
@@ -55,6 +56,7 @@ def write_episode(folder, ros, *, has_infos=True):
         robot='yam_bimanual',
         objects=('red block', 'blue block'),
         cameras=list(cameras.values()),
+        metadata={PLACE: 'bench'},
     ) as writer:
         writer.write_instruction(START_NS)
         for step in range(NUM_STEPS):
@@ -192,6 +194,7 @@ def test_stamps_are_moved_to_now_but_stay_in_step(episode, launch, ros):
         assert code == 0, said
         assert """-p "objects:=['red block', 'blue block']\"""" in said
         assert 'world_model takes them with -p calibration_file:=FILE' in said
+        assert "world_model is told with -p 'place:=bench'" in said
         stamps = {
             topic: np.array([to_ns(m.header.stamp) for m in messages])
             for topic, messages in client.received.items()
