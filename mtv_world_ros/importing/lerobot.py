@@ -598,7 +598,7 @@ def _check_table(metadata: Any, file: Path, columns: Sequence[str] | None) -> No
         column
         for part in parts
         for column in map(part.column, range(part.num_columns))
-        if columns is None or column.path_in_schema.partition('.')[0] in columns
+        if columns is None or _is_of(column.path_in_schema, columns)
     ]
     count = sum(column.num_values for column in read)
     texts = [column for column in read if column.physical_type == 'BYTE_ARRAY']
@@ -615,6 +615,11 @@ def _check_table(metadata: Any, file: Path, columns: Sequence[str] | None) -> No
         raise EpisodeError(str(error)) from error
 
 
+def _is_of(path: str, columns: Sequence[str]) -> bool:
+    """Return True if a path in the schema belongs to a column; names of columns may have dots."""
+    return any(path == name or path.startswith(f'{name}.') for name in columns)
+
+
 def _text_bytes(file: Path, paths: Sequence[str]) -> int:
     """Return the size of texts and images in these columns of a table.
 
@@ -623,8 +628,7 @@ def _text_bytes(file: Path, paths: Sequence[str]) -> int:
     """
     _, parquet = pyarrow_modules()
     table = parquet.ParquetFile(file, read_dictionary=list(paths))
-    roots = sorted({path.partition('.')[0] for path in paths})
-    batches = table.iter_batches(columns=roots)
+    batches = table.iter_batches(columns=list(paths))
     return sum(_array_bytes(column) for batch in batches for column in batch.columns)
 
 

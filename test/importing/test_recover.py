@@ -16,6 +16,7 @@ from rosbags.rosbag2 import Reader
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.data.bag.copying import copy_companions
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.importing.recover import find_damaged, recover
@@ -201,3 +202,16 @@ def test_flushing_costs_little_time(tmp_path) -> None:
             writer.write_raw('/noise', TYPE, index, payload(index, 100))
             writer.flush()
         assert time.process_time() - begin < 2.0
+
+
+def test_what_goes_with_a_recording_is_copied_and_its_damaged_bag_is_not(tmp_path) -> None:
+    source, folder = tmp_path / 'bag', tmp_path / 'whole'
+    (source / 'notes').mkdir(parents=True)
+    folder.mkdir()
+    bag = ['a_0.db3', 'a_0.db3-wal', 'a_0.db3-shm', 'a_1.mcap', 'a_2.mcap.zstd', 'metadata.yaml']
+    for name in (*bag, 'calibration.yaml', 'notes/day.txt', 'meshes.zstd'):
+        (source / name).write_bytes(b'0')
+    copy_companions(source, folder)
+    assert {path.name for path in folder.rglob('*')} == {
+        'calibration.yaml', 'notes', 'day.txt', 'meshes.zstd',
+    }  # fmt: skip

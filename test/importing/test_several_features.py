@@ -309,3 +309,12 @@ def test_short_texts_that_are_repeated_are_read(datasets, tmp_path):
     file = tmp_path / 'tasks.parquet'
     repeated_text(file, 'stack the red block', 200_000)
     assert lerobot._text_bytes(file, ['task']) == 200_000 * len('stack the red block')
+
+
+def test_a_column_with_dots_in_its_name_does_not_fill_the_memory(tmp_path):
+    """LeRobot's names have them; a column that is not read does not count."""
+    file = tmp_path / 'rows.parquet'
+    repeated_text(file, 'x' * 2_000_000, 20_000, column='observation.images.top')
+    with pytest.raises(EpisodeError, match=r'rows.parquet.* 40000000000 bytes'):
+        lerobot._read_table(file, columns=['observation.images.top', 'task_index'])
+    assert lerobot._read_table(file, columns=['task_index']).num_rows == 20_000

@@ -7,11 +7,13 @@ from pathlib import Path
 import shutil
 
 from mtv_world_ros.data.bag.metadata import parse_qos
-from mtv_world_ros.data.bag.reader import BagMessage, BagReader
+from mtv_world_ros.data.bag.reader import BagMessage, BagReader, is_storage
 from mtv_world_ros.data.bag.writer import BagWriter, RESERVE_NAME
 
 #: name of the MCAP metadata record that every writer makes anew
 _ROSBAG2_RECORD = 'rosbag2'
+#: ends of the files that SQLite keeps next to a bag while it is written
+_SQLITE_JOURNALS = ('.db3-wal', '.db3-shm', '.db3-journal')
 
 
 def write_copies(
@@ -56,9 +58,15 @@ def copy_companions(source: Path, folder: Path) -> None:
     if source.is_file():
         return
     for path in source.iterdir():
-        if path.suffix == '.mcap' or path.name in ('metadata.yaml', RESERVE_NAME):
+        if _is_of_bag(path):
             continue
         if path.is_dir():
             shutil.copytree(path, folder / path.name, symlinks=True)
         elif path.is_file():
             shutil.copyfile(path, folder / path.name)
+
+
+def _is_of_bag(path: Path) -> bool:
+    """Return whether a file holds messages or is made anew by every writer."""
+    journal = path.name.endswith(_SQLITE_JOURNALS)
+    return is_storage(path) or journal or path.name in ('metadata.yaml', RESERVE_NAME)

@@ -142,7 +142,7 @@ class BagReader:
             if not file.is_file():
                 self._problem(f"'{file}' is named in metadata.yaml but is not there")
         files = [file for file in named if file.is_file()] or [
-            file for file in sorted(self.path.iterdir()) if file.is_file() and _is_storage(file)
+            file for file in sorted(self.path.iterdir()) if file.is_file() and is_storage(file)
         ]
         if not files:
             raise EpisodeError(f"'{self.path}' is not a bag: it holds no .mcap or .db3 file")
@@ -293,7 +293,8 @@ class BagReader:
         return fits
 
 
-def _is_storage(file: Path) -> bool:
+def is_storage(file: Path) -> bool:
+    """Return whether a file holds messages of a bag, by its name."""
     return Path(file.name.removesuffix('.zstd')).suffix in ('.mcap', '.db3')
 
 

@@ -156,6 +156,7 @@ class LiveObserver(Node):
         self._words = MatchedSubscription(self, String, 'instruction', take, depth=1)
         self._watch = QosWatch(self)
         parameters.refuse_unknown(self)
+        self._listens_s = time.monotonic()
 
     def settings(self) -> StartSettings:
         """Return the present parameters."""
@@ -315,6 +316,8 @@ class LiveObserver(Node):
                 silent.append(f'nobody publishes {" or ".join(names)}')
             elif not subscription.num_received:
                 unheard.append(f'nothing was received on {subscription.topic}')
+        if silent and time.monotonic() - self._listens_s < SETTLE_S:
+            unheard = []  # the whole time was spent waiting for images
         found = [*silent, *unheard, *self._watch.mismatches]
         found += [why] if why and not (silent or unheard) else []
         found += [f'refused: {text}' for text in self._refused if text != why]

@@ -146,6 +146,23 @@ def test_topics_that_nobody_publishes_are_named(observe):
         assert topic in text
 
 
+def test_topics_that_bring_messages_are_not_blamed_for_a_missing_camera(observe, ros):
+    def publish(client):
+        client.publish('/joint_states', ros.make_joint_state(client.now_ns()))
+
+    text = ''
+    with published(ros, publish, {'/joint_states': ros.JOINT_STATE}):
+        for timeout_s in (1.0, 4.0, 16.0):
+            with pytest.raises(ObservationError) as error:
+                observe(timeout_s=timeout_s)
+            text = str(error.value)
+            if 'nobody publishes /joint_states' not in text:  # it was discovered
+                break
+    assert 'nobody publishes /low/image_raw' in text
+    assert 'nobody publishes /joint_states' not in text
+    assert 'nothing was received on /joint_states' not in text
+
+
 def test_a_topic_that_brings_nothing_is_named(observe, ros):
     def publish(client):
         client.send_scene(joints=None)
