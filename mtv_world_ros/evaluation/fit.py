@@ -267,11 +267,14 @@ def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]
 
 def fit_futures(samples: Sequence[Sample], l2: float) -> ShareFit | None:
     """Return the fit of the share of futures that succeed; None = too few samples have one."""
-    pairs = [(f, sample.success) for sample in samples for f in sample.features if f]
-    odds = np.array([share_logit(features) for features, _ in pairs])
-    labels = np.array([success for _, success in pairs], np.bool_)
-    known = np.isfinite(odds)
-    odds, labels = odds[known], labels[known]
+    # rollouts of several seeds are of one episode with one outcome: one row, not several
+    means = [
+        (float(np.mean(known)), sample.success)
+        for sample in samples
+        if (known := [o for o in map(share_logit, sample.features) if isfinite(o)])
+    ]
+    odds = np.array([mean for mean, _ in means])
+    labels = np.array([success for _, success in means], np.bool_)
     if len(odds) < MIN_EPISODES or len(set(labels.tolist())) < 2:
         return None
     scale = max(float(odds.std()), 1e-6)
@@ -282,7 +285,7 @@ def fit_futures(samples: Sequence[Sample], l2: float) -> ShareFit | None:
     design = np.column_stack([np.ones(len(rows)), rows])
     curvature = (design.T * (likely * (1 - likely))) @ design + np.diag([1e-6, l2])
     covariance = np.linalg.inv(curvature)
-    gaps = np.array([features.get('picture_gap', nan) for features, _ in pairs])
+    gaps = np.array([f.get('picture_gap', nan) for sample in samples for f in sample.features])
     gaps = gaps[np.isfinite(gaps)]
     limit = float(np.quantile(gaps, 1 - CONTRADICTING_FRACTION)) if len(gaps) else 0.0
     return ShareFit(

@@ -120,9 +120,16 @@ class SceneKeeper:
             before = memory.last.motion.camera_poses[:, -1]
             stayed = np.abs(before - poses).max((1, 2)) < _SAME_POSE
             known = memory.known & stayed[:, None, None]
+        # what showed an object and is covered since may be empty by now
+        shows_object = np.zeros_like(known)
+        if memory is not None and memory.masks.shape[-2:] == known.shape[-2:]:
+            shows_object = self._near(memory.masks.any(1), self._settings.object_margin)
+        found = self._near(masks.masks.any(1), self._settings.object_margin)
         for frame in range(frames.shape[1]):
             free = ~arms[:, frame] & self._stands_still(motion)[:, None, None]
             pictures[free], known = frames[:, frame][free], known | free
+            shows_object = np.where(free, found[:, frame], shows_object)
+        known = known & ~(shows_object & arms[:, -1])
         last = masks.masks[:, :, -1]
         return SceneMemory(
             pictures=pictures,
@@ -150,7 +157,7 @@ class SceneKeeper:
             drawn: (V, T, H, W, 4) the objects where they are foreseen; None = not foreseen.
         """
         robot, found = self._drawn(motion), masks.masks
-        memory = self._after_contact(memory, robot, found)
+        memory = self._after_contact(memory, robot, found, drawn)
         covered = self._near(robot, self._settings.arm_margin)
         covered |= self._moved(memory, found, drawn)
         share = self._shares(memory.known[:, None] & ~covered)
@@ -207,34 +214,45 @@ class SceneKeeper:
         return np.stack(drawn)
 
     def _after_contact(
-        self, memory: SceneMemory, robot: BoolArray, found: BoolArray
+        self, memory: SceneMemory, robot: BoolArray, found: BoolArray, drawn: ByteArray | None
     ) -> SceneMemory:
-        """Return the memory with the objects that the robot approaches in all views.
+        """Return the memory with the objects that are approached in all views.
 
-        A view in which the robot stays away from an object shows that it does not touch it.
+        By the robot, or by an object that it may have moved: what is carried pushes others. A view
+        in which both stay away from an object shows that nothing touches it.
         """
         if found.shape[1] != len(memory.touched):
             touched = np.ones(found.shape[1], np.bool_)
             return replace(memory, masks=found[:, :, 0], touched=touched)
         seen = np.asarray(memory.masks.any((-2, -1)))
-        reach = self._near(robot, self._settings.object_margin)
-        near = (reach[:, None] & memory.masks[:, :, None]).any((-2, -1))  # (V, O, T)
-        may_touch = (near | ~seen[..., None]).all(0).any(-1)
-        return replace(memory, touched=memory.touched | may_touch)
+        touched, before = memory.touched, None
+        while before is None or (touched != before).any():
+            moving, _ = self._places(memory.masks, touched, found, drawn)
+            reach = self._near(robot | moving, self._settings.object_margin)
+            near = (reach[:, None] & memory.masks[:, :, None]).any((-2, -1))  # (V, O, T)
+            may_touch = (near | ~seen[..., None]).all(0).any(-1)
+            before, touched = touched, touched | may_touch
+        return replace(memory, touched=touched)
 
     def _moved(self, memory: SceneMemory, found: BoolArray, drawn: ByteArray | None) -> BoolArray:
-        """Return (V, T, H, W) near objects that may have moved: where they were, and are.
+        """Return (V, T, H, W) near objects that may have moved: where they were, and are."""
+        now, were = self._places(memory.masks, memory.touched, found, drawn)
+        return self._near(now | were, self._settings.object_margin)
 
-        Where motion is foreseen, masks count near these places alone: those of imagined frames
-        wander off into smears.
+    def _places(
+        self, masks: BoolArray, which: BoolArray, found: BoolArray, drawn: ByteArray | None
+    ) -> tuple[BoolArray, BoolArray]:
+        """Return (V, T, H, W) where some objects are, and (V, 1 or T, H, W) where they were.
+
+        Where motion is foreseen, the second has the drawn objects too, and masks count near it
+        alone: those of imagined frames wander off into smears.
         """
-        which = memory.touched
         now = np.asarray(found[:, which].any(1))
-        were = np.asarray(memory.masks[:, which].any(1))[:, None]
+        were = np.asarray(masks[:, which].any(1))[:, None]
         if drawn is not None:
             were = were | (drawn[..., 3] > 0)
             now &= self._near(were, self._settings.arm_margin)
-        return self._near(now | were, self._settings.object_margin)
+        return now, were
 
     def _stands_still(self, motion: Motion) -> BoolArray:
         """(V,) whether no joint of the robot moves a camera."""

@@ -413,6 +413,17 @@ def test_the_fit_of_shares_is_that_of_a_logistic_on_their_log_odds():
     assert found.covariance == pytest.approx(wanted, rel=1e-2)
 
 
+def test_several_seeds_of_an_episode_are_no_more_episodes():
+    shares = np.repeat([0.0, 0.25, 0.5, 0.75, 1.0], 4)
+    samples = [of_futures(share, k % 4 < 4 * share) for k, share in enumerate(shares)]
+    seeds = [replace(sample, features=sample.features * 3) for sample in samples]
+    once, thrice = fit_futures(samples, 1.0), fit_futures(seeds, 1.0)
+    assert thrice.num_episodes == len(samples)
+    assert thrice.covariance == pytest.approx(once.covariance)
+    assert [thrice.bias, thrice.slope] == pytest.approx([once.bias, once.slope])
+    assert fit_futures(seeds[:4], 1.0) is None
+
+
 def test_frames_that_follow_the_motion_state_the_limit_of_a_contradiction():
     gaps = np.linspace(0.0, 0.1, 41)
     samples = [of_futures(k % 2, bool(k % 2), picture_gap=gap) for k, gap in enumerate(gaps)]

@@ -90,6 +90,41 @@ def test_an_object_stays_in_the_memory_until_the_robot_may_have_moved_it(
     assert (frames[0, 0, y, x] == 7).all() == touched
 
 
+@pytest.mark.parametrize(('column', 'touched'), [(90, True), (20, False)])
+def test_an_object_that_a_moved_one_reaches_may_have_moved_too(
+    one_arm, make_camera, keeper, column, touched
+):
+    camera = make_camera(192, 144)
+    x, y = np.rint(camera.K @ RIGHT)[:2].astype(int)
+    taken, other = (y - 3, y + 3, x - 3, x + 3), (4, 10, 88, 94)
+    scene, drawn = texture(camera), np.full_like(texture(camera), 7)
+    start = motion_of(one_arm, [camera], [LEFT], keeper)
+    memory = keeper.seen(None, start, scene, masks_of(camera, [taken, other]))
+    at_right = motion_of(one_arm, [camera], [RIGHT], keeper)
+    _, memory = keeper.held(memory, at_right, drawn, masks_of(camera, [taken, other]), None)
+    assert memory.touched.tolist() == [True, False]
+    pushed = masks_of(camera, [(4, 10, column - 6, column), None])
+    frames, memory = keeper.held(memory, at_right, drawn, pushed, None)
+    assert memory.touched.tolist() == [True, touched]
+    assert (frames[0, 0, 7, 93] == 7).all() == touched
+
+
+def test_where_an_object_was_is_unknown_while_the_robot_covers_it(one_arm, make_camera, keeper):
+    camera = make_camera(192, 144)
+    x, y = np.rint(camera.K @ RIGHT)[:2].astype(int)
+    scene, left = texture(camera), motion_of(one_arm, [camera], [LEFT], keeper)
+    right = motion_of(one_arm, [camera], [RIGHT], keeper)
+    taken = masks_of(camera, [(y - 3, y + 3, x - 3, x + 3)])
+    memory = keeper.seen(None, left, scene, taken)
+    assert memory.known[0, y, x]
+    carried = masks_of(camera, [(4, 10, 4, 10)])  # real frames show it elsewhere
+    memory = keeper.seen(memory, right, scene, carried)
+    assert not memory.known[0, y, x]
+    frames, _ = keeper.held(memory, left, np.full_like(scene, 7), carried, None)
+    assert (frames[0, 0, y, x] == 7).all()  # not the object that is no longer there
+    assert keeper.seen(memory, left, scene, carried).known[0, y, x]
+
+
 def test_a_view_in_which_the_robot_stays_away_shows_that_it_touched_nothing(
     one_arm, make_camera, keeper
 ):
