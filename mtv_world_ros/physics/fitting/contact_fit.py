@@ -622,7 +622,8 @@ def _joint_draws(
     """
     order = np.argsort(logs @ [_HOLD.get(name, 0) for name in RANGES], kind='stable')
     levels = np.cumsum(weights[order])
-    # bit reversal of 0, 1, 2, ...: 1/2, 1/4, 3/4, 1/8, ... of the way
+    # bit reversal of 0, 1, 2, ...: 0, 1/2, 1/4, 3/4, ... of the way. The first draw slips most, so
+    # that few futures lean to slipping: 15 draws by .05 of the way, 3 by .24
     bits = MAX_MOTIONS.bit_length() - 1
     turned = [int(f'{number:0{bits}b}'[::-1], 2) for number in range(MAX_MOTIONS)]
     at = (np.array(turned) + 0.5) / MAX_MOTIONS * levels[-1]
