@@ -66,9 +66,8 @@ def _notes(summary: Summary) -> list[str]:
     found = [_truth_remark(summary), _agreement_remark(summary), _unknown_remark(summary)]
     reasons = ' '.join(reason for result in summary.results for reason in result.imagined.reasons)
     if 'uncalibrated' in reasons:
-        weights = (
-            'stated ones, not fitted ones' if 'stated weights' in reasons else 'fitted elsewhere'
-        )
+        is_fitted = '; weights fitted on ' in reasons
+        weights = 'fitted elsewhere' if is_fitted else 'stated ones, not fitted ones'
         found.append(f'The estimates are not calibrated: their weights are {weights}.')
     cut = sum(not result.is_over for result in summary.results)
     if cut:

@@ -76,6 +76,7 @@ _COUNTED_TWICE = (
     'that was drawn into them; run mtv-world fit success again'
 )
 _SHARE = 'the share of simulated futures that succeed'
+_STATED = 'a logistic with stated weights, given the world model'
 #: largest probability of a task that cannot be done yet: a gripper that has to be open is closed,
 #: or an object that has to move has not moved
 UNDONE_PROBABILITY = 0.1
@@ -272,7 +273,7 @@ class SuccessEstimator:
             'picture_gap': nan if gap is None else gap.distance_m,
             'released': _released(task, views, subjects),
         }
-        basis, elsewhere, fit = self._objection(task), '', ShareFit()
+        basis, elsewhere, fit = self._objection(task, _SHARE), '', ShareFit()
         if not basis and self.calibration is not None:
             if self.calibration.futures is None:
                 basis = f'{_COUNTED_TWICE}: {_SHARE}'
@@ -311,7 +312,7 @@ class SuccessEstimator:
         features, spread = dict(evidence.features), 1.96 * evidence.sigma
         features['foreseen'] = nan
         features['released'] = _released(task, views, subjects)
-        basis = self._objection(task)
+        basis = self._objection(task, _STATED)
         weights = None
         if self.calibration is not None and not basis:
             weights = self.calibration.given(is_real)
@@ -359,9 +360,13 @@ class SuccessEstimator:
             return [_STILL_CLOSED[task.gripper]]
         return []
 
-    def _objection(self, task: TaskSpec) -> str:
-        """Return the reason why the probability is not fitted; empty if it is fitted."""
-        stated = 'a logistic with stated weights, given the world model'
+    def _objection(self, task: TaskSpec, stated: str) -> str:
+        """Return the reason why the probability is not fitted; empty if it is fitted.
+
+        Args:
+            task: task that is judged.
+            stated: name of the estimate that is used instead.
+        """
         if self.calibration is None:
             return f'uncalibrated: {stated}'
         objection = self.calibration.objection(task.name, self.segmenter)

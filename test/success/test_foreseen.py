@@ -218,6 +218,16 @@ def test_calibrations_that_count_frames_twice_are_not_used_for_futures():
     assert 'run mtv-world fit success again' in found.reasons[-1]
 
 
+@pytest.mark.parametrize('calibration', [None, CALIBRATION.replace(segmenter='other')])
+def test_an_uncalibrated_estimate_of_futures_says_that_it_is_their_share(calibration):
+    estimator = SuccessEstimator(TASKS, calibration=calibration, segmenter=COLOUR)
+    shown = footage(masks(path(RED, GOAL), [BLUE] * 9), masks([RED], [BLUE]))
+    found = estimator.estimate(shown, LEFT, foreseen=held(GOAL, GOAL, RED)).estimate
+    assert found.probability == pytest.approx(3 / 5)
+    assert found.reasons[-1].startswith('uncalibrated')
+    assert found.reasons[-1].endswith('the share of simulated futures that succeed')
+
+
 def test_where_nothing_was_fitted_futures_that_disagree_leave_the_verdict_open():
     estimator = SuccessEstimator(TASKS, calibration=CALIBRATION, segmenter=COLOUR)
     shown = footage(masks(path(RED, GOAL), [BLUE] * 9), masks([RED], [BLUE]))
