@@ -166,6 +166,7 @@ class Player(Node):
         self._clock_output = self.create_publisher(Clock, clock, 10) if options.clock else None
         self._plans: list[PlayedPlan] = []
         self._ends: list[dict[str, str]] = []
+        self._was_reported = False
         self._unpublished: set[tuple[str, str]] = set()
         self.create_subscription(DiagnosticArray, options.report_topic, self._on_report, 100)
         self._hint = self._describe_cameras(types)
@@ -346,6 +347,7 @@ class Player(Node):
                 continue
             bag_s = (message.stamp_ns - self._first_ns) / NANO
             self._plans.append(PlayedPlan(bag_s=bag_s, stamp_ns=stamp_ns))
+            self._was_reported = self._was_reported or self._is_reported()
             if self._options.lock_step:
                 self._wait_for_answer(timeline, message.stamp_ns, stamp_ns)
 
@@ -430,11 +432,15 @@ class Player(Node):
         self._plans[index] = replace(self._plans[index], state=state, reason=reason)
         self._counts[state] += 1
 
-    def _give_up(self) -> None:
+    def _is_reported(self) -> bool:
+        """Return whether somebody publishes reports."""
+        return self.count_publishers(self._options.report_topic) > 0
+
+    def _give_up(self, reason: str = '') -> None:
         """End the plans that wait for an answer: they are unanswered."""
+        reason = reason or f'no answer within {self._options.answer_timeout:g} s'
         for index, plan in enumerate(self._plans):
             if plan.is_open:
-                reason = f'no answer within {self._options.answer_timeout:g} s'
                 self._end(index, UNANSWERED, reason)
 
     def _wait_for_answer(self, timeline: Timeline, bag_ns: int, stamp_ns: int) -> None:
@@ -454,11 +460,15 @@ class Player(Node):
 
     def _wait_for_ends(self) -> None:
         """Wait for the answers that are due, if a node reports any."""
-        if not self._options.lock_step and not self.count_publishers(self._options.report_topic):
+        if not (self._options.lock_step or self._was_reported or self._is_reported()):
             self._plans = []  # nobody reports: whether they were answered is not known
             return
         end_s = time.monotonic() + self._options.answer_timeout
         while self._open_plans() and time.monotonic() < end_s:
+            if not self._is_reported():
+                topic = self.resolve_topic_name(self._options.report_topic)
+                self._give_up(f"no answer, and nobody publishes '{topic}' any more")
+                break
             if self._timeline is not None:
                 self._publish_clock(self._timeline.bag_time(time.monotonic_ns()))
             self._executor.spin_once(timeout_sec=_CLOCK_PERIOD_NS / NANO)

@@ -267,6 +267,22 @@ def test_a_plan_without_an_answer_is_a_failure_unless_the_player_is_stopped(
         assert '2 unanswered, at 0.00, 0.40 s: no answer within 0.5 s' in said
 
 
+@pytest.mark.slow
+def test_plans_of_a_node_that_ended_meanwhile_are_a_failure(episode, launch, client, ros):
+    client.subscribe(JointTrajectory, '/joint_trajectory', depth=10)
+    reports = client.node.create_publisher(ros.REPORT, '/ended/report', 10)
+    taken = client.received['/joint_trajectory']
+    taken.clear()
+    options = ('--rate', '4', '--answer-timeout', '20', '--report-topic', '/ended/report')
+    player = launch('player', episode, *options)
+    client.wait(lambda: len(taken) >= len(PLANS), 'both plans')
+    client.node.destroy_publisher(reports)
+    code, said = finish(player)
+    assert code == 1, said
+    assert "2 unanswered, at 0.00, 0.40 s: no answer, and nobody publishes '/ended/report'" in said
+    assert 'Traceback' not in said
+
+
 def test_truncated_bag_is_played_up_to_the_cut_and_says_so(episode, launch, tmp_path, ros):
     cut = tmp_path / 'cut'
     cut.mkdir()
