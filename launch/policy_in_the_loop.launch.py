@@ -38,6 +38,8 @@ POLICY = {
     'seed': (int, '0', "of the policy's own randomness"),
     'max_chunks': (int, '0', 'chunks of an episode; 0 = until the policy is done'),
 }
+#: arguments of version 0.1.0, whose work `mtv-world imagine` does now
+REPLACED = ('episodes', 'live', 'count', 'device', 'steps', 'out')
 #: pace of the world model's images by mode: in imagination the policy waits for them
 PACES = {'imagine': 'burst', 'observe': 'realtime'}
 
@@ -51,6 +53,14 @@ def end_launch(event, context):
 
 def make_nodes(context):
     """The world model, at the pace of its mode, and the policy."""
+    old = [name for name in REPLACED if LaunchConfiguration(name).perform(context)]
+    if old:
+        raise RuntimeError(
+            f'{", ".join(old)}: no longer an argument of this launch file, which starts the nodes '
+            'of the policy and the world model alone. Whole episodes, from recordings or from the '
+            'cameras, are run by: mtv-world imagine --episodes EPISODES, or --live (device and '
+            'steps of the nodes: params_file)'
+        )
     mode = LaunchConfiguration('mode').perform(context)
     if mode not in PACES:
         raise RuntimeError(f"mode is '{mode}'; it must be one of {', '.join(PACES)}")
@@ -98,5 +108,9 @@ def generate_launch_description():
             description='parameter file of the world model',
         ),
         DeclareLaunchArgument('namespace', default_value='', description='of both nodes'),
+    ]
+    arguments += [
+        DeclareLaunchArgument(name, default_value='', description='see mtv-world imagine --help')
+        for name in REPLACED
     ]
     return LaunchDescription([*arguments, OpaqueFunction(function=make_nodes)])

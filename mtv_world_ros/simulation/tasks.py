@@ -303,6 +303,7 @@ def _read_tasks() -> dict[str, Task]:
     for path in sorted(folder.glob('*.yaml')):
         definition = load_task(path)
         if definition.scene is not None:
+            _check_new(definition.name, tasks, path)
             tasks[definition.name] = Task.of(definition, str(path))
             places[definition.name] = definition.scene.get('after', '')
     names = [name for name in tasks if not places[name]]
@@ -316,9 +317,23 @@ def _read_tasks() -> dict[str, Task]:
     ordered = {name: tasks[name] for name in names}
     for path in sorted(folder.glob('zero_shot/*.yaml')):
         definition = load_task(path)
+        _check_new(definition.name, ordered, path)
         ordered[definition.name] = Task.of(definition, str(path), zero_shot=True)
     _check_old_table(folder.parent / 'scenes.yaml', ordered)
     return ordered
+
+
+def _check_new(name: str, tasks: Mapping[str, Task], path: Path) -> None:
+    """Raise if another file holds a task of this name.
+
+    Raises:
+        ConfigError: names the file.
+    """
+    if name in tasks:
+        raise ConfigError(
+            f"'{path}': another file of '{path.parent}' or the folder beside it holds a task "
+            f"'{name}', too; give one of them another name"
+        )
 
 
 def _check_old_table(path: Path, tasks: Mapping[str, Task]) -> None:

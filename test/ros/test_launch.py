@@ -261,3 +261,10 @@ def test_a_mode_that_does_not_exist_is_refused():
         LaunchStandIn(share_path('launch')).nodes(
             'policy_in_the_loop.launch.py', {'mode': 'watch'}
         )
+
+
+@pytest.mark.parametrize('old', [{'live': 'true'}, {'episodes': '/data', 'out': 'out'}])
+def test_arguments_of_before_say_what_does_their_work_now(old):
+    said = f'{", ".join(old)}: no longer an argument.*mtv-world imagine'
+    with pytest.raises(RuntimeError, match=said):
+        LaunchStandIn(share_path('launch')).nodes('policy_in_the_loop.launch.py', old)

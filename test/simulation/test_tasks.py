@@ -1,4 +1,5 @@
 from dataclasses import replace
+import shutil
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ import yaml
 from mtv_world_ros.core.errors import ConfigError, SimulatorError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.simulation import tasks
 from mtv_world_ros.simulation.randomize import draw_scene, instruction_of, start_situation
 from mtv_world_ros.simulation.shapes import SHAPES
 from mtv_world_ros.simulation.tasks import (
@@ -115,6 +117,16 @@ def test_every_file_with_a_scene_is_a_task_of_its_name():
     for path in with_scene:
         assert files[path]['name'] == path.stem
         assert TASKS[path.stem].zero_shot == (path.parent.name == 'zero_shot')
+
+
+@pytest.mark.parametrize('place', ['copy.yaml', 'zero_shot/copy.yaml'])
+def test_two_files_of_one_task_are_refused(place, tmp_path, monkeypatch):
+    folder = tmp_path / 'config' / 'tasks'
+    shutil.copytree(share_path('config', 'tasks'), folder)
+    shutil.copy(folder / 'shake_bottle.yaml', folder / place)
+    monkeypatch.setattr(tasks, 'share_path', lambda *parts: tmp_path.joinpath(*parts))
+    with pytest.raises(ConfigError, match="holds a task 'shake_bottle', too"):
+        tasks._read_tasks()
 
 
 def test_the_papers_15_tasks_are_there_in_their_order():
