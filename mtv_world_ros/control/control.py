@@ -162,7 +162,8 @@ class InputLayout:
             name: name of the control.
 
         Raises:
-            CheckpointError: an input is missing, is not declared, or has another size.
+            CheckpointError: an input is missing, is not declared, or has another size or
+                another number of frames.
         """
         for kind in ('video', 'context', 'frame'):
             if (getattr(inputs, kind) is not None) != bool(getattr(self, kind)):
@@ -177,6 +178,15 @@ class InputLayout:
                 raise CheckpointError(
                     f"control '{name}' made the input '{kind}' with shape {given.shape}; "
                     f'its layout says vectors of {size} numbers'
+                )
+        rows = {'video': 1, 'frame': 0}
+        for kind, axis in rows.items():
+            given = getattr(inputs, kind)
+            if given is not None and given.shape[axis] != 1 + inputs.num_frames:
+                raise CheckpointError(
+                    f"control '{name}' made the input '{kind}' with shape {given.shape}; axis "
+                    f'{axis} must be 1 + num_frames = {1 + inputs.num_frames} long: the start and '
+                    'each frame'
                 )
 
 

@@ -19,6 +19,7 @@ from mtv_world_ros.control.control import (
     ControlInputs,
     ControlOptions,
     ControlScene,
+    FrameInput,
     InputLayout,
 )
 from mtv_world_ros.control.registry import (
@@ -102,6 +103,17 @@ def test_every_control_of_the_package_makes_the_inputs_that_it_declares(name, ro
     inputs = control.make(scene)
     control.layout.check(inputs, name)
     assert inputs.num_frames == 16
+    assert inputs.video is None or inputs.video.dtype == np.uint8
+    assert inputs.frame is None or inputs.frame.dtype == np.float32
+    assert inputs.context is None or inputs.context.dtype in (np.int64, np.float32)
+
+
+def test_a_vector_for_each_frame_and_the_start_is_asked_for():
+    layout = InputLayout(frame=FrameInput(vector_size=2))
+    layout.check(ControlInputs(num_frames=16, frame=np.zeros((17, 2), np.float32)), 'mine')
+    short = ControlInputs(num_frames=16, frame=np.zeros((15, 2), np.float32))
+    with pytest.raises(CheckpointError, match=r"'mine' made.*\(15, 2\).*1 \+ num_frames = 17"):
+        layout.check(short, 'mine')
 
 
 def test_a_name_that_is_not_registered_names_the_nearest(robot):
