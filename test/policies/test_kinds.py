@@ -164,6 +164,7 @@ def test_every_kind_of_the_package_has_settings_and_every_bundled_file_one_of_th
         kind = settings_class({'kind': name}, '')
         assert issubclass(kind, PolicySettings)
         assert 'kind' in kind.model_fields
+        assert kind.make is not PolicySettings.make, f'{name} makes no policy'
         assert not kind.server_address or 'server' in kind.model_fields
     for path in share_path('config', 'policies').glob('*.yaml'):
         assert yaml.safe_load(path.read_text())['kind'] in POLICY_KINDS
