@@ -66,6 +66,8 @@ CHUNK_S = 0.8
 ASK_AGAIN_S = 3.0
 #: an answer that has not come after this time is lost [s]
 ANSWER_LOST_S = 10.0
+#: a client that no service matches in this time is made anew; discovery may have lost it [s]
+MATCH_AGAIN_S = 15.0
 TIMEOUT_S = 60.0  # a busy machine takes long to start a node
 
 
@@ -195,11 +197,25 @@ class Client:
         subscriptions = [s for s in self.node.subscriptions if s.topic_name == topic]
         return all(s.get_publisher_count() for s in subscriptions)
 
+    def _ready_client(self, kind, name):
+        """A client that its service has matched; one that it does not match is made anew."""
+        end = time.monotonic() + TIMEOUT_S
+        while True:
+            if name not in self.services:
+                self.services[name] = self.node.create_client(kind, name)
+            client = self.services[name]
+            patience_s = min(MATCH_AGAIN_S, max(end - time.monotonic(), 0.1))
+            try:
+                self.wait(client.service_is_ready, f'service {name}', patience_s)
+            except AssertionError:
+                if time.monotonic() > end:
+                    raise
+                self.node.destroy_client(self.services.pop(name))
+            else:
+                return client
+
     def call(self, kind, name, request):
-        if name not in self.services:
-            self.services[name] = self.node.create_client(kind, name)
-        client = self.services[name]
-        self.wait(client.service_is_ready, f'service {name}')
+        client = self._ready_client(kind, name)
         asked = []
 
         def is_answered():
