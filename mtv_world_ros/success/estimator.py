@@ -291,14 +291,9 @@ class SuccessEstimator:
         reasons += self._shown(task, evidence, views)
         reasons += self._gripper_reasons(task, views, features)
         reasons.append(basis or self._origin(elsewhere, is_real=False))
-        return SuccessEstimate(
-            probability=probability,
-            interval=(low, high),
-            jaccard=_jaccard(views, evidence.goal_jaccard, list(evidence.goal_jaccard)),
-            reasons=tuple(reasons),
-            features=features,
-            is_calibrated=not (basis or elsewhere),
-        )
+        is_calibrated = not (basis or elsewhere)
+        numbers = (low, probability, high)
+        return _estimate(numbers, evidence, views, reasons, features, is_calibrated)
 
     def _judge(
         self,
@@ -330,14 +325,8 @@ class SuccessEstimator:
         reasons += self._gripper_reasons(task, views, features)
         elsewhere = self._elsewhere(views, False) if weights else ''
         reasons.append(basis or self._origin(elsewhere, is_real))
-        return SuccessEstimate(
-            probability=middle,
-            interval=(low, high),
-            jaccard=_jaccard(views, evidence.goal_jaccard, list(evidence.goal_jaccard)),
-            reasons=tuple(reasons),
-            features=features,
-            is_calibrated=not (basis or elsewhere),
-        )
+        is_calibrated = not (basis or elsewhere)
+        return _estimate((low, middle, high), evidence, views, reasons, features, is_calibrated)
 
     @staticmethod
     def _shown(task: TaskSpec, evidence: Evidence, views: Views) -> list[str]:
@@ -419,6 +408,35 @@ def _abstains(reason: CannotTell, views: Views, subjects: Sequence[int]) -> Succ
         interval=(nan, nan),
         jaccard=_jaccard(views, {}, subjects),
         reasons=(f'abstains: {reason}',),
+    )
+
+
+def _estimate(
+    numbers: tuple[float, float, float],
+    evidence: Evidence,
+    views: Views,
+    reasons: Sequence[str],
+    features: Mapping[str, float],
+    is_calibrated: bool,
+) -> SuccessEstimate:
+    """Return an estimate with the Jaccard indices of its evidence.
+
+    Args:
+        numbers: low end of the 95 % interval, probability, high end.
+        evidence: what the views show.
+        views: the views.
+        reasons: what the estimate rests on, in words.
+        features: numbers by name that the probability was computed from.
+        is_calibrated: whether weights that were fitted here were used.
+    """
+    low, probability, high = numbers
+    return SuccessEstimate(
+        probability=probability,
+        interval=(low, high),
+        jaccard=_jaccard(views, evidence.goal_jaccard, list(evidence.goal_jaccard)),
+        reasons=tuple(reasons),
+        features=dict(features),
+        is_calibrated=is_calibrated,
     )
 
 

@@ -256,7 +256,7 @@ class Player(Node):
         return text
 
     def _say_parameters(self, types: dict[str, str]) -> None:
-        """Say what the node is told of the episode by parameters: no topic carries it."""
+        """Log the parameters of the node that this episode needs: no topic carries them."""
         if TRAJECTORY not in {types[topic] for topic in self._outputs}:
             return
         values = self._reader.metadata.get(METADATA_NAME, {})
