@@ -32,7 +32,7 @@ from mtv_world_ros.robot.file import RobotFile
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.rollout.recorded_policy import RecordedPolicySettings
 from mtv_world_ros.simulation.physics import Physics
-from mtv_world_ros.simulation.tasks import SceneSpec
+from mtv_world_ros.simulation.scenes.tasks import SceneSpec
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.training.training_config import TrainingConfig
 from mtv_world_ros.vision.describers.describer_config import DescriberConfig

@@ -29,7 +29,7 @@ from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.model.transformer import attention
 from mtv_world_ros.model.world_model import DiffusionWorldModel
-from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import load_training_config
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter

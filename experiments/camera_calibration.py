@@ -38,14 +38,14 @@ from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import load_shape
-from mtv_world_ros.simulation.arm import actuators_of
+from mtv_world_ros.simulation.arms.arm import actuators_of
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.opengl import load_mujoco
-from mtv_world_ros.simulation.randomize import draw_scene
-from mtv_world_ros.simulation.scene import scene_xml
+from mtv_world_ros.simulation.scenes.randomize import draw_scene
+from mtv_world_ros.simulation.scenes.scene import scene_xml
+from mtv_world_ros.simulation.scenes.tasks import task_named
+from mtv_world_ros.simulation.scenes.workcell import workcell_of
 from mtv_world_ros.simulation.simulator import scene_generator
-from mtv_world_ros.simulation.tasks import task_named
-from mtv_world_ros.simulation.workcell import workcell_of
 
 #: of estimates
 KINDS = ('on the arm, guess', 'on the arm, no guess', 'fixed, guess', 'fixed, no guess')

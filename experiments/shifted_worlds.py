@@ -56,7 +56,7 @@ from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.evaluation.metrics.statistics import clustered_wilson
 from mtv_world_ros.evaluation.metrics.success_agreement import expected_calibration_error
 from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
-from mtv_world_ros.physics.arm_response import PERIOD_S
+from mtv_world_ros.physics.arms.arm_response import PERIOD_S
 from mtv_world_ros.physics.checkpoint_files import load_foresight
 from mtv_world_ros.physics.foreseen_motions import foreseen_of
 from mtv_world_ros.physics.object_motion import FoundObjects, ObjectMotionModel
@@ -75,8 +75,8 @@ from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
 from mtv_world_ros.simulation.faults.catalogue import EXPERT, FAULTS, kinds_of, PolicyVariant
 from mtv_world_ros.simulation.faults.drawn import is_drawn
 from mtv_world_ros.simulation.physics import catalogue, physics_named
+from mtv_world_ros.simulation.scenes.tasks import task_named
 from mtv_world_ros.simulation.simulator import CONTROL_PERIOD_S, SimEpisode
-from mtv_world_ros.simulation.tasks import task_named
 from mtv_world_ros.success.doubts import Grounds, NEAR_M, PhysicsWatch, unforeseen
 from mtv_world_ros.success.estimator import (
     capped,

@@ -33,7 +33,7 @@ from mtv_world_ros.data.splits import select
 from mtv_world_ros.model.runtime import choose_dtype, place
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.robot.file import load_robot, robot_path
-from mtv_world_ros.training.batches import BatchSource, ClipBatch
+from mtv_world_ros.training.clips.batches import BatchSource, ClipBatch
 from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.objective import NoiseDraws
 from mtv_world_ros.training.trainer import batch_loss, Trainer

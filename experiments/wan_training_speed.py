@@ -31,9 +31,9 @@ from mtv_world_ros.model.serving import ServingOptions
 from mtv_world_ros.model.trained_model import TrainedModel
 from mtv_world_ros.training.adapter import add_adapter
 from mtv_world_ros.training.base_checkpoint import Base
-from mtv_world_ros.training.batches import ClipBatch
+from mtv_world_ros.training.clips.batches import ClipBatch
+from mtv_world_ros.training.clips.encoding import encode_batch, EncodedBatch, Encoders
 from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
-from mtv_world_ros.training.encoding import encode_batch, EncodedBatch, Encoders
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
 

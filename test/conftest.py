@@ -15,12 +15,12 @@ import pytest
 
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.model.checkpoint import checkpoint_folder
-from mtv_world_ros.physics.arm_response import ArmResponse
+from mtv_world_ros.physics.arms.arm_response import ArmResponse
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.opengl import missing_opengl
-from mtv_world_ros.simulation.workcell import workcell_of
+from mtv_world_ros.simulation.scenes.workcell import workcell_of
 from test.support.left_behind import left, restore, state
 from test.support.tiers import tier_lines
 

@@ -96,7 +96,7 @@ def _collect(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.simulation.collect.episode_maker import CollectConfig
     from mtv_world_ros.simulation.collect.record import RecordConfig
     from mtv_world_ros.simulation.faults.catalogue import kinds_named
-    from mtv_world_ros.simulation.randomize import RandomizationConfig
+    from mtv_world_ros.simulation.scenes.randomize import RandomizationConfig
 
     size = RandomizationConfig(width=arguments.width, height=arguments.height)
     made = collect(

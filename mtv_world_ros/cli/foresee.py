@@ -65,7 +65,7 @@ def _foresight(arguments: argparse.Namespace) -> SolidForesight:
     from mtv_world_ros.core.processes import threads_each
     from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
     from mtv_world_ros.model.checkpoint import checkpoint_folder
-    from mtv_world_ros.physics.arms import Arms
+    from mtv_world_ros.physics.arms.arms import Arms
     from mtv_world_ros.physics.checkpoint_files import load_foresight
     from mtv_world_ros.physics.fitting.contact_fit import (
         first_settings,

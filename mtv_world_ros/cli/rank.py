@@ -281,7 +281,7 @@ def _jobs(
     )
     from mtv_world_ros.simulation.expert.expert import Expert
     from mtv_world_ros.simulation.faults.catalogue import policies_of
-    from mtv_world_ros.simulation.tasks import bundled_tasks_named
+    from mtv_world_ros.simulation.scenes.tasks import bundled_tasks_named
 
     policies, names = DEFAULT_POLICIES, DEFAULT_TASKS
     if listed:

@@ -17,7 +17,7 @@ from mtv_world_ros.core.config import Length, ListOf, Metres, read_yaml, Schema,
 from mtv_world_ros.core.data_types import ByteArray, FloatArray, JointTrajectory
 from mtv_world_ros.core.errors import TrajectoryError
 from mtv_world_ros.core.files import write_whole
-from mtv_world_ros.physics.arm_response import PERIOD_S
+from mtv_world_ros.physics.arms.arm_response import PERIOD_S
 from mtv_world_ros.physics.mujoco_import import mujoco
 from mtv_world_ros.physics.object_motion import ObjectMotion
 from mtv_world_ros.physics.solid_foresight import (

@@ -11,7 +11,7 @@ from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.config import validated
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.core.files import write_json
-from mtv_world_ros.physics.arm_response import ArmResponse
+from mtv_world_ros.physics.arms.arm_response import ArmResponse
 from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.physics.solid_foresight import SolidForesight
 from mtv_world_ros.robot.model import RobotModel

@@ -13,11 +13,11 @@ import numpy as np
 
 from mtv_world_ros.cameras.mask_geometry import centroids, locate_all
 from mtv_world_ros.core.data_types import BoolArray, CameraModel, FloatArray
-from mtv_world_ros.physics.arm_response import ArmResponse, PERIOD_S
-from mtv_world_ros.physics.arms import Arms
+from mtv_world_ros.physics.arms.arm_response import ArmResponse, PERIOD_S
+from mtv_world_ros.physics.arms.arms import Arms
 from mtv_world_ros.physics.contact_settings import ContactSettings
-from mtv_world_ros.physics.engine import Batch, BatchState, Engine
-from mtv_world_ros.physics.futures import draw_futures, Future, STANDS_M
+from mtv_world_ros.physics.engine.engine import Batch, BatchState, Engine
+from mtv_world_ros.physics.engine.futures import draw_futures, Future, STANDS_M
 from mtv_world_ros.physics.object_motion import ObjectMotion
 from mtv_world_ros.physics.solids import bottom_of, find_solid, fit_solid, is_box, is_vessel, Solid
 from mtv_world_ros.robot.model import RobotModel

@@ -18,7 +18,7 @@ from mtv_world_ros.core.errors import CannotTell
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.rollout import Rollout
-from mtv_world_ros.simulation.shapes import SHAPES
+from mtv_world_ros.simulation.scenes.shapes import SHAPES
 from mtv_world_ros.success.relations import FLOOR_M
 from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import ever_and_final, match_task, TaskSpec

@@ -23,7 +23,7 @@ from mtv_world_ros.ranking.server_process import PORT, ServerProcess
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
-from mtv_world_ros.simulation.tasks import bundled_tasks_named
+from mtv_world_ros.simulation.scenes.tasks import bundled_tasks_named
 
 #: names are parts of file names
 _NAME = r'^[A-Za-z0-9][A-Za-z0-9._-]*$'

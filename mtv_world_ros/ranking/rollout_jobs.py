@@ -15,7 +15,7 @@ from mtv_world_ros.simulation.collect.episode_jobs import episode_seed
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
 from mtv_world_ros.simulation.faults.catalogue import EXPERT, parse_variant
-from mtv_world_ros.simulation.tasks import bundled_tasks_named
+from mtv_world_ros.simulation.scenes.tasks import bundled_tasks_named
 from mtv_world_ros.success.estimator import verdict
 
 #: NaN is null in a file

@@ -17,8 +17,8 @@ from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray
 from mtv_world_ros.core.errors import nearest, SimulatorError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.simulation.actuator import Actuator
-from mtv_world_ros.simulation.workcell import Workcell
+from mtv_world_ros.simulation.arms.actuator import Actuator
+from mtv_world_ros.simulation.scenes.workcell import Workcell
 
 #: the second engine
 DART = 'dart'

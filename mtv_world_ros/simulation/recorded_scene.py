@@ -16,11 +16,11 @@ from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.episode import CALIBRATION_FILE, Episode, NOMINAL, PHYSICS
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.simulation.physics import physics_named
-from mtv_world_ros.simulation.randomize import draw_scene
-from mtv_world_ros.simulation.scene import Place, Scene, SceneLook, SceneObject
+from mtv_world_ros.simulation.scenes.randomize import draw_scene
+from mtv_world_ros.simulation.scenes.scene import Place, Scene, SceneLook, SceneObject
+from mtv_world_ros.simulation.scenes.tasks import Task, task_named, TASKS
+from mtv_world_ros.simulation.scenes.workcell import Workcell
 from mtv_world_ros.simulation.simulator import scene_generator
-from mtv_world_ros.simulation.tasks import Task, task_named, TASKS
-from mtv_world_ros.simulation.workcell import Workcell
 from mtv_world_ros.success.task import TaskSpec
 
 #: key of the metadata that holds objects, look and goals

@@ -9,13 +9,13 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import SimulatorError
-from mtv_world_ros.physics.arm_response import ArmResponse
+from mtv_world_ros.physics.arms.arm_response import ArmResponse
 from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.physics.solids import Solid
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.simulation.actuator import Actuator
-from mtv_world_ros.simulation.scene import Scene, SceneObject
-from mtv_world_ros.simulation.shapes import CONTAINER_KG, RIM_M, shape_named, WALL_M
+from mtv_world_ros.simulation.arms.actuator import Actuator
+from mtv_world_ros.simulation.scenes.scene import Scene, SceneObject
+from mtv_world_ros.simulation.scenes.shapes import CONTAINER_KG, RIM_M, shape_named, WALL_M
 
 if TYPE_CHECKING:
     from mtv_world_ros.simulation.dart.stepped_world import SteppedWorld

@@ -11,7 +11,7 @@ from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.core.errors import SimulatorError, TrajectoryError
 from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.simulation.arm import actuators_of
+from mtv_world_ros.simulation.arms.arm import actuators_of
 from mtv_world_ros.simulation.opengl import load_mujoco
 from mtv_world_ros.simulation.physics import (
     DART,
@@ -20,11 +20,15 @@ from mtv_world_ros.simulation.physics import (
     physics_named,
     picture_generator,
 )
-from mtv_world_ros.simulation.randomize import draw_scene, instruction_of, RandomizationConfig
-from mtv_world_ros.simulation.scene import Scene, scene_xml, TIMESTEP_S
+from mtv_world_ros.simulation.scenes.randomize import (
+    draw_scene,
+    instruction_of,
+    RandomizationConfig,
+)
+from mtv_world_ros.simulation.scenes.scene import Scene, scene_xml, TIMESTEP_S
+from mtv_world_ros.simulation.scenes.tasks import Task, task_named
+from mtv_world_ros.simulation.scenes.workcell import workcell_of
 from mtv_world_ros.simulation.second_engine import second_engine
-from mtv_world_ros.simulation.tasks import Task, task_named
-from mtv_world_ros.simulation.workcell import workcell_of
 from mtv_world_ros.success.situation import TruePoses
 
 if TYPE_CHECKING:

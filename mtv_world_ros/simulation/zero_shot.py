@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from mtv_world_ros.core.errors import nearest, SimulatorError
-from mtv_world_ros.simulation.cameras import CameraMoves, moved_camera
-from mtv_world_ros.simulation.randomize import RandomizationConfig
-from mtv_world_ros.simulation.shapes import SHAPES
-from mtv_world_ros.simulation.tasks import (
+from mtv_world_ros.simulation.scenes.cameras import CameraMoves, moved_camera
+from mtv_world_ros.simulation.scenes.randomize import RandomizationConfig
+from mtv_world_ros.simulation.scenes.shapes import SHAPES
+from mtv_world_ros.simulation.scenes.tasks import (
     ANY_SIZE,
     ObjectRole,
     PickPlace,

@@ -80,7 +80,7 @@ class TaskSpec(Schema):
         views: names of the views to look at; empty = all.
         softness_m: length that counts as one in the margins [m].
         scene: objects on the table and moves of the expert, for the simulator; None = the task can
-            be judged, but not simulated. `simulation/tasks.py` reads it.
+            be judged, but not simulated. `simulation/scenes/tasks.py` reads it.
     """
 
     name: str

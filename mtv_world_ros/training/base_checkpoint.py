@@ -20,7 +20,7 @@ from mtv_world_ros.model.runtime import place
 from mtv_world_ros.model.trained_model import load_trained_model, TrainedModel
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.adapter import add_adapter
-from mtv_world_ros.training.encoding import Encoders
+from mtv_world_ros.training.clips.encoding import Encoders
 from mtv_world_ros.training.training_config import TrainingConfig
 
 

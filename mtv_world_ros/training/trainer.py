@@ -28,10 +28,16 @@ from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.adapter import save_adapter
 from mtv_world_ros.training.averaged_weights import AveragedWeights
 from mtv_world_ros.training.base_checkpoint import Base
-from mtv_world_ros.training.batches import BatchSource, ClipBatch
+from mtv_world_ros.training.clips.batches import BatchSource, ClipBatch
+from mtv_world_ros.training.clips.encoding import (
+    drop_conditions,
+    encode_batch,
+    EncodedBatch,
+    Encoders,
+)
+from mtv_world_ros.training.clips.latent_cache import CachedSource
+from mtv_world_ros.training.clips.self_rollout import SelfRollout
 from mtv_world_ros.training.distributed import memory_errors_named, Processes
-from mtv_world_ros.training.encoding import drop_conditions, encode_batch, EncodedBatch, Encoders
-from mtv_world_ros.training.latent_cache import CachedSource
 from mtv_world_ros.training.objective import (
     add_noise,
     draw_sigmas,
@@ -48,7 +54,6 @@ from mtv_world_ros.training.resume import (
     save_state,
     STATE,
 )
-from mtv_world_ros.training.self_rollout import SelfRollout
 from mtv_world_ros.training.training_config import OptimizerConfig, TrainingConfig
 
 #: losses averaged for the progress bar and the log

@@ -41,13 +41,13 @@ from mtv_world_ros.robot.file import save_robot
 from mtv_world_ros.robot.model import check_positions, RobotModel
 from mtv_world_ros.robot.shape import moving_links
 from mtv_world_ros.training.base_checkpoint import load_base, needs_base
-from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.clips.batches import BatchSource
+from mtv_world_ros.training.clips.fit_control import fitted_control
+from mtv_world_ros.training.clips.latent_cache import cached_batches, CachedSource
+from mtv_world_ros.training.clips.mapped_arrays import read_mapped
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
-from mtv_world_ros.training.fit_control import fitted_control
-from mtv_world_ros.training.latent_cache import cached_batches, CachedSource
 from mtv_world_ros.training.log import TrainingLog
-from mtv_world_ros.training.mapped_arrays import read_mapped
 from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun

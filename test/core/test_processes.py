@@ -13,7 +13,7 @@ import pytest
 from mtv_world_ros.core.errors import MtvWorldError, TrainingError
 from mtv_world_ros.core.processes import stop_process, STOPPED_S, StoppedProcesses
 from mtv_world_ros.core.worker_pool import run_all, run_job, WorkerPool
-from mtv_world_ros.training.batches import ClipWorkers
+from mtv_world_ros.training.clips.batches import ClipWorkers
 from test.robustness.worker_jobs import LongJobs, make_held_back, make_stopping
 
 
@@ -79,7 +79,7 @@ def test_forked_workers_that_note_sigterm_as_training_does_end_with_a_broken_poo
 #: the pool of OpenCV's threads has been used before clips are made
 AFTER_OPENCV = """
 import os, time, cv2, numpy as np
-from mtv_world_ros.training.batches import ClipWorkers
+from mtv_world_ros.training.clips.batches import ClipWorkers
 cv2.setNumThreads(3)
 image, grid = np.zeros((600, 600), np.uint8), np.zeros((600, 600), np.float32)
 tasks = len(os.listdir('/proc/self/task'))

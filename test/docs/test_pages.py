@@ -22,7 +22,7 @@ from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.ranking.policy_list import load_policy_list
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.rollout.assembly import policy_settings
-from mtv_world_ros.simulation.tasks import Task
+from mtv_world_ros.simulation.scenes.tasks import Task
 from mtv_world_ros.success.relations import KINDS
 from mtv_world_ros.success.task import load_task
 from test.support.pages import generator

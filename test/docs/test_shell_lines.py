@@ -242,7 +242,7 @@ def check_values(given: dict[str, Any]) -> None:
     from mtv_world_ros.model.serving import ServingOptions
     from mtv_world_ros.robot.file import robot_path
     from mtv_world_ros.simulation.faults.catalogue import parse_variant
-    from mtv_world_ros.simulation.tasks import tasks_named
+    from mtv_world_ros.simulation.scenes.tasks import tasks_named
     from mtv_world_ros.simulation.zero_shot import kinds_named
     from mtv_world_ros.training.training_config import load_training_config
     from mtv_world_ros.vision.segmenters.choose import check_segmenter_name

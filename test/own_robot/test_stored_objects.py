@@ -15,7 +15,7 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data.recordings import cut_clip, described_objects
 from mtv_world_ros.rollout.assembly import assemble_describer
-from mtv_world_ros.training.clip_controls import ControlMaker
+from mtv_world_ros.training.clips.clip_controls import ControlMaker
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 from test.support.bags import bag_cameras, MAPPING, record
 from test.support.chat_server import ChatServer, completion

@@ -5,7 +5,7 @@ import pytest
 
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.model.checkpoint import checkpoint_folder
-from mtv_world_ros.physics.arms import Arms
+from mtv_world_ros.physics.arms.arms import Arms
 from mtv_world_ros.physics.checkpoint_files import load_contact
 from mtv_world_ros.physics.contact_settings import (
     ContactDraw,
@@ -15,8 +15,8 @@ from mtv_world_ros.physics.contact_settings import (
     PRIOR_LOG_STD,
     RANGES,
 )
+from mtv_world_ros.physics.engine.futures import draw_futures
 from mtv_world_ros.physics.fitting.contact_fit import _joint_draws
-from mtv_world_ros.physics.futures import draw_futures
 from mtv_world_ros.physics.solid_foresight import SolidForesight
 from mtv_world_ros.physics.solids import Solid
 from mtv_world_ros.robot.file import load_robot

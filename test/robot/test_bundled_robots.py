@@ -11,10 +11,10 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.simulation.expert.expert import Expert
-from mtv_world_ros.simulation.randomize import draw_scene
-from mtv_world_ros.simulation.scene import scene_xml
-from mtv_world_ros.simulation.tasks import TASKS
-from mtv_world_ros.simulation.workcell import workcell_of
+from mtv_world_ros.simulation.scenes.randomize import draw_scene
+from mtv_world_ros.simulation.scenes.scene import scene_xml
+from mtv_world_ros.simulation.scenes.tasks import TASKS
+from mtv_world_ros.simulation.scenes.workcell import workcell_of
 
 FOLDERS = sorted(path.parent for path in share_path('config', 'robots').glob('*/robot.yaml'))
 WITH_WORKCELL = [folder for folder in FOLDERS if (folder / 'workcell.yaml').is_file()]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.core.errors import RobotError
-from mtv_world_ros.physics.robot_parts import load_parts
+from mtv_world_ros.physics.arms.robot_parts import load_parts
 from mtv_world_ros.robot.file import load_robot, save_robot
 from mtv_world_ros.robot.mesh_pieces import load_mesh, MissingMeshError
 from mtv_world_ros.robot.shape import load_shape, ROD_RADIUS_M

@@ -110,7 +110,7 @@ def worker(folder: Path, one: Signal) -> None:
 
 def clip_worker(folder: Path, one: Signal) -> None:
     """Two processes make clips of eight steps."""
-    from mtv_world_ros.training.batches import ClipWorkers
+    from mtv_world_ros.training.clips.batches import ClipWorkers
 
     workers = ClipWorkers(lambda step, item: _job(item), 2)
     try:

@@ -31,7 +31,7 @@ from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.joint_plans import read_plan
 from mtv_world_ros.importing.recover import recover
 from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.simulation.tasks import Task
+from mtv_world_ros.simulation.scenes.tasks import Task
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from test.robustness import parameter_calls, wild_numbers, wild_plans, wild_scenes

@@ -284,7 +284,7 @@ def make_latents(folder: Path) -> None:
     """A cache of two clips, and one of other settings."""
     import torch
 
-    from mtv_world_ros.training.latent_cache import LatentCache
+    from mtv_world_ros.training.clips.latent_cache import LatentCache
 
     for settings in (CACHE_SETTINGS, {'autoencoder': 'b'}):
         with_clips = LatentCache(folder, settings)
@@ -294,7 +294,7 @@ def make_latents(folder: Path) -> None:
 
 
 def _read_latents(folder: Path) -> Any:
-    from mtv_world_ros.training.latent_cache import LatentCache
+    from mtv_world_ros.training.clips.latent_cache import LatentCache
 
     LatentCache(folder, {'autoencoder': 'c'})
     held = LatentCache(folder, CACHE_SETTINGS)

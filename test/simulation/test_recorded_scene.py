@@ -13,11 +13,11 @@ from mtv_world_ros.data.episode import ObjectPoses
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.robot.file import load_robot, robot_path
-from mtv_world_ros.simulation.randomize import draw_scene
 from mtv_world_ros.simulation.recorded_scene import recorded_scene, SCENE, scene_of
+from mtv_world_ros.simulation.scenes.randomize import draw_scene
+from mtv_world_ros.simulation.scenes.tasks import task_named
+from mtv_world_ros.simulation.scenes.workcell import workcell_of
 from mtv_world_ros.simulation.simulator import scene_generator
-from mtv_world_ros.simulation.tasks import task_named
-from mtv_world_ros.simulation.workcell import workcell_of
 
 ROBOT = load_robot(robot_path('yam_bimanual'))
 WORKCELL = workcell_of(ROBOT)

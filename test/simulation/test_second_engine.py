@@ -13,8 +13,8 @@ from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.simulation.collect.record import carry_out, RecordConfig
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
+from mtv_world_ros.simulation.scenes.tasks import task_named
 from mtv_world_ros.simulation.simulator import SimEpisode
-from mtv_world_ros.simulation.tasks import task_named
 
 ROBOT = load_robot(bundled('robots', 'yam_bimanual', '--robot'))
 TASK, SEED, GRAVITY, TABLE_FRICTION = 'place_block_a2b_left', 4, 9.81, 0.9

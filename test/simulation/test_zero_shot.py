@@ -9,14 +9,14 @@ from mtv_world_ros.core.errors import SimulatorError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.simulation.cameras import camera_model, CameraJitter, CameraMoves
 from mtv_world_ros.simulation.collect.collect_dataset import collect
 from mtv_world_ros.simulation.collect.episode_jobs import episode_seed, jobs_of, zero_shot_jobs
 from mtv_world_ros.simulation.collect.episode_maker import cameras_of, CollectConfig
-from mtv_world_ros.simulation.randomize import draw_scene, RandomizationConfig
-from mtv_world_ros.simulation.shapes import SHAPES
-from mtv_world_ros.simulation.tasks import task_named, TASKS, tasks_named
-from mtv_world_ros.simulation.workcell import workcell_of
+from mtv_world_ros.simulation.scenes.cameras import camera_model, CameraJitter, CameraMoves
+from mtv_world_ros.simulation.scenes.randomize import draw_scene, RandomizationConfig
+from mtv_world_ros.simulation.scenes.shapes import SHAPES
+from mtv_world_ros.simulation.scenes.tasks import task_named, TASKS, tasks_named
+from mtv_world_ros.simulation.scenes.workcell import workcell_of
 from mtv_world_ros.simulation.zero_shot import kinds_named, tasks_of, UNSEEN_SHAPES, variant
 
 WORKCELL = workcell_of(load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml')))

@@ -7,9 +7,9 @@ import pytest
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.simulation.randomize import draw_scene, instruction_of
-from mtv_world_ros.simulation.tasks import Shake, task_named, tasks_named
-from mtv_world_ros.simulation.workcell import workcell_of
+from mtv_world_ros.simulation.scenes.randomize import draw_scene, instruction_of
+from mtv_world_ros.simulation.scenes.tasks import Shake, task_named, tasks_named
+from mtv_world_ros.simulation.scenes.workcell import workcell_of
 from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import load_task, load_tasks, match_task, object_called
 from mtv_world_ros.vision.describers.describer import objects_from_instruction

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from mtv_world_ros.physics.arms import Arms
+from mtv_world_ros.physics.arms.arms import Arms
 from mtv_world_ros.physics.contact_settings import ContactSettings
-from mtv_world_ros.physics.engine import Batch, Engine
-from mtv_world_ros.physics.futures import draw_futures
+from mtv_world_ros.physics.engine.engine import Batch, Engine
+from mtv_world_ros.physics.engine.futures import draw_futures
 from mtv_world_ros.physics.solids import Solid
 from mtv_world_ros.robot.model import RobotModel
 

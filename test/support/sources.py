@@ -17,7 +17,7 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.training.batches import BatchSource
+from mtv_world_ros.training.clips.batches import BatchSource
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import (
     load_training_config,

@@ -12,7 +12,7 @@ import sys
 from safetensors.torch import save_file
 import torch
 
-from mtv_world_ros.training.batches import ClipBatch
+from mtv_world_ros.training.clips.batches import ClipBatch
 from mtv_world_ros.training.trainer import Trainer
 from test.support.sources import run_training
 

@@ -12,7 +12,7 @@ from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.model import checkpoint as opening
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.robot.file import load_robot, robot_path
-from mtv_world_ros.training.fit_control import fitted_control
+from mtv_world_ros.training.clips.fit_control import fitted_control
 from mtv_world_ros.training.training_config import load_training_config, TrainingRun
 from mtv_world_ros.training.training_run import training_notes
 

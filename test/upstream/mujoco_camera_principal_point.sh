@@ -9,7 +9,7 @@
 # 270 (cx = 320 - 40), and the sensor says 410 300, as if the principal point were in the middle:
 # 50 pixels from the picture and 50 from the calibrated camera.
 #
-# Guards mtv_world_ros/simulation/cameras.py, which makes MuJoCo cameras of centred principal
+# Guards mtv_world_ros/simulation/scenes/cameras.py, which makes MuJoCo cameras of centred principal
 # points alone.
 set -eu
 place=$(mktemp -d)

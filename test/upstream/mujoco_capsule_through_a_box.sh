@@ -7,7 +7,7 @@
 # in the table top +10 cm and no contact: whoever asks whether a pose is free is told yes. (The
 # like of it for a sphere in a box, issue 2206, is mended.) Releases 3.3.7 and 3.17.0 do the same.
 #
-# Guards mtv_world_ros/physics/robot_parts.py, which gives the engine convex hulls in place of
+# Guards mtv_world_ros/physics/arms/robot_parts.py, which gives the engine convex hulls in place of
 # capsules.
 set -eu
 place=$(mktemp -d)

@@ -8,7 +8,7 @@
 # a word. Locking the joint that is mimicked (buildReducedModel), as a closed gripper is, ends in
 # "Should never happen".
 #
-# Guards mtv_world_ros/physics/mechanics.py, which couples mimic joints itself and asks for
+# Guards mtv_world_ros/physics/arms/mechanics.py, which couples mimic joints itself and asks for
 # nonLinearEffects.
 set -eu
 place=$(mktemp -d)

@@ -62,7 +62,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.core.processes import threads_each
     from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
-    from mtv_world_ros.physics.arms import Arms
+    from mtv_world_ros.physics.arms.arms import Arms
     from mtv_world_ros.physics.checkpoint_files import (
         CONTACT_FILE,
         load_contact,

@@ -23,9 +23,8 @@ from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.physics.arm_response import PERIOD_S
-from mtv_world_ros.physics.arms import Arms
-from mtv_world_ros.physics.contact_scene import CompiledScene
+from mtv_world_ros.physics.arms.arm_response import PERIOD_S
+from mtv_world_ros.physics.arms.arms import Arms
 from mtv_world_ros.physics.contact_settings import (
     ContactDraw,
     ContactOrigin,
@@ -35,8 +34,10 @@ from mtv_world_ros.physics.contact_settings import (
     PRIOR_LOG_STD,
     RANGES,
 )
-from mtv_world_ros.physics.drive_inputs import CoursePlanner, SUBSTEPS
-from mtv_world_ros.physics.engine import Engine
+from mtv_world_ros.physics.engine.contact_scene import CompiledScene
+from mtv_world_ros.physics.engine.drive_inputs import CoursePlanner, SUBSTEPS
+from mtv_world_ros.physics.engine.engine import Engine
+from mtv_world_ros.physics.engine.futures import Future, shifted
 from mtv_world_ros.physics.fitting.tracks import (
     fine_commands,
     first_frame,
@@ -45,7 +46,6 @@ from mtv_world_ros.physics.fitting.tracks import (
     read_each,
     recorded_positions,
 )
-from mtv_world_ros.physics.futures import Future, shifted
 from mtv_world_ros.physics.solid_foresight import COMMANDS_A_STEP, STEP_S, table_in
 from mtv_world_ros.physics.solids import bottom_of, fit_solid, is_box, is_vessel, Solid
 from mtv_world_ros.robot.model import RobotModel

@@ -20,8 +20,8 @@ from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import measured_positions, stitched_commands
-from mtv_world_ros.physics.arm_response import ArmResponse, PERIOD_S
-from mtv_world_ros.physics.mechanics import RobotMechanics
+from mtv_world_ros.physics.arms.arm_response import ArmResponse, PERIOD_S
+from mtv_world_ros.physics.arms.mechanics import RobotMechanics
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.resample import resample
 

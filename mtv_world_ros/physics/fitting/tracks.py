@@ -19,7 +19,7 @@ from mtv_world_ros.core.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.data.episode import Episode, JointStates
 from mtv_world_ros.data.recording import stitched_commands
-from mtv_world_ros.physics.arm_response import PERIOD_S
+from mtv_world_ros.physics.arms.arm_response import PERIOD_S
 from mtv_world_ros.physics.solid_foresight import COMMANDS_A_STEP, STEP_S
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.resample import nearest_rows, resample

@@ -40,7 +40,7 @@ from mtv_world_ros.simulation.collect.episode_maker import (
     plain_config,
 )
 from mtv_world_ros.simulation.opengl import load_mujoco
-from mtv_world_ros.simulation.tasks import tasks_named
+from mtv_world_ros.simulation.scenes.tasks import tasks_named
 from mtv_world_ros.simulation.zero_shot import kinds_named
 
 #: episodes between two writings of the card

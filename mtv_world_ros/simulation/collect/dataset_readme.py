@@ -17,7 +17,7 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.simulation.collect.contact_sheet import SHEET_FILE
 from mtv_world_ros.simulation.collect.dataset_card import CardEntry, write_file, ZERO_SHOT_SET
 from mtv_world_ros.simulation.collect.episode_maker import CollectConfig, plain_config
-from mtv_world_ros.simulation.tasks import TASKS
+from mtv_world_ros.simulation.scenes.tasks import TASKS
 
 README_FILE = 'README.md'
 KEYS = {

@@ -10,7 +10,7 @@ import zlib
 import numpy as np
 
 from mtv_world_ros.core.errors import SimulatorError
-from mtv_world_ros.simulation.tasks import Task
+from mtv_world_ros.simulation.scenes.tasks import Task
 from mtv_world_ros.simulation.zero_shot import tasks_of
 
 BLOCK = 10

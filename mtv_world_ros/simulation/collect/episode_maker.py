@@ -12,16 +12,16 @@ from mtv_world_ros.core.errors import EpisodeError, PolicyError, SimulatorError
 from mtv_world_ros.core.files import bundled
 from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.robot.file import load_robot
-from mtv_world_ros.simulation.cameras import CameraMoves, TRAINING_MOVES
 from mtv_world_ros.simulation.collect.dataset_card import GO_ON
 from mtv_world_ros.simulation.collect.episode_jobs import CollectJob, episode_seed
 from mtv_world_ros.simulation.collect.record import RecordConfig, simulate, Take, write_take
 from mtv_world_ros.simulation.expert.expert import Expert, ExpertConfig
 from mtv_world_ros.simulation.faults.catalogue import draw_variant, parse_variant, PolicyVariant
 from mtv_world_ros.simulation.physics import physics_named
-from mtv_world_ros.simulation.randomize import RandomizationConfig
+from mtv_world_ros.simulation.scenes.cameras import CameraMoves, TRAINING_MOVES
+from mtv_world_ros.simulation.scenes.randomize import RandomizationConfig
+from mtv_world_ros.simulation.scenes.workcell import workcell_of
 from mtv_world_ros.simulation.simulator import SimEpisode
-from mtv_world_ros.simulation.workcell import workcell_of
 from mtv_world_ros.simulation.zero_shot import variant, with_moved_cameras
 
 #: whose data sets the card does not name

@@ -18,8 +18,8 @@ from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import ScriptedPolicy
 from mtv_world_ros.simulation.faults.catalogue import PolicyVariant
 from mtv_world_ros.simulation.recorded_scene import dump_scene, dump_task, SCENE
+from mtv_world_ros.simulation.scenes.tasks import Task
 from mtv_world_ros.simulation.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
-from mtv_world_ros.simulation.tasks import Task
 from mtv_world_ros.success.task import ever_and_final
 
 #: stamp of every episode's first frame [ns]; ROS takes zero for "not set"

@@ -24,8 +24,8 @@ from mtv_world_ros.core.bounded_input import read_text
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import RobotError
 from mtv_world_ros.core.transforms import about_z
-from mtv_world_ros.physics.arm_response import ArmResponse
-from mtv_world_ros.physics.arms import finger_travels
+from mtv_world_ros.physics.arms.arm_response import ArmResponse
+from mtv_world_ros.physics.arms.arms import finger_travels
 from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.physics.solids import Solid
 from mtv_world_ros.robot.model import RobotModel

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import SimulatorError
-from mtv_world_ros.physics.arm_response import ArmResponse, ArmState, PERIOD_S
+from mtv_world_ros.physics.arms.arm_response import ArmResponse, ArmState, PERIOD_S
 from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.physics.solids import Solid
 from mtv_world_ros.robot.model import RobotModel

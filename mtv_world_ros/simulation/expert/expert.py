@@ -18,11 +18,11 @@ from mtv_world_ros.simulation.faults.edited_move import ring, UP
 from mtv_world_ros.simulation.faults.second_arm import Visit
 from mtv_world_ros.simulation.faults.variant_faults import WayPointFaults
 from mtv_world_ros.simulation.physics import physics_named
-from mtv_world_ros.simulation.placement import side_of
-from mtv_world_ros.simulation.scene import Place, Scene, SceneObject
-from mtv_world_ros.simulation.shapes import Grasp, SHAPES
-from mtv_world_ros.simulation.tasks import Move, PickPlace, Shake, Task
-from mtv_world_ros.simulation.workcell import workcell_of
+from mtv_world_ros.simulation.scenes.placement import side_of
+from mtv_world_ros.simulation.scenes.scene import Place, Scene, SceneObject
+from mtv_world_ros.simulation.scenes.shapes import Grasp, SHAPES
+from mtv_world_ros.simulation.scenes.tasks import Move, PickPlace, Shake, Task
+from mtv_world_ros.simulation.scenes.workcell import workcell_of
 
 #: step in the search for the longest reachable part of a path [fraction of the path]
 _SHORTENING_STEP = 0.05

@@ -18,13 +18,13 @@ from mtv_world_ros.simulation.faults.variant_faults import (
     WayPointFaults,
     with_faults,
 )
-from mtv_world_ros.simulation.placement import goals_of
-from mtv_world_ros.simulation.randomize import draw_scene, instruction_of
 from mtv_world_ros.simulation.recorded_scene import recorded_scene
-from mtv_world_ros.simulation.scene import Place, Scene
-from mtv_world_ros.simulation.shapes import SHAPES
+from mtv_world_ros.simulation.scenes.placement import goals_of
+from mtv_world_ros.simulation.scenes.randomize import draw_scene, instruction_of
+from mtv_world_ros.simulation.scenes.scene import Place, Scene
+from mtv_world_ros.simulation.scenes.shapes import SHAPES
+from mtv_world_ros.simulation.scenes.tasks import Move, PickPlace, START, Task, task_named
 from mtv_world_ros.simulation.simulator import scene_generator
-from mtv_world_ros.simulation.tasks import Move, PickPlace, START, Task, task_named
 
 #: horizon of a chunk [s]
 _CHUNK_S = 3.2

@@ -21,16 +21,16 @@ from mtv_world_ros.simulation.collect.collect_dataset import collect, dataset_lo
 from mtv_world_ros.simulation.collect.episode_jobs import episode_seed, jobs_of, misses_grasp
 from mtv_world_ros.simulation.collect.episode_maker import CollectConfig
 from mtv_world_ros.simulation.collect.record import RecordConfig
-from mtv_world_ros.simulation.randomize import RandomizationConfig
 from mtv_world_ros.simulation.recorded_scene import (
     recorded_task,
     SCENE,
     scene_of,
     TASK_DEFINITION,
 )
+from mtv_world_ros.simulation.scenes.randomize import RandomizationConfig
+from mtv_world_ros.simulation.scenes.tasks import Task, task_named, tasks_named
+from mtv_world_ros.simulation.scenes.workcell import workcell_of
 from mtv_world_ros.simulation.simulator import situation_of
-from mtv_world_ros.simulation.tasks import Task, task_named, tasks_named
-from mtv_world_ros.simulation.workcell import workcell_of
 from mtv_world_ros.success.task import ever_and_final, load_task
 
 SMALL = CollectConfig(randomization=RandomizationConfig(width=96, height=72))

@@ -19,7 +19,7 @@ from mtv_world_ros.simulation.collect.dataset_card import (
 from mtv_world_ros.simulation.collect.dataset_readme import commands, readme
 from mtv_world_ros.simulation.collect.episode_maker import CollectConfig, plain_config
 from mtv_world_ros.simulation.collect.record import RecordConfig
-from mtv_world_ros.simulation.tasks import tasks_named
+from mtv_world_ros.simulation.scenes.tasks import tasks_named
 
 START_NS, HEIGHT, WIDTH = 1_700_000_000_000_000_000, 24, 32
 

@@ -11,10 +11,10 @@ from mtv_world_ros.simulation.collect.record import RecordConfig, simulate
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
 from mtv_world_ros.simulation.opengl import missing_opengl
-from mtv_world_ros.simulation.randomize import RandomizationConfig
+from mtv_world_ros.simulation.scenes.randomize import RandomizationConfig
+from mtv_world_ros.simulation.scenes.tasks import task_named
 from mtv_world_ros.simulation.simulated_world import SimulatedWorld
 from mtv_world_ros.simulation.simulator import SimEpisode
-from mtv_world_ros.simulation.tasks import task_named
 
 TASK, SEED = 'stack_blocks_two', 3
 

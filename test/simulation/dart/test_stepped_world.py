@@ -12,9 +12,9 @@ pytest.importorskip('dartpy', reason='dartpy is not installed (pip install .[dar
 
 from mtv_world_ros.core.errors import RobotError
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.physics.arms.mechanics import RobotMechanics
 from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.physics.fitting.contact_fit import _Trial, read_contact
-from mtv_world_ros.physics.mechanics import RobotMechanics
 from mtv_world_ros.physics.solids import Solid
 from mtv_world_ros.robot.arm_solver import ArmSolver
 from mtv_world_ros.robot.file import load_robot

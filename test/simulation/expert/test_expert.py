@@ -11,8 +11,8 @@ from mtv_world_ros.simulation.collect.record import (
     simulate,
 )
 from mtv_world_ros.simulation.expert.expert import top_down
+from mtv_world_ros.simulation.scenes.tasks import TASKS
 from mtv_world_ros.simulation.simulator import SimEpisode
-from mtv_world_ros.simulation.tasks import TASKS
 from test.support.tiers import rest_slow
 
 

@@ -12,8 +12,8 @@ from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.training.batches import BatchSource
-from mtv_world_ros.training.clip_controls import draw_past, history_before
+from mtv_world_ros.training.clips.batches import BatchSource
+from mtv_world_ros.training.clips.clip_controls import draw_past, history_before
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import (
     HistoryConfig,

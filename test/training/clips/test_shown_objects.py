@@ -11,8 +11,8 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.data.recordings import Clip, cut_clip
 from mtv_world_ros.robot.shape import load_shape
-from mtv_world_ros.training.batches import BatchSource
-from mtv_world_ros.training.clip_controls import ControlMaker
+from mtv_world_ros.training.clips.batches import BatchSource
+from mtv_world_ros.training.clips.clip_controls import ControlMaker
 from mtv_world_ros.training.training_config import load_training_config
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 

@@ -1,0 +1,1 @@
+"""Arms in the physics: bodies, inertia, collision parts, response to commands."""

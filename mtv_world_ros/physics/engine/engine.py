@@ -1,0 +1,543 @@
+"""Many futures of a scene, computed side by side on all cores.
+
+Shape letters: K futures, T rows, O solids, D degrees of freedom of the arms, J joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+import logging
+import time
+from typing import Any
+
+import numpy as np
+
+from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.core.errors import RolloutPreempted
+from mtv_world_ros.physics.arms.arm_response import PERIOD_S
+from mtv_world_ros.physics.arms.arms import Arms, SOLIDS
+from mtv_world_ros.physics.engine.contact_scene import CompiledScene, kind_of, STEP_S
+from mtv_world_ros.physics.engine.drive_inputs import (
+    ArmsState,
+    CoursePlanner,
+    FreeMotion,
+    FULL,
+    SUBSTEPS,
+)
+from mtv_world_ros.physics.engine.futures import Future
+from mtv_world_ros.physics.grips import Grip, GripCourse
+from mtv_world_ros.physics.mujoco_import import mujoco, Rollout
+
+
+@dataclass(frozen=True, slots=True)
+class SleepSettings:
+    """Limits below which solids and arms are not simulated.
+
+    Attributes:
+        max_angular_speed_rad_s: a slower solid is at rest.
+        max_linear_speed_m_s: a slower solid is at rest.
+        tracking_tolerance: largest distance of a joint from its free motion [rad or m].
+        tracking_speed_tolerance: largest difference of its speed [rad/s or m/s].
+        num_still_rows: rows without motion before arms only pass by.
+    """
+
+    max_angular_speed_rad_s: float = 0.02
+    max_linear_speed_m_s: float = 0.002
+    tracking_tolerance: float = 1e-3
+    tracking_speed_tolerance: float = 0.02
+    num_still_rows: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class DivergenceLimits:
+    """Values beyond which the simulation of a future is treated as diverged.
+
+    Attributes:
+        max_distance_m: distance of an object from the origin.
+        max_linear_speed_m_s: speed of an object.
+        max_angular_speed_rad_s: angular speed of an object.
+        overlapping_constraints: constraints of objects that cannot all be where they were found.
+        max_mean_constraints: mean number of constraints of a future over a plan.
+    """
+
+    max_distance_m: float = 3.0
+    max_linear_speed_m_s: float = 20.0
+    max_angular_speed_rad_s: float = 1000.0
+    overlapping_constraints: int = 1500
+    max_mean_constraints: int = 400
+
+
+_SLEEP = SleepSettings()
+_LIMITS = DivergenceLimits()
+#: distance at which contact between an arm and a solid is simulated [m]
+CONTACT_RANGE_M = 0.015
+#: distance at which contact between a finger and the table is simulated [m]
+TABLE_CONTACT_RANGE_M = 0.002
+#: wall-clock limit of one plan: SLOWDOWN_LIMIT times its duration plus EXTRA_S; a safeguard only,
+#: because wall time depends on the load of the machine
+SLOWDOWN_LIMIT = 20.0
+EXTRA_S = 60.0
+#: constraints (three a contact) from which a step is slow, so that it is computed in pieces whose
+#: work is counted
+CROWDED_CONSTRAINTS = 300
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BatchState:
+    """State of K futures, between two parts of a plan.
+
+    Attributes:
+        physics: (K, N) MuJoCo's full physics states.
+        arms: state of the arms in free space, as if they had touched nothing.
+        last: the course before; None = the arms rested.
+        still: (K,) rows for which all was at rest.
+        lost: reasons why futures were dropped, by number of the future.
+        grips: of each future, what measured fingers hold (`ContactSettings.grips_hold`).
+    """
+
+    physics: FloatArray
+    arms: ArmsState
+    still: np.ndarray
+    last: FreeMotion | None = None
+    lost: dict[int, str] = field(default_factory=dict)
+    grips: tuple[dict[int, Grip], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BatchMotion:
+    """Motion of K futures; row 0 is their start.
+
+    Attributes:
+        points: (K, T + 1, O, 3) centres of the solids [m].
+        rotations: (K, T + 1, O, 3, 3).
+        joints: (K, T + 1, J) joints of the robot, which what it touches may stop [rad or m].
+        steps: steps of the engine that were computed, of all futures together.
+    """
+
+    points: FloatArray
+    rotations: FloatArray
+    joints: FloatArray
+    steps: int
+
+
+def _log_once(message: str) -> None:
+    """Log each warning of the engine once; by default they fill a file and the terminal."""
+    kind = message.split(' Time =')[0]
+    if kind not in _told:
+        _told.add(kind)
+        logger.warning('MuJoCo, of a foreseen future: %s', kind)
+
+
+#: warnings that were logged
+_told: set[str] = set()
+
+
+class Engine:
+    """Computes futures of a robot and solids; holds compiled scenes and threads.
+
+    Args:
+        arms: arms of the robot.
+        threads: number of computing threads.
+    """
+
+    def __init__(self, arms: Arms, threads: int = 1) -> None:
+        self.arms, self.threads = arms, max(threads, 1)
+        self._scenes: dict[tuple[str, ...], tuple[CompiledScene, list[Any]]] = {}
+        mujoco.set_mju_user_warning(_log_once)
+        self._rollout = Rollout(nthread=0 if threads < 2 else threads)
+
+    def scene_of(self, kinds: Sequence[str]) -> tuple[CompiledScene, list[Any]]:
+        """Return the compiled scene of solids of some kinds, and data of each thread."""
+        key = tuple(kinds)
+        if key not in self._scenes:
+            if len(self._scenes) >= 8:
+                self._scenes.pop(next(iter(self._scenes)))
+            scene = CompiledScene.compiled(self.arms, kinds)
+            self._scenes[key] = scene, [mujoco.MjData(scene.model) for _ in range(self.threads)]
+        return self._scenes[key]
+
+    def begin(self, futures: Sequence[Future]) -> Batch:
+        """Return what computes futures of solids of the same kinds."""
+        return Batch(self, futures)
+
+    def run(
+        self, models: Sequence[Any], data: Sequence[Any], states: FloatArray, controls: FloatArray
+    ) -> FloatArray:
+        """Return the states (K, S, N) of K models at S steps from some states (K, N) on."""
+        return self._rollout.rollout(
+            models, data, states, controls, chunk_size=1 if self.threads > 1 else None
+        )[0]
+
+
+class Batch:
+    """K futures of the same robot and kinds of solids.
+
+    Args:
+        engine: engine that computes them.
+        futures: K.
+
+    Attributes:
+        futures: K.
+    """
+
+    def __init__(self, engine: Engine, futures: Sequence[Future]) -> None:
+        self._engine, self.futures = engine, tuple(futures)
+        first = futures[0]
+        kinds = tuple(map(kind_of, first.solids))
+        self._scene, self._data = engine.scene_of(kinds)
+        self._models = [
+            self._scene.model_of(future.settings, future.solids, self._data[0])
+            for future in futures
+        ]
+        free, _ = engine.scene_of(())
+        self._planner = CoursePlanner(free, first.settings)
+        self._nearby = _Nearby(self._scene, self._models[0])
+        self._delays = [round(future.delay_s / STEP_S) for future in futures]
+        self._gains = np.stack([model.actuator_gainprm[:, 0] for model in self._models])
+
+    @property
+    def model(self) -> Any:
+        """MuJoCo's model of the first future."""
+        return self._models[0]
+
+    def touches_arms(self, positions: FloatArray) -> bool:
+        """Return whether arms at joints (J,) are near a solid, as one that they hold."""
+        at = self._scene.arms.drives.spread(positions)
+        return not self._nearby.is_clear(
+            self._scene.positions(at, self.futures[0].solids), at[None]
+        )
+
+    def start(self, positions: FloatArray) -> BatchState:
+        """Return the start of the futures, with the robot at rest at joints (J,)."""
+        scene, model = self._scene, self._models[0]
+        at = scene.arms.drives.spread(positions)
+        physics = np.zeros((len(self.futures), mujoco.mj_stateSize(model, FULL)))
+        for row, future in zip(physics, self.futures, strict=True):
+            row[1 : 1 + model.nq] = scene.positions(at + future.zeros, future.solids)
+        return BatchState(
+            physics=physics,
+            arms=self._planner.begin(positions),
+            still=np.full(len(physics), _SLEEP.num_still_rows),
+        )
+
+    def advance(
+        self,
+        commands: FloatArray,
+        every: int,
+        state: BatchState | None = None,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> tuple[BatchMotion, BatchState]:
+        """Return the motion at each `every`-th of commands, and the state after them.
+
+        Args:
+            commands: (1 + T * every, J), `PERIOD_S` apart [rad or m].
+            every: periods between two rows.
+            state: present states of the futures; None = their start.
+            should_stop: asked after every row, and within one that takes long.
+
+        Raises:
+            RolloutPreempted: `should_stop` said so.
+        """
+        state = state or self.start(commands[0])
+        course, arms = self._planner.plan(commands, state.arms)
+        courses = [course.late(delay, state.last) for delay in self._delays]
+        rows = (len(commands) - 1) // every
+        run = _Run(self._scene, self.futures, courses, every * SUBSTEPS, state)
+        if self.futures[0].settings.grips_hold:
+            robot = self._scene.arms.robot
+            run.grip(GripCourse.of(robot, commands[: 1 + rows * every : every]))
+        cap_s = time.monotonic() + SLOWDOWN_LIMIT * rows * every * PERIOD_S + EXTRA_S
+
+        def check() -> None:
+            if should_stop():
+                raise RolloutPreempted('stopped while objects were foreseen')
+            if time.monotonic() > cap_s:
+                run.lose_all('took too long')
+
+        for row in range(rows):
+            check()
+            self._advance_row(run, row, check)
+        return run.motion(), replace(
+            state,
+            physics=run.physics,
+            arms=arms,
+            last=course,
+            still=run.still,
+            lost=run.lost,
+            grips=tuple(run.grips),
+        )
+
+    def _advance_row(self, run: _Run, row: int, check: Callable[[], None]) -> None:
+        passing = [
+            number in run.lost or (run.may_pass(number, row) and self._is_clear(run, number, row))
+            for number in range(len(self.futures))
+        ]
+        moving = np.flatnonzero(~np.array(passing))
+        if len(moving):
+            self._compute_row(run, row, moving, check)
+        run.finish_row(row, moving)
+
+    def _compute_row(
+        self, run: _Run, row: int, moving: np.ndarray, check: Callable[[], None]
+    ) -> None:
+        """Compute a row of some futures; those that are crowded in pieces, few at a time."""
+        controls = np.stack([self._controls(run, int(number), row) for number in moving])
+        crowded = np.zeros(len(moving), np.bool_)
+        for place, number in enumerate(moving):
+            check()  # of many futures of many parts the counting takes long itself
+            crowded[place] = self._constraints(run, number) > CROWDED_CONSTRAINTS
+        self._compute(run, moving[~crowded], controls[~crowded])
+        few = self._engine.threads
+        slow, goals = moving[crowded], controls[crowded]
+        for first in range(0, len(slow), few):
+            self._compute_crowded(
+                run, slow[first : first + few], goals[first : first + few], check
+            )
+
+    def _compute_crowded(
+        self, run: _Run, moving: np.ndarray, controls: FloatArray, check: Callable[[], None]
+    ) -> None:
+        """Compute a row in pieces of the same length on every machine, which the result shows.
+
+        What counts as too much is a number of constraints, not a time: so the same is lost
+        whatever else a machine does.
+        """
+        for first in range(0, controls.shape[1], SUBSTEPS):
+            check()
+            for number in moving:
+                if number not in run.lost:
+                    run.charge(int(number), self._constraints(run, number), SUBSTEPS)
+            kept = np.array([number not in run.lost for number in moving])
+            self._compute(run, moving[kept], controls[kept, first : first + SUBSTEPS])
+
+    def _compute(self, run: _Run, moving: np.ndarray, controls: FloatArray) -> None:
+        if not len(moving):
+            return
+        models = [self._models[number] for number in moving]
+        states = self._engine.run(models, self._data, run.physics[moving], controls)
+        run.take(moving, states)
+
+    def _constraints(self, run: _Run, number: int) -> int:
+        """Return the number of constraints, of contacts most, where a future is.
+
+        They make steps slow.
+        """
+        model, data = self._models[number], self._data[0]
+        mujoco.mj_setState(model, data, run.physics[number], FULL)
+        mujoco.mj_fwdPosition(model, data)
+        return data.nefc
+
+    def _controls(self, run: _Run, number: int, row: int) -> FloatArray:
+        """Return (S, D) numbers of the drives of a future in a row."""
+        course, steps = run.courses[number], run.steps_of(row)
+        targets = course.controls[steps] + course.pushes[steps] / self._gains[number]
+        return targets + self.futures[number].zeros
+
+    def _is_clear(self, run: _Run, number: int, row: int) -> bool:
+        """Return True if the arms pass by all solids in a row."""
+        last = run.first_step(row + 1)
+        steps = [*range(run.first_step(row), last, 2 * SUBSTEPS), last]
+        where = run.courses[number].positions[steps] + self.futures[number].zeros
+        return self._nearby.is_clear(run.qpos(number), where)
+
+
+class _Run:
+    """Futures while they advance by some rows."""
+
+    def __init__(
+        self,
+        scene: CompiledScene,
+        futures: Sequence[Future],
+        courses: Sequence[FreeMotion],
+        steps: int,
+        state: BatchState,
+    ) -> None:
+        self._scene, self._futures, self.courses, self._steps = scene, futures, courses, steps
+        self.physics, self.still = state.physics.copy(), state.still.copy()
+        self.lost, self.computed = dict(state.lost), 0
+        self._spent = np.zeros(len(futures), np.int64)
+        self.grips = list(state.grips) or [{} for _ in futures]
+        self._grip_course: GripCourse | None = None
+        self._rows = [self._read()]
+
+    def grip(self, course: GripCourse) -> None:
+        """Hold what the fingers of a course are seen to hold, from its first row on."""
+        self._grip_course = course
+        self._hold(0)
+        self._rows = [self._read()]
+
+    def _hold(self, row: int) -> None:
+        """Move the solids that are held at a row with their grippers."""
+        scene, course = self._scene, self._grip_course
+        if course is None:
+            return
+        nq = scene.model.nq
+        at = scene.solid_qpos[:, None] + np.arange(7)
+        for number, future in enumerate(self._futures):
+            if number in self.lost or not len(scene.solid_qpos):
+                continue
+            qpos, poses = self.qpos(number), np.tile(np.eye(4), (len(scene.solid_qpos), 1, 1))
+            poses[:, :3, 3] = qpos[at[:, :3]]
+            poses[:, :3, :3] = _matrices(qpos[at[:, 3:]])
+            held, poses = course.after(row, self.grips[number], poses, future.solids)
+            self.grips[number] = held
+            for item in held:
+                qpos[at[item]] = [*poses[item, :3, 3], *_quaternion(poses[item, :3, :3])]
+                speeds = self.physics[number, 1 + nq :]
+                speeds[scene.solid_dofs[item] + np.arange(6)] = 0.0
+
+    def first_step(self, row: int) -> int:
+        return row * self._steps
+
+    def steps_of(self, row: int) -> slice:
+        return slice(self.first_step(row), self.first_step(row + 1))
+
+    def qpos(self, number: int) -> FloatArray:
+        return self.physics[number, 1 : 1 + self._scene.model.nq]
+
+    def may_pass(self, number: int, row: int) -> bool:
+        """Return True if all solids are at rest and the arms move as in free air."""
+        if self.still[number] < _SLEEP.num_still_rows or self.grips[number]:
+            return False
+        course, step, scene = self.courses[number], self.first_step(row), self._scene
+        off = self.qpos(number)[scene.arm_qpos] - self._futures[number].zeros
+        speeds = self.physics[number, 1 + scene.model.nq :][scene.arm_dofs]
+        return bool(
+            (np.abs(off - course.positions[step]) < _SLEEP.tracking_tolerance).all()
+            and (np.abs(speeds - course.velocities[step]) < _SLEEP.tracking_speed_tolerance).all()
+        )
+
+    def take(self, moving: np.ndarray, states: FloatArray) -> None:
+        """Take what was computed; futures that no object can have are lost."""
+        self.computed += states.shape[0] * states.shape[1]
+        for number, last in zip(map(int, moving), states[:, -1], strict=True):
+            why = self._implausible(last)
+            if why:
+                self.lost[number] = why
+            else:
+                self.physics[number] = last
+
+    def charge(self, number: int, constraints: int, steps: int) -> None:
+        """Count what steps of a crowded future cost; it is lost where that is too much."""
+        self._spent[number] += constraints * steps
+        if constraints > _LIMITS.overlapping_constraints:
+            self.lost[number] = 'objects overlap: more touches than things on a table can have'
+        elif self._spent[number] > _LIMITS.max_mean_constraints * len(self.courses[0].controls):
+            self.lost[number] = 'more touches, for longer, than can be foreseen in time'
+
+    def lose_all(self, why: str) -> None:
+        """Give up the futures that still count."""
+        self.lost = dict.fromkeys(range(len(self.physics)), why) | self.lost
+
+    def finish_row(self, row: int, moving: np.ndarray) -> None:
+        """Move the arms of futures that were not computed, and keep where all is."""
+        scene, step = self._scene, self.first_step(row + 1)
+        nq, moved = scene.model.nq, set(map(int, moving))
+        for number, physics in enumerate(self.physics):
+            if number in self.lost:
+                continue
+            if number not in moved:
+                course = self.courses[number]
+                physics[1 + scene.arm_qpos] = course.positions[step] + self._futures[number].zeros
+                physics[1 + nq + scene.arm_dofs] = course.velocities[step]
+            elif self._at_rest(physics):
+                self.still[number] += 1
+            else:
+                self.still[number] = 0
+        self._hold(row + 1)
+        self._rows.append(self._read())
+
+    def motion(self) -> BatchMotion:
+        """Return what the rows were."""
+        points, rotations, joints = (np.stack(rows, 1) for rows in zip(*self._rows, strict=True))
+        return BatchMotion(points=points, rotations=rotations, joints=joints, steps=self.computed)
+
+    def _read(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the points (K, O, 3), rotations (K, O, 3, 3) and joints (K, J) now."""
+        scene, drives = self._scene, self._scene.arms.drives
+        qpos = self.physics[:, 1 : 1 + scene.model.nq]
+        at = scene.solid_qpos[:, None]
+        turns = _matrices(qpos[:, at + np.arange(3, 7)])
+        zeros = np.stack([future.zeros for future in self._futures])
+        driven = qpos[:, scene.arm_qpos] - zeros
+        joints = drives.joints(driven, len(scene.arms.robot.joint_names))
+        return qpos[:, at + np.arange(3)], turns, joints
+
+    def _speeds(self, physics: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return (O, 3) speeds of ways and of turns of the solids."""
+        scene = self._scene
+        rows = physics[1 + scene.model.nq :][scene.solid_dofs[:, None] + np.arange(6)]
+        return rows[:, :3], rows[:, 3:]
+
+    def _at_rest(self, physics: FloatArray) -> bool:
+        ways, turns = self._speeds(physics)
+        return bool(
+            (np.abs(ways) < _SLEEP.max_linear_speed_m_s).all()
+            and (np.abs(turns) < _SLEEP.max_angular_speed_rad_s).all()
+        )
+
+    def _implausible(self, physics: FloatArray) -> str:
+        """Return the reason why the simulation diverged; empty if it did not."""
+        if not np.isfinite(physics).all():
+            return 'the engine diverged'
+        ways, turns = self._speeds(physics)
+        places = physics[1 + self._scene.solid_qpos[:, None] + np.arange(3)]
+        if (np.abs(places) > _LIMITS.max_distance_m).any():
+            return 'an object left the table for good'
+        if (np.abs(ways) > _LIMITS.max_linear_speed_m_s).any() or (
+            np.abs(turns) > _LIMITS.max_angular_speed_rad_s
+        ).any():
+            return 'an object became faster than anything on a table'
+        return ''
+
+
+class _Nearby:
+    """Test for contact range between arms and solids, and between fingers and the table."""
+
+    def __init__(self, scene: CompiledScene, model: Any) -> None:
+        self._scene, self._model = scene, model.__copy__()
+        of_arms = self._model.geom_contype > SOLIDS
+        of_solids = self._model.geom_contype == SOLIDS
+        fingers = of_arms & (self._model.geom_priority > 0)
+        self._model.geom_contype[:] = np.where(of_arms, 2, 0) + np.where(fingers, 4, 0)
+        self._model.geom_conaffinity[:] = np.where(of_solids, 2, 0)
+        # the table, where arms touch it
+        self._model.geom_conaffinity[0] = 4 if model.geom_conaffinity[0] < 0 else 0
+        self._model.geom_margin[of_solids], self._model.geom_margin[0] = (
+            CONTACT_RANGE_M,
+            TABLE_CONTACT_RANGE_M,
+        )
+        self._data = mujoco.MjData(self._model)
+
+    def is_clear(self, qpos: FloatArray, arms: FloatArray) -> bool:
+        """Return whether arms at (T, D) are clear of the solids at `qpos`."""
+        model, data = self._model, self._data
+        data.qpos[:] = qpos
+        for positions in arms:
+            data.qpos[self._scene.arm_qpos] = positions
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            if data.ncon:
+                return False
+        return True
+
+
+def _quaternion(rotation: FloatArray) -> FloatArray:
+    """Return the quaternion (4,), w first, of a rotation (3, 3)."""
+    found = np.zeros(4)
+    mujoco.mju_mat2Quat(found, np.ascontiguousarray(rotation).ravel())
+    return found
+
+
+def _matrices(quaternions: FloatArray) -> FloatArray:
+    """Return (..., 3, 3) of quaternions (..., 4), w first."""
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))

@@ -1,0 +1,1 @@
+"""A robot's arms as MJCF, with their actuators."""

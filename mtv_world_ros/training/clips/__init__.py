@@ -1,0 +1,1 @@
+"""Contents of a training batch: clips, their control inputs and latents, and the latent cache."""
