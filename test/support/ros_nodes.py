@@ -8,12 +8,14 @@ import signal
 import subprocess
 import sys
 import time
+from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from rcl_interfaces.srv import GetParameters, SetParameters
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
@@ -66,8 +68,9 @@ CHUNK_S = 0.8
 ASK_AGAIN_S = 3.0
 #: an answer that has not come after this time is lost [s]
 ANSWER_LOST_S = 10.0
-#: a client that no service matches in this time is made anew; discovery may have lost it [s]
-MATCH_AGAIN_S = 15.0
+#: a client that no service matches in this time is made anew, in a participant that discovers all
+#: services again: what discovery has lost once, a participant never learns [s]
+MATCH_AGAIN_S = 12.0
 TIMEOUT_S = 60.0  # a busy machine takes long to start a node
 
 
@@ -96,6 +99,23 @@ def make_calibration(path):
     return path
 
 
+class Participant(NamedTuple):
+    """A node that DDS knows as a participant of its own."""
+
+    context: rclpy.Context
+    node: Node
+    executor: SingleThreadedExecutor
+
+
+def _new_participant(name):
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node(name, context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    return Participant(context, node, executor)
+
+
 class Client:
     """Plays cameras, arms and policy, and keeps what the node publishes."""
 
@@ -109,6 +129,7 @@ class Client:
         )
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
+        self.callers = [Participant(self.context, self.node, self.executor)]
         self.received, self.totals = defaultdict(list), Counter()
         self.publishers, self.services = {}, {}
         self.gone = set()
@@ -116,9 +137,10 @@ class Client:
         self.subscribe(DiagnosticArray, '/diagnostics', 10)
 
     def close(self):
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
+        for caller in self.callers:
+            caller.executor.shutdown()
+            caller.node.destroy_node()
+            rclpy.shutdown(context=caller.context)
 
     def forget_node(self):
         """The node was killed: the graph shows it for 20 s more, and it answers nothing."""
@@ -126,8 +148,8 @@ class Client:
             infos = self.node.get_subscriptions_info_by_topic(publisher.topic_name)
             self.gone |= {bytes(info.endpoint_gid) for info in infos}
             self.node.destroy_publisher(publisher)
-        for service in self.services.values():
-            self.node.destroy_client(service)
+        for name in tuple(self.services):
+            self._destroy_client(name)
         for kept in (self.publishers, self.services, self.received):
             kept.clear()
 
@@ -176,12 +198,17 @@ class Client:
         end = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < end, f'waited {timeout_s} s for {what}'
-            self.executor.spin_once(timeout_sec=0.02)
+            self._spin_once()
 
     def spin_for(self, seconds):
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=0.02)
+            self._spin_once()
+
+    def _spin_once(self):
+        for caller in self.callers[1:]:
+            caller.executor.spin_once(timeout_sec=0)
+        self.executor.spin_once(timeout_sec=0.02)
 
     def connect_outputs(self, topics, timeout_s=TIMEOUT_S, depth=NUM_FRAMES):
         """Subscribe to `{topic: type}` and wait for their publishers."""
@@ -202,17 +229,34 @@ class Client:
         end = time.monotonic() + TIMEOUT_S
         while True:
             if name not in self.services:
-                self.services[name] = self.node.create_client(kind, name)
+                self.services[name] = self.callers[-1].node.create_client(kind, name)
             client = self.services[name]
             patience_s = min(MATCH_AGAIN_S, max(end - time.monotonic(), 0.1))
             try:
                 self.wait(client.service_is_ready, f'service {name}', patience_s)
-            except AssertionError:
+            except AssertionError as error:
                 if time.monotonic() > end:
-                    raise
-                self.node.destroy_client(self.services.pop(name))
+                    raise AssertionError(f'{error}; {self._known_ends(name)}') from error
+                self._destroy_client(name)
+                self.callers.append(_new_participant(f'client_{len(self.callers)}'))
             else:
                 return client
+
+    def _destroy_client(self, name):
+        client = self.services.pop(name)
+        for caller in self.callers:
+            caller.node.destroy_client(client)  # of another node's client, it does nothing
+
+    def _known_ends(self, name):
+        """What each participant knows of a service: who reads its requests, who writes answers."""
+        known = []
+        for caller in self.callers:
+            ends = (
+                caller.node.get_subscriptions_info_by_topic(f'rq{name}Request', no_mangle=True),
+                caller.node.get_publishers_info_by_topic(f'rr{name}Reply', no_mangle=True),
+            )
+            known.append([[info.node_name for info in infos] for infos in ends])
+        return f'servers that read, and that answer, as each participant knows them: {known}'
 
     def call(self, kind, name, request):
         client = self._ready_client(kind, name)
