@@ -6,7 +6,8 @@ For each seed the expert and seven fault kinds that the seed drew act in `--phys
 `shifted_worlds.py` has it; logs are kept in `--logs` and the same command goes on. Seeds are drawn
 after the code is frozen, so that nothing could be fitted to them. All seeds are pooled; intervals
 are over scenes (tasks of a seed): AUROC jackknife, shares clustered Wilson. `--readme` writes the
-first table between the markers `unseen-faults` of README.md and docs/results.md.
+first table between the markers `unseen-faults` of docs/results.md, and its main columns into
+README.md.
 
 *Both* is the estimate with imagined frames, in the physics `--pictures`. In every physics but
 `nominal` nothing was fitted in the robot cell: *foreseen motions alone* draws contact parameters
@@ -76,6 +77,9 @@ COVERED = ('truth', 'judged by', 'estimates', 'covered', 'up to the sampling err
 BLOCK = ('judged by', 'nominal: AUROC', 'failures called a success', 'no verdict',
          'other truths: AUROC, mean (worst)', 'failures called a success, mean (worst)',
          'from .9 on succeed', 'no verdict, mean')  # fmt: skip
+#: columns and judges of the table in README.md
+README_COLUMNS = (0, 1, 2, 4, 5, 7)
+README_JUDGES = (f'**{BOTH}**', FORESEEN, RULE)
 _MARKED = re.compile(
     r'(<!-- unseen-faults: begin -->\n).*?(<!-- unseen-faults: end -->)', re.DOTALL
 )
@@ -175,8 +179,8 @@ def _before(calibration: Calibration, said: Line) -> ShareEstimate:
     return ShareEstimate(middle, low, high)
 
 
-def block(rows: Sequence[Row], num_scenes: int, seeds: str, count: int) -> str:
-    """Return the table of README.md."""
+def judged(rows: Sequence[Row]) -> list[list[str]]:
+    """Return a line of cells for each judge, see `BLOCK`."""
     lines = []
     for judge in (BOTH, FORESEEN, AS_FITTED, RULE):
         of = [r for r in rows if r.judge == judge]
@@ -186,6 +190,11 @@ def block(rows: Sequence[Row], num_scenes: int, seeds: str, count: int) -> str:
             nominal = next(r for r in rows if r.physics == NOMINAL and r.judge == FORESEEN)
         cells = ['–'] * 3 if nominal is None else [nominal.cells[k] for k in (4, 5, 7)]
         lines.append([f'**{judge}**' if judge == BOTH else judge, *cells, *_over(others)])
+    return lines
+
+
+def block(rows: Sequence[Row], num_scenes: int, seeds: str, count: int) -> str:
+    """Return the table of docs/results.md."""
     truths = sorted({r.physics for r in rows} - {NOMINAL})
     note = (
         f'*The expert and seven fault kinds that each of {len(seeds.split(","))} seeds ({seeds}) '
@@ -194,7 +203,19 @@ def block(rows: Sequence[Row], num_scenes: int, seeds: str, count: int) -> str:
         f'{date.today().isoformat()}, `experiments/unseen_faults.py`. Brackets: 95 % intervals '
         'over scenes.*'
     )
-    return f'{table(BLOCK, lines)}\n\n{note}\n'
+    return f'{table(BLOCK, judged(rows))}\n\n{note}\n'
+
+
+def readme_block(rows: Sequence[Row], num_scenes: int, count: int) -> str:
+    """Return the table of README.md: the main columns of that of docs/results.md."""
+    lines = [line for line in judged(rows) if line[0] in README_JUDGES]
+    truths = len({r.physics for r in rows} - {NOMINAL})
+    note = (
+        f'*{num_scenes} scenes, n = {count} in the nominal physics and in each of {truths} '
+        'others; [95 % intervals]. [All results](docs/results.md).*'
+    )
+    cells = [[line[k] for k in README_COLUMNS] for line in lines]
+    return f'{table([BLOCK[k] for k in README_COLUMNS], cells)}\n\n{note}\n'
 
 
 def _over(rows: Sequence[Row]) -> list[str]:
@@ -308,11 +329,13 @@ def main() -> None:
     found = estimates_of(options, pipelines, lines)
     rows = [row(physics, judge, *pair) for (physics, judge), pair in found.items()]
     scenes = {tuple(line['job'][1:4:2]) for line in lines}
-    first = block(rows, len(scenes), options.seeds, sum(r['job'][0] == NOMINAL for r in lines))
+    count = sum(r['job'][0] == NOMINAL for r in lines)
+    first = block(rows, len(scenes), options.seeds, count)
     if options.readme:
-        for name in ('README.md', 'docs/results.md'):
+        short = readme_block(rows, len(scenes), count)
+        for name, text in (('README.md', short), ('docs/results.md', first)):
             page = (ROOT / name).read_text(encoding='utf-8')
-            page = _MARKED.sub(lambda match: match[1] + first + match[2], page)
+            page = _MARKED.sub(lambda match, text=text: match[1] + text + match[2], page)
             (ROOT / name).write_text(page, encoding='utf-8')
     covered = [
         [physics, judge, *coverage(*pair)]

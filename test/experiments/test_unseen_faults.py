@@ -112,6 +112,11 @@ def test_the_block_of_the_readme_has_a_row_for_each_judge(script, monkeypatch):
     ]  # fmt: skip
     assert body[1][4:7] == ['1.00 (1.00, `bold`)', '0.00 (0.00, `bold`)', '8 of 8']
     assert '2 seeds (1,2)' in text and '`bold`' in text
+    short = script.readme_block(made, 4, 16).splitlines()
+    cells = [line.strip('| ').split(' | ') for line in short if line.startswith('| ')][2:]
+    assert [row[0] for row in cells] == [f'**{script.BOTH}**', script.FORESEEN, script.RULE]
+    assert cells[1] == [body[1][k].strip('| ') for k in script.README_COLUMNS]
+    assert '4 scenes, n = 16 in the nominal physics and in each of 1 others' in short[-1]
     assert script.of_seed(
         Namespace(logs=Path('logs'), seed=0, faults='', log=None), 5
     ).log == Path('logs/5.jsonl')
