@@ -3,6 +3,7 @@
     python experiments/real_recordings.py verdicts EPISODES [--task TASK.yaml] [--every 8]
     python experiments/real_recordings.py carried EPISODES --checkpoint CHECKPOINT
     python experiments/real_recordings.py rollouts EPISODES --checkpoint CHECKPOINT [--memory off]
+                                                   [--out out/real_rollouts]
 
 EPISODES is a folder of imported recordings whose cameras are known (`mtv-world fit camera --apply`)
 and whose objects were found (`import ... --objects`).
@@ -12,17 +13,20 @@ frames, so that most cuts are failures; somebody who looks at the frames says wh
 right. `carried` compares where objects are foreseen in each chunk, from the recorded frame that it
 starts from, with their recorded masks and with the first frame held; no picture is imagined.
 `rollouts` imagines recordings whole from their first frame: J of the arm in the first chunk and in
-all, PSNR, and J of moving objects, with and without the memory of the background.
+all, PSNR, and J of moving objects, with and without the memory of the background. It writes the
+scores of each chunk and a contact sheet of each recording; run again, it goes on where it stopped.
 """  # noqa: E501
 
 from __future__ import annotations
 
 import argparse
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+import json
 from math import isnan, nan
 from pathlib import Path
+import subprocess
 from typing import Any
 
 import numpy as np
@@ -30,8 +34,9 @@ from page import table
 
 from mtv_world_ros.cameras.camera import camera_poses
 from mtv_world_ros.cameras.motion import Motion
-from mtv_world_ros.core.data_types import FloatArray, WorldModelSpec
+from mtv_world_ros.core.data_types import ByteArray, FloatArray, SuccessEstimate, WorldModelSpec
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.core.images import write_png
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.data.recordings import commands_until
@@ -43,6 +48,8 @@ from mtv_world_ros.evaluation.imagined_stretches import (
 )
 from mtv_world_ros.evaluation.metrics.arm_masks import arm_scenes
 from mtv_world_ros.evaluation.metrics.jaccard_scores import find_masks, true_masks
+from mtv_world_ros.evaluation.metrics.statistics import mean_interval
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.options import RolloutOptions
@@ -50,6 +57,7 @@ from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.success.estimator import SuccessEstimator, verdict_word
 from mtv_world_ros.success.rollout_memory import footage_of
 from mtv_world_ros.success.task import load_task, load_tasks
+from mtv_world_ros.viewing.video import Comparison, contact_sheet
 from mtv_world_ros.vision.jaccard import jaccard
 from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids
 
@@ -85,18 +93,21 @@ def judge_recorded(arguments: argparse.Namespace) -> None:
             motion = Motion.of(robot, recording.cameras, recording.positions[:end])
             shown = footage_of(motion, first, rest)
             found = estimator.estimate(shown, recording.instruction, is_real=True).estimate
-            rows.append(
-                (
-                    recording.path.name,
-                    f'{recording.times[end - 1]:.1f}',
-                    f'{found.probability:.2f}',
-                    verdict_word(found.probability),
-                    found.reasons[0],
-                )
-            )
+            rows.append(verdict_row(recording.path.name, recording.times[end - 1], found))
             if isnan(found.probability) and 'no known task' in found.reasons[0]:
                 break  # and so it says of every cut
     print(table(('recording', 'until [s]', 'probability', 'verdict', 'first reason'), rows))
+
+
+def verdict_row(name: str, until_s: float, found: SuccessEstimate) -> tuple[str, ...]:
+    """Return the row of an estimate; the verdict is open where the interval reaches the other."""
+    return (
+        name,
+        f'{until_s:.1f}',
+        f'{found.probability:.2f}',
+        verdict_word(found.probability, found.interval),
+        found.reasons[0],
+    )
 
 
 class HeldFrames:
@@ -176,46 +187,160 @@ def _foreseen(
 
 
 def imagine_whole(arguments: argparse.Namespace) -> None:
-    """Print scores of whole rollouts."""
-    pipeline, rows = open_pipeline(arguments), []
+    """Print scores of whole rollouts; those of an earlier run are read."""
+    pipeline = open_pipeline(arguments)
     if arguments.memory == 'off':
         pipeline = replace(pipeline, scene_keeper=None)
-    parts = load_shape(pipeline.robot).parts
+    made_with = {
+        'checkpoint': Checkpoint.open(arguments.checkpoint).digest(),
+        'code': code_version(),
+        'seed': arguments.seed,
+        'memory': arguments.memory,
+    }
+    out: Path = arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    scores: list[dict[str, Any]] = []
     for recording in recordings(arguments.episodes, pipeline.spec):
-        (stretch,) = stretches(recording, pipeline.spec, 'imagine')
-        chunks = imagine_stretch(
-            replace(pipeline, objects=recording.names),
-            recording,
-            stretch,
-            actions=recording,
-            seed=arguments.seed,
-            num_inference_steps=0,
-        )
-        frames, real = predicted_frames(chunks), stretch.frames[:, 1:]
-        moving = _moving(pipeline, recording, stretch, frames)
-        for view, scene in enumerate(arm_scenes(recording, pipeline.robot, parts)):
-            if scene is None:
-                continue
-            masks = scene.masks(stretch.positions[1 : 1 + frames.shape[1]])
-            first = slice(0, pipeline.spec.num_frames)
-            early = replace(masks, arm=masks.arm[first])
-            error = ((frames[view].astype(float) - real[view]) ** 2).mean((1, 2, 3))
-            rows.append(
-                (
-                    recording.path.name,
-                    pipeline.spec.views[view],
-                    f'{early.jaccard(frames[view, first]):.3f}',
-                    f'{early.jaccard(real[view, first]):.3f}',
-                    f'{masks.jaccard(frames[view]):.3f}',
-                    f'{masks.jaccard(real[view]):.3f}',
-                    f'{float((10 * np.log10(255**2 / error)).mean()):.2f}',
-                    *(f'{value:.3f}' for value in moving[view]),
-                )
-            )
-        print(recording.path.name, chunks[-1].success.reasons, chunks[-1].success.probability)
+        file = out / f'{recording.path.name}.json'
+        stored = json.loads(file.read_text()) if file.exists() else {}
+        if stored.get('made_with') != made_with or not made_with['code']:
+            stored = {'made_with': made_with, **_imagine_one(arguments, pipeline, recording)}
+            file.write_text(json.dumps(stored, indent=1))
+        print(recording.path.name, stored['estimate'], f'{stored["probability"]:.2f}')
+        scores += stored['views']
     head = ('recording', 'view', 'J of the arm, first chunk', 'recorded', 'whole', 'recorded',
-            'PSNR, whole [dB]', 'J of moving objects, whole', 'held')  # fmt: skip
+            'PSNR, whole [dB]', 'held', 'J of moving objects, whole', 'held')  # fmt: skip
+    rows = [
+        (
+            score['recording'],
+            score['view'],
+            *(f'{score[key]:.{digits}f}' for key, digits in SCORES),
+        )
+        for score in scores
+    ]
     print(table(head, rows))
+    print(table(('mean of views, then of recordings', 'mean', '95 %', 'n'), mean_rows(scores)))
+
+
+def code_version() -> str:
+    """Return the hash of the package's committed files; empty with changes on top."""
+    words = [['status', '--porcelain', 'mtv_world_ros'], ['rev-parse', 'HEAD:mtv_world_ros']]
+    root = Path(__file__).resolve().parents[1]
+    changes, tree = (
+        subprocess.run(['git', *part], cwd=root, capture_output=True, text=True, check=True).stdout
+        for part in words
+    )
+    return '' if changes else tree.strip()
+
+
+#: name of a score of a view -> decimals shown
+SCORES = (
+    ('arm_first', 3),
+    ('arm_first_recorded', 3),
+    ('arm', 3),
+    ('arm_recorded', 3),
+    ('psnr', 2),
+    ('psnr_held', 2),
+    ('moving', 3),
+    ('moving_held', 3),
+)
+#: differences whose means over recordings are printed: words, the score, what is taken off
+DIFFERENCES = (
+    ('J of the arm, whole: imagined less recorded frames', ('arm',), ('arm_recorded',)),
+    ('J of the arm, imagined: whole less first chunk', ('arm',), ('arm_first',)),
+    (
+        'and the same of recorded frames taken off',
+        ('arm', 'arm_first_recorded'),
+        ('arm_first', 'arm_recorded'),
+    ),
+    ('PSNR, whole: imagined less first frame held [dB]', ('psnr',), ('psnr_held',)),
+    ('J of moving objects, whole: imagined less held', ('moving',), ('moving_held',)),
+)
+
+
+def mean_rows(scores: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str, str]]:
+    """Return rows of mean differences, with 95 % t intervals over recordings."""
+    rows: list[tuple[str, str, str, str]] = []
+    for words, plus, minus in DIFFERENCES:
+        by_recording: dict[str, list[float]] = {}
+        for score in scores:
+            value = sum(score[key] for key in plus) - sum(score[key] for key in minus)
+            if not isnan(value):
+                by_recording.setdefault(score['recording'], []).append(value)
+        means = np.array([np.mean(values) for values in by_recording.values()])
+        mean, ends = mean_interval(
+            means[:, None], np.ones((len(means), 1)), low=-np.inf, high=np.inf
+        )
+        low, high = ends[:, 0]
+        shown = '-' if isnan(low) else f'[{low:+.3f}, {high:+.3f}]'
+        rows.append((words, f'{mean[0]:+.3f}', shown, str(len(means))))
+    return rows
+
+
+def _imagine_one(
+    arguments: argparse.Namespace, pipeline: Pipeline, recording: Recording
+) -> dict[str, Any]:
+    """Imagine a recording whole; write its contact sheet and return its scores."""
+    (stretch,) = stretches(recording, pipeline.spec, 'imagine')
+    chunks = imagine_stretch(
+        replace(pipeline, objects=recording.names),
+        recording,
+        stretch,
+        actions=recording,
+        seed=arguments.seed,
+        num_inference_steps=0,
+    )
+    frames, real = predicted_frames(chunks), stretch.frames[:, 1:]
+    drawn = np.concatenate([chunk.trajectory_video.frames[:, 1:] for chunk in chunks], axis=1)
+    comparison = Comparison(
+        views=pipeline.spec.views,
+        times=np.arange(1, 1 + frames.shape[1]) / pipeline.spec.fps,
+        real=real,
+        trajectory=drawn[:, : frames.shape[1]],
+        imagined=frames,
+    )
+    sheet = contact_sheet(comparison, title=recording.instruction, num_columns=10)
+    write_png(arguments.out / f'{recording.path.name}.png', sheet)
+    moving = _moving(pipeline, recording, stretch, frames)
+    parts, views = load_shape(pipeline.robot).parts, list[dict[str, Any]]()
+    for view, scene in enumerate(arm_scenes(recording, pipeline.robot, parts)):
+        if scene is None:
+            continue
+        masks = scene.masks(stretch.positions[1 : 1 + frames.shape[1]])
+        length = pipeline.spec.num_frames
+        cuts = [slice(k, k + length) for k in range(0, frames.shape[1], length)]
+        arm, recorded = (
+            [replace(masks, arm=masks.arm[cut]).jaccard(shown[cut]) for cut in cuts]
+            for shown in (frames[view], real[view])
+        )
+        views.append(
+            {
+                'recording': recording.path.name,
+                'view': pipeline.spec.views[view],
+                'arm_first': arm[0],
+                'arm_first_recorded': recorded[0],
+                'arm': masks.jaccard(frames[view]),
+                'arm_recorded': masks.jaccard(real[view]),
+                'psnr': _psnr(frames[view], real[view]),
+                'psnr_held': _psnr(stretch.frames[view, :1], real[view]),
+                'moving': float(moving[view][0]),
+                'moving_held': float(moving[view][1]),
+                'arm_of_chunks': arm,
+                'arm_recorded_of_chunks': recorded,
+            }
+        )
+    success = chunks[-1].success
+    return {
+        'views': views,
+        'estimate': list(success.reasons),
+        'probability': success.probability,
+    }
+
+
+def _psnr(shown: ByteArray, real: ByteArray) -> float:
+    """Return the mean PSNR of frames (T, H, W, 3) [dB]."""
+    error = ((shown.astype(float) - real) ** 2).mean((1, 2, 3))
+    return float((10 * np.log10(255**2 / error)).mean())
 
 
 def _moving(
@@ -252,6 +377,7 @@ def main() -> None:
     parser.add_argument('--checkpoint', default='')
     parser.add_argument('--memory', choices=('on', 'off'), default='on')
     parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--out', type=Path, default=Path('out/real_rollouts'))
     arguments = parser.parse_args()
     {'verdicts': judge_recorded, 'carried': compare_carried, 'rollouts': imagine_whole}[
         arguments.what
