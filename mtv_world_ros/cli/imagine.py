@@ -133,6 +133,11 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
         '--instruction', default='', help="text for the robot; default: the recorded episode's"
     )
     parser.add_argument(
+        '--place',
+        help='name of the robot cell, as in `mtv-world fit contact --place`; default: what the '
+        'recording states; with --live the parameter `place`',
+    )
+    parser.add_argument(
         '--out', type=Path, default=Path('out/imagine'), help='default: out/imagine'
     )
     parser.add_argument(
@@ -208,6 +213,8 @@ def _in_world_model(
         num_inference_steps=arguments.steps,
     )
     starts = _starts(arguments, episodes, pipeline)
+    if arguments.place is not None:
+        starts = (start.at_place(arguments.place) for start in starts)
     viewer = _viewer(arguments)
     watched = {'on_start': viewer.begin, 'on_chunk': viewer.add} if viewer else {}
     results = imagine_episodes(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import nan
 from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.core.data_types import BoolArray, FloatArray
+from mtv_world_ros.core.data_types import BoolArray, FloatArray, SuccessEstimate
 from mtv_world_ros.core.images import resize_frames
 from mtv_world_ros.ranking.rollout_jobs import COMMANDS_PART, OBJECTS_PART, WorldComparison
 from mtv_world_ros.rollout.prediction import Prediction
@@ -74,8 +74,8 @@ class BothWorlds:
             command_gaps=_rounded(gaps),
             overlaps=_rounded(_least(overlaps, len(gaps))),
             ends=tuple(ends),
-            seen=_rounded([seen.get(end, nan) for end in ends]),
-            imagined=_rounded([imagined.get(end, nan) for end in ends]),
+            seen=_rounded([_probability(seen, end) for end in ends]),
+            imagined=_rounded([_probability(imagined, end) for end in ends]),
             commands_part_s=_first(gaps > COMMANDS_PART, times),
             objects_part_s=float(times[frame]) if frame >= 0 else nan,
             parted_object=names[number] if frame >= 0 else '',
@@ -83,7 +83,7 @@ class BothWorlds:
                 (
                     end
                     for end in ends
-                    if {verdict(seen.get(end, nan)), verdict(imagined.get(end, nan))} == {0.0, 1.0}
+                    if end in seen and end in imagined and verdicts_part(seen[end], imagined[end])
                 ),
                 nan,
             ),
@@ -173,15 +173,27 @@ def _masks(chunks: Sequence[ObservedChunk] | Sequence[Prediction]) -> BoolArray:
     return np.concatenate([chunk.masks.masks for chunk in chunks], axis=2)
 
 
+def verdicts_part(one: SuccessEstimate, other: SuccessEstimate) -> bool:
+    """Return True if one verdict is a success, the other a failure, and intervals do not overlap.
+
+    An estimate that is open, or abstains, parts from none.
+    """
+    calls = {verdict(estimate.probability, estimate.interval) for estimate in (one, other)}
+    low = max(one.interval[0], other.interval[0])
+    high = min(one.interval[1], other.interval[1])
+    return calls == {0.0, 1.0} and not low <= high
+
+
 def _estimates(
     chunks: Sequence[ObservedChunk] | Sequence[Prediction], fps: float
-) -> dict[float, float]:
+) -> dict[float, SuccessEstimate]:
     """Return the estimates by the time at which their chunk ends [s]."""
     ends = np.cumsum([chunk.masks.masks.shape[2] for chunk in chunks]) / fps
-    return {
-        round(float(end), 3): chunk.success.probability
-        for end, chunk in zip(ends, chunks, strict=True)
-    }
+    return {round(float(end), 3): chunk.success for end, chunk in zip(ends, chunks, strict=True)}
+
+
+def _probability(estimates: Mapping[float, SuccessEstimate], end: float) -> float:
+    return estimates[end].probability if end in estimates else nan
 
 
 def _least(overlaps: FloatArray, num: int) -> FloatArray:

@@ -145,7 +145,8 @@ class WorldComparison:
         commands_part_s: when commands first differ by more than `COMMANDS_PART`; NaN = never.
         objects_part_s: when an object's overlap falls below `OBJECTS_PART`; NaN = never.
         parted_object: name of that object.
-        verdicts_part_s: when one estimate first calls a success what the other calls a failure;
+        verdicts_part_s: when one estimate first calls a success what the other calls a failure,
+            and their intervals do not overlap;
             NaN = never.
     """
 

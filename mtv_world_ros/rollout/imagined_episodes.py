@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, cycle, islice
 import json
 from math import isfinite, nan
@@ -90,6 +90,10 @@ class EpisodeStart:
     origin: EpisodeOrigin
     robot: RobotModel | None = None
     stored_objects: tuple[str, ...] = ()
+
+    def at_place(self, place: str) -> EpisodeStart:
+        """Return the start with the name of its robot cell, see `Observation.place`."""
+        return replace(self, observation=replace(self.observation, place=place))
 
 
 def recorded_start(path: Path, pipeline: Pipeline, start_s: float = 0.0) -> EpisodeStart:

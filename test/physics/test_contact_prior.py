@@ -110,6 +110,11 @@ def test_draws_of_the_posterior_are_joint_and_their_first_ones_are_spread_evenly
     assert np.corrcoef(grip, density)[0, 1] > 0.97
     assert grip.mean() == pytest.approx(weights @ logs[:, 0], abs=0.1)
     hold = grip - density
+    # 3, 7 and 15 draws divide the posterior into equal parts: they lean to neither side
+    levels = weights @ (logs[:, 0] - logs[:, 2] <= hold[:15, None]).T
+    for count in (3, 7, 15):
+        expected = np.arange(1, count + 1) / (count + 1)
+        assert np.sort(levels[:count]) == pytest.approx(expected, abs=0.002)
     for count in (8, 15, 64):
         expected = np.quantile(logs[:, 0] - logs[:, 2], [0.2, 0.8])
         assert np.quantile(hold[:count], [0.2, 0.8]) == pytest.approx(expected, abs=0.02)

@@ -14,6 +14,7 @@ from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibr
 from mtv_world_ros.cli import main
 from mtv_world_ros.cli.imagine import episode_table
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.success.estimator import NOT_FITTED_HERE
 from mtv_world_ros.viewing.streams import read_streams
 
 DEMO = share_path('resource', 'demo_episode')
@@ -132,6 +133,18 @@ def test_an_episode_ends_after_its_longest_time_and_keeps_its_chunks(tmp_path):
 
 
 @pytest.mark.slow
+def test_an_episode_in_another_robot_cell_is_judged_by_the_wide_prior(tmp_path):
+    """`--place` takes the place of what the recording states."""
+    words = ('--steps', '1', '--max-chunks', '1', '--no-video')
+    reasons = []
+    for folder, place in (('stated', ()), ('named', ('--place', 'cell 3'))):
+        assert run(tmp_path / folder, 'recorded', *words, *place) == 0
+        (episode,) = json.loads((tmp_path / folder / 'episodes.json').read_text())
+        reasons.append(NOT_FITTED_HERE in episode['reasons'])
+    assert reasons == [False, True]
+
+
+@pytest.mark.slow
 def test_live_episodes_start_from_what_a_bag_shows(tmp_path, capsys, monkeypatch):
     """The two commands of docs/policies.md."""
     pytest.importorskip('rclpy', reason='rclpy is not installed (pip install .[ros])')
@@ -144,6 +157,7 @@ def test_live_episodes_start_from_what_a_bag_shows(tmp_path, capsys, monkeypatch
     (tmp_path / 'holding.yaml').write_text('kind: python\nfactory: holding_policy:Holding\n')
     words = ['--live', '--policy', str(tmp_path / 'holding.yaml'), '--count', '2']
     words += ['--max-chunks', '1', '--steps', '1', '--out', str(tmp_path / 'out'), '--no-video']
+    words += ['--place', 'simulator/nominal']
     words += ['--ros-args', '-p', f'calibration_file:={DEMO / "calibration.yaml"}']
     try:
         assert main(['imagine', *words]) == 0, playing.output()
@@ -155,6 +169,7 @@ def test_live_episodes_start_from_what_a_bag_shows(tmp_path, capsys, monkeypatch
     assert [(r['start'], r['how'], r['num_chunks']) for r in results] == [
         ('live', 'max_chunks', 1)
     ] * 2
+    assert not any(NOT_FITTED_HERE in r['reasons'] for r in results)
     # the bag says what the robot is to do
     streams = read_streams([tmp_path / 'out' / 'episode_00000'])
     assert 'purple block' in ' '.join(text for _, text in streams.words)

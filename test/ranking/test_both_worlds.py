@@ -5,13 +5,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from mtv_world_ros.ranking.both_worlds import command_gaps, first_apart, object_overlaps
+from mtv_world_ros.core.data_types import SuccessEstimate
+from mtv_world_ros.ranking.both_worlds import (
+    command_gaps,
+    first_apart,
+    object_overlaps,
+    verdicts_part,
+)
 from mtv_world_ros.ranking.ranking_summary import Summary
 from mtv_world_ros.ranking.rollout_jobs import make_jobs, Result, WorldComparison
 from mtv_world_ros.ranking.rollout_runner import ComparisonRunner
 from mtv_world_ros.ranking.run_jobs import RankedCheckpoint, read_results, run_jobs
 from mtv_world_ros.reports.ranking_report import write_ranking
 from mtv_world_ros.reports.rollout_cards import curves, verdict, when_they_part, worst_first
+from mtv_world_ros.success.estimator import verdict_word
 from mtv_world_ros.viewing.stored_rollout import load_rollout
 from mtv_world_ros.viewing.video import decode_video
 from test.support.browser import Browser
@@ -62,6 +69,37 @@ def test_what_is_hidden_in_both_worlds_does_not_part():
     assert first_apart(object_overlaps(true, found)) == [-1]
     # lost in one world alone
     assert first_apart(object_overlaps(block(4), found)) == [2]
+
+
+def said(probability, low, high):
+    return SuccessEstimate(
+        probability=probability, interval=(low, high), jaccard=np.zeros((1, 1)), reasons=()
+    )
+
+
+SURE = said(0.98, 0.87, 1.0)
+
+
+@pytest.mark.parametrize(
+    ('other', 'expected'),
+    [
+        (said(0.05, 0.0, 0.24), True),
+        (said(0.3, 0.05, 0.8), False),  # open: it may well be a success
+        (said(0.3, 0.1, 0.7), True),  # a failure, whose interval ends below that of the other
+        (said(0.9, 0.8, 1.0), False),
+        (said(NAN, NAN, NAN), False),
+    ],
+)
+def test_verdicts_part_where_one_is_a_success_and_the_other_a_failure(other, expected):
+    assert verdicts_part(SURE, other) is verdicts_part(other, SURE) is expected
+
+
+def test_verdicts_whose_intervals_overlap_do_not_part():
+    success, failure = said(0.8, 0.55, 0.95), said(0.3, 0.1, 0.7)
+    assert verdict_word(success.probability, success.interval) == 'success'
+    assert verdict_word(failure.probability, failure.interval) == 'failure'
+    assert not verdicts_part(success, failure)
+    assert verdicts_part(success, said(0.3, 0.1, 0.5))
 
 
 @dataclass

@@ -144,6 +144,15 @@ def test_the_described_robot_is_imagined(imagine, pipeline, observation):
     assert found['how'] == 'done'
 
 
+def test_a_start_takes_the_name_of_a_robot_cell(observation):
+    start = EpisodeStart(
+        source='live', observation=observation, instruction='', origin=EpisodeOrigin()
+    )
+    named = start.at_place('cell 3')
+    assert named.observation.place == 'cell 3' and start.observation.place == observation.place
+    np.testing.assert_array_equal(named.observation.frames, observation.frames)
+
+
 def test_episodes_are_not_overwritten_unasked(imagine, pipeline, tmp_path):
     imagine()
     with pytest.raises(ConfigError, match='--overwrite'):

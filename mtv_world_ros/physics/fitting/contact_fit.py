@@ -622,11 +622,10 @@ def _joint_draws(
     """
     order = np.argsort(logs @ [_HOLD.get(name, 0) for name in RANGES], kind='stable')
     levels = np.cumsum(weights[order])
-    # bit reversal of 0, 1, 2, ...: 0, 1/2, 1/4, 3/4, ... of the way. The first draw slips most, so
-    # that few futures lean to slipping: 15 draws by .05 of the way, 3 by .24
-    bits = MAX_MOTIONS.bit_length() - 1
-    turned = [int(f'{number:0{bits}b}'[::-1], 2) for number in range(MAX_MOTIONS)]
-    at = (np.array(turned) + 0.5) / MAX_MOTIONS * levels[-1]
+    # 1/2, 1/4, 3/4, 1/8, ...: the sequence begins with 0, the draw that slips most of all, with
+    # which few futures would lean to slipping
+    sequence = qmc.Halton(d=1, scramble=False).random(1 + MAX_MOTIONS)[1:, 0]
+    at = sequence * levels[-1]
     chosen = order[np.minimum(np.searchsorted(levels, at), len(order) - 1)]
     settings = [_settings(first, row) for row in logs[chosen]]
     return tuple(
