@@ -23,7 +23,12 @@ def child():
 
     It sleeps in short pieces: Python sees a signal that arrives just before a sleep after it.
     """
-    code = 'import time\nprint(flush=True)\nwhile True: time.sleep(0.05)'
+    code = (
+        'import signal, time\n'
+        'signal.signal(signal.SIGINT, signal.SIG_DFL)\n'  # a shell's background job ignores it
+        'print(flush=True)\n'
+        'while True: time.sleep(0.05)'
+    )
     with subprocess.Popen([sys.executable, '-c', code], stdout=subprocess.PIPE) as process:
         assert process.stdout.readline()
         yield process
