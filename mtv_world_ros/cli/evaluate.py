@@ -169,7 +169,9 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
     selection, truth = of_physics(selection, arguments.physics)
     from mtv_world_ros.reports.comparison import write_comparison
+    from mtv_world_ros.success.own_tasks import named_here
 
+    arguments.task = named_here(arguments.task, selection.paths)
     print(f'{arguments.dataset}: {selection}; physics: {truth}')
     alone = len(entries) == 1
     folders = [arguments.out if alone else arguments.out / _slug(e.label) for e in entries]

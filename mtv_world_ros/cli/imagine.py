@@ -59,8 +59,10 @@ def _replay(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.rollout.assembly import asked_describer
     from mtv_world_ros.rollout.offline import replay_offline
+    from mtv_world_ros.success.own_tasks import named_here
 
     (arguments.checkpoint,) = open_checkpoints(arguments.device, arguments.checkpoint)
+    arguments.task = named_here(arguments.task, [arguments.episode])
     out = arguments.out or Path('out') / f'{arguments.episode.name}_predictions'
     check_free(out, arguments.overwrite)
     summary = replay_offline(
@@ -144,7 +146,7 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
         '--no-video', dest='video', action='store_false', help='write no comparison.mp4'
     )
     add_watch(parser, 'every episode')
-    add_options(parser, 'overwrite checkpoint model describer segmenter')
+    add_options(parser, 'overwrite checkpoint model describer segmenter task')
     parser.set_defaults(
         handler=_imagine,
         takes_more=lambda chosen, more: chosen.live and more[0] == '--ros-args',
@@ -195,12 +197,14 @@ def _in_world_model(
         EpisodeOptions,
         imagine_episodes,
     )
+    from mtv_world_ros.success.own_tasks import named_here
 
     # a wrong name is an error here, before anything is loaded or removed
     robot = arguments.checkpoint.load_robot(arguments.robot)
     check_start(arguments.policy, robot, arguments.start, is_recorded=not arguments.live)
     for bag in sorted(arguments.out.glob('episode_*')):
         check_free(bag, arguments.overwrite)
+    arguments.task = named_here(arguments.task, episodes)
     describer = asked_describer(arguments.describer)
     pipeline = replace(pipeline_of(arguments), describer=describer)
     options = EpisodeOptions(

@@ -79,7 +79,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--tasks',
         metavar='LIST',
-        help='names of tasks, comma-separated; default: three, with --faults six',
+        help='names of tasks, or YAML files with a scene, comma-separated; default: three, with '
+        '--faults six',
     )
     parser.add_argument('--episodes', type=int, default=10, help='number of scenes of each task')
     parser.add_argument(
@@ -281,17 +282,18 @@ def _jobs(
     )
     from mtv_world_ros.simulation.expert.expert import Expert
     from mtv_world_ros.simulation.faults.catalogue import policies_of
-    from mtv_world_ros.simulation.scenes.tasks import bundled_tasks_named
+    from mtv_world_ros.simulation.scenes.tasks import tasks_named
 
     policies, names = DEFAULT_POLICIES, DEFAULT_TASKS
     if listed:
         policies = tuple(policy.name for policy in listed)
-        names = tasks_of(listed, DEFAULT_TASKS)
     elif arguments.policies is not None:
         policies = policies_named(arguments.policies)
     elif arguments.faults is not None:
         policies, names = policies_of(arguments.faults), BENCHMARK_TASKS
-    tasks = [task.name for task in bundled_tasks_named(arguments.tasks or ','.join(names))]
+    tasks = tasks_named(arguments.tasks or ','.join(names))
+    if listed and not arguments.tasks:
+        tasks = tasks_of(listed, tasks)
     check_tasks(listed, tasks)
     expert = Expert(robot, physics=arguments.physics)
     jobs = make_jobs(policies, tasks, arguments.episodes, arguments.seed, expert)
@@ -300,7 +302,7 @@ def _jobs(
         jobs = [
             replace(job, definition=of[job.policy].definition)
             for job in jobs
-            if job.task in (of[job.policy].tasks or tasks)
+            if job.task in {task.name for task in of[job.policy].tasks or tasks}
         ]
     print(f'{len(policies)} policies, {len(tasks)} tasks, {len(jobs)} rollouts in each world')
     return jobs

@@ -34,6 +34,8 @@ UNKNOWN_CAMERAS = 'unknown_cameras'
 PHYSICS = 'physics'
 #: key of the metadata that names the robot cell of an episode
 PLACE = 'place'
+#: key of the metadata that holds the definition of a task that is not a bundled one, as JSON
+TASK_DEFINITION = 'task_definition'
 #: name of the default physics
 NOMINAL = 'nominal'
 CALIBRATION_FILE = 'calibration.yaml'

@@ -175,6 +175,19 @@ def _physics(info: EpisodeInfo) -> str:
     return info.physics or 'not stated'
 
 
+def task_definitions(dataset: Path) -> dict[str, dict[str, Any]]:
+    """Return the definitions of a data set's tasks that are not bundled, by name of the task.
+
+    Args:
+        dataset: folder of the data set; without `dataset.json`, or with one of an earlier
+            version, it defines none.
+
+    Raises:
+        ConfigError: the card cannot be read.
+    """
+    return _card(dataset).task_definitions
+
+
 class _Entry(BaseModel):
     """An episode in `dataset.json`: its name, what is zero-shot in it, scene and seed if any."""
 
@@ -189,6 +202,7 @@ class _Card(BaseModel):
 
     splits: dict[str, list[str]] = {}
     episodes: list[_Entry] = []
+    task_definitions: dict[str, dict[str, Any]] = {}
 
 
 def _card(dataset: Path) -> _Card:
@@ -203,8 +217,8 @@ def _card(dataset: Path) -> _Card:
         return _Card.model_validate(card)
     except ValidationError as error:
         raise ConfigError(
-            f"'{file}' is not a data set card: 'splits' or 'episodes' are not as 'mtv-world "
-            "collect' writes them"
+            f"'{file}' is not a data set card: 'splits', 'episodes' or 'task_definitions' are not "
+            "as 'mtv-world collect' writes them"
         ) from error
 
 

@@ -49,6 +49,7 @@ from mtv_world_ros.robot.shape import load_shape, RobotShape
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.prediction import Prediction
 from mtv_world_ros.success.estimator import SUCCESS_FROM
+from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.viewing.scored_rollout import StoredRollout
 from mtv_world_ros.viewing.stored_rollout import join_stretches, save_rollout
 
@@ -66,6 +67,7 @@ class EvaluationJob:
         donors: episodes that may lend their actions; the first one that can be read does.
         zero_shot: what the model was not trained for in it: `view`, `task`, `object`; or empty.
         objects: names of its objects; empty = the pipeline's, or recorded, or named by the task.
+        task: task that the episode defines; None = the one that its instruction matches.
     """
 
     path: Path
@@ -73,6 +75,7 @@ class EvaluationJob:
     donors: tuple[Path, ...] = ()
     zero_shot: str = ''
     objects: tuple[str, ...] = ()
+    task: TaskSpec | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,8 +97,9 @@ class Instruments:
 
 @dataclass(slots=True)
 class _Found:
-    """Results gathered over the stretches of an episode."""
+    """Results gathered over the stretches of an episode, and the task that it defines."""
 
+    task: TaskSpec | None
     rows: list[ScoreRow] = field(default_factory=list)
     shown: list[StoredRollout] = field(default_factory=list)
     quality: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
@@ -133,7 +137,7 @@ class EpisodeScorer:
         Raises:
             MtvWorldError: the episode cannot be read or imagined.
         """
-        found = _Found()
+        found = _Found(job.task)
         with found.timed('reading'):
             recording, donor = self._load(job.path), self._donor(job)
             if self._shape.is_known:
@@ -147,10 +151,10 @@ class EpisodeScorer:
             success = chunks[-1].success
             if self.config.observed:
                 with found.timed('segmenting'):
-                    pipeline = replace(self.pipeline, objects=names)
+                    pipeline = self._pipeline_for(names, found.task)
                     real = observe_stretch(pipeline, recording, stretch)
                     observed, shown = real.features, real.probability
-                last = last_chunk(recording, stretch, pipeline.spec)
+                last = last_chunk(recording, stretch, self.pipeline.spec)
                 if last is not None:
                     chunk = self._imagine(recording, last, recording, names, found)[-1]
                     resumed = chunk.success.features
@@ -192,6 +196,11 @@ class EpisodeScorer:
     def _read(self, path: Path) -> Recording:
         pipeline = self.pipeline
         return load_recording(path, pipeline.spec, pipeline.robot, source=self.config.source)
+
+    def _pipeline_for(self, names: tuple[str, ...], task: TaskSpec | None) -> Pipeline:
+        """Return the pipeline for the objects and the own task of an episode."""
+        estimator = self.pipeline.estimator.for_task(task)
+        return replace(self.pipeline, objects=names, estimator=estimator)
 
     def _donor(self, job: EvaluationJob) -> Recording | None:
         """Return the episode that lends its actions; None if there is none that can be read."""
@@ -261,7 +270,7 @@ class EpisodeScorer:
     ) -> list[Prediction]:
         with found.timed('imagining'):
             chunks = imagine_stretch(
-                replace(self.pipeline, objects=names),
+                self._pipeline_for(names, found.task),
                 recording,
                 stretch,
                 actions=actions,

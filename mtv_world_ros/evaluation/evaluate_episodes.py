@@ -36,6 +36,8 @@ from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.evaluation.tables import write_summary
 from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.success.own_tasks import own_tasks
+from mtv_world_ros.success.task import dump_task, TaskSpec
 from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.jaccard import mean_of_known
 
@@ -97,14 +99,16 @@ def evaluate(
         show_progress: draw a progress bar, on a terminal.
 
     Raises:
-        ConfigError: weights are missing, or `out` holds results of other settings.
+        ConfigError: weights are missing, `out` holds results of other settings, or two episodes
+            define a task of one name differently.
         EpisodeError: no episode can be used.
     """
     if not config.num_inference_steps:  # results say the number
         config = config.replace(num_inference_steps=pipeline.spec.num_inference_steps)
     run = _Run(pipeline, out, name, config, parallel, describer)
     check_same_settings(out / 'episodes', run.settings, overwrite or not name)
-    jobs = make_jobs(episode_paths, zero_shot, config.seed)
+    tasks = {} if pipeline.estimator.is_given else own_tasks(episode_paths)
+    jobs = make_jobs(episode_paths, zero_shot, config.seed, tasks)
     results, failed = [], {}
     bar = tqdm(
         run.results(jobs), total=len(jobs), unit='ep', disable=None if show_progress else True
@@ -144,11 +148,20 @@ def result_names(paths: Sequence[Path]) -> dict[Path, str]:
 
 
 def make_jobs(
-    paths: Sequence[Path], zero_shot: Mapping[Path, str], seed: int
+    paths: Sequence[Path],
+    zero_shot: Mapping[Path, str],
+    seed: int,
+    tasks: Mapping[Path, TaskSpec] = MappingProxyType({}),
 ) -> list[EvaluationJob]:
     """Return the episodes in an order in which each lends its actions to the next.
 
     Where it cannot be read, the ones before it are asked.
+
+    Args:
+        paths: folders of the episodes.
+        zero_shot: by path what the model was not trained for: `view`, `task` or `object`.
+        seed: seed of the order.
+        tasks: by path the tasks that episodes define.
     """
     order = np.random.default_rng(seed).permutation(len(paths))
     shuffled = [Path(paths[index]) for index in order]
@@ -161,6 +174,7 @@ def make_jobs(
                 shuffled[index - k] for k in range(1, min(len(shuffled), 1 + _MAX_DONORS))
             ),
             zero_shot=zero_shot.get(path, ''),
+            task=tasks.get(path),
         )
         for index, path in enumerate(shuffled)
     ]
@@ -294,6 +308,8 @@ class _Run:
             'donor': str(job.donors[0] if job.donors else None),
             'zero_shot': job.zero_shot,
             'objects': list(job.objects),
+            # absent for bundled tasks, so that evaluations of earlier versions can be resumed
+            **({} if job.task is None else {'task': dump_task(job.task)}),
         }
 
     def _stored(self, job: EvaluationJob) -> EpisodeResult | None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from hashlib import sha256
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import content_digest, plain
 from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.success.task import dump_task, TaskSpec
 
 
 def fingerprint(
@@ -17,7 +20,7 @@ def fingerprint(
     *,
     calibrated: bool = True,
     adapter: Path | None = None,
-    task: str | None = None,
+    task: str | TaskSpec | None = None,
 ) -> str:
     """Return the checkpoint's name and a hash of its files: other weights, other name.
 
@@ -25,14 +28,17 @@ def fingerprint(
         checkpoint: the checkpoint.
         calibrated: the calibration counts too.
         adapter: LoRA adapter that is used with it.
-        task: name or file of the task that is judged.
+        task: name or file of the task that is judged, or its definition.
     """
     from mtv_world_ros.success.calibration import CALIBRATION, HORIZON
 
     without = () if calibrated else (CALIBRATION, HORIZON)
     parts = [f'{checkpoint} ({checkpoint.digest(without)[:8]})']
     files = [] if adapter is None else [('adapter', adapter)]
-    if task is not None and not task.endswith(('.yaml', '.yml')):
+    if isinstance(task, TaskSpec):
+        text = json.dumps(dump_task(task), sort_keys=True)
+        parts.append(f'task {task.name} ({sha256(text.encode()).hexdigest()[:8]})')
+    elif task is not None and not task.endswith(('.yaml', '.yml')):
         parts.append(f'task {task}')
     elif task is not None:
         files += [('task', Path(task))]

@@ -21,12 +21,15 @@ class EpisodeOrigin:
 
     Attributes:
         task: name of the task; empty = not known.
+        task_definition: definition of a task that is not bundled, as JSON; empty = the task is
+            bundled, or not known.
         scene_seed: seed of the simulated scene; -1 = not known.
         recording: folder of the recorded episode; empty = there is none.
         recording_ns: stamp of the recorded frame that it begins from [ns].
     """
 
     task: str = ''
+    task_definition: str = ''
     scene_seed: int = -1
     recording: str = ''
     recording_ns: int = 0

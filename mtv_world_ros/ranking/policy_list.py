@@ -23,7 +23,7 @@ from mtv_world_ros.ranking.server_process import PORT, ServerProcess
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
-from mtv_world_ros.simulation.scenes.tasks import bundled_tasks_named
+from mtv_world_ros.simulation.scenes.tasks import own_definition, Task, tasks_named
 
 #: names are parts of file names
 _NAME = r'^[A-Za-z0-9][A-Za-z0-9._-]*$'
@@ -51,7 +51,8 @@ class PolicyEntry(Schema):
         default=120.0, description='longest wait until the server listens [s]'
     )
     tasks: ListOf[str] = Field(
-        default=(), description='tasks that it is ranked on; empty = all of `--tasks`'
+        default=(),
+        description='tasks that it is ranked on, names or YAML files; empty = all of `--tasks`',
     )
 
     @model_validator(mode='after')
@@ -76,7 +77,7 @@ class ListedPolicy:
         config: the policy's configuration.
         command: starts its server; empty = it has none, or it runs already.
         start_timeout_s: longest wait until the server listens [s].
-        tasks: tasks that it is ranked on; empty = all that are asked for.
+        tasks: tasks that it is ranked on; empty = all that the ranking has.
         definition: changes with everything that decides what the policy does.
     """
 
@@ -84,7 +85,7 @@ class ListedPolicy:
     config: PolicySettings
     command: tuple[str, ...]
     start_timeout_s: float
-    tasks: tuple[str, ...]
+    tasks: tuple[Task, ...]
     definition: str
 
 
@@ -129,7 +130,7 @@ def _listed(entry: PolicyEntry, path: Path, robot: RobotModel) -> ListedPolicy:
         config=config,
         command=entry.command,
         start_timeout_s=entry.start_timeout_s,
-        tasks=tuple(task.name for name in entry.tasks for task in bundled_tasks_named(name)),
+        tasks=tasks_named(','.join(entry.tasks), path.parent),
         definition=hashlib.sha256(text.encode()).hexdigest()[:16],
     )
 
@@ -159,28 +160,42 @@ def _merged(values: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, A
     return merged
 
 
-def tasks_of(policies: Sequence[ListedPolicy], others: Sequence[str]) -> tuple[str, ...]:
+def tasks_of(policies: Sequence[ListedPolicy], others: Sequence[Task]) -> tuple[Task, ...]:
     """Return the tasks that policies are ranked on where the user names none.
 
     Args:
         policies: the file's policies.
         others: tasks of those policies that state none.
     """
-    found = dict.fromkeys(task for policy in policies for task in policy.tasks or others)
-    return tuple(found)
+    found = {task.name: task for policy in policies for task in policy.tasks or others}
+    return tuple(found.values())
 
 
-def check_tasks(policies: Sequence[ListedPolicy], tasks: Sequence[str]) -> None:
-    """Refuse policies that would be ranked on nothing.
+def check_tasks(policies: Sequence[ListedPolicy], tasks: Sequence[Task]) -> None:
+    """Refuse policies that would be ranked on nothing, or on another task of the same name.
+
+    Args:
+        policies: policies that are ranked.
+        tasks: tasks of the ranking.
 
     Raises:
-        ConfigError: a policy is for other tasks than those that are asked for.
+        ConfigError: a policy is for other tasks than those of the ranking, or defines one of them
+            differently.
     """
+    wanted = {task.name: task for task in tasks}
     for policy in policies:
-        if policy.tasks and not set(policy.tasks) & set(tasks):
+        for task in policy.tasks:
+            if wanted.get(task.name, task) != task:
+                raise ConfigError(
+                    f"policy '{policy.name}' is for a task '{task.name}' that differs from the "
+                    'one of this name that --tasks or another policy gives; give one of the two '
+                    'another name in its file'
+                )
+        names = [task.name for task in policy.tasks]
+        if names and not set(names) & set(wanted):
             raise ConfigError(
-                f"policy '{policy.name}' is for the tasks {', '.join(policy.tasks)}, --tasks is "
-                f"'{','.join(tasks)}'; name one of its tasks, or leave it out"
+                f"policy '{policy.name}' is for the tasks {', '.join(names)}, --tasks is "
+                f"'{','.join(wanted)}'; name one of its tasks, or leave it out"
             )
 
 
@@ -213,13 +228,15 @@ class ListedPolicies:
     logs: Path
     _made: dict[str, Policy] = field(default_factory=dict)
 
-    def __call__(self, name: str, task: str, seed: int, expert: Expert) -> Policy:
+    def __call__(self, name: str, task: Task, seed: int, expert: Expert) -> Policy:
         """Return the policy of a name; those that know their scene are made for it."""
         listed = next(policy for policy in self.policies if policy.name == name)
         config = listed.config
         if isinstance(config, ScriptedPolicySettings):
             return scripted_policy(config.variant, task, seed, expert, hold_s=config.hold_s)
-        origin = EpisodeOrigin(task=task, scene_seed=seed)
+        origin = EpisodeOrigin(
+            task=task.name, task_definition=own_definition(task), scene_seed=seed
+        )
         if config.is_made_for_episode:
             return GuardedPolicy(listed, self.logs, origin, expert.robot)
         if name not in self._made:

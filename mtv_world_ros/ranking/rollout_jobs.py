@@ -15,7 +15,7 @@ from mtv_world_ros.simulation.collect.episode_jobs import episode_seed
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
 from mtv_world_ros.simulation.faults.catalogue import EXPERT, parse_variant
-from mtv_world_ros.simulation.scenes.tasks import bundled_tasks_named
+from mtv_world_ros.simulation.scenes.tasks import own_definition, stored_or_named, Task
 from mtv_world_ros.success.estimator import verdict
 
 #: NaN is null in a file
@@ -58,6 +58,7 @@ class Job:
     Attributes:
         policy: name of the policy.
         task: name of the task.
+        task_definition: definition of the task as JSON; empty = it is bundled.
         index: number of the episode within the task.
         seed: random seed of the scene, the policy and the denoising noise.
         definition: hash of the policy's configuration, as a name may have meant another policy
@@ -69,11 +70,17 @@ class Job:
     index: int
     seed: int
     definition: str = ''
+    task_definition: str = ''
 
     @property
     def name(self) -> str:
         """Stem of its result's files."""
         return f'{self.task}_{self.index:05d}_{self.policy}'
+
+    def load_task(self) -> Task:
+        """Return the task with its scene."""
+        where = f"definition of task '{self.task}'"
+        return stored_or_named(self.task_definition, self.task, where)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -257,7 +264,7 @@ def policies_named(text: str) -> tuple[str, ...]:
 
 
 def make_jobs(
-    policies: Sequence[str], tasks: Sequence[str], num_episodes: int, seed: int, expert: Expert
+    policies: Sequence[str], tasks: Sequence[Task], num_episodes: int, seed: int, expert: Expert
 ) -> list[Job]:
     """Return the jobs; all policies meet the same episodes.
 
@@ -265,27 +272,34 @@ def make_jobs(
 
     Raises:
         ConfigError: less than one episode, no task, or a task twice.
-        SimulatorError: unknown task, or none of its scenes is in the expert's reach.
+        SimulatorError: no scene of a task is in the expert's reach.
     """
     if num_episodes < 1:
         raise ConfigError(f'--episodes is {num_episodes}; it must be at least 1')
-    names = [task.name for task in bundled_tasks_named(','.join(tasks))]
+    names = [task.name for task in tasks]
     if len(set(names)) != len(names) or not names:
-        raise ConfigError(f"--tasks is '{','.join(tasks)}'; give at least one task, each once")
+        raise ConfigError(f"--tasks is '{','.join(names)}'; give at least one task, each once")
+    definitions = {task.name: own_definition(task) for task in tasks}
     return [
-        Job(policy=policy, task=task, index=index, seed=episode)
+        Job(
+            policy=policy,
+            task=task.name,
+            index=index,
+            seed=episode,
+            task_definition=definitions[task.name],
+        )
         for index in range(num_episodes)
-        for task in names
+        for task in tasks
         for episode in [_seed(task, index, seed, expert)]
         for policy in policies
     ]
 
 
-def _seed(task: str, index: int, seed: int, expert: Expert) -> int:
+def _seed(task: Task, index: int, seed: int, expert: Expert) -> int:
     """Return the first seed whose scene exists and is in the expert's reach."""
     reason = ''
     for attempt in range(_MAX_ATTEMPTS):
-        found = episode_seed(seed, task, index, attempt)
+        found = episode_seed(seed, task.name, index, attempt)
         try:
             scripted_policy(EXPERT, task, found, expert).reset(seed=found)
         except (SimulatorError, PolicyError) as error:
@@ -293,6 +307,6 @@ def _seed(task: str, index: int, seed: int, expert: Expert) -> int:
         else:
             return found
     raise SimulatorError(
-        f"task '{task}', episode {index}: no scene in the expert's reach in {_MAX_ATTEMPTS} "
+        f"task '{task.name}', episode {index}: no scene in the expert's reach in {_MAX_ATTEMPTS} "
         f'draws ({reason}); choose another --seed'
     )

@@ -25,11 +25,13 @@ from mtv_world_ros.rollout.rollout import Rollout
 from mtv_world_ros.rollout.world import ImaginedWorld, PolicyRun, run_policy, World
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
+from mtv_world_ros.simulation.scenes.tasks import Task
 from mtv_world_ros.simulation.simulated_world import SimulatedWorld
 from mtv_world_ros.simulation.simulator import SimEpisode
+from mtv_world_ros.success.task import TaskSpec
 
 #: (policy, task, seed, expert) -> policy; has to be picklable for several processes
-MakePolicy = Callable[[str, str, int, Expert], Policy]
+MakePolicy = Callable[[str, Task, int, Expert], Policy]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,14 +90,16 @@ class RolloutRunner:
 
     def simulate(self, job: Job) -> SimulatedRollout:
         """Return what a policy reached in the simulator."""
-        policy = self.config.make_policy(job.policy, job.task, job.seed, self._expert)
+        task = job.load_task()
+        policy = self.config.make_policy(job.policy, task, job.seed, self._expert)
         spec = self.pipeline.spec
-        world = SimulatedWorld(self._sim, job.task, fps=spec.fps, chunk_s=spec.chunk_seconds)
+        world = SimulatedWorld(self._sim, task, fps=spec.fps, chunk_s=spec.chunk_seconds)
         run = self._run(policy, world, job)
         ever, final = world.outcome()
         return SimulatedRollout(
             policy=policy,
             world=world,
+            task=task.definition if job.task_definition else None,
             instruction=world.instruction,
             run=run,
             ever=ever,
@@ -194,6 +198,7 @@ class RolloutRunner:
         return RolloutOptions(
             instruction=real.instruction,
             objects=objects,
+            task=real.task,
             seed=job.seed,
             num_inference_steps=self.config.num_inference_steps,
         )
@@ -215,6 +220,7 @@ class SimulatedRollout:
     Attributes:
         policy: the policy that acted.
         world: the observations and commands.
+        task: definition of a task that is not bundled; None = it is bundled.
         instruction: the language instruction.
         run: number of answers, end and time of the episode.
         ever: the task was done at some time.
@@ -223,6 +229,7 @@ class SimulatedRollout:
 
     policy: Policy
     world: SimulatedWorld
+    task: TaskSpec | None
     instruction: str
     run: PolicyRun
     ever: bool

@@ -127,6 +127,7 @@ class _Store:
         try:
             values = read_json(path)
             definition = values.get('definition', '')
+            task_definition = values.get('task_definition', '')
         except (OSError, ValueError, AttributeError):
             return None  # not readable, thus nothing is lost
         if definition != job.definition and not overwrite:
@@ -134,12 +135,18 @@ class _Store:
                 f"'{path}' is of another policy with the name '{job.policy}'; give this one "
                 'another name, or --overwrite to replace its results'
             )
+        is_same_task = task_definition == job.task_definition
+        if not is_same_task and not overwrite:
+            raise ConfigError(
+                f"'{path}' is of another definition of the task '{job.task}'; give this one "
+                'another name, or --overwrite to replace its results'
+            )
         try:
             result = Result.from_json(values['result'])
             same = values['settings'] == plain(self._settings) and result.seed == job.seed
         except (ValueError, KeyError, TypeError):
             return None
-        return result if same and definition == job.definition else None
+        return result if same and is_same_task and definition == job.definition else None
 
     def add(self, job: Job, values: dict[str, Any]) -> None:
         """Write a result."""
@@ -147,6 +154,8 @@ class _Store:
         for suffix, data in values.pop('files', {}).items():
             write_whole(path.with_name(f'{job.name}{suffix}'), base64.b64decode(data))
         stored = {'settings': self._settings, 'definition': job.definition, 'result': values}
+        if job.task_definition:
+            stored['task_definition'] = job.task_definition
         write_json(path, stored)
         self.found[job] = Result.from_json(values)
 

@@ -37,6 +37,8 @@ from mtv_world_ros.rollout.prediction import Prediction
 from mtv_world_ros.rollout.prediction_writer import chunk_values, ERROR, OK, PredictionWriter
 from mtv_world_ros.rollout.world import End, ImaginedWorld, run_policy
 from mtv_world_ros.success.estimator import verdict_word
+from mtv_world_ros.success.own_tasks import own_task
+from mtv_world_ros.success.task import TaskSpec
 
 #: free space that the bags and reports need before anything is computed [bytes]
 ROOM_BYTES = 8 * 2**20
@@ -82,6 +84,7 @@ class EpisodeStart:
         origin: task, scene and recording, for policies that use them in place of pictures.
         robot: the robot as it describes itself; None = the pipeline's.
         stored_objects: names of the objects that are stored with the recorded episode.
+        task: task that the recorded episode defines; None = a task that the instruction matches.
     """
 
     source: str
@@ -90,6 +93,7 @@ class EpisodeStart:
     origin: EpisodeOrigin
     robot: RobotModel | None = None
     stored_objects: tuple[str, ...] = ()
+    task: TaskSpec | None = None
 
     def at_place(self, place: str) -> EpisodeStart:
         """Return the start with the name of its robot cell, see `Observation.place`."""
@@ -107,6 +111,7 @@ def recorded_start(path: Path, pipeline: Pipeline, start_s: float = 0.0) -> Epis
     Raises:
         EpisodeError: the episode cannot be read, or ends before.
         CalibrationError: a view is not calibrated.
+        ConfigError: the task that the episode defines cannot be used.
     """
     views, robot = pipeline.spec.views, pipeline.robot
     episode = read_episode(path, views=views, with_masks=False, robot=robot)
@@ -117,6 +122,7 @@ def recorded_start(path: Path, pipeline: Pipeline, start_s: float = 0.0) -> Epis
         observation=observation,
         instruction=info.instruction,
         stored_objects=info.objects,
+        task=own_task(info),
         origin=EpisodeOrigin(
             task=info.task,
             scene_seed=-1 if info.seed is None else info.seed,
@@ -264,6 +270,7 @@ class _EpisodeRun:
             options = RolloutOptions(
                 instruction=instruction,
                 stored_objects=self._start.stored_objects,
+                task=self._start.task,
                 num_inference_steps=self._options.num_inference_steps,
                 limits=LIMITS,
                 should_stop=self._is_late,

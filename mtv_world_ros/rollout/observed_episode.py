@@ -12,6 +12,7 @@ from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.rollout import Rollout
 from mtv_world_ros.rollout.state import fit_observation
+from mtv_world_ros.success.task import TaskSpec
 
 #: least time between two frames that are kept, as a share of the model's period
 _SEEN_SHARE = 0.9
@@ -105,9 +106,11 @@ class ObservedEpisode:
         return rollout
 
 
-def _task(options: RolloutOptions) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
-    """The options that another episode differs in."""
-    return options.instruction, options.objects, options.stored_objects
+def _task(
+    options: RolloutOptions,
+) -> tuple[str, tuple[str, ...], tuple[str, ...], TaskSpec | None]:
+    """Return the options that another episode differs in."""
+    return options.instruction, options.objects, options.stored_objects, options.task
 
 
 def _look_at(episode: Rollout, observations: Sequence[Observation]) -> None:

@@ -23,6 +23,7 @@ from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.prediction import Prediction
 from mtv_world_ros.rollout.prediction_writer import chunk_values, ERROR, OK, PredictionWriter
+from mtv_world_ros.success.own_tasks import own_task, own_tasks
 
 
 @dataclass(slots=True, kw_only=True)
@@ -116,6 +117,7 @@ def replay_offline(
     )
     if not episode.trajectories:
         raise EpisodeError(f"'{episode_path}' holds no joint_trajectory message to imagine")
+    task = own_task(episode.info)
     summary = ReplaySummary(out=Path(out), warnings=episode.warnings)
     observed = ObservedEpisode(pipeline)
     starts = [stamp for stamp, _ in episode.trajectories]
@@ -132,6 +134,7 @@ def replay_offline(
                 options = RolloutOptions(
                     instruction=text,
                     stored_objects=episode.info.objects,
+                    task=task,
                     seed=seed + 1000 * index,
                     num_inference_steps=num_inference_steps,
                 )
@@ -224,6 +227,10 @@ def judge(pipeline: Pipeline, recording: Recording) -> SuccessEstimate:
             f"'{recording.path}' cannot be judged: it lasts {seconds:.2f} s, has a gap or fewer "
             f'than two frames at {spec.fps:g} Hz; record images without a break'
         )
-    options = RolloutOptions(instruction=recording.instruction, stored_objects=recording.objects)
+    options = RolloutOptions(
+        instruction=recording.instruction,
+        stored_objects=recording.objects,
+        task=own_tasks([recording.path]).get(recording.path),
+    )
     episode = pipeline.begin(recording.observation(0), options)
     return episode.observe(recording.frames[:, rows[1:]], recording.positions[rows]).success

@@ -9,6 +9,7 @@ import warnings
 
 from mtv_world_ros.core.errors import ConfigError, nearest
 from mtv_world_ros.robot.plan import PlanLimits
+from mtv_world_ros.success.task import TaskSpec
 
 #: keyword of version 0.1.0 for `RolloutOptions.limits.tolerance`
 _OLD_TOLERANCE = 'limit_tolerance'
@@ -28,6 +29,8 @@ class RolloutOptions:
         objects: names of the objects; empty = the pipeline's, else its describer's, which is
             asked once for each instruction, else `stored_objects`, else those of the instruction.
         stored_objects: names of the objects that are stored with the recorded episode.
+        task: task that the recorded episode defines, which is judged unless the pipeline was
+            given another one; None = a task that the instruction matches.
         seed: seed of the noise; chunk k of seed r uses `seed + k + r * SEED_STEP`.
         num_seeds: number of rollouts with different noise, whose mean the estimate is; the run
             time grows linearly.
@@ -41,6 +44,7 @@ class RolloutOptions:
     instruction: str = ''
     objects: tuple[str, ...] = ()
     stored_objects: tuple[str, ...] = ()
+    task: TaskSpec | None = None
     seed: int = 0
     num_seeds: int = 1
     num_inference_steps: int = 0

@@ -23,7 +23,6 @@ from mtv_world_ros.core.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.core.errors import CheckpointError
-from mtv_world_ros.core.files import share_path
 from mtv_world_ros.core.processes import threads_each
 from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import BUNDLED, Checkpoint, control_options
@@ -43,8 +42,9 @@ from mtv_world_ros.success.calibration import Calibration, Fits, HorizonCurve, l
 from mtv_world_ros.success.doubts import doubted, Grounds, widened
 from mtv_world_ros.success.estimator import JudgedChunk, SuccessEstimator
 from mtv_world_ros.success.fitted_to import Setting
+from mtv_world_ros.success.own_tasks import bundled_tasks, chosen_task
 from mtv_world_ros.success.rollout_memory import footage_of
-from mtv_world_ros.success.task import load_task, load_tasks, TaskSpec
+from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
@@ -52,7 +52,6 @@ from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 #: reason against an estimate if the plan is drawn outside of all views
 _UNSEEN = 'no view shows a tool at any time'
-_YAML = ('.yaml', '.yml')
 
 
 class WorldModel(Protocol):
@@ -144,7 +143,7 @@ class Pipeline:
         *,
         robot: str | Path | None = None,
         objects: tuple[str, ...] = (),
-        task: str | None = None,
+        task: str | TaskSpec | None = None,
         device: str = 'cpu',
         dtype: str = 'auto',
         num_threads: int = 0,
@@ -162,8 +161,8 @@ class Pipeline:
             checkpoint: folder, or `bundled`.
             robot: YAML file or name of a bundled robot; default: the one in the checkpoint.
             objects: names of the objects; empty = the describer's.
-            task: the task to judge, by name or YAML file; default: the one that the instruction
-                matches.
+            task: the task to judge, by name, as YAML file or as its definition; default: the one
+                that the episode defines, else the one that the instruction matches.
             device: `cpu`, `cuda`, ...
             dtype: `float32`, `bfloat16`, or `auto` (bfloat16 where the processor has it).
             num_threads: threads of the model on a CPU; 0 = all cores but one, of two both. As many
@@ -241,7 +240,7 @@ class Pipeline:
         robot: RobotModel,
         control: Control | None = None,
         objects: tuple[str, ...] = (),
-        task: str | None = None,
+        task: str | TaskSpec | None = None,
         segmenter: Segmenter | None = None,
         describer: Describer | None = None,
         calibration: Calibration | None = None,
@@ -572,7 +571,7 @@ class Pipeline:
     ) -> JudgedChunk:
         """Return the estimate after a chunk of 1 + T states, and what it remembers."""
         check, footage = state.camera_check, footage_of(motion, start_masks, masks)
-        judged = self.estimator.estimate(
+        judged = self.estimator.for_task(options.task).estimate(
             footage, options.instruction, state.memory, foreseen, is_real=is_real
         )
         estimate = judged.estimate if is_real else self.grounds.bear(judged.estimate)
@@ -585,7 +584,8 @@ class Pipeline:
         """Return the rule that selects futures of majority outcome, for pictures and estimate."""
 
         def majority(motions: ForeseenMotions) -> BoolArray | None:
-            ends = self.estimator.foresee(motions, options.instruction, state.memory)
+            estimator = self.estimator.for_task(options.task)
+            ends = estimator.foresee(motions, options.instruction, state.memory)
             return None if ends is None else ends.is_majority
 
         return majority
@@ -619,17 +619,13 @@ def _check_inputs(name: str, control: Control, transformer: Mapping[str, Any]) -
             )
 
 
-def _tasks(task: str | None) -> tuple[tuple[TaskSpec, ...], str | None]:
-    """Return the known tasks, and the name of the one to judge.
+def _tasks(task: str | TaskSpec | None) -> tuple[tuple[TaskSpec, ...], str | None]:
+    """Return the known tasks, and the name of the one to judge; None = each that matches.
 
-    A file of the user's own is one more.
-
-    Tasks of objects of any size come last: an instruction that fits one of the benchmark's is
-    judged with the benchmark's thresholds.
+    A task of the user's own is one more.
     """
-    folders = (('config', 'tasks'), ('config', 'tasks', 'any_size'))
-    known = tuple(task for folder in folders for task in load_tasks(share_path(*folder)))
-    if task is None or not task.endswith(_YAML):
-        return known, task
-    given = load_task(Path(task))
+    known = bundled_tasks()
+    given = task if isinstance(task, TaskSpec) else chosen_task(task, ())
+    if given is None:
+        return known, None
     return (*(spec for spec in known if spec.name != given.name), given), given.name

@@ -11,22 +11,28 @@ from pydantic import TypeAdapter
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.core.bounded_input import parse_json
-from mtv_world_ros.core.config import validated
 from mtv_world_ros.core.errors import EpisodeError
-from mtv_world_ros.data.episode import CALIBRATION_FILE, Episode, NOMINAL, PHYSICS
+from mtv_world_ros.data.episode import (
+    CALIBRATION_FILE,
+    Episode,
+    NOMINAL,
+    PHYSICS,
+    TASK_DEFINITION,
+)
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.simulation.physics import physics_named
 from mtv_world_ros.simulation.scenes.randomize import draw_scene
 from mtv_world_ros.simulation.scenes.scene import Place, Scene, SceneLook, SceneObject
-from mtv_world_ros.simulation.scenes.tasks import Task, task_named, TASKS
+from mtv_world_ros.simulation.scenes.tasks import (
+    own_definition,
+    stored_or_named,
+    Task,
+)
 from mtv_world_ros.simulation.scenes.workcell import Workcell
 from mtv_world_ros.simulation.simulator import scene_generator
-from mtv_world_ros.success.task import TaskSpec
 
 #: key of the metadata that holds objects, look and goals
 SCENE = 'drawn_scene'
-#: key of the metadata that holds the definition of a task that is not a bundled one
-TASK_DEFINITION = 'task_definition'
 #: a scene that is drawn anew has its objects where they were recorded, up to this [m]
 _SAME_PLACE_M = 1e-3
 
@@ -43,11 +49,8 @@ def dump_scene(scene: Scene) -> str:
 
 def dump_task(task: Task) -> dict[str, str]:
     """Return the metadata of a task's definition as JSON; empty for a bundled task."""
-    name = task.name
-    if name in TASKS and TASKS[name].definition == task.definition:
-        return {}
-    values = task.definition.model_dump(mode='json', exclude_unset=True, serialize_as_any=True)
-    return {TASK_DEFINITION: json.dumps(values)}
+    definition = own_definition(task)
+    return {TASK_DEFINITION: definition} if definition else {}
 
 
 def recorded_scene(path: Path, workcell: Workcell) -> tuple[Task, Scene]:
@@ -72,15 +75,9 @@ def recorded_task(episode: Episode) -> Task:
         ConfigError: the stored definition cannot be used.
         SimulatorError: there is no such task.
     """
-    stored = episode.info.metadata.get(TASK_DEFINITION)
-    if stored is None:
-        return task_named(episode.info.task)
-    where = f"'{TASK_DEFINITION}' of '{episode.info.path}'"
-    try:
-        values = parse_json(stored, where)
-    except ValueError as error:
-        raise EpisodeError(f'{where} cannot be used: {error}') from error
-    return Task.of(validated(TaskSpec, values, where), where)
+    info = episode.info
+    where = f"'{TASK_DEFINITION}' of '{info.path}'"
+    return stored_or_named(info.metadata.get(TASK_DEFINITION, ''), info.task, where)
 
 
 def scene_of(episode: Episode, workcell: Workcell) -> Scene:

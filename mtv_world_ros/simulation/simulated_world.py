@@ -13,6 +13,7 @@ from mtv_world_ros.data.episode import simulated_place
 from mtv_world_ros.robot.plan import Plan
 from mtv_world_ros.robot.resample import resample
 from mtv_world_ros.simulation.collect.record import START_NS
+from mtv_world_ros.simulation.scenes.tasks import Task
 from mtv_world_ros.simulation.simulator import CONTROL_PERIOD_S, SimEpisode, SimObservation
 from mtv_world_ros.success.task import ever_and_final
 
@@ -48,13 +49,13 @@ class SimulatedWorld:
 
     Args:
         sim: the simulator.
-        task: name of the task.
+        task: the task, or the name of a bundled one.
         fps: frame rate of the model [Hz]; pictures are taken at this rate, answers executed for
             whole frames.
         chunk_s: time after which a policy is asked again by default [s].
     """
 
-    def __init__(self, sim: SimEpisode, task: str, *, fps: float, chunk_s: float) -> None:
+    def __init__(self, sim: SimEpisode, task: str | Task, *, fps: float, chunk_s: float) -> None:
         self._sim, self._task, self._fps, self.chunk_s = sim, task, fps, chunk_s
         self.rendering_s = self.physics_s = 0.0
         self.chunks: list[SeenChunk] = []

@@ -181,6 +181,19 @@ class SuccessEstimator:
         other.calibration = calibration
         return other
 
+    def for_task(self, task: TaskSpec | None) -> SuccessEstimator:
+        """Return an estimator of the task that an episode defines.
+
+        Args:
+            task: definition of the task; None = the episode defines none. A task that the
+                estimator was given goes before it.
+        """
+        if task is None or self.is_given:
+            return self
+        other = copy(self)
+        other.tasks = (task,)
+        return other
+
     def estimate(
         self,
         footage: Footage,

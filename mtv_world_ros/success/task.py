@@ -10,6 +10,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import BeforeValidator, model_validator, PlainValidator
 
+from mtv_world_ros.core.bounded_input import parse_json
 from mtv_world_ros.core.config import expected, ListOf, read_yaml, Schema, validated, wrong
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import ConfigError, nearest
@@ -231,6 +232,29 @@ def load_task(path: Path) -> TaskSpec:
     if isinstance(values, Mapping) and _is_table_of_scenes(values):
         raise ConfigError(f'{path}: {SCENES_REPLACED}')
     return validated(TaskSpec, values, str(path))
+
+
+def dump_task(task: TaskSpec) -> dict[str, Any]:
+    """Return a task's definition in plain values, as its file has it; inverse of `stored_task`."""
+    return task.model_dump(mode='json', exclude_unset=True, serialize_as_any=True)
+
+
+def stored_task(values: Any, where: str) -> TaskSpec:
+    """Return the task of a stored definition.
+
+    Args:
+        values: what `dump_task` returned, or its JSON text.
+        where: place of the definition, for error texts.
+
+    Raises:
+        ConfigError: the definition cannot be used.
+    """
+    if isinstance(values, str):
+        try:
+            values = parse_json(values, where)
+        except ValueError as error:
+            raise ConfigError(f'{where} cannot be used: {error}') from error
+    return validated(TaskSpec, values, where)
 
 
 def _is_table_of_scenes(values: Mapping[str, Any]) -> bool:

@@ -1,5 +1,6 @@
 import csv
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -10,6 +11,10 @@ from mtv_world_ros.evaluation.evaluate_episodes import evaluate
 from mtv_world_ros.evaluation.references import with_actions
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.model.autoencoders import SpaceToDepthAutoencoder
+from test.support.own_task import shift_right_episode
+
+#: reason of an estimate without a task
+_UNKNOWN = 'is no known task'
 
 
 def run(pipeline, episodes, out, *, name='', zero_shot=None, overwrite=False, **config):
@@ -140,6 +145,29 @@ def test_finished_episodes_are_not_imagined_again(make_pipeline, episodes, oracl
     assert oracle.num_calls == calls
     run(pipeline, episodes, tmp_path, name='oracle', seed=1, overwrite=True)
     assert oracle.num_calls > calls
+
+
+def test_an_episode_is_judged_by_the_task_that_it_defines(make_pipeline, make_episode, tmp_path):
+    """Without the task's file; results of another definition are not taken over."""
+    pipeline, data, out = make_pipeline(), tmp_path / 'data', tmp_path / 'out'
+    path = make_episode(data / 'own', **shift_right_episode(tmp_path))
+    options = {'name': 'own', 'actions': ('true',), 'ceiling': False, 'mode': 'imagine'}
+
+    def judged():
+        run(pipeline, [path], out, **options)
+        return json.loads((out / 'episodes' / 'own.json').read_text())
+
+    first = judged()
+    assert first['settings']['task']['name'] == 'shift_right'
+    assert not any(_UNKNOWN in reason for reason in first['result']['reasons'])
+    assert judged() == first
+    shutil.rmtree(path)
+    make_episode(data / 'own', **shift_right_episode(tmp_path, distance_m=0.2))
+    assert judged()['settings']['task'] != first['settings']['task']
+    shutil.rmtree(path)
+    make_episode(data / 'own', **{**shift_right_episode(tmp_path), 'metadata': {}})
+    undefined = judged()
+    assert 'task' not in undefined['settings'] and _UNKNOWN in undefined['result']['reasons'][0]
 
 
 def test_results_without_a_name_are_not_taken_over(make_pipeline, episodes, oracle, tmp_path):

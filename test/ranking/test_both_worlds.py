@@ -18,6 +18,7 @@ from mtv_world_ros.ranking.rollout_runner import ComparisonRunner
 from mtv_world_ros.ranking.run_jobs import RankedCheckpoint, read_results, run_jobs
 from mtv_world_ros.reports.ranking_report import write_ranking
 from mtv_world_ros.reports.rollout_cards import curves, verdict, when_they_part, worst_first
+from mtv_world_ros.simulation.scenes.tasks import tasks_named
 from mtv_world_ros.success.estimator import verdict_word
 from mtv_world_ros.viewing.stored_rollout import load_rollout
 from mtv_world_ros.viewing.video import decode_video
@@ -120,7 +121,7 @@ class Shifted:
 def ranked(runner, expert, tmp_path_factory):
     """A ranking of a perfect imagination in a folder."""
     out = tmp_path_factory.mktemp('ranking')
-    jobs = make_jobs(('expert', 'expert-stop-0.3'), (TASK,), 1, 0, expert)
+    jobs = make_jobs(('expert', 'expert-stop-0.3'), tasks_named(TASK), 1, 0, expert)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
             'mtv_world_ros.ranking.run_jobs.make_runner',
@@ -160,7 +161,7 @@ def test_objects_that_are_imagined_elsewhere_part_and_the_page_says_when(
     runner, expert, ranked, tmp_path
 ):
     pipeline = replace(runner.pipeline, world_model=Shifted(runner.pipeline.world_model, 40))
-    (job,) = make_jobs(('expert-stop-0.3',), (TASK,), 1, 0, expert)
+    (job,) = make_jobs(('expert-stop-0.3',), tasks_named(TASK), 1, 0, expert)
     moved = type(runner)(pipeline, replace(runner.config, clips=False)).score(job)
     assert set(moved.files) == {'.png', '.objects.png'}
     assert moved.course.objects_part_s == pytest.approx(0.2) and moved.course.parted_object

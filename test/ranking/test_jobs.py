@@ -1,7 +1,11 @@
+import pickle
+
 import pytest
 
-from mtv_world_ros.core.errors import ConfigError, PolicyError, SimulatorError
+from mtv_world_ros.core.errors import ConfigError, PolicyError
 from mtv_world_ros.ranking.rollout_jobs import DEFAULT_POLICIES, make_jobs, policies_named
+from mtv_world_ros.simulation.scenes.tasks import task_named, tasks_named
+from test.support.own_task import write_shift_right
 
 
 def test_policies_are_named_once_each():
@@ -16,10 +20,10 @@ def test_policies_are_named_once_each():
 
 
 def test_all_policies_meet_the_same_episodes_and_tasks_take_turns(expert):
-    tasks = ('stack_blocks_two', 'place_bread_plate')
+    tasks = tasks_named('stack_blocks_two,place_bread_plate')
     jobs = make_jobs(('expert', 'expert-stop-0.5'), tasks, 2, 0, expert)
     assert [(job.index, job.task) for job in jobs[::2]] == [
-        (index, task) for index in range(2) for task in tasks
+        (index, task.name) for index in range(2) for task in tasks
     ]
     assert all(
         a.seed == b.seed and a.policy != b.policy
@@ -32,8 +36,18 @@ def test_all_policies_meet_the_same_episodes_and_tasks_take_turns(expert):
 
 def test_wrong_numbers_and_tasks_are_refused(expert):
     with pytest.raises(ConfigError, match='--episodes is 0'):
-        make_jobs(('expert',), ('stack_blocks_two',), 0, 0, expert)
+        make_jobs(('expert',), tasks_named('stack_blocks_two'), 0, 0, expert)
     with pytest.raises(ConfigError, match='each once'):
-        make_jobs(('expert',), ('stack_blocks_two', 'stack_blocks_two'), 1, 0, expert)
-    with pytest.raises(SimulatorError, match='did you mean'):
-        make_jobs(('expert',), ('stack_block_two',), 1, 0, expert)
+        make_jobs(('expert',), tasks_named('stack_blocks_two, stack_blocks_two'), 1, 0, expert)
+    with pytest.raises(ConfigError, match='at least one task'):
+        make_jobs(('expert',), tasks_named(' ,'), 1, 0, expert)
+
+
+def test_a_job_holds_the_definition_of_a_task_of_ones_own(expert, tmp_path):
+    path = write_shift_right(tmp_path)
+    tasks = tasks_named(f'stack_blocks_two,{path}')
+    bundled, own = make_jobs(('expert',), tasks, 1, 0, expert)
+    path.unlink()  # workers on other machines do not have it
+    assert own.name == 'shift_right_00000_expert' and len({bundled, own}) == 2
+    assert bundled.task_definition == '' and bundled.load_task() is task_named('stack_blocks_two')
+    assert pickle.loads(pickle.dumps(own)).load_task() == tasks[1]  # noqa: S301

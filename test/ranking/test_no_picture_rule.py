@@ -3,6 +3,7 @@ import pytest
 
 from mtv_world_ros.ranking.no_picture_rule import Thing
 from mtv_world_ros.ranking.rollout_jobs import make_jobs
+from mtv_world_ros.simulation.scenes.tasks import tasks_named
 
 
 def thing(name, centre, size=(0.04, 0.04, 0.04), **more):
@@ -33,7 +34,7 @@ def test_reach_is_2_cm_in_the_plane_and_3_in_height_and_at_the_rim_of_a_plate():
 def test_the_rule_sees_a_grasp_that_is_too_high_and_not_a_gripper_that_is_too_wide(runner, expert):
     """The expert, a grasp 5 cm too high, and one whose fingers stay a little open."""
     names = ('expert', 'expert-high-0.05', 'expert-drops-1')
-    jobs = make_jobs(names, ('place_block_a2b_left',), 1, 0, expert)
+    jobs = make_jobs(names, tasks_named('place_block_a2b_left'), 1, 0, expert)
     said = {job.policy: runner.score(job) for job in jobs}
     assert {name: found.no_picture.success for name, found in said.items()} == {
         'expert': 1.0, 'expert-high-0.05': 0.0, 'expert-drops-1': 0.0,

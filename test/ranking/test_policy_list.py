@@ -25,6 +25,8 @@ from mtv_world_ros.ranking.policy_list import (
     load_policy_list,
     tasks_of,
 )
+from mtv_world_ros.simulation.scenes.tasks import task_named, tasks_named
+from test.support.own_task import write_shift_right
 
 #: a websocket server of openpi's protocol whose prompt says what goes wrong
 SERVER = Path(__file__).parents[1] / 'support' / 'openpi_server.py'
@@ -71,7 +73,7 @@ def make(load, tmp_path, expert):
 
     def make(entry):
         made = pickle.loads(pickle.dumps(ListedPolicies(load(entry), tmp_path / 'logs')))  # noqa: S301
-        return made(entry['name'], 'stack_blocks_two', 1, expert)
+        return made(entry['name'], task_named('stack_blocks_two'), 1, expert)
 
     return make
 
@@ -109,13 +111,25 @@ def test_a_definition_changes_with_the_policy_and_not_with_patience(load):
 def test_a_policy_is_ranked_on_its_own_tasks(load):
     mine = {'name': 'mine', 'policy': 'expert', 'tasks': ['shake_bottle']}
     listed = load(mine, {'name': 'any', 'policy': 'expert'})
-    assert tasks_of(listed, ('stack_blocks_two',)) == ('shake_bottle', 'stack_blocks_two')
-    assert tasks_of(listed[:1], ('stack_blocks_two',)) == ('shake_bottle',)
-    check_tasks(listed, ['shake_bottle', 'place_cup_plate'])
+    others = tasks_named('stack_blocks_two')
+    assert tasks_of(listed, others) == tasks_named('shake_bottle,stack_blocks_two')
+    assert tasks_of(listed[:1], others) == tasks_named('shake_bottle')
+    check_tasks(listed, tasks_named('shake_bottle,place_cup_plate'))
     with pytest.raises(ConfigError, match="'mine' is for the tasks shake_bottle"):
-        check_tasks(listed, ['place_cup_plate'])
+        check_tasks(listed, tasks_named('place_cup_plate'))
     with pytest.raises(SimulatorError, match="'shake_botle' .did you mean 'shake_bottle'"):
         load({**mine, 'tasks': ['shake_botle']})
+
+
+def test_a_policy_is_ranked_on_task_files_beside_the_list(load, tmp_path):
+    path = write_shift_right(tmp_path)
+    mine = {'name': 'mine', 'policy': 'expert', 'tasks': ['shift_right.yaml', 'shake_bottle']}
+    (listed,) = load(mine)
+    tasks = tasks_named(f'{path},shake_bottle')
+    assert listed.tasks == tasks == tasks_of([listed], ())
+    check_tasks([listed], tasks)
+    with pytest.raises(ConfigError, match="'mine' is for a task 'shift_right' that differs from"):
+        check_tasks([listed], tasks_named(str(write_shift_right(tmp_path, distance_m=0.15))))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
 from dataclasses import replace
+import json
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from mtv_world_ros.ranking.rollout_runner import (
     WantedJob,
 )
 from mtv_world_ros.ranking.run_jobs import RankedCheckpoint, run_jobs
+from mtv_world_ros.simulation.scenes.tasks import tasks_named
 from mtv_world_ros.vision.describers.describer import DescribedObject
+from test.support.own_task import write_shift_right
 
 TASK = 'place_block_a2b_left'
 COLOURS = ('red', 'blue', 'green', 'purple')
@@ -22,7 +25,7 @@ COLOURS = ('red', 'blue', 'green', 'purple')
 
 @pytest.fixture(scope='module')
 def results(runner, expert):
-    jobs = make_jobs(('expert', 'expert-stop-0.3'), (TASK,), 1, 0, expert)
+    jobs = make_jobs(('expert', 'expert-stop-0.3'), tasks_named(TASK), 1, 0, expert)
     return {job.policy: runner.score(job) for job in jobs}
 
 
@@ -44,7 +47,7 @@ def test_a_perfect_imagination_is_judged_like_the_simulator_s_own_frames(results
 
 def test_a_policy_sees_images_of_one_size_the_first_one_real(runner, expert):
     """In both worlds; and limits of joints are checked in both."""
-    (job,) = make_jobs(('expert',), (TASK,), 1, 0, expert)
+    (job,) = make_jobs(('expert',), tasks_named(TASK), 1, 0, expert)
 
     class Watching:
         name = 'expert'
@@ -95,7 +98,7 @@ def test_a_policy_sees_images_of_one_size_the_first_one_real(runner, expert):
 
 
 def test_frames_come_with_joints_as_measured_and_as_commanded(runner, expert):
-    (job,) = make_jobs(('expert',), (TASK,), 1, 0, expert)
+    (job,) = make_jobs(('expert',), tasks_named(TASK), 1, 0, expert)
     world = runner.simulate(job).world
     for chunk in world.chunks:
         assert len(chunk.positions) == 1 + chunk.frames.shape[1] == 1 + len(chunk.commands)
@@ -113,7 +116,7 @@ def test_a_describer_is_asked_once_about_the_simulator_s_first_frame(runner, exp
             shown.append(first_frame)
             return tuple(DescribedObject(id=colour, name=f'{colour} block') for colour in COLOURS)
 
-    (job,) = make_jobs(('expert-stop-0.3',), (TASK,), 1, 0, expert)
+    (job,) = make_jobs(('expert-stop-0.3',), tasks_named(TASK), 1, 0, expert)
     asking = RolloutRunner(replace(runner.pipeline, describer=Describer()), runner.config)
     real = asking.simulate(job)
     result = asking.imagine(job, real)
@@ -123,11 +126,27 @@ def test_a_describer_is_asked_once_about_the_simulator_s_first_frame(runner, exp
 
 
 @pytest.mark.slow
+def test_a_task_of_ones_own_is_simulated_and_judged_by_its_definition(runner, expert, tmp_path):
+    """No bundled task has this instruction: without its definition the estimates abstain."""
+    path = write_shift_right(tmp_path)
+    (job,) = make_jobs(('expert',), tasks_named(str(path)), 1, 0, expert)
+    path.unlink()  # the job has it
+    real = runner.simulate(job)
+    assert real.instruction.startswith('shift the') and real.final
+    result = runner.imagine(job, real)
+    assert (result.seen.success, result.imagined.success) == (1.0, 1.0)
+    assert result.no_picture.success == 1.0
+    unknown = runner.imagine(job, replace(real, task=None))
+    assert np.isnan([unknown.seen.success, unknown.imagined.success]).all()
+    assert 'is no known task' in unknown.seen.reasons[0]
+
+
+@pytest.mark.slow
 def test_two_checkpoints_share_one_simulated_rollout(runner, expert, results, monkeypatch):
     simulated = []
     simulate = runner.simulate
     monkeypatch.setattr(runner, 'simulate', lambda job: simulated.append(job) or simulate(job))
-    (job,) = make_jobs(('expert-stop-0.3',), (TASK,), 1, 0, expert)
+    (job,) = make_jobs(('expert-stop-0.3',), tasks_named(TASK), 1, 0, expert)
     both = ComparisonRunner([runner, runner])
     first, none = both.score(WantedJob(job, (0,))).by_checkpoint
     assert len(simulated) == 1 and none is None
@@ -137,7 +156,7 @@ def test_two_checkpoints_share_one_simulated_rollout(runner, expert, results, mo
 
 def test_results_are_kept_and_not_run_again(expert, tmp_path, monkeypatch, make_result):
     """A second run takes what is there, a broken file is run again, other settings when asked."""
-    jobs = make_jobs(('expert',), (TASK,), 2, 0, expert)
+    jobs = make_jobs(('expert',), tasks_named(TASK), 2, 0, expert)
     scored = []
 
     class Counting:
@@ -187,6 +206,33 @@ def test_results_are_kept_and_not_run_again(expert, tmp_path, monkeypatch, make_
     assert not list(tmp_path.rglob('*.part'))
 
 
+def test_results_of_another_definition_of_a_task_are_not_taken_over(
+    expert, tmp_path, monkeypatch, make_result
+):
+    class Scoring:
+        def score(self, wanted):
+            job = wanted.job
+            return Results((make_result('expert', 0, True, 0.9, job.task, seed=job.seed),))
+
+    monkeypatch.setattr(
+        'mtv_world_ros.ranking.run_jobs.make_runner', lambda make_pipeline, config: Scoring()
+    )
+    alone = RankedCheckpoint(make_pipeline=lambda: None, out=tmp_path, settings={})
+
+    def run(distance_m, **options):
+        path = write_shift_right(tmp_path, distance_m=distance_m)
+        jobs = make_jobs(('expert',), tasks_named(str(path)), 1, 0, expert)
+        return run_jobs(jobs, [alone], config=RolloutConfig(), show_progress=False, **options)
+
+    run(0.1)
+    (file,) = (tmp_path / 'rollouts').glob('*.json')
+    assert '"offset_m": [0.1, 0.0, 0.0]' in json.loads(file.read_text())['task_definition']
+    with pytest.raises(ConfigError, match="is of another definition of the task 'shift_right'"):
+        run(0.12)
+    run(0.12, overwrite=True)
+    assert '"offset_m": [0.12, 0.0, 0.0]' in json.loads(file.read_text())['task_definition']
+
+
 def test_a_policy_that_cannot_answer_is_told_and_the_others_go_on(
     expert, tmp_path, monkeypatch, make_result
 ):
@@ -199,7 +245,7 @@ def test_a_policy_that_cannot_answer_is_told_and_the_others_go_on(
     monkeypatch.setattr(
         'mtv_world_ros.ranking.run_jobs.make_runner', lambda make_pipeline, config: Failing()
     )
-    jobs = make_jobs(('expert',), (TASK,), 2, 0, expert)
+    jobs = make_jobs(('expert',), tasks_named(TASK), 2, 0, expert)
     alone = RankedCheckpoint(make_pipeline=lambda: None, out=tmp_path, settings={})
     found, failed = run_jobs(jobs, [alone], config=RolloutConfig(), show_progress=False)
     assert [result.index for result in found[0]] == [1]

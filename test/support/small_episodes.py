@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import cv2
@@ -82,15 +82,18 @@ def make_episode(robot) -> Callable[..., Path]:
         outcome: str = 'success',
         objects: tuple[str, ...] = OBJECTS,
         instruction: str = INSTRUCTION,
+        task: str = 'place_block_a2b_left',
+        metadata: Mapping[str, str] | None = None,
     ) -> Path:
         cameras = [camera(view) for view in SPEC.views]
         with EpisodeWriter(
             path,
-            task='place_block_a2b_left',
+            task=task,
             instruction=instruction,
             robot=robot.name,
             cameras=cameras,
             objects=objects,
+            metadata=metadata,
         ) as writer:
             writer.write_instruction(START_NS)
             for start in starts:

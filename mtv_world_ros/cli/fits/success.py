@@ -77,8 +77,10 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.evaluation.fit import calibrate, samples_of
     from mtv_world_ros.reports.calibration_report import write_calibration_report
+    from mtv_world_ros.success.own_tasks import named_here
 
     print(f'{arguments.dataset}: {selection}')
+    arguments.task = named_here(arguments.task, selection.paths)
     refuse_test_kinds(selection.paths, 'calibration')
     made = {**provenance(arguments), 'dataset': f'{arguments.dataset}: {selection}'}
     runs = _imagine(arguments, checkpoint, selection)

@@ -19,6 +19,7 @@ from mtv_world_ros.simulation.collect.dataset_card import (
     card_of,
     CardEntry,
     check_same_set,
+    check_same_tasks,
     read_entries,
     read_entry,
     remove_leftovers,
@@ -153,6 +154,9 @@ class _DataSet:
         check_same_set(out, kind, seed, self._config)
         remove_leftovers(out)
         self.entries = read_entries(out, {job.path.name for job in jobs})
+        check_same_tasks(
+            out, self.entries.values(), {job.task.name: job.task for job in jobs}.values()
+        )
         self._write_card()
 
     def make(

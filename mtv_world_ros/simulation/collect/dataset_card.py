@@ -17,7 +17,9 @@ import numpy as np
 from mtv_world_ros.core.bounded_input import parse_json, read_json
 from mtv_world_ros.core.errors import EpisodeError, SimulatorError
 from mtv_world_ros.core.files import write_whole
-from mtv_world_ros.data.episode import METADATA_NAME
+from mtv_world_ros.data.episode import METADATA_NAME, TASK_DEFINITION
+from mtv_world_ros.simulation.scenes.tasks import own_definition, Task
+from mtv_world_ros.success.task import stored_task
 
 CARD_FILE = 'dataset.json'
 #: name of the set of episodes that show the tasks
@@ -48,6 +50,8 @@ class CardEntry:
         instruction: the language instruction.
         objects: names, in the order of the mask ids.
         scene: name of the scene that it shares with its siblings; empty = it has none.
+        task_definition: definition of a task that is not bundled, as JSON; empty = it is bundled.
+            The card holds it once for each task.
     """
 
     name: str
@@ -63,6 +67,7 @@ class CardEntry:
     instruction: str
     objects: tuple[str, ...]
     scene: str = ''
+    task_definition: str = ''
 
 
 def read_entry(path: Path) -> CardEntry:
@@ -82,6 +87,9 @@ def read_entry(path: Path) -> CardEntry:
         counts = summary.statistics.channel_message_counts
         images = [i for i, c in summary.channels.items() if '/image_raw' in c.topic]
         spans = summary.statistics.message_start_time, summary.statistics.message_end_time
+        definition = described.get(TASK_DEFINITION, '')
+        if definition:
+            parse_json(definition, f"'{TASK_DEFINITION}'")
         index, zero_shot = int(described['index']), described.get('zero_shot')
         return CardEntry(
             name=path.name,
@@ -97,6 +105,7 @@ def read_entry(path: Path) -> CardEntry:
             instruction=described['instruction'],
             objects=tuple(parse_json(described['objects'], "'objects'")),
             scene=described.get('scene', ''),
+            task_definition=definition,
         )
     except (OSError, KeyError, ValueError, McapError) as error:
         raise EpisodeError(
@@ -155,6 +164,37 @@ def check_same_set(out: Path, kind: str, seed: int, config: dict[str, Any]) -> N
         )
 
 
+def check_same_tasks(out: Path, entries: Iterable[CardEntry], tasks: Iterable[Task]) -> None:
+    """Refuse to add episodes of a task to episodes of another task of the same name.
+
+    Args:
+        out: folder of the data set.
+        entries: its episodes.
+        tasks: tasks of the episodes that are to be made.
+
+    Raises:
+        SimulatorError: names the task and an episode of the other definition.
+        ConfigError: an episode holds a definition that cannot be used.
+    """
+    wanted = {task.name: task for task in tasks}
+    for entry in entries:
+        task = wanted.get(entry.task)
+        if task is None or _is_of(entry, task, f"'{TASK_DEFINITION}' of '{out / entry.name}'"):
+            continue
+        raise SimulatorError(
+            f"'{out / entry.name}' is of another definition of the task '{entry.task}'; give this "
+            'one another name in its file, or choose another --out'
+        )
+
+
+def _is_of(entry: CardEntry, task: Task, where: str) -> bool:
+    """Return whether an episode is of a task, and not of another one of the same name."""
+    own = own_definition(task)
+    if not (own and entry.task_definition):
+        return own == entry.task_definition
+    return stored_task(entry.task_definition, where) == task.definition
+
+
 def remove_leftovers(out: Path) -> None:
     """Remove the hidden folders of episodes whose recording was killed."""
     for folder in out.glob('.*_*.tmp'):
@@ -190,16 +230,25 @@ def card_of(
         split: [entry.name for entry in listed if entry.split == split]
         for split in ('train', 'test')
     }
+    own = {e.task: json.loads(e.task_definition) for e in listed if e.task_definition}
     return {
         'kind': kind,
         'seed': seed,
         'config': config,
         'num_episodes': len(listed),
+        # absent where all tasks are bundled, as in cards of earlier versions
+        **({'task_definitions': own} if own else {}),
         'tasks': _by('task', listed),
         'zero_shot': _by('zero_shot', [entry for entry in listed if entry.zero_shot]),
         'splits': splits,
-        'episodes': [asdict(entry) for entry in listed],
+        'episodes': [_listed(entry) for entry in listed],
     }
+
+
+def _listed(entry: CardEntry) -> dict[str, Any]:
+    values = asdict(entry)
+    del values['task_definition']
+    return values
 
 
 def write_card(out: Path, card: dict[str, Any]) -> None:

@@ -11,6 +11,7 @@ from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import policy_of_recording, scripted_policy
 from mtv_world_ros.simulation.faults.catalogue import parse_variant, refuse_test_kinds
+from mtv_world_ros.simulation.scenes.tasks import stored_or_named
 
 __all__ = ['check', 'fault_kinds', 'make', 'refuse_test_kinds']
 
@@ -39,7 +40,8 @@ def make(settings: ScriptedPolicySettings, origin: EpisodeOrigin, robot: RobotMo
             f"policy '{variant}' knows its scene instead of looking at it: set 'task' and "
             "'scene_seed' to those of the recorded episode"
         )
-    return scripted_policy(variant, task, scene_seed, expert, hold_s=settings.hold_s)
+    kind = stored_or_named(origin.task_definition, task, f"definition of task '{task}'")
+    return scripted_policy(variant, kind, scene_seed, expert, hold_s=settings.hold_s)
 
 
 def fault_kinds(variant: str) -> tuple[str, ...]:

@@ -240,7 +240,7 @@ class ScriptedPolicy:
 
 def scripted_policy(
     name: str,
-    task: str,
+    task: str | Task,
     seed: int,
     expert: Expert,
     hold_s: float = HOLD_S,
@@ -249,7 +249,7 @@ def scripted_policy(
 
     Args:
         name: e.g. `expert` or `expert-miss-0.5`; see `parse_variant`.
-        task: name of a task.
+        task: the task, or the name of a bundled one.
         seed: seed of the episode, as `SimEpisode.reset` takes it and a recorded episode has it.
         expert: the scripted expert, which plans.
         hold_s: time from the end of the plan to the end of the episode [s].
@@ -258,7 +258,7 @@ def scripted_policy(
         PolicyError: no such policy.
         SimulatorError: no such task, or no scene for this seed.
     """
-    variant, kind = parse_variant(name), task_named(task)
+    variant, kind = parse_variant(name), task_named(task) if isinstance(task, str) else task
     scene = draw_scene(kind, scene_generator(seed), expert.workcell)
     return ScriptedPolicy(variant, expert, kind, scene, hold_s)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+import json
 from pathlib import Path
 import re
 from typing import Annotated, Any, Literal
@@ -30,8 +31,15 @@ from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import ConfigError, nearest, SimulatorError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.simulation.scenes.shapes import SHAPES
+from mtv_world_ros.success.own_tasks import YAML
 from mtv_world_ros.success.situation import TruePoses
-from mtv_world_ros.success.task import load_task, SCENES_REPLACED, TaskSpec
+from mtv_world_ros.success.task import (
+    dump_task,
+    load_task,
+    SCENES_REPLACED,
+    stored_task,
+    TaskSpec,
+)
 
 #: (x, y) [m], or a pair of angles [rad]
 Two = Annotated[tuple[Number, Number], Strict(False), expected('a list of 2 numbers')]
@@ -58,8 +66,6 @@ TABLE = 'table'
 ANY_SIZE = (0.0, 1.0)
 #: names of tasks are parts of file names
 _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
-#: ends of the names of task files
-_YAML = ('.yaml', '.yml')
 #: page that describes a task's file
 _PAGE = 'docs/tasks.md'
 
@@ -372,10 +378,12 @@ def task_named(name: str) -> Task:
     return TASKS[name]
 
 
-def tasks_named(text: str) -> tuple[Task, ...]:
+def tasks_named(text: str, folder: Path = Path()) -> tuple[Task, ...]:
     """Return the tasks of a comma-separated list of names and of YAML files.
 
-    `all` = all bundled ones but the zero-shot ones.
+    Args:
+        text: the list; `all` = all bundled ones but the zero-shot ones.
+        folder: folder that relative paths of files begin in.
 
     Raises:
         SimulatorError: unknown name, or a file without a scene.
@@ -384,7 +392,7 @@ def tasks_named(text: str) -> tuple[Task, ...]:
     if text.strip() == 'all':
         return tuple(task for task in TASKS.values() if not task.zero_shot)
     words = [word.strip() for word in text.split(',') if word.strip()]
-    tasks = tuple(_read_task(w) if w.endswith(_YAML) else task_named(w) for w in words)
+    tasks = tuple(_read_task(w, folder) if w.endswith(YAML) else task_named(w) for w in words)
     by_name: dict[str, Task] = {}
     for task in tasks:
         if by_name.setdefault(task.name, task) != task:
@@ -392,21 +400,31 @@ def tasks_named(text: str) -> tuple[Task, ...]:
     return tasks
 
 
-def bundled_tasks_named(text: str) -> tuple[Task, ...]:
-    """Return tasks by name alone, for what knows a task by its name in several processes.
+def own_definition(task: Task) -> str:
+    """Return the definition of a task as JSON, for `stored_or_named`; empty for a bundled task."""
+    name = task.name
+    if name in TASKS and TASKS[name].definition == task.definition:
+        return ''
+    return json.dumps(dump_task(task.definition), sort_keys=True)
+
+
+def stored_or_named(definition: str, name: str, where: str) -> Task:
+    """Return the task of a stored definition, else the bundled task of a name.
+
+    Args:
+        definition: what `own_definition` returned; empty = the name is enough.
+        name: name of the task.
+        where: place of the definition, for error texts.
 
     Raises:
-        SimulatorError: unknown name, or a file.
+        ConfigError: the definition cannot be used.
+        SimulatorError: there is no such task.
     """
-    files = [word for word in text.split(',') if word.strip().endswith(_YAML)]
-    if files:
-        raise SimulatorError(
-            f"'{files[0].strip()}' is a file: a ranking takes bundled tasks by name; put the file "
-            f"into '{share_path('config', 'tasks')}' first ({_PAGE})"
-        )
-    return tasks_named(text)
+    if not definition:
+        return task_named(name)
+    return Task.of(stored_task(definition, where), where)
 
 
-def _read_task(word: str) -> Task:
-    path = Path(word).expanduser()
+def _read_task(word: str, folder: Path) -> Task:
+    path = folder / Path(word).expanduser()
     return Task.of(load_task(path), str(path))

@@ -31,7 +31,9 @@ from mtv_world_ros.simulation.scenes.randomize import RandomizationConfig
 from mtv_world_ros.simulation.scenes.tasks import Task, task_named, tasks_named
 from mtv_world_ros.simulation.scenes.workcell import workcell_of
 from mtv_world_ros.simulation.simulator import situation_of
-from mtv_world_ros.success.task import ever_and_final, load_task
+from mtv_world_ros.success.own_tasks import own_task
+from mtv_world_ros.success.task import ever_and_final, load_task, stored_task
+from test.support.own_task import write_shift_right
 
 SMALL = CollectConfig(randomization=RandomizationConfig(width=96, height=72))
 #: one of a single move and one of two, whose episodes are longer
@@ -41,19 +43,6 @@ COMMAND = (
     sys.executable, '-m', 'mtv_world_ros.cli', 'collect', '--task', TASKS, '--seed', str(SEED),
     '--width', '96', '--height', '72',
 )  # fmt: skip
-
-
-SHIFTED = """
-name: shift_right
-instruction: shift the {a} to the right
-relations: [{kind: shifted, subject: a, offset_m: [0.1, 0, 0]}]
-scene:
-  roles:
-    - {role: a, shapes: [cup], x_range: [-0.2, -0.15]}
-    - {role: b, x_range: [0.1, 0.2]}
-  moves:
-    - {subject: a, reference: start, offset: [0.1, 0.0]}
-"""
 
 
 def _collect(out, tasks=TASKS, episodes=2, seed=SEED, **options):
@@ -139,28 +128,32 @@ def test_the_command_says_what_was_made_and_draws_no_bar_into_a_file(data_set, t
 
 
 def test_a_task_of_ones_own_is_collected_and_known_again_from_its_episodes(tmp_path, opengl):
-    own = tmp_path / 'shift_right.yaml'
-    own.write_text(SHIFTED)
+    own = write_shift_right(tmp_path)
     out = tmp_path / 'set'
     (entry,) = collect(str(own), 1, SEED, out, config=SMALL, failures_of_ten=0, progress=False)
     assert (entry.task, entry.outcome) == ('shift_right', 'success')
     episode = read_episode(out / 'shift_right_00000')
     assert episode.info.instruction.startswith('shift the ')
-    own.unlink()  # the episode has it
-    assert recorded_task(episode) == Task.of(load_task(_written(own)), 'own')
+    definition = load_task(own)
+    own.unlink()  # the episode and the card have it
+    assert recorded_task(episode) == Task.of(definition, 'own')
+    assert own_task(episode.info) == definition
+    card = json.loads((out / 'dataset.json').read_text())
+    assert stored_task(card['task_definitions']['shift_right'], 'card') == definition
+    assert 'task_definition' not in card['episodes'][0]
     text = (out / 'README.md').read_text()
     assert f'--task shift_right.yaml --episodes 1 --seed {SEED}' in text
     assert 'JSON of a task that is not among the bundled ones' in text
-
-
-def _written(path):
-    path.write_text(SHIFTED)
-    return path
+    moved = write_shift_right(tmp_path, distance_m=0.12)
+    with pytest.raises(SimulatorError, match="00000' is of another definition of the task 'shift"):
+        collect(str(moved), 2, SEED, out, config=SMALL, progress=False)
+    assert [path.name for path in out.glob('shift_*')] == ['shift_right_00000']
 
 
 def test_episodes_of_bundled_tasks_name_theirs_alone(data_set):
     episode = read_episode(data_set / _names(data_set)[0])
-    assert TASK_DEFINITION not in episode.info.metadata
+    assert TASK_DEFINITION not in episode.info.metadata and own_task(episode.info) is None
+    assert 'task_definitions' not in json.loads((data_set / 'dataset.json').read_text())
     assert recorded_task(episode) is task_named(episode.info.task)
 
 

@@ -13,8 +13,9 @@ from mtv_world_ros.simulation.scenes.randomize import draw_scene, instruction_of
 from mtv_world_ros.simulation.scenes.shapes import SHAPES
 from mtv_world_ros.simulation.scenes.tasks import (
     _check_old_table,
-    bundled_tasks_named,
+    own_definition,
     Shake,
+    stored_or_named,
     Task,
     task_named,
     TASKS,
@@ -221,11 +222,29 @@ def test_a_task_of_ones_own_is_chosen_by_its_file(tmp_path):
     assert [move.rest for move in own.moves] == ['on']
 
 
-def test_a_ranking_says_where_a_task_of_ones_own_belongs(tmp_path):
-    path = written(tmp_path, SCENE)
-    with pytest.raises(SimulatorError, match=r"own.yaml' is a file: a ranking takes bundled tas"):
-        bundled_tasks_named(f'stack_blocks_two, {path}')
-    assert bundled_tasks_named('stack_blocks_two') == (TASKS['stack_blocks_two'],)
+def test_a_task_of_ones_own_is_found_in_a_folder_that_paths_begin_in(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path, SCENE).rename(tmp_path / 'there.yaml')
+    other = tmp_path / 'other'
+    other.mkdir()
+    assert tasks_named('../there.yaml', other) == tasks_named('there.yaml')
+    assert tasks_named(str(tmp_path / 'there.yaml'), other) == tasks_named('there.yaml')
+
+
+def test_the_definition_of_a_task_of_ones_own_gives_the_same_task_again(tmp_path):
+    (own,) = tasks_named(str(written(tmp_path, SCENE)))
+    text = own_definition(own)
+    assert stored_or_named(text, 'own', 'here') == own
+    turned = {key: OWN[key] for key in reversed(OWN)}
+    again = Task.of(TaskSpec.model_validate({'scene': SCENE, **turned}), 'here')
+    assert own_definition(again) == text  # whatever the order of the keys
+    bundled = task_named('stack_blocks_two')
+    assert own_definition(bundled) == ''
+    assert stored_or_named('', 'stack_blocks_two', 'here') is bundled
+    with pytest.raises(SimulatorError, match="unknown task 'own'"):
+        stored_or_named('', 'own', 'here')
+    with pytest.raises(ConfigError, match='^here.*cannot be used'):
+        stored_or_named('{', 'own', 'here')
 
 
 def test_a_task_without_a_scene_can_be_judged_but_not_simulated(tmp_path):
