@@ -28,6 +28,8 @@ SCENES_REPLACED = (
     "scenes are no longer read from a table: a task is one file, 'config/tasks/NAME.yaml' or your "
     "own, and its entry of the table is its key 'scene' (docs/tasks.md)"
 )
+#: keys of a task's file of which no other file has one
+_REQUIRED = {'instruction', 'relations'}
 #: words of an instruction that name nothing
 _ARTICLES = frozenset({'a', 'an', 'the'})
 
@@ -231,6 +233,12 @@ def load_task(path: Path) -> TaskSpec:
     values = read_yaml(path, 'task file', 'task')
     if isinstance(values, Mapping) and _is_table_of_scenes(values):
         raise ConfigError(f'{path}: {SCENES_REPLACED}')
+    if isinstance(values, Mapping) and not _REQUIRED & set(values):
+        keys = ', '.join(map(str, list(values)[:5])) or 'none'
+        raise ConfigError(
+            f"'{path}' is no task: its keys are {keys}; the file of a task has name, instruction "
+            'and relations (docs/tasks.md)'
+        )
     return validated(TaskSpec, values, str(path))
 
 

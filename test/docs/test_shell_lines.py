@@ -260,8 +260,8 @@ def check_values(given: dict[str, Any]) -> None:
         if name.startswith('expert') or (name in listed and '/' not in name):
             parse_variant(name)
     for key in ('task', 'tasks'):
-        if given.get(key) not in (None, '', 'all') and not given[key].endswith('.yaml'):
-            tasks_named(given[key])
+        # files are those that a page writes
+        tasks_named(','.join(n for n in each(given.get(key) or ()) if not n.endswith('.yaml')))
     kinds_named(given.get('zero_shot') or '')
     ServingOptions.parse(given.get('serving') or '')
     check_segmenter_name(given.get('segmenter') or 'auto')

@@ -281,3 +281,18 @@ def test_views_that_a_task_leaves_out_do_not_count(views, word):
     tasks = [t.replace(views=views) for t in load_tasks(share_path('config', 'tasks'))]
     shown = put_to_the_left()
     assert_abstains(SuccessEstimator(tasks).estimate(shown, LEFT).estimate, word)
+
+
+def test_an_episode_that_defines_its_task_is_judged_by_it_unless_another_is_given():
+    """It counts also where a bundled task has the same instruction."""
+    tasks, shown = load_tasks(share_path('config', 'tasks')), put_to_the_left()
+    estimator = SuccessEstimator(tasks)
+    (left,) = (task for task in tasks if task.name == 'place_block_a2b_left')
+    far = left.replace(
+        name='far_left', relations=[left.relations[0].replace(distance_m=(0.3, 0.4))]
+    )
+    assert estimator.for_task(None) is estimator
+    assert estimator.estimate(shown, LEFT).estimate.probability > 0.8
+    assert estimator.for_task(far).estimate(shown, LEFT).estimate.probability < 0.2
+    given = SuccessEstimator(tasks, task='place_block_a2b_left')
+    assert given.for_task(far) is given

@@ -31,7 +31,7 @@ from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import ConfigError, nearest, SimulatorError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.simulation.scenes.shapes import SHAPES
-from mtv_world_ros.success.own_tasks import YAML
+from mtv_world_ros.success.own_tasks import bundled_tasks, YAML
 from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.success.task import (
     dump_task,
@@ -214,7 +214,7 @@ class Task:
         if definition.scene is None:
             raise SimulatorError(
                 f"{where}: task '{definition.name}' has no scene: it can be judged, but not "
-                f"simulated; add 'scene' with its roles and moves ({_PAGE})"
+                f"simulated; add 'scene' with its roles and moves to its file ({_PAGE})"
             )
         scene = validated(SceneSpec, definition.scene, f'{where}: scene')
         for fault in (_fault_of_names(definition, scene), _fault_of_moves(definition, scene)):
@@ -368,9 +368,13 @@ def task_named(name: str) -> Task:
     """Return a task by name.
 
     Raises:
-        SimulatorError: unknown name; the text names the nearest known one.
+        SimulatorError: unknown name, for which the text names the nearest known one, or a task
+            without a scene.
     """
     if name not in TASKS:
+        judged = {spec.name: spec for spec in bundled_tasks()}
+        if name in judged:
+            return Task.of(judged[name], f"'{name}'")
         raise SimulatorError(
             f"unknown task '{name}'{nearest(name, TASKS)}; known are {', '.join(sorted(TASKS))}, "
             'or give the YAML file of a task'

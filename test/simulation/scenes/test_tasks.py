@@ -45,6 +45,11 @@ def test_unknown_task_names_the_nearest():
         task_named('stack_block_two')
 
 
+def test_a_bundled_task_that_is_only_judged_says_so():
+    with pytest.raises(SimulatorError, match="task 'put_on' has no scene: it can be judged, but"):
+        tasks_named('put_on')
+
+
 def test_tasks_are_chosen_by_all_or_by_a_list():
     assert [task.name for task in tasks_named('all')] == [
         name for name, task in TASKS.items() if not task.zero_shot
