@@ -1,6 +1,6 @@
 # `make` installs into .venv; nothing here needs root. `make help` lists the targets.
 .DEFAULT_GOAL := install
-.PHONY: help install demo test test-all fast-tests slow-tests tiers style types fuzz kills soak attacks lint format docs clean distclean upstream lerobot-tests
+.PHONY: help install demo test test-all fast-tests slow-tests tiers style types fuzz kills soak attacks lint format pages docs clean distclean upstream lerobot-tests
 
 # .venv has its own ROS: a native one that is sourced, or wheels of another environment, would load
 # in its place.
@@ -106,6 +106,10 @@ upstream:  ## show what libraries do otherwise than documented, and which work-a
 format: $(STAMP)  ## sort imports and format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+pages: $(STAMP)  ## write the pages anew that are made from the code; tests compare them
+	@for page in command_pages configuration_page parameter_tables bundled_tables topics_page; do \
+		$(BIN)/python docs/$$page.py || exit; done
 
 docs: $(STAMP)  ## build the documentation; open out/docs/index.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict

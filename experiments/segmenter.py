@@ -26,7 +26,8 @@ from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.vision.jaccard import jaccard
-from mtv_world_ros.vision.segmenters.choose import check_segmenter_name, choose_segmenter
+from mtv_world_ros.vision.segmenters.choose import choose_segmenter
+from mtv_world_ros.vision.segmenters.registry import check_segmenter_name
 from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, Segmenter
 
 WINDOW = 17

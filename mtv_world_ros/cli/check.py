@@ -10,6 +10,7 @@ import sys
 import tempfile
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.fits.several_cameras import (
     read_for_checks,
     robot_file,
@@ -44,7 +45,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='names of the views, comma-separated; default: all; needed with --live',
     )
     add_options(parser, 'source')
-    parser.add_argument('--robot', help="robot YAML, or a bundled robot; default: the episode's")
+    parser.add_argument('--robot', help=f"{robots()}; default: the episode's")
     parser.add_argument(
         '--out', type=Path, help='folder of the report; default: out/doctor/<episode>'
     )

@@ -6,6 +6,7 @@ import argparse
 from collections import Counter
 from pathlib import Path
 
+from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.physics_option import add_physics
 from mtv_world_ros.cli.shared_options import names
 
@@ -26,8 +27,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--robot',
         default='yam_bimanual',
-        help='a robot with a workcell in the simulator: yam_bimanual, franka, ur5e_pair, or the '
-        'folder of your own',
+        help=f'a robot with a workcell: {robots(in_simulator=True)}',
     )
     parser.add_argument(
         '--episodes',

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -32,9 +33,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         action='store_true',
         help='PNG images in the tables in place of MP4: lossless, no video decoder is needed',
     )
-    parser.add_argument(
-        '--robot', default='yam_bimanual', help="a bundled robot's name, or a robot's YAML"
-    )
+    parser.add_argument('--robot', default='yam_bimanual', help=robots())
     parser.set_defaults(handler=_export)
 
 

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.shared_options import add_options, names
 from mtv_world_ros.core.files import check_free
 
@@ -29,7 +30,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         'said.',
     )
     parser.add_argument('scene', type=Path, help='folder of an episode, or a YAML file')
-    parser.add_argument('--robot', default='yam_bimanual', help='robot YAML, or a bundled robot')
+    parser.add_argument('--robot', default='yam_bimanual', help=robots())
     parser.add_argument(
         '--contact', metavar='DIR', help="folder that fit contact wrote, or 'bundled'"
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.cli.bundled_help import policies
 from mtv_world_ros.cli.shared_options import (
     add_options,
     add_watch,
@@ -107,8 +108,8 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--policy',
         default='scripted',
-        help='YAML file, name of one in config/policies (recorded: the commands of --episodes), '
-        'or a scripted policy such as expert-miss-0.5',
+        help=f'YAML file, name of a bundled one ({policies()}; recorded: the commands of '
+        '--episodes), or a scripted policy such as expert-miss-0.5',
     )
     parser.add_argument(
         '--episodes',

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         'look at the picture, correct the YAML where the guess is wrong, and call it again with '
         'the YAML.',
     )
-    parser.add_argument('file', help='URDF, robot YAML, or name of a bundled robot')
+    parser.add_argument('file', help=f'a URDF, {robots()}')
     parser.add_argument(
         '--out', type=Path, help='YAML to write (of a URDF); default: beside the URDF'
     )

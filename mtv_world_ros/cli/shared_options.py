@@ -12,6 +12,7 @@ import platform
 import shlex
 from typing import Any, TYPE_CHECKING
 
+from mtv_world_ros.cli import bundled_help
 from mtv_world_ros.viewing.viewer_process import PageAddress
 
 if TYPE_CHECKING:
@@ -52,10 +53,11 @@ def _count(text: str) -> int:
     return number
 
 
-#: options by the word that `add_options` knows them by
+#: options by the word that `add_options` knows them by; a help text that names what is bundled is
+#: a function, as its folder is read when a parser is made
 _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     'model': {
-        '--robot': {'help': 'robot YAML, or a bundled robot; default: that of the checkpoint'},
+        '--robot': {'help': lambda: f'{bundled_help.robots()}; default: that of the checkpoint'},
         '--device': {'default': 'cpu', 'help': 'PyTorch device, e.g. cpu (default) or cuda'},
         '--threads': {
             'type': number_or_0,
@@ -122,9 +124,11 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     'segmenter': {
         '--segmenter': {
             'default': 'auto',
-            'help': 'finds objects: auto, colour, sam2, sam3, module:Class of your own, or the '
-            'objects.safetensors of an import with --objects; auto = sam2 where MTV_WORLD_WEIGHTS '
-            'has it, else colour',
+            'help': lambda: (
+                f'finds objects: {bundled_help.segmenters()}, module:Class of your own, or the '
+                'objects.safetensors of an import with --objects; auto = sam2 where '
+                'MTV_WORLD_WEIGHTS has it, else colour'
+            ),
         }
     },
     'describer': {
@@ -152,7 +156,8 @@ def add_options(parser: argparse.ArgumentParser, words: str) -> None:
     """Add options that several commands share, e.g. those of `overwrite model task`."""
     for word in words.split():
         for flag, how in _OPTIONS[word].items():
-            parser.add_argument(flag, **how)
+            text = how['help']
+            parser.add_argument(flag, **{**how, 'help': text() if callable(text) else text})
 
 
 def add_watch(parser: argparse.ArgumentParser, what: str) -> None:

@@ -11,6 +11,7 @@ import shlex
 import shutil
 from typing import Any, TYPE_CHECKING
 
+from mtv_world_ros.cli.bundled_help import presets
 from mtv_world_ros.cli.shared_options import add_options, number_or_0
 from mtv_world_ros.core.errors import ConfigError
 
@@ -37,9 +38,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         'dataset', type=Path, nargs='?', help='folder of episodes; left out with --dry-run'
     )
     parser.add_argument('--out', type=Path, help='folder of the run; one that is there is resumed')
-    parser.add_argument(
-        '--preset', default='small', help='training preset: a name, or a YAML file'
-    )
+    parser.add_argument('--preset', default='small', help=f'training preset: {presets()}')
     parser.add_argument('--views', help="names of the views, e.g. low,high; default: the preset's")
     parser.add_argument(
         '--object-mask', choices=('on', 'off'), help='object masks in the trajectory video'

@@ -1,9 +1,5 @@
 """Control `ee_mlp`: the end-effector pose of each frame, seen by that frame alone.
 
-Ctrl-World: absolute pose of each tool point (x, y, z, Euler angles) and gripper opening, scaled by
-the 1st and 99th percentile to [-1, 1] and clipped; an MLP a frame; each frame cross-attends to its
-own vector alone; 5 % of the training samples go without.
-
 Shape letters: A arms, N states.
 """
 
@@ -40,7 +36,11 @@ VERTICAL = 1e-9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EndEffectorMlp(Control):
-    """Scaled pose and opening of each gripper, a vector a frame.
+    """Ctrl-World's control: pose and opening of every gripper, a vector a frame.
+
+    Absolute poses (x, y, z, Euler angles) and openings are scaled by the 1st and 99th percentile
+    to [-1, 1] and clipped; an MLP a frame; each frame cross-attends to its own vector alone; 5 %
+    of the training samples go without.
 
     Attributes:
         scaling: percentiles in the training set.

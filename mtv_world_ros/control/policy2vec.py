@@ -1,8 +1,4 @@
-"""Control `policy2vec`: one vector for all actions of a chunk, added to every text token.
-
-World-Eval: the mean of the chunk's actions passes through an MLP (linear, GELU, linear) and is
-added to the embedded text with a learned scale, in both branches of guidance.
-"""
+"""Control `policy2vec`: one vector for all actions of a chunk, added to every text token."""
 
 from __future__ import annotations
 
@@ -29,7 +25,10 @@ CLIP = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Policy2Vec(Control):
-    """Mean of the scaled joint commands of a chunk, as one context vector.
+    """World-Eval's control: the mean joint command of a chunk, as one context vector.
+
+    The mean passes through an MLP (linear, GELU, linear) and is added to every text token with a
+    learned scale (0.3 at first), in both branches of guidance.
 
     Attributes:
         scaling: percentiles of the joint positions in the training set.

@@ -499,8 +499,9 @@ def _in_pieces(points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryVideo(Control):
-    """Trails of the tool points and the objects' first masks, as video latents by channel.
+    """The paper's control: trails of the tools and the objects' first masks in every view.
 
+    The frames are encoded as video latents and concatenated by channel.
     Options of `config` also draw the links, the fingers, the arm's own pixels, and the objects
     where they are expected to be.
 

@@ -13,7 +13,7 @@ POLICIES = 'mtv_world.policies'
 ROLLOUTS = 'mtv_world.rollouts'
 #: group of controls: each entry point names a class, see `control/control.py`
 CONTROLS = 'mtv_world.controls'
-#: group of segmenters: each entry point names a class, see `vision/segmenters/choose.py`
+#: group of segmenters: each entry point names a class, see `vision/segmenters/registry.py`
 SEGMENTERS = 'mtv_world.segmenters'
 #: group of describers: each entry point names a class without arguments
 DESCRIBERS = 'mtv_world.describers'

@@ -29,6 +29,8 @@ _RENAME_EXCHANGE = 2
 _OWN_NAME_BYTES = 24
 #: file of a robot in a folder of its own
 ROBOT_YAML = 'robot.yaml'
+#: file of a robot's folder: where its arms and cameras stand in the simulator
+WORKCELL_YAML = 'workcell.yaml'
 
 
 def _candidates() -> list[Path]:
@@ -74,16 +76,34 @@ def bundled(kind: str, name: str | Path, setting: str) -> Path:
         return path
     if kind == 'robots' and (path / ROBOT_YAML).is_file():
         return path / ROBOT_YAML
+    files = _bundled_files(kind)
+    if str(name) not in files:
+        raise ConfigError(
+            f"'{name}' is not in config/{kind}{nearest(str(name), list(files))}; set '{setting}' "
+            f'to a YAML file or to one of {", ".join(files)}'
+        )
+    return files[str(name)]
+
+
+def bundled_names(kind: str, holding: str = '') -> list[str]:
+    """Return the names of the files of `config/<kind>`, of robots those of their folders, sorted.
+
+    Args:
+        kind: folder of `config`.
+        holding: name of a file that lies in the folder, for robots; empty = all.
+
+    Raises:
+        ConfigError: there is no such folder among the installed files.
+    """
+    files = _bundled_files(kind).items()
+    return [name for name, file in files if not holding or (file.parent / holding).is_file()]
+
+
+def _bundled_files(kind: str) -> dict[str, Path]:
     folder = share_path('config', kind)
     files = {file.stem: file for file in folder.glob('*.yaml')}
     files |= {file.parent.name: file for file in folder.glob(f'*/{ROBOT_YAML}')}
-    known = sorted(files)
-    if str(name) not in known:
-        raise ConfigError(
-            f"'{name}' is not in config/{kind}{nearest(str(name), known)}; set '{setting}' to a "
-            f'YAML file or to one of {", ".join(known)}'
-        )
-    return files[str(name)]
+    return dict(sorted(files.items()))
 
 
 def content_digest(folder: Path, without: Collection[str] = ()) -> str:

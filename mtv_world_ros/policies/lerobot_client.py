@@ -39,7 +39,7 @@ class LeRobotPolicySettings(Schema):
 
 
 class LeRobotConfig(ServerMapping, PolicySettings):
-    """A policy file of kind `lerobot`: which server and policy, and what it gets and gives."""
+    """A policy behind the policy server of [LeRobot](https://github.com/huggingface/lerobot)."""
 
     server_address: ClassVar[str] = '127.0.0.1:{port}'
     serves_one_client: ClassVar[bool] = True

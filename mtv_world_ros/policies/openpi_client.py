@@ -33,7 +33,7 @@ def _address(server: str) -> str:
 
 
 class OpenPiConfig(ServerMapping, PolicySettings):
-    """A policy file of kind `openpi`: which server, and what it gets and gives."""
+    """A policy behind the websocket server of [openpi](https://github.com/Physical-Intelligence/openpi)."""
 
     server_address: ClassVar[str] = 'ws://127.0.0.1:{port}'
 

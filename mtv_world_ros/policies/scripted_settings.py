@@ -13,7 +13,7 @@ from mtv_world_ros.robot.model import RobotModel
 
 
 class ScriptedPolicySettings(PolicySettings):
-    """A scripted policy of the simulator."""
+    """A scripted policy of the simulator, with its name under `variant`."""
 
     is_made_for_episode: ClassVar[bool] = True
     needs_first_frame: ClassVar[bool] = True

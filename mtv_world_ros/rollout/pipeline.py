@@ -167,8 +167,7 @@ class Pipeline:
             dtype: `float32`, `bfloat16`, or `auto` (bfloat16 where the processor has it).
             num_threads: threads of the model on a CPU; 0 = all cores but one, of two both. As many
                 processes, or one a core, compute motions of rigid bodies.
-            segmenter: `auto`, `colour`, `sam2`, `sam3`, `module:Class`, ...; see
-                `choose_segmenter`.
+            segmenter: name, `module:Class` or file of examples; see `choose_segmenter`.
             describer: YAML file of what names the objects of the first real frame; empty = the
                 words of the instruction.
             serving: what makes the model faster or smaller, e.g. `compile=true`; see

@@ -16,7 +16,7 @@ from mtv_world_ros.robot.model import RobotModel
 
 
 class RecordedPolicySettings(PolicySettings):
-    """The recorded commands of the episode that an imagined one begins from."""
+    """The recorded commands of the episode that an imagined one begins from, on any robot."""
 
     is_made_for_episode: ClassVar[bool] = True
     needs_recording: ClassVar[bool] = True

@@ -23,6 +23,7 @@ import yaml
 from mtv_world_ros.core.config import ListOf, Model, Schema
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
 from mtv_world_ros.robot.plan import PlanLimits
+from mtv_world_ros.vision.segmenters.registry import SEGMENTERS
 
 Span = tuple[float, float]
 Mode = Literal['observe', 'imagine']
@@ -133,7 +134,7 @@ class Settings(LiveSettings, NodeSettings):
     )
     segmenter: str = at_start(
         'auto',
-        'What finds the objects: auto, colour, sam2, sam3, module:Class of your own or a file of '
+        f'What finds the objects: {", ".join(SEGMENTERS)}, module:Class of your own or a file of '
         'examples; auto = sam2 if MTV_WORLD_WEIGHTS has its weights, else colour.',
     )
     describer: str = at_start(

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, model_validator
 
 from mtv_world_ros.control.control import ControlOptions
-from mtv_world_ros.control.registry import check_control_name, TRAJECTORY_VIDEO
+from mtv_world_ros.control.registry import check_control_name, CONTROLS, TRAJECTORY_VIDEO
 from mtv_world_ros.control.trajectory_video import TrajectoryVideoConfig
 from mtv_world_ros.core.config import (
     Count,
@@ -48,8 +48,8 @@ class VideoConfig(Schema):
     robot: str = Field(default='yam_bimanual', description='bundled robot, or a robot YAML')
     control: Annotated[str, AfterValidator(check_control_name)] = Field(
         default=TRAJECTORY_VIDEO,
-        description='how a plan enters the model: trajectory_video (the paper), policy2vec, '
-        'ee_mlp, fast_tokens, the name of an entry point of mtv_world.controls, or module:Class',
+        description=f'how a plan enters the model: {", ".join(CONTROLS)}, the name of an entry '
+        "point of mtv_world.controls, or module:Class; the first is the paper's method",
     )
     object_mask: bool = Field(
         default=True, description="the trajectory video carries the objects' masks"

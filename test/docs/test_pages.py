@@ -15,9 +15,10 @@ import pytest
 import yaml
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
+from mtv_world_ros.control.registry import CONTROLS
 from mtv_world_ros.data.bag_mapping import load_source
 from mtv_world_ros.importing.object_boxes import load_object_boxes
-from mtv_world_ros.policies.kinds import load_policy_config
+from mtv_world_ros.policies.kinds import load_policy_config, POLICY_KINDS
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.ranking.policy_list import load_policy_list
 from mtv_world_ros.robot.file import load_robot, robot_path
@@ -25,6 +26,7 @@ from mtv_world_ros.rollout.assembly import policy_settings
 from mtv_world_ros.simulation.scenes.tasks import Task
 from mtv_world_ros.success.relations import KINDS
 from mtv_world_ros.success.task import load_task
+from mtv_world_ros.vision.segmenters.registry import SEGMENTERS
 from test.support.pages import generator
 from test.support.tables import table
 
@@ -109,7 +111,6 @@ def test_every_page_is_linked_from_the_index():
     [
         ('command_pages', 'commands'),
         ('configuration_page', 'configuration'),
-        ('task_table', 'tasks'),
     ],
 )
 def test_generated_pages_are_what_the_code_says(name, page):
@@ -123,10 +124,29 @@ def test_every_key_of_a_configuration_file_has_a_meaning():
     assert not [row for row in rows if row.endswith('|  |') or 'see the guide' in row]
 
 
-def test_every_task_is_in_the_table_of_tasks():
-    written = (ROOT / 'docs' / 'tasks.md').read_text()
-    for path in (ROOT / 'config' / 'tasks').rglob('*.yaml'):
-        assert f'(../{path.relative_to(ROOT)})' in written
+TABLES = generator('bundled_tables')
+
+
+@table('page', TABLES.PAGES)
+def test_tables_of_what_is_bundled_are_those_of_folders_and_registries(page):
+    text = (ROOT / 'docs' / page).read_text()
+    assert '<!-- bundled: ' in text
+    assert text == TABLES.written_page(text), 'write it again: python docs/bundled_tables.py'
+
+
+@table(
+    'page, names',
+    [
+        ('tasks.md', sorted(p.stem for p in (ROOT / 'config' / 'tasks').rglob('*.yaml'))),
+        ('robots.md', sorted(p.parent.name for p in ROOT.glob('config/robots/*/robot.yaml'))),
+        ('training.md', CONTROLS),
+        ('objects.md', SEGMENTERS),
+        ('policies.md', POLICY_KINDS),
+    ],
+)
+def test_every_bundled_name_has_a_row(page, names):
+    rows = re.findall(r'^\| \[?`(\w+)`.*\|$', (ROOT / 'docs' / page).read_text(), re.M)
+    assert set(names) <= set(rows)
 
 
 def test_the_index_of_benchmarks_has_every_page():

@@ -245,7 +245,7 @@ def check_values(given: dict[str, Any]) -> None:
     from mtv_world_ros.simulation.scenes.tasks import tasks_named
     from mtv_world_ros.simulation.zero_shot import kinds_named
     from mtv_world_ros.training.training_config import load_training_config
-    from mtv_world_ros.vision.segmenters.choose import check_segmenter_name
+    from mtv_world_ros.vision.segmenters.registry import check_segmenter_name
 
     def each(names: str | Sequence[str]) -> list[str]:
         return names.split(',') if isinstance(names, str) else list(names)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.core.errors import RobotError
+from mtv_world_ros.core.files import bundled_names
 from mtv_world_ros.physics.arms.robot_parts import load_parts
 from mtv_world_ros.robot.file import load_robot, save_robot
 from mtv_world_ros.robot.mesh_pieces import load_mesh, MissingMeshError
@@ -171,7 +172,7 @@ def test_a_link_that_is_scaled_twice_is_named(tmp_path):
     assert "link 'upper' is 0.000309 m large" in load_shape(made).doubts[0]
 
 
-@pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
+@pytest.mark.parametrize('name', bundled_names('robots'))
 def test_bundled_robots_have_no_doubtful_links(name):
     from mtv_world_ros.robot.file import robot_path
 

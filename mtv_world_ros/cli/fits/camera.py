@@ -8,6 +8,7 @@ from pathlib import Path
 import re
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.fits.several_cameras import (
     calibrate_shared,
     is_shared,
@@ -98,7 +99,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='link that carries the camera; `find` = the link of the arm whose motion fits; '
         'default: as recorded',
     )
-    parser.add_argument('--robot', help="YAML, or a bundled robot; default: the episode's")
+    parser.add_argument('--robot', help=f"{robots()}; default: the episode's")
     add_options(parser, 'source')
     parser.add_argument(
         '--between',

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.shared_options import add_options, names, number_or_0
 from mtv_world_ros.core.files import check_free, check_output
 
@@ -33,7 +34,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar='OUT',
         help='folder of a checkpoint, or any other folder',
     )
-    parser.add_argument('--robot', default='yam_bimanual', help='robot YAML, or a bundled robot')
+    parser.add_argument('--robot', default='yam_bimanual', help=robots())
     parser.add_argument(
         '--views', type=names, default='low,high', help='names of the views, comma-separated'
     )

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.imports.common import (
     add_common_options,
     import_parser,
@@ -37,7 +38,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--topics', type=Path, metavar='FILE', help='mapping: which topic is what')
     parser.add_argument(
         '--robot',
-        help="robot YAML, or a bundled robot; default: the mapping's, or /robot_description",
+        help=f"{robots()}; default: the mapping's, or /robot_description",
     )
     parser.add_argument(
         '--action',

@@ -9,6 +9,7 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
+from mtv_world_ros.cli.bundled_help import segmenters
 from mtv_world_ros.cli.shared_options import add_options
 from mtv_world_ros.core.errors import ConfigError
 
@@ -118,8 +119,8 @@ def _add_masks(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--segmenter',
         metavar='NAME',
-        help="store the objects' masks with the episodes: auto, colour, sam2, sam3 or "
-        'module:Class of your own; default: none, or those recorded',
+        help=f"store the objects' masks with the episodes: {segmenters()}, or module:Class of "
+        'your own; default: none, or those recorded',
     )
     parser.add_argument('--device', default='cpu', help='PyTorch device of the segmenter')
 

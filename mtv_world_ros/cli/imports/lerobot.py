@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.imports.common import (
     add_common_options,
     import_parser,
@@ -38,7 +39,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='which feature is what; default: made of --robot, for columns that are named like '
         "the robot's joints [rad or m]",
     )
-    parser.add_argument('--robot', help='robot YAML, or a bundled robot, without --mapping')
+    parser.add_argument('--robot', help=f'{robots()}; without --mapping')
     parser.add_argument('--episodes', help="numbers, comma-separated, e.g. '0,4,7'; default: all")
     add_common_options(
         parser,

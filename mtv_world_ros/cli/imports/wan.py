@@ -7,6 +7,7 @@ from pathlib import Path
 import shlex
 from typing import Any, TYPE_CHECKING
 
+from mtv_world_ros.cli.bundled_help import presets
 from mtv_world_ros.core.errors import CheckpointError
 
 if TYPE_CHECKING:
@@ -30,9 +31,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         'path', type=Path, help="folder in VideoX-Fun's or diffusers' layout, or transformer file"
     )
     parser.add_argument('--out', type=Path, required=True, help='the new checkpoint folder')
-    parser.add_argument(
-        '--preset', default='wan-1.3b', help='training preset: a name, or a YAML file'
-    )
+    parser.add_argument('--preset', default='wan-1.3b', help=f'training preset: {presets()}')
     parser.add_argument(
         '--prompt', default=PROMPT, help="the instruction; default: the paper's for all tasks"
     )

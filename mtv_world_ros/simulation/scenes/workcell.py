@@ -13,12 +13,9 @@ from pydantic import ConfigDict, Field
 from mtv_world_ros.core.config import Length, ListOf, read_yaml, Schema, validated
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import SimulatorError
-from mtv_world_ros.core.files import share_path
+from mtv_world_ros.core.files import bundled_names, share_path, WORKCELL_YAML
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.scenes.cameras import AnyCameraSpec, CameraSpec, WristCameraSpec
-
-#: file of a robot's folder: where its arms and cameras stand in the simulator
-WORKCELL_YAML = 'workcell.yaml'
 
 Number = Annotated[int | float, Field(ge=-1000, le=1000)]
 Vector = ListOf[Number]
@@ -107,7 +104,7 @@ def workcell_of(robot: RobotModel) -> Workcell:
     if robot.file is not None and (robot.file.parent / WORKCELL_YAML).is_file():
         path = robot.file.parent / WORKCELL_YAML
     if not path.is_file():
-        known = ', '.join(sorted(file.parent.name for file in folder.glob(f'*/{WORKCELL_YAML}')))
+        known = ', '.join(bundled_names('robots', WORKCELL_YAML))
         raise SimulatorError(
             f"robot '{robot.name}' has no workcell in the simulator; there are some for {known}; "
             f'one of your own stands in {WORKCELL_YAML} in the folder of its robot.yaml'

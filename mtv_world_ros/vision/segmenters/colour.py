@@ -1,4 +1,9 @@
-"""Object masks from colour words, without weights; the status states every doubt."""
+"""Object masks from colour words, without weights; the status states every doubt.
+
+A pixel belongs to the word whose hue is nearest. The edge of an object is where saturation falls
+to that of a pixel half object, half background, so blur moves it little. Connected pieces are then
+followed from frame to frame.
+"""
 
 from __future__ import annotations
 
@@ -63,11 +68,9 @@ _MIN_PIXELS_FOR_THREADS = 1_000_000
 
 
 class ColourSegmenter:
-    """Finds objects whose name holds a word of the palette.
+    """Objects whose name holds one of eight colour words.
 
-    A pixel belongs to the word whose hue is nearest. The edge of an object is where saturation
-    falls to that of a pixel half object, half background, so blur moves it little. Connected
-    pieces are then followed from frame to frame.
+    They are red, orange, yellow, green, cyan, blue, purple and pink.
     """
 
     name = 'colour'

@@ -27,8 +27,6 @@ from mtv_world_ros.vision.segmenters.tracking import judge_tracks, track, Tracki
 Box = tuple[float, float, float, float]
 
 Floats = NDArray[np.floating]
-#: suffix of files with examples
-SUFFIX = '.safetensors'
 #: bins of a histogram of CIELAB in 8 bits
 _BINS = (16, 64, 64)
 #: standard deviation of the smoothing of a histogram [bins]

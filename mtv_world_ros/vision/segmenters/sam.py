@@ -122,7 +122,10 @@ def sam2_segmenter(
 
 
 class Sam2:
-    """MM-Grounding-DINO and SAM 2, from the folder of weights."""
+    """Any short noun phrase: MM-Grounding-DINO's box in the first frame, followed by SAM 2.
+
+    Needs the extra `vision` and weights.
+    """
 
     models = ('mm-grounding-dino', 'sam2_video')
 
@@ -259,7 +262,10 @@ def sam3_segmenter(
 
 
 class Sam3:
-    """SAM 3, from the folder of weights."""
+    """Any short noun phrase, with SAM 3 alone.
+
+    Needs the extra `vision` and weights, to which Meta grants access.
+    """
 
     models = ('sam3_video',)
 

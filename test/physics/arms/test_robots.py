@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import ConvexHull, Delaunay
 
 from mtv_world_ros.core.errors import RobotError
-from mtv_world_ros.core.files import share_path
+from mtv_world_ros.core.files import bundled_names, share_path
 from mtv_world_ros.physics.arms.arms import Arms
 from mtv_world_ros.physics.arms.robot_parts import load_parts
 from mtv_world_ros.physics.engine.engine import Engine
@@ -122,7 +122,7 @@ def test_a_mesh_that_is_missing_is_named(tmp_path):
         load_parts(mesh_robot(tmp_path, 'nowhere.stl'))
 
 
-@pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
+@pytest.mark.parametrize('name', bundled_names('robots'))
 def test_bundled_robots_stay_where_they_are_told_to_be(name):
     robot = load_robot(share_path('config', 'robots', name, 'robot.yaml'))
     away = Solid(centre=np.array([1.5, 1.5, 0.02]), size=np.full(3, 0.04))

@@ -6,7 +6,7 @@ import pytest
 from mtv_world_ros.cameras.camera import camera_poses, project
 from mtv_world_ros.cameras.silhouettes import draw_silhouettes
 from mtv_world_ros.core.errors import SimulatorError
-from mtv_world_ros.core.files import share_path
+from mtv_world_ros.core.files import bundled_names, share_path
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.simulation.arms.arm import actuators_of
@@ -34,7 +34,7 @@ def put(model, data, robot, row):
     load_mujoco(rendering=False).mj_forward(model, data)
 
 
-@pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
+@pytest.mark.parametrize('name', bundled_names('robots'))
 def test_simulated_arms_stand_where_pinocchio_puts_them(name):
     mujoco = load_mujoco(rendering=False)
     robot = load_robot(share_path('config', 'robots', name, 'robot.yaml'))
@@ -60,7 +60,7 @@ def test_simulated_arms_stand_where_pinocchio_puts_them(name):
             np.testing.assert_allclose(seen.xmat.reshape(3, 3), axes, atol=1e-6)
 
 
-@pytest.mark.parametrize('name', ['yam_bimanual', 'franka', 'ur5e_pair'])
+@pytest.mark.parametrize('name', bundled_names('robots'))
 def test_the_urdf_is_drawn_where_the_simulator_draws_the_robot(name, opengl):
     mujoco = load_mujoco()
     robot = load_robot(share_path('config', 'robots', name, 'robot.yaml'))

@@ -9,12 +9,8 @@ import pytest
 
 from mtv_world_ros.core import registry
 from mtv_world_ros.core.errors import CheckpointError, ConfigError
-from mtv_world_ros.vision.segmenters.choose import (
-    check_segmenter_name,
-    choose_segmenter,
-    SEGMENTERS,
-    WEIGHTS_VARIABLE,
-)
+from mtv_world_ros.vision.segmenters.choose import choose_segmenter, WEIGHTS_VARIABLE
+from mtv_world_ros.vision.segmenters.registry import check_segmenter_name, SEGMENTERS
 
 ROOT = Path(__file__).parents[3]
 OWN = 'own_segmenter:HueSegmenter'
