@@ -6,33 +6,33 @@ Keys, types, defaults, ranges and meanings are those of the schemas that read th
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass, MISSING
+from importlib import import_module
 import inspect
 from pathlib import Path
 import re
 from types import NoneType, UnionType
-from typing import Annotated, Any, get_args, get_origin, Literal, NamedTuple, Union
+from typing import Annotated, Any, get_args, get_origin, get_type_hints, Literal, NamedTuple, Union
 
 from pydantic.fields import FieldInfo
 import yaml
 
 from mtv_world_ros.cameras.calibration_file import CalibratedView
-from mtv_world_ros.core.config import Schema
+from mtv_world_ros.core.config import read_yaml, Schema
+from mtv_world_ros.core.files import bundled_names, share_path
 from mtv_world_ros.data.bag_mapping import BagMapping
 from mtv_world_ros.importing.mapping import DatasetMapping
 from mtv_world_ros.importing.object_boxes import ObjectBoxes
 from mtv_world_ros.importing.videos import VideoMapping
 from mtv_world_ros.inspection.foreseen_scene import SceneFile
 from mtv_world_ros.physics.contact_settings import ContactSettings
-from mtv_world_ros.policies.lerobot_client import LeRobotConfig
-from mtv_world_ros.policies.openpi_client import OpenPiConfig
-from mtv_world_ros.policies.python_policy import PythonPolicyConfig
-from mtv_world_ros.policies.scripted_settings import ScriptedPolicySettings
+from mtv_world_ros.policies.kinds import POLICY_KINDS
 from mtv_world_ros.ranking.policy_list import PolicyList
 from mtv_world_ros.robot.file import RobotFile
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.rollout.recorded_policy import RecordedPolicySettings
 from mtv_world_ros.simulation.physics import Physics
 from mtv_world_ros.simulation.scenes.tasks import SceneSpec
+from mtv_world_ros.simulation.scenes.workcell import WorkcellFile
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.training.training_config import TrainingConfig
 from mtv_world_ros.vision.describers.describer_config import DescriberConfig
@@ -65,6 +65,25 @@ class ConfigFile(NamedTuple):
         return f'{text} Example: [`{path}`](../{path}).' if self.example else text
 
 
+def _policy_files() -> Iterator[ConfigFile]:
+    """Return the kinds of policy files of the registry, each with its first bundled example."""
+    examples: dict[str, str] = {}
+    for name in bundled_names('policies'):
+        path = share_path('config', 'policies', f'{name}.yaml')
+        kind = read_yaml(path, 'policy file', 'policy')['kind']
+        if name == kind:
+            examples[kind] = f'policies/{name}.yaml'
+    for kind, target in POLICY_KINDS.items():
+        module, _, schema = target.partition(':')
+        yield ConfigFile(
+            f'Policy: {kind}',
+            '`--policy FILE`.',
+            getattr(import_module(module), schema),
+            'policies.md#which-policy',
+            examples.get(kind, ''),
+        )
+
+
 FILES = (
     ConfigFile(
         'Robot',
@@ -80,6 +99,14 @@ FILES = (
         CalibratedView,
         'cameras.md',
         'robots/yam_bimanual/cameras.yaml',
+    ),
+    ConfigFile(
+        'Workcell',
+        "`workcell.yaml` in a robot's folder, for the simulator. Positions are in the base link: "
+        'x to the right, y away from the robot, z up from the table.',
+        WorkcellFile,
+        'simulator.md',
+        'robots/franka/workcell.yaml',
     ),
     ConfigFile(
         'Task',
@@ -136,36 +163,7 @@ FILES = (
         'objects.md',
         'describer.yaml',
     ),
-    ConfigFile(
-        'Policy: scripted',
-        '`--policy FILE`.',
-        ScriptedPolicySettings,
-        'policies.md',
-        'policies/scripted.yaml',
-    ),
-    ConfigFile(
-        'Policy: recorded',
-        '`--policy FILE`.',
-        RecordedPolicySettings,
-        'policies.md',
-        'policies/recorded.yaml',
-    ),
-    ConfigFile(
-        'Policy: python',
-        '`--policy FILE`: a class of your own.',
-        PythonPolicyConfig,
-        'policies.md#which-policy',
-    ),
-    ConfigFile(
-        'Policy: openpi', '`--policy FILE`.', OpenPiConfig, 'policies.md', 'policies/openpi.yaml'
-    ),
-    ConfigFile(
-        'Policy: lerobot',
-        '`--policy FILE`.',
-        LeRobotConfig,
-        'policies.md',
-        'policies/lerobot.yaml',
-    ),
+    *_policy_files(),
     ConfigFile(
         'List of policies',
         '`mtv-world rank --policies FILE`.',
@@ -218,7 +216,7 @@ _PLAIN = {
 def page() -> str:
     """Return the text of the page: a table of keys for each file and each of its sections."""
     lines = [_HEAD]
-    shown: set[type[Schema]] = set()
+    shown: set[type] = set()
     for file in FILES:
         lines += [f'## {file.heading}', '', file.introduction(), '', *_table(file.schema), '']
         shown.add(file.schema)
@@ -232,23 +230,25 @@ def page() -> str:
     return '\n'.join(lines)
 
 
-def _title(kind: type[Schema]) -> str:
+def _title(kind: type) -> str:
     """Return the heading of a section, e.g. `OptimizerConfig` -> `Optimizer`."""
-    name = re.sub(r'(Config|Settings|Entry)$', '', kind.__name__).replace('LeRobot', 'Lerobot')
+    name = re.sub(r'(Config|Settings|Entry|Spec)$', '', kind.__name__).replace(
+        'LeRobot', 'Lerobot'
+    )
     first, *rest = re.findall(r'[A-Z]+(?![a-z])|[A-Z][a-z0-9]*', name)
     words = [first, *(word if word.isupper() else word.lower() for word in rest)]
     return ' '.join(_NAMES.get(word) or word for word in words)
 
 
-def _first_line(kind: type[Schema]) -> str:
+def _first_line(kind: type) -> str:
     return (inspect.getdoc(kind) or '').split('\n\n')[0].replace('\n', ' ')
 
 
-def _table(kind: type[Schema]) -> Iterator[str]:
+def _table(kind: type) -> Iterator[str]:
     meanings = _attributes(kind)
     yield '| key | value | default | |'
     yield '|---|---|---|---|'
-    for name, field in kind.model_fields.items():
+    for name, field in _fields(kind).items():
         meaning = ' '.join((field.description or meanings.get(name, '')).split())
         if not meaning and len(get_args(field.annotation)) == 1:
             meaning = 'selects this kind'
@@ -256,7 +256,24 @@ def _table(kind: type[Schema]) -> Iterator[str]:
         yield '| ' + ' | '.join(cell.replace('|', r'\|') for cell in cells) + ' |'
 
 
-def _attributes(kind: type[Schema]) -> dict[str, str]:
+def _fields(kind: type) -> Mapping[str, FieldInfo]:
+    """Return the keys of a schema, or of a dataclass that a schema holds."""
+    if issubclass(kind, Schema):
+        return kind.model_fields
+    hints = get_type_hints(kind, include_extras=True)
+    return {
+        one.name: FieldInfo.from_annotation(hints[one.name])
+        if one.default is MISSING and one.default_factory is MISSING
+        else FieldInfo.from_annotated_attribute(hints[one.name], one.default)
+        for one in fields(kind)
+    }
+
+
+def _is_part(kind: Any) -> bool:
+    return inspect.isclass(kind) and (issubclass(kind, Schema) or is_dataclass(kind))
+
+
+def _attributes(kind: type) -> dict[str, str]:
     """Return the meanings of attributes in the docstrings of a class and its bases."""
     found: dict[str, str] = {}
     for base in kind.__mro__:
@@ -302,7 +319,7 @@ def _type(kind: Any) -> str:
         return f'name -> {_type(arguments[1])}'
     if kind is RobotModel:
         return _PLAIN[Path]
-    if inspect.isclass(kind) and issubclass(kind, Schema):
+    if kind is not RobotModel and _is_part(kind):
         return f'[{_title(kind)}](#{_title(kind).lower().replace(" ", "-")})'
     return _PLAIN.get(kind, 'see the guide')
 
@@ -323,17 +340,17 @@ def _default(field: FieldInfo) -> str:
     return f'`{yaml.safe_dump(value, default_flow_style=True).splitlines()[0]}`'
 
 
-def _parts(kind: type[Schema]) -> list[type[Schema]]:
+def _parts(kind: type) -> list[type]:
     """Return the schemas that the fields of a schema hold, in their order."""
-    found: list[type[Schema]] = []
+    found: list[type] = []
 
     def visit(one: Any) -> None:
-        if inspect.isclass(one) and issubclass(one, Schema):
+        if one is not RobotModel and _is_part(one):
             found.append(one)
         for part in get_args(one):
             visit(part)
 
-    for field in kind.model_fields.values():
+    for field in _fields(kind).values():
         visit(field.annotation)
     return list(dict.fromkeys(found))
 

@@ -75,6 +75,11 @@ Pair = Annotated[
 ]
 #: a coordinate [m]; farther away is a wrong unit
 Metres = Annotated[float, Field(ge=-100, le=100)]
+Point = Annotated[
+    tuple[Metres, Metres, Metres],
+    Strict(False),
+    expected('x, y, z in metres, each of at most 100 either way'),
+]
 Share = Annotated[float, Field(ge=0, le=1), expected('in [0, 1]')]
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 
+from mtv_world_ros.core.config import Length, Point
 from mtv_world_ros.core.data_types import CameraModel, FloatArray
 
 
@@ -16,21 +18,21 @@ class CameraSpec:
 
     Attributes:
         view: name of the view.
-        target: (x, y, z) the point looked at, in the base frame [m].
-        distance: camera to target [m].
+        target: x, y, z of the point looked at, in the base frame [m].
+        distance: distance from the camera to the target [m].
         azimuth: 0 = opposite the robot; positive moves the camera to the robot's right [deg].
-        elevation: above the table [deg].
-        visible_width: width of the view's plane through the target [m].
+        elevation: angle above the table [deg].
+        visible_width: width of what the view shows at the target [m].
     """
 
     __pydantic_config__ = ConfigDict(extra='forbid')
 
     view: str
-    target: tuple[float, float, float]
-    distance: float
-    azimuth: float
-    elevation: float
-    visible_width: float
+    target: Point
+    distance: Length
+    azimuth: Annotated[float, Field(ge=-360, le=360)]
+    elevation: Annotated[float, Field(ge=-90, le=90)]
+    visible_width: Length
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,21 +41,21 @@ class WristCameraSpec:
 
     Attributes:
         view: name of the view.
-        link: name of the link that carries it.
-        position: position (x, y, z) in the link [m].
-        target: (x, y, z) the point looked at, in the link [m].
-        right: approximate direction (x, y, z) of the image's x axis in the link.
-        visible_width: width of the view's plane through the target [m].
+        link: name of the link that carries the camera.
+        position: x, y, z of the camera in the link [m].
+        target: x, y, z of the point looked at, in the link [m].
+        right: x, y, z of the approximate direction of the image's x axis, in the link.
+        visible_width: width of what the view shows at the target [m].
     """
 
     __pydantic_config__ = ConfigDict(extra='forbid')
 
     view: str
     link: str
-    position: tuple[float, float, float]
-    target: tuple[float, float, float]
-    right: tuple[float, float, float]
-    visible_width: float
+    position: Point
+    target: Point
+    right: Point
+    visible_width: Length
 
     @property
     def distance(self) -> float:

@@ -10,22 +10,26 @@ from typing import Annotated
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from mtv_world_ros.core.config import Length, ListOf, read_yaml, Schema, validated
+from mtv_world_ros.core.config import Length, ListOf, Point, read_yaml, Schema, validated
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import SimulatorError
 from mtv_world_ros.core.files import bundled_names, share_path, WORKCELL_YAML
+from mtv_world_ros.robot.arm_solver import ArmSolver
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.scenes.cameras import AnyCameraSpec, CameraSpec, WristCameraSpec
 
-Number = Annotated[int | float, Field(ge=-1000, le=1000)]
-Vector = ListOf[Number]
+#: a joint position; farther away is a wrong unit [rad or m]
+_Joint = Annotated[float, Field(ge=-1000, le=1000)]
 
 
 class ArmEntry(Schema):
     """One arm at rest."""
 
-    home_tool: Vector = Field(description='x, y, z of the tool, which points down [m]')
-    home_joints: Vector = Field(description='joints near that pose, gripper left out [rad]')
+    home_tool: Point = Field(description='x, y, z of the tool at rest, where it points down [m]')
+    home_joints: ListOf[_Joint] = Field(
+        description="positions of the arm's joints near that pose, without the gripper's [rad or "
+        'm]; a search for the pose starts there'
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,10 +37,11 @@ class PlacementConfig:
     """Limits of a feasible scene.
 
     Attributes:
-        clearance: least gap between the objects' outlines, room for a finger [m].
-        reach: largest distance of a tool from its arm's base, top-down, over the table [m].
-        reach_above: the same where it is higher, over or in another object [m].
-        max_x: goals are at most this far from the table's middle line, in all views [m].
+        clearance: smallest gap between the outlines of two objects, room for a finger [m].
+        reach: largest distance of a tool from its arm's base, seen from above, at the table [m].
+        reach_above: largest such distance where the tool is higher, over or in an object [m].
+        max_x: largest distance of a goal from the middle line of the table (x = 0), so that all
+            views show it [m].
     """
 
     __pydantic_config__ = ConfigDict(extra='forbid')
@@ -48,13 +53,21 @@ class PlacementConfig:
 
 
 class WorkcellFile(Schema):
-    """A workcell file; its name is the robot's."""
+    """A workcell file: where a robot's arms rest and reach in the simulator, and its cameras."""
 
-    arms: Mapping[str, ArmEntry]
-    finger_width_m: Length
-    finger_thickness_m: Length
-    placement: PlacementConfig
-    cameras: ListOf[CameraSpec | WristCameraSpec]
+    arms: Mapping[str, ArmEntry] = Field(
+        description="arms at rest, by the robot's names and in its order"
+    )
+    finger_width_m: Length = Field(
+        description="width of a finger tip across the fingers' travel [m]"
+    )
+    finger_thickness_m: Length = Field(
+        description="thickness of a finger tip along the fingers' travel [m]"
+    )
+    placement: PlacementConfig = Field(description='limits of a feasible scene')
+    cameras: ListOf[CameraSpec | WristCameraSpec] = Field(
+        description='cameras before an episode moves them a little, in the order of the views'
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,7 +109,7 @@ def workcell_of(robot: RobotModel) -> Workcell:
     """Return the workcell of a robot: `workcell.yaml` in its folder, else in `config/robots/NAME`.
 
     Raises:
-        SimulatorError: there is none for this robot, or it is for other arms.
+        SimulatorError: there is none for this robot, or it is for other arms or joints.
         ConfigError: its file has unknown, missing or wrong values.
     """
     folder = share_path('config', 'robots')
@@ -113,6 +126,14 @@ def workcell_of(robot: RobotModel) -> Workcell:
     arms = [tool.arm for tool in robot.tools]
     if list(file.arms) != arms:
         raise SimulatorError(f"'{path}' has arms {list(file.arms)}, the robot has {arms}")
+    for tool in robot.tools:
+        names = [robot.joint_names[index] for index in ArmSolver(robot, tool).indices]
+        count = len(file.arms[tool.arm].home_joints)
+        if count != len(names):
+            raise SimulatorError(
+                f'{path}: arms.{tool.arm}.home_joints has {count} numbers; the arm has '
+                f'{len(names)} joints without the gripper: {", ".join(names)}'
+            )
     points = robot.kinematics(np.zeros((1, len(robot.joint_names)))).arm_points
     return Workcell(
         base_link=robot.base_link,

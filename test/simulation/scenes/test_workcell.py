@@ -6,7 +6,7 @@ import pytest
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.cli import main
-from mtv_world_ros.core.errors import SimulatorError
+from mtv_world_ros.core.errors import ConfigError, SimulatorError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.robot.file import load_robot
@@ -103,6 +103,27 @@ def test_a_robot_of_ones_own_has_its_workcell_in_its_folder(tmp_path):
     (folder / 'workcell.yaml').unlink()
     with pytest.raises(SimulatorError, match=r"'mine' has no workcell.* stands in workcell.yaml"):
         workcell_of(load_robot(file))
+
+
+@pytest.mark.parametrize(
+    ('before', 'after', 'said'),
+    [
+        ('1.9, 0.785]', '1.9]', r'panda.home_joints has 6 numbers; the arm has 7 joints .*: p'),
+        ('[0.0, 0.14, 0.24]', '[0.0, 0.14]', r"'home_tool' is .*, must be x, y, z"),
+        ('target: [0.0, 0.22, 0.1]', 'target: [0, .1, 999]', r"'target' is .*, must be x, y, z"),
+        ('distance: 1.25', 'distance: -1.25', r'distance'),
+        ('elevation: 28', 'elevation: 280', r'elevation'),
+        ('finger_width_m', 'finger_widht_m', r"did you mean 'finger_width_m'"),
+    ],
+)
+def test_a_workcell_with_a_wrong_value_is_refused_and_says_which(tmp_path, before, after, said):
+    folder = shutil.copytree(share_path('config', 'robots', 'franka'), tmp_path / 'franka')
+    file = folder / 'workcell.yaml'
+    text = file.read_text()
+    assert before in text
+    file.write_text(text.replace(before, after))
+    with pytest.raises((ConfigError, SimulatorError), match=rf'workcell\.yaml.*{said}'):
+        workcell_of(load_robot(folder / 'robot.yaml'))
 
 
 @pytest.mark.slow
