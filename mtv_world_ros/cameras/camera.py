@@ -140,8 +140,8 @@ def with_camera_info(
         width: width of the images that the CameraInfo is for [px].
         height: height of the images [px].
         K: (3, 3) [px].
-        distortion_model: as in CameraInfo; ignored if all coefficients are zero, unless it is
-            `equidistant`.
+        distortion_model: name of the distortion model as in CameraInfo; ignored if all
+            coefficients are zero, unless it is `equidistant`.
         distortion: coefficients; zeros beyond those of the model are ignored.
 
     Raises:

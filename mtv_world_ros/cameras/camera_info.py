@@ -29,7 +29,7 @@ class Intrinsics:
         height: height of the full resolution [px]; 0 = not given.
         matrix: the nine entries of K, or of rectified images those of P's left part [px].
         distortion_model: distortion model as in the message.
-        distortion: coefficients.
+        distortion: coefficients of the distortion model.
         window: region of interest and binning.
     """
 
@@ -93,7 +93,7 @@ def read_camera_info(view: str, info: Any, *, is_rectified: bool = False) -> Int
 
     Args:
         view: name of the view, for error texts.
-        info: the message.
+        info: message sensor_msgs/CameraInfo.
         is_rectified: whether the images are; they have P's left part as K and no distortion.
 
     Returns:

@@ -23,8 +23,8 @@ class ImageWindow:
     """Region of interest and binning of a CameraInfo.
 
     Attributes:
-        x, y: left and top of the region of interest, in full resolution [px].
-        width, height: of the region in full resolution [px]; 0 = the whole image.
+        x, y: left and top edge of the region of interest, in full resolution [px].
+        width, height: size of the region in full resolution [px]; 0 = the whole image.
         binning_x, binning_y: pixels that are combined into one; 0 and 1 = none.
     """
 

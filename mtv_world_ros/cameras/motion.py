@@ -28,7 +28,7 @@ class Motion:
         cameras: calibrated cameras of the V views.
         positions: (N, J) joint positions [rad or m].
         links: (N, 4, 4) T_base_link of each link that was asked for, by its name [m].
-        arm_points: for each arm (P, N, 3) its joints' origins and its tool centre point [m].
+        arm_points: (P, N, 3) origins of the joints and the tool centre point of each arm [m].
         tools: (A, N, 4, 4) T_base_tool of the tool centre points [m].
         camera_poses: (V, N, 4, 4) T_base_camera [m].
         openings: (A, N) gripper openings, 0 closed to 1 open; 1 where there is no gripper.
@@ -65,7 +65,7 @@ class Motion:
         """Return the motion of a robot and its cameras along positions (N, J) [rad or m].
 
         Args:
-            robot: gives the kinematics.
+            robot: robot whose kinematics are used.
             cameras: calibrated cameras of the V views, fixed or carried by a link.
             positions: (N, J) [rad or m].
             links: names of further links whose poses are wanted, e.g. to draw them.

@@ -165,7 +165,7 @@ def add_watch(parser: argparse.ArgumentParser, what: str) -> None:
 
     Args:
         parser: parser of the command.
-        what: is shown while it runs.
+        what: words of the help: what the viewer shows.
     """
     parser.add_argument(
         '--watch',
@@ -206,7 +206,7 @@ class Watch:
 
     Attributes:
         address: address of the page for browsers.
-        file: is written instead; None = no file.
+        file: path of a recording that is written in place of a page; None = a page is served.
     """
 
     address: PageAddress = PageAddress()

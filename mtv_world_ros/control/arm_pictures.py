@@ -41,7 +41,7 @@ class _Source:
     Attributes:
         frame: (H, W, 3) uint8 RGB.
         seen: (H, W) 1 + the number of the link that is seen in each pixel, 0 = none.
-        pixels: of each of P parts, (N, 2).
+        pixels: (N, 2) pixels of the points of each of P parts.
     """
 
     frame: ByteArray
@@ -172,13 +172,13 @@ def _draw_link(
     """Draw a link into pictures (T, H, W, 4) where it is seen (T, H, W).
 
     Args:
-        pictures: drawn upon.
-        seen: where it is not hidden.
+        pictures: (T, H, W, 4) uint8 pictures that are drawn upon.
+        seen: (T, H, W) pixels in which the link is not hidden.
         points: (T, N, 2) pixels of points on it, NaN behind the camera.
         source_frame: (H, W, 3) uint8 RGB frame that its pixels are taken from.
-        was_seen: (H, W) where that frame shows it.
+        was_seen: (H, W) pixels of the source frame that show the link.
         was_at: (N, 2) pixels of the points in that frame.
-        hidden: (3,) its colour where that frame shows nothing of it.
+        hidden: (3,) colour of the link where the source frame shows nothing of it.
     """
     colour = (*_mean_colour(source_frame, was_seen, hidden), 255)
     size = np.array(seen.shape[:0:-1])

@@ -112,7 +112,7 @@ class FrameInput:
     """Size of the input `frame`.
 
     Attributes:
-        vector_size: D.
+        vector_size: length D of the vector.
         hidden_size: width of the MLP that embeds it, at most the transformer's.
     """
 
@@ -133,8 +133,9 @@ class InputLayout:
 
     Attributes:
         video: whether it feeds latents by channel; else these are zero.
-        context: its tokens of the cross-attention; None = none.
-        frame: its vector a frame; None = none.
+        context: size and joining of the control's tokens for the cross-attention; None = it feeds
+            none.
+        frame: sizes of the control's vector for each frame; None = it feeds none.
     """
 
     video: bool = False

@@ -90,8 +90,8 @@ def load_control(name: str, options: ControlOptions, folder: Path) -> Control:
 
     Args:
         name: name of the control.
-        options: what it is created for.
-        folder: may hold `control.json`.
+        options: robot, drawing settings and number of frames that the control is created for.
+        folder: folder of the checkpoint; may hold `control.json`.
 
     Raises:
         CheckpointError: no such control, its package is missing, or its file is missing or broken.

@@ -390,7 +390,7 @@ class ToolMotion:
     """Tool points over time.
 
     Attributes:
-        times: (N,) [s].
+        times: (N,) times of the points [s].
         points: (A, N, 3) points in the base frame [m].
         closed: (A, T) 0 open .. 1 closed, at the frames.
         shown_at: (T,) index of the point at each frame.
@@ -457,7 +457,7 @@ class ArmLinks:
     Args:
         camera: the view.
         poses: (T, 4, 4) T_base_camera.
-        arms: for each arm (N, T, 3) points along it, in the base frame [m].
+        arms: (N, T, 3) points along each arm, in the base frame [m].
         width_m: width of the lines [m]; None = nothing is drawn.
     """
 

@@ -79,28 +79,28 @@ class Limits:
     """The largest sizes that are accepted from outside.
 
     Attributes:
-        yaml_bytes: of a YAML text.
-        yaml_nodes: values in it, once aliases and merges are written out.
-        urdf_bytes: of a robot's URDF.
-        urdf_links: links of a robot, or joints.
-        chain_links: links of a robot in a row, from its root; parsers recurse over them.
-        xml_elements: of a URDF or a COLLADA mesh.
-        mesh_bytes: of a mesh file.
+        yaml_bytes: size of a YAML text.
+        yaml_nodes: number of values in a YAML text, once aliases and merges are written out.
+        urdf_bytes: size of a robot's URDF.
+        urdf_links: number of links, or of joints, of a robot.
+        chain_links: number of links of a robot in a row, from its root; parsers recurse over them.
+        xml_elements: number of elements of a URDF or a COLLADA mesh.
+        mesh_bytes: size of a mesh file.
         nesting: levels of lists, maps and elements, in YAML, JSON, XML and answers of policy
             servers.
-        json_bytes: of a JSON file; tokenizers have tens of megabytes.
-        image_bytes: of an image file in a message.
-        image_pixels: of an image, before it is decoded.
-        jpeg_scans: of a progressive JPEG; each costs a pass over all pixels.
-        video_bytes: of a video once it is decoded.
-        chunk_bytes: of a bag's chunk once it is inflated, and of a message.
-        joint_names: in a message.
-        trajectory_points: in a message.
-        instruction_characters: of an instruction.
+        json_bytes: size of a JSON file; tokenizers have tens of megabytes.
+        image_bytes: size of an image file in a message.
+        image_pixels: number of pixels of an image, checked before it is decoded.
+        jpeg_scans: number of scans of a progressive JPEG; each costs a pass over all pixels.
+        video_bytes: size of a video once it is decoded.
+        chunk_bytes: size of a bag's chunk once it is inflated, and of a message.
+        joint_names: number of joint names in a message.
+        trajectory_points: number of points of a trajectory in a message.
+        instruction_characters: length of an instruction.
         table_values: numbers and texts in the columns that are read of a parquet file.
         table_bytes: texts and images in these columns, each counted as often as it is repeated.
-        answer_bytes: of an answer of a policy server or of a language model.
-        array_bytes: of an array in an answer, and of all arrays in a file, inflated.
+        answer_bytes: size of an answer of a policy server or of a language model.
+        array_bytes: size of an array in an answer, and of all arrays in a file, inflated.
     """
 
     yaml_bytes: int = 4 * 2**20
@@ -195,7 +195,7 @@ _HEAD_BYTES = 512
 
 
 def placeholder(path: Path | str) -> str:
-    """Return what a file is that only stands in another one's place, and the remedy; else empty.
+    """Return the reason why a file is a placeholder, with the remedy; empty if it is none.
 
     Repositories that were cloned without Git LFS hold pointers, and failed downloads HTML pages.
     """
@@ -207,7 +207,7 @@ def placeholder(path: Path | str) -> str:
 
 
 def placeholder_content(data: bytes) -> str:
-    """Return what the content of a file is that only stands in another one's place; else empty."""
+    """Return the reason why a file of this content is a placeholder; empty if it is none."""
     head = data[:_HEAD_BYTES].lstrip().lower()
     if head.startswith(b'version https://git-lfs.github.com/'):
         return "is a pointer of Git LFS, not the file: run 'git lfs pull' in its repository"

@@ -101,8 +101,8 @@ class Schema(BaseModel):
     """Base of all configuration.
 
     Attributes:
-        section: how errors name a value: None = by its quoted key; a text = by its dotted path,
-            which begins with this text if the model is made by itself.
+        section: way in which errors name a value: None = by its quoted key; a text = by its dotted
+            path, which begins with this text if the model is made by itself.
     """
 
     model_config = ConfigDict(frozen=True, extra='forbid', strict=True, allow_inf_nan=False)
@@ -167,7 +167,7 @@ def validated(
 
     Args:
         kind: class of the model.
-        values: e.g. of a YAML file.
+        values: plain values, e.g. of a YAML file.
         where: beginning of the error text, e.g. the file.
         context: values that validators use, e.g. the robot.
         error: raised instead of `ConfigError`.

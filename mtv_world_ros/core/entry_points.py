@@ -25,7 +25,7 @@ def registered(group: str) -> dict[str, metadata.EntryPoint]:
 
 
 def load(entry: metadata.EntryPoint) -> Any:
-    """Return what an entry point names.
+    """Return the object that an entry point names.
 
     Raises:
         ConfigError: the module cannot be imported.

@@ -214,7 +214,7 @@ def check_room(folder: Path, num_bytes: int) -> None:
 
 
 def copy_folder(source: Path, target: Path) -> None:
-    """Copy a folder's regular files, and what links in it stand for.
+    """Copy a folder's regular files; a link in it is replaced by the file that it points to.
 
     Raises:
         OSError: a file cannot be read, or is a device or a pipe, which may have no end.
@@ -237,7 +237,7 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return what JSON can hold: NaN as None, tuples as lists, floats to 6 digits."""
+    """Return plain values for JSON: NaN as None, tuples as lists, floats to 6 digits."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -345,7 +345,7 @@ def _exchange_names(one: Path, other: Path) -> bool:
 
 
 def recover_folder(folder: Path) -> None:
-    """Tidy up what a process left that was killed while it wrote a folder by `whole_folder`.
+    """Restore or remove the leftovers of a process that was killed while it wrote a folder.
 
     A folder that was replaced, while the new one did not get its name, is renamed back. What
     living processes write is left alone. Earlier versions left `<folder>.old` and, complete,

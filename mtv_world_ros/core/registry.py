@@ -60,7 +60,7 @@ class Registry:
         return name
 
     def load(self, name: str) -> Any:
-        """Return a class, or what else its name stands for.
+        """Return the class, or other object, that a name stands for.
 
         Args:
             name: registered, or `module:Class`.

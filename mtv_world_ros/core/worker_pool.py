@@ -70,8 +70,8 @@ def run_all(
 
     Args:
         jobs: arguments of the function, one a call.
-        make_run: makes what runs a job, once in every process; has to be picklable for more than
-            one.
+        make_run: returns the function that runs a job; called once in every process; has to be
+            picklable for more than one.
         workers: processes; 1 = this one.
         threads: threads of each process, where there are several.
 
@@ -218,8 +218,9 @@ class _Scoring:
     """Runs a scorer; a job without scores gives the reason.
 
     Args:
-        make_scorer: makes it.
-        is_late: in a worker process, where every job gives the error of `make_scorer`.
+        make_scorer: returns the scorer.
+        is_late: whether an error of `make_scorer` is the outcome of every job, as in a worker
+            process; False = it is raised at once.
     """
 
     def __init__(self, make_scorer: Callable[[], Scorer], is_late: bool = True) -> None:
@@ -250,7 +251,8 @@ def score_all(
 
     Args:
         jobs: jobs to score, in any order.
-        make_scorer: called once in every process; has to be picklable for more than one.
+        make_scorer: returns the scorer; called once in every process; has to be picklable for more
+            than one.
         workers: processes; 1 = this one.
         threads: threads of each process, where there are several.
     """
@@ -268,7 +270,7 @@ def score_with_ray(
 
     Args:
         jobs: jobs to score, in any order.
-        make_scorer: called once in every actor; has to be picklable.
+        make_scorer: returns the scorer; called once in every actor; has to be picklable.
         workers: actors, of one core each.
         address: address of the cluster; empty = `RAY_ADDRESS`, else a new one on this machine.
 

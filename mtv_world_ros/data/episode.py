@@ -113,7 +113,7 @@ class EpisodeInfo:
     """Metadata of an episode.
 
     Attributes:
-        path: its folder or file.
+        path: folder or file of the episode.
         task: name of the task; empty where not recorded.
         outcome: `success`, `failure` or `unknown`.
         seed: seed of the simulated scene, or None.
@@ -319,7 +319,7 @@ class Episode:
         masks: object masks of the views that have them; None where there are none.
         instructions: (stamp [ns], text), by stamp.
         object_poses: None if not recorded.
-        unknown: what is not known of the cameras of some views (`pose`, or `pose and
+        unknown: parameters that are not known of some views' cameras (`pose`, or `pose and
             intrinsics`), by view; `cameras` has a placeholder.
         camera_tracks: (N, 4, 4) T_mount_camera [m] at the images of each view whose camera moves
             against the robot's links; `cameras` has the first one.

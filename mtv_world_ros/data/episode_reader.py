@@ -124,8 +124,8 @@ def read_episode(
         topics: topics that differ from the default names, by view or by `joint_states`,
             `joint_trajectory`, `instruction`, `object_poses`, e.g.
             `{'low': '/camera_low/color/image_raw'}`.
-        mapping: what the topics of a robot's own bag are; `topics` goes before it.
-        robot: its links may carry cameras whose poses are from TF; None = any frame may.
+        mapping: topics of a robot's own bag; `topics` takes precedence.
+        robot: robot whose links may carry cameras with poses from TF; None = any frame may.
         unknown_mount: link that carries cameras whose pose is not known; they get a placeholder
             (without a CameraInfo, for the intrinsics too) and are named in `Episode.unknown`;
             empty = they are an error.

@@ -129,7 +129,7 @@ def hold_at_stops(
 
     Args:
         plans: (start stamp [ns], trajectory, or the joint names of an empty one), by stamp.
-        states: measured positions.
+        states: measured joint positions.
 
     Returns:
         Plans by stamp, and how many were empty. An empty one of other joints is left out.
@@ -214,7 +214,7 @@ def complete_plans(
     Args:
         plans: (start stamp [ns], trajectory), by stamp.
         states: measured positions; None = nothing is completed.
-        robot: the robot.
+        robot: robot whose joints every plan gets.
         chunk_s: length of plans between plans [s].
 
     Returns:
@@ -240,8 +240,8 @@ class _Measured:
     """Measured positions between stamps.
 
     Args:
-        states: at least those of the robot.
-        robot: whose order is taken.
+        states: measured positions of at least the robot's joints.
+        robot: robot whose order of joints is taken.
     """
 
     def __init__(self, states: JointStates, robot: RobotModel) -> None:
@@ -296,6 +296,6 @@ class _Measured:
 
 
 def _union(times: FloatArray, more: FloatArray) -> FloatArray:
-    """Both, in order; of `more` those that are not among the times already."""
+    """Return the sorted union of two arrays of times; equal times count once."""
     apart = np.abs(more[:, None] - times[None]).min(axis=1, initial=np.inf) > SAME_S
     return np.sort(np.concatenate([times, more[apart]]))

@@ -88,9 +88,10 @@ def read_sample(
     """Return the positions of a JointState by joint.
 
     Args:
-        names: names of the message.
-        positions: one a name.
-        joints: those that matter; the others are ignored, whatever they hold. None = all.
+        names: names of the joints in the message.
+        positions: position of each name [rad or m].
+        joints: names of the joints that are read; others are ignored, whatever their positions.
+            None = all.
     """
     found: dict[str, float] = {}
     faults: dict[str, str] = {}
@@ -176,10 +177,10 @@ class _Course:
     """Samples of one joint while they arrive.
 
     Attributes:
-        stamp_ns, position: of the last sample that was taken [ns], [rad or m].
+        stamp_ns, position: stamp [ns] and position [rad or m] of the last sample that was taken.
         other: stamp of the first and the last sample of a course out of reach [ns], and its last
             position; None = there is none.
-        jumps: for each of the newest samples, whether it was out of reach.
+        jumps: one entry for each of the newest samples: whether it was out of reach.
         step, step_s: last step that was taken [rad or m], [s].
     """
 
@@ -533,7 +534,7 @@ def mend_rows(
         what: name of the table or feature, for texts.
         times: (T,) times of the rows [s].
         positions: (T, J) positions in the robot's order [rad or m].
-        robot: gives names and limits.
+        robot: robot whose joint names and limits are used.
 
     Raises:
         EpisodeError: a joint has no position at all, or see `find_unreachable`.
@@ -588,9 +589,9 @@ def merge_joint_states(
     Args:
         topic: topic, for texts.
         messages: (stamp [ns], sensor_msgs/JointState), in the order received.
-        warnings: gets what was odd and how it was handled.
+        warnings: list that repairs and oddities are added to, one line each.
         robot: samples that its joints cannot have moved to are left out; None = not checked.
-        renamed: gives the robot's names of the recorded ones.
+        renamed: function that returns the robot's names of recorded names.
         constants: positions of joints that are not recorded [rad or m].
 
     Returns:

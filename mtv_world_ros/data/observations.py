@@ -23,12 +23,12 @@ VIEW_SKEW_S = 0.05
 def newest_observation(
     episode: Episode, views: Sequence[str], robot: RobotModel, stamp_ns: int
 ) -> Observation:
-    """Return what was seen last before a time, as the node sees it.
+    """Return the newest frames and joint positions before a time, as the node observes them.
 
     Args:
         episode: the episode.
         views: names of the V views.
-        robot: gives the order of the joints.
+        robot: robot whose order of joints is taken.
         stamp_ns: the time [ns].
 
     Raises:
@@ -55,12 +55,12 @@ def newest_observation(
 def observation_after(
     episode: Episode, views: Sequence[str], robot: RobotModel, start_s: float
 ) -> Observation:
-    """Return what was seen nearest to a time since the first frame of the first view [s].
+    """Return the frames and joint positions nearest to a time after the first frame [s].
 
     Args:
         episode: the episode.
         views: names of the V views.
-        robot: gives the order of the joints.
+        robot: robot whose order of joints is taken.
         start_s: the time [s].
 
     Raises:

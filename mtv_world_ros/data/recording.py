@@ -62,7 +62,8 @@ class Recording:
             views, then NaN until seen; None where neither is there.
         warnings: problems found and how the reader handled them.
         place: name of the robot cell; empty = not stated.
-        recorded: V views as they were recorded, and their cameras; empty = from a cache.
+        recorded: frames and camera of each of the V views at the recorded size; empty = read from
+            a cache.
     """
 
     path: Path
@@ -135,7 +136,8 @@ def stitch(trajectories: Sequence[tuple[int, JointTrajectory]], origin_ns: int) 
     """Join trajectory messages into one; each counts until the next one starts.
 
     Args:
-        trajectories: (start stamp [ns], trajectory) with equal joint names, in any order.
+        trajectories: pairs of a start stamp [ns] and a trajectory, all with the same joint names,
+            in any order.
         origin_ns: zero of the result's clock.
 
     Raises:

@@ -102,8 +102,8 @@ def cut_clip(
     """Cut the clip that starts at recorded frame `start`.
 
     Args:
-        recording: the episode.
-        start: recorded frame.
+        recording: recording of the episode.
+        start: number of the recorded frame that the clip starts from.
         spec: spec of the model; its clock counts.
         num_frames: frames that follow the first one; default: those of a chunk.
 
@@ -148,7 +148,7 @@ def commanded(recording: Recording, start: int, times: FloatArray) -> FloatArray
     """Return (len(times), J) positions: measured at frame `start`, commanded after it.
 
     Args:
-        recording: the episode.
+        recording: recording of the episode.
         start: recorded frame that is time zero.
         times: [s] since that frame, from 0 on.
     """
@@ -206,7 +206,7 @@ def cached_recording(
     Args:
         path: folder of the episode.
         spec: views and size of the frames.
-        robot: of the episode.
+        robot: robot of the episode.
         cache: folder of the cache.
         source: topics and calibration of the episode.
         read: reads a file of the cache, as `read_arrays` does.

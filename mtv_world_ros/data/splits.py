@@ -91,9 +91,10 @@ class Selection:
     """Episodes to score.
 
     Attributes:
-        paths: their folders.
+        paths: folders of the episodes.
         split: split of the chosen episodes; `all` where the data set has no splits.
-        zero_shot: by folder what the model was not trained for, where the data set says so.
+        zero_shot: property that the model was not trained for (`view`, `task` or `object`), by
+            folder, where the data set states one.
         num_in_dataset: number of episodes in the data set.
     """
 
@@ -116,7 +117,7 @@ def select(
             splits and, per episode, `zero_shot`: `view`, `task` or `object`.
         split: name of a split, or `all`; None = `default` where the data set has it, else `all`.
         limit: maximum number of episodes; the first ones are kept.
-        default: see `split`.
+        default: name of the split where none is given, see `split`.
 
     Raises:
         EpisodeError: the folder holds no episodes, or none of the split.

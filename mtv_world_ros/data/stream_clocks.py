@@ -74,7 +74,7 @@ class StampedStream:
     """Stamps and receive times of the messages of one sender.
 
     Attributes:
-        name: topic.
+        name: name of the topic.
         key: view or stream of the mapping, e.g. `front` or `joint_states`.
         stamps_ns: (N,) stamps of the headers [ns]; 0 = not stamped.
         received_ns: (N,) when the messages were recorded [ns].
@@ -100,8 +100,8 @@ class ClockStep(NamedTuple):
     """A clock that changes at once.
 
     Attributes:
-        before_ns: receive time of the last message before it [ns].
-        after_ns: that of the first message after it [ns].
+        before_ns: receive time of the last message before the change [ns].
+        after_ns: receive time of the first message after the change [ns].
         size_s: change of the offset [s]; negative = back.
     """
 
@@ -128,7 +128,7 @@ class ClockBreakError(EpisodeError):
     """All clocks of a recording change at once: it is several recordings.
 
     Attributes:
-        windows: its parts.
+        windows: parts of the recording, each with one clock.
     """
 
     def __init__(self, text: str, windows: Sequence[Window]) -> None:
@@ -142,7 +142,7 @@ class SettledClocks:
 
     Attributes:
         stamps_ns: (N,) stamps of each stream.
-        is_kept: (N,) of each stream; the others have stamps that cannot be.
+        is_kept: (N,) whether each message of a stream is kept; the others have impossible stamps.
         offset_s: offset of the clock against the receive times, at the middle of the recording.
         notes: repairs and oddities, one line each.
     """
@@ -163,7 +163,7 @@ def settle_clocks(
 
     Args:
         streams: images, joint states and commands, in the order of the recording.
-        settings: thresholds.
+        settings: thresholds of steps, gaps and offsets.
 
     Raises:
         ClockBreakError: all clocks change at once.
@@ -303,9 +303,9 @@ def find_steps(
     """Return where the offset of a stream changes at once and stays changed.
 
     Args:
-        stamps: (N,) [ns] in the order received.
-        received: (N,) not decreasing [ns].
-        settings: thresholds.
+        stamps: (N,) stamps in the order received [ns].
+        received: (N,) receive times, not decreasing [ns].
+        settings: thresholds of a step.
     """
     ds, dr = np.diff(stamps) * 1e-9, np.diff(received) * 1e-9
     if len(ds) < 1 or not received[-1] > received[0]:
@@ -628,8 +628,8 @@ def check_row_times(times: FloatArray, what: str, rate_hz: float | None = None) 
     """Check the times of the rows of a table, which has no receive times but the rows' order.
 
     Args:
-        times: (N,) [s].
-        what: their name, e.g. `timestamp`.
+        times: (N,) times of the rows [s].
+        what: name of the column, e.g. `timestamp`.
         rate_hz: rows a second by other information; None = not known.
 
     Returns:

@@ -51,13 +51,13 @@ class _Edge:
     """The transforms from one frame to another: the first one and their span.
 
     Attributes:
-        T: (4, 4) the first one [m].
-        last: position and quaternion of the last one.
-        low: (4, 4) least entries.
-        high: (4, 4) greatest entries.
-        stamp_ns: stamp of the newest one [ns]; None = from /tf_static.
-        count: transforms.
-        is_still: whether they vary by no more than `STILL`.
+        T: (4, 4) first transform [m].
+        last: position and quaternion of the last transform.
+        low: (4, 4) least value of each entry.
+        high: (4, 4) greatest value of each entry.
+        stamp_ns: stamp of the newest transform [ns]; None = from /tf_static.
+        count: number of transforms.
+        is_still: whether the transforms vary by no more than `STILL`.
         recent: stamps [ns] and numbers of the last ones while it moves, in the order received.
     """
 
@@ -100,11 +100,11 @@ class _Replacement(NamedTuple):
     """The last change of a static transform.
 
     Attributes:
-        count: changes.
+        count: number of changes.
         old_parent: frame that the child was in before.
-        parent: frame that it is in.
-        before: (4, 4) the transform before [m].
-        after: (4, 4) the newest one.
+        parent: frame that the child is in now.
+        before: (4, 4) transform before the change [m].
+        after: (4, 4) newest transform [m].
     """
 
     count: int
@@ -150,7 +150,8 @@ class TransformTree:
 
         Args:
             message: message of /tf or /tf_static.
-            latched: of /tf_static; the transforms hold for all times, and the newest wins.
+            latched: whether the message is from /tf_static, whose transforms hold for all times;
+                the newest wins.
         """
         for item in message.transforms:
             edge = self.name(item.header.frame_id), self.name(item.child_frame_id)
@@ -251,7 +252,7 @@ class TransformTree:
         """Return the nearest of the robot's links that is fixed to a frame.
 
         Args:
-            frame: e.g. a camera's optical frame.
+            frame: name of the frame, e.g. a camera's optical frame.
             links: links of the robot; empty = the topmost frame that is fixed to it.
 
         Raises:
@@ -393,7 +394,7 @@ def pose_track(
 
     Args:
         messages: TFMessages of /tf.
-        frame: e.g. a camera's optical frame.
+        frame: name of the frame, e.g. a camera's optical frame.
         links: links of the robot; the nearest one counts.
         stamps_ns: (N,) when the poses are wanted; between two transforms they are interpolated.
         prefix: prefix of frame names, removed.

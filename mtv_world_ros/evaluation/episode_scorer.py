@@ -65,7 +65,8 @@ class EvaluationJob:
         path: folder of the episode.
         name: name of its results, unique in the evaluation.
         donors: episodes that may lend their actions; the first one that can be read does.
-        zero_shot: what the model was not trained for in it: `view`, `task`, `object`; or empty.
+        zero_shot: property that the model was not trained for: `view`, `task` or `object`; empty =
+            none.
         objects: names of its objects; empty = the pipeline's, or recorded, or named by the task.
         task: task that the episode defines; None = the one that its instruction matches.
     """

@@ -91,7 +91,8 @@ def evaluate(
         name: fingerprint of the checkpoint; only results of the same name are taken over, and none
             without a name.
         label: name of its rows in tables that compare checkpoints.
-        zero_shot: by path what the model was not trained for: `view`, `task` or `object`.
+        zero_shot: property that the model was not trained for (`view`, `task` or `object`), by
+            path of the episode.
         provenance: command, date and versions, by heading; goes into metrics.json.
         parallel: processes to score with; None = this one.
         describer: names the objects from each episode's first frame; None = see `EvaluationJob`.
@@ -159,9 +160,9 @@ def make_jobs(
 
     Args:
         paths: folders of the episodes.
-        zero_shot: by path what the model was not trained for: `view`, `task` or `object`.
+        zero_shot: property that the model was not trained for, by path of the episode.
         seed: seed of the order.
-        tasks: by path the tasks that episodes define.
+        tasks: tasks that episodes define, by path of the episode.
     """
     order = np.random.default_rng(seed).permutation(len(paths))
     shuffled = [Path(paths[index]) for index in order]
@@ -181,7 +182,7 @@ def make_jobs(
 
 
 def make_scorer(make_pipeline: MakePipeline, config: EvaluationConfig, out: Path) -> EpisodeScorer:
-    """Return what scores episodes, with everything that the configuration asks to measure.
+    """Return the scorer of episodes, with every measure that the configuration asks for.
 
     Raises:
         ConfigError, CheckpointError: weights or packages for that are missing.

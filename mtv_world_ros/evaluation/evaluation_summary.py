@@ -62,7 +62,7 @@ class EvaluationSummary:
         label: name of its rows in tables that compare checkpoints.
         spec: views, rate and size of the model's frames.
         settings: settings of the evaluation, by name; written to metrics.json.
-        results: scored episodes.
+        results: results of the scored episodes.
         failed: reason by path of those that could not be scored.
         provenance: versions, machine and command, by heading.
         distances: FID and FVD by (zero-shot set, view), the set None for all episodes.

@@ -397,11 +397,12 @@ def fit_logistic(
     The bias is not penalised.
 
     Args:
-        features: (N, F).
-        labels: (N,) outcomes.
+        features: (N, F) features of the samples.
+        labels: (N,) outcomes of the samples, 0 or 1.
         l2: strength of the penalty; positive, so that there is one minimum.
         prior: (F,) weights that hold where the rows say nothing; None = zero.
-        non_negative: no weight below 0, for features that grow with the probability.
+        non_negative: whether no weight may be below 0, for features that grow with the
+            probability.
 
     Raises:
         ConfigError: there are no rows, or `l2` is not positive.

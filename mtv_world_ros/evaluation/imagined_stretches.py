@@ -37,7 +37,7 @@ class Stretch:
         frames: (V, 1 + T, H, W, 3) recorded frames on the model's clock, frame 0 the start.
         object_ids: (V, 1 + T, H, W) true masks as identities, None where not recorded.
         positions: (1 + T, J) measured at these frames [rad or m].
-        points: (1 + T, O, 3) where two views show the recording's objects [m], NaN until seen;
+        points: (1 + T, O, 3) places of the recording's objects by two views [m], NaN until seen;
             None where the identities are the simulator's, or no place is known.
     """
 
@@ -136,7 +136,7 @@ def imagine_stretch(
         stretch: recorded frames to imagine.
         actions: the episode whose commands are executed: the same one, or another for a control.
         seed: seed of the noise.
-        num_inference_steps: denoising steps.
+        num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
         num_seeds: rollouts whose mean the success estimate is.
     """
     trajectory = _commands(pipeline, actions, stretch)
@@ -145,7 +145,7 @@ def imagine_stretch(
 
 
 def observe_stretch(pipeline: Pipeline, recording: Recording, stretch: Stretch) -> SuccessEstimate:
-    """Return what the estimate says of recorded frames, those of a stretch the last ones."""
+    """Return the estimate on recorded frames; it ends with the frames of the stretch."""
     episode = _begin(pipeline, recording, stretch)
     return episode.observe(stretch.frames[:, 1:], stretch.positions).success
 

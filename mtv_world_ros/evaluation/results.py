@@ -122,7 +122,7 @@ def stored_stretch(
     masks: ObjectMasks,
     j: FloatArray,
 ) -> StoredRollout:
-    """Return what is kept of a stretch for later reports.
+    """Return the frames, masks and scores of a stretch that later reports need.
 
     Args:
         chunks: imagined from the stretch's first frame.

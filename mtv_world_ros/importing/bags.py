@@ -338,11 +338,11 @@ def write_imported(
     """Write a recording as an episode, whose folder appears when it is complete.
 
     Args:
-        episode: what was read, with cameras.
+        episode: recording as it was read, with cameras.
         source: name of the recording.
         out: folder of the episode.
         mapping: task, outcome and quality of what is written, and how commands are checked.
-        robot: gives the order of joints and their limits.
+        robot: robot whose order of joints and limits are used.
         key: digest of mapping, robot and calibration.
         stage: names the objects and finds their masks.
 

@@ -22,7 +22,7 @@ def boxes_page(
 
     Args:
         found: the recordings by name.
-        read: reads one.
+        read: function that reads a recording.
         names: names of objects, to choose from.
 
     Raises:

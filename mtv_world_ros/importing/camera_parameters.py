@@ -124,7 +124,8 @@ class CameraTrack(NamedTuple):
     Attributes:
         camera: camera at the images' size, posed as at the first row.
         poses: (T, 4, 4) T_mount_camera [m] of the rows, where it moves.
-        note: how images of another size than the calibration's were taken; empty = they are not.
+        note: treatment of images of another size than the calibration's; empty = they have its
+            size.
     """
 
     camera: CameraModel

@@ -37,9 +37,9 @@ class ImportSummary(Generic[Item]):
     """Outcome of an import, by the number of the episode or by bag.
 
     Attributes:
-        made: converted now.
-        kept: were there already.
-        failed: why.
+        made: episodes that were converted now.
+        kept: episodes of an earlier run.
+        failed: reasons of the episodes that could not be converted.
         warnings: problems and how they were handled.
         robot_notes: problems of the robot's description.
     """
@@ -60,9 +60,9 @@ def import_each(
     """Convert the episodes that do not exist yet.
 
     Args:
-        items: e.g. numbers of a data set's episodes.
+        items: keys of the episodes, e.g. their numbers in a data set.
         key: digest of mapping, robot and calibration; an episode made with others is an error.
-        place: gives the folder of an item's episode.
+        place: function that returns the folder of an item's episode.
         convert: writes the folder, unless it divides the item into further ones of `items`;
             returns what was odd and how it was handled.
     """

@@ -61,11 +61,11 @@ class EpisodeEntry:
     """One episode of a dataset.
 
     Attributes:
-        index: its number.
+        index: number of the episode.
         length: number of rows.
-        data_file: parquet file with its rows, maybe among others'.
+        data_file: parquet file with the episode's rows, maybe among others'.
         videos: videos by feature.
-        tasks: texts.
+        tasks: instructions of the episode.
     """
 
     index: int
@@ -79,7 +79,7 @@ class LeRobotDataset:
     """A dataset: a folder with `meta/`, `data/` and `videos/`.
 
     Attributes:
-        root: the folder.
+        root: folder of the dataset.
         version: version of the format.
         fps: rows a second [Hz].
         features: types and shapes of the columns, by name.
@@ -122,7 +122,7 @@ class LeRobotDataset:
             ) from error
 
     def feature(self, name: str, kinds: Sequence[str] = ()) -> dict[str, Any]:
-        """Return what the dataset says about a feature.
+        """Return the description of a feature in the dataset's metadata.
 
         Raises:
             ConfigError: there is none of that name and (if any are given) kinds.
@@ -137,7 +137,7 @@ class LeRobotDataset:
         return self.features[name]
 
     def colour_feature(self, name: str) -> dict[str, Any]:
-        """Return what the dataset says about a camera's video or images.
+        """Return the description of a camera's video or images in the dataset's metadata.
 
         Raises:
             ConfigError: there is no such feature, or it is a depth map.

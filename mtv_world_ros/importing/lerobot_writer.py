@@ -53,13 +53,13 @@ class _Rows:
     """An episode on the dataset's clock.
 
     Attributes:
-        times: (T,) [s].
-        state: (T, J) measured [rad or m].
-        action: (T, J) commanded one period later [rad or m].
-        frames: (V, T, H, W, 3) uint8 RGB.
+        times: (T,) times of the rows [s].
+        state: (T, J) measured joint positions [rad or m].
+        action: (T, J) joint positions commanded one period later [rad or m].
+        frames: (V, T, H, W, 3) uint8 RGB recorded frames.
         outcome: `success`, `failure` or `unknown`.
         task: text for the robot.
-        cameras: V cameras.
+        cameras: cameras of the V views.
     """
 
     times: FloatArray
@@ -90,7 +90,7 @@ def export_dataset(
     Args:
         episodes: folders of episodes with the same views and image sizes.
         out: folder of the dataset.
-        robot: gives the order of joints.
+        robot: robot whose order of joints is written.
         robot_name: bundled name or file of the robot, for the mapping.
         fps: rows a second [Hz].
         progress: wraps the episodes, e.g. in a progress bar.

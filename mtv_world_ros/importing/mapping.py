@@ -124,7 +124,7 @@ class ActionStream(Stream):
             values: values in the dataset's units.
             names: names of the columns; empty where the dataset does not name them.
             measured: (T, J) positions of the same rows.
-            robot: gives the order of joints, and the tools.
+            robot: robot whose order of joints and tools are used.
             state: stream of the measured joints, for commands without `joints`.
 
         Raises:

@@ -28,10 +28,10 @@ class NumberTable:
 
     Attributes:
         path: file that holds them.
-        values: (T, C); nan where a cell holds no number.
-        names: C names, empty where columns have none.
-        keys: everything that the file holds, by key or column.
-        notes: how the file was read, where it is not plain.
+        values: (T, C) numbers; NaN where a cell holds none.
+        names: names of the C columns, empty where they have none.
+        keys: content of the file, by key or column name.
+        notes: deviations of the file from a plain table and how they were read, one line each.
         cells: text of cells that hold no number, by row and column.
     """
 

@@ -86,10 +86,10 @@ class BoxedObjects:
     """Object examples and start masks from boxes that a user drew.
 
     Attributes:
-        boxes: as drawn.
-        examples: how the objects look.
-        starts: by recording and view the first frame (H, W, 3) uint8 RGB and the masks (H, W) of
-            the objects that have a box in it.
+        boxes: boxes as the user drew them.
+        examples: appearance of the objects in their boxes.
+        starts: first frame (H, W, 3) uint8 RGB and masks (H, W) of the objects that have a box in
+            it, by recording and view.
         missing: recordings that have boxes and are not among those of the import.
     """
 
@@ -117,7 +117,7 @@ def learn_objects(
     """Cut the objects out of the frames in which they have boxes.
 
     Args:
-        boxes: as drawn.
+        boxes: boxes as the user drew them.
         found: the recordings of the import by name; boxes of others are not used.
         read: reads a recording.
 

@@ -238,7 +238,7 @@ class VideoFileFrames:
     Attributes:
         times: (N,) times of the frames in the file [s]; None where the file has none that
             increase.
-        note: what is done to the frames and why; empty if nothing is.
+        note: change that is made to the frames, with its reason; empty = none.
 
     Raises:
         EpisodeError: the file is missing or damaged, or holds no frame.
@@ -312,8 +312,8 @@ class FrameMatch:
 
     Attributes:
         numbers: (M,) numbers of the frames.
-        times: (M,) since the first row [s].
-        note: how frames were matched where it is not one frame a row; else empty.
+        times: (M,) times of the frames since the first row [s].
+        note: rule of the match; empty where each row has one frame.
     """
 
     numbers: NDArray[np.int64]
@@ -337,7 +337,7 @@ def match_frames(
 
     Args:
         frame_times: (N,) frame times in the file [s]; None = not known.
-        count: N.
+        count: number of frames, N.
         row_times: (T,) since the first row [s].
         rows_are_timed: whether each row has a time of its own, in place of a rate.
         source: `video` and `rows` choose the times of frames without looking at them.
@@ -460,7 +460,7 @@ def times_in_video(
     The text is empty where each row has a frame at its time, or where no match is found.
 
     Args:
-        path: video file.
+        path: path of the video file.
         times: increasing times of the rows in the file [s].
         tolerance_s: a frame may be this far from its row [s].
         is_alone: whether the file holds these rows and no others. As many frames as rows then
@@ -494,7 +494,7 @@ def video_offset(path: Path, times: FloatArray, tolerance_s: float, *, is_alone:
     names the first row without a frame.
 
     Args:
-        path: video file.
+        path: path of the video file.
         times: increasing times of the rows in the file [s].
         tolerance_s: a frame may be this far from its row [s].
         is_alone: whether the file holds these rows and no others. As many frames as rows then

@@ -130,7 +130,7 @@ class VideoRecording:
     name: str
 
     def file(self, pattern: str) -> Path:
-        """Return a file of it."""
+        """Return the path of a file of the recording."""
         return self.folder / pattern.replace('{name}', self.name)
 
 

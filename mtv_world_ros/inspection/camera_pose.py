@@ -143,7 +143,7 @@ def left_out(total: FloatArray, normal: FloatArray, gradient: FloatArray) -> Flo
     Args:
         total: (6, 6) normal matrix of all measurements, in `UNITS`.
         normal: (6, 6) normal matrix of those left out.
-        gradient: (6,) theirs.
+        gradient: (6,) gradient of those left out.
     """
     ridge = 1e-6 * np.trace(total) * np.eye(6)
     return np.asarray(np.linalg.solve(total - normal + ridge, gradient) * UNITS, np.float64)

@@ -108,10 +108,10 @@ def check_commands(
     """Check the commands against frames, and how late the joints follow them.
 
     Args:
-        commands: all of the recording, in the robot's order; None where there are none.
+        commands: all commands of the recording, in the robot's order; None where there are none.
         origin_ns: time zero of the commands [ns].
         frames_ns: frames of the first view.
-        joints: measured.
+        joints: measured joint positions.
     """
     if commands is None:
         return {'commands': 'none'}, [

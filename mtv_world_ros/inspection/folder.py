@@ -46,11 +46,11 @@ class FolderInspection:
     """Inspections of the episodes of a folder.
 
     Attributes:
-        episodes: one of each, by name.
+        episodes: inspection of each episode, by name.
         failed: reasons why episodes could not be inspected, by name.
         places: places of each view's camera in `members`, by view.
         members: names of the episodes that have the view, by view.
-        findings: about all episodes.
+        findings: findings about all episodes.
         notes: other things to know of all episodes.
     """
 

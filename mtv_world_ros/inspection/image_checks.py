@@ -174,7 +174,7 @@ class MirroredFrames:
     """Frames that are mirrored left to right when asked for.
 
     Args:
-        track: the frames.
+        track: frames of the recording.
     """
 
     def __init__(self, track: Track) -> None:

@@ -182,7 +182,7 @@ def to_json(
     """Return the content of `check.json`: verdicts, numbers, faults and what was not checked.
 
     Args:
-        inspections: one of each episode, by name.
+        inspections: inspection of each episode, by name.
         failed: reasons why episodes could not be inspected, by name.
     """
     episodes: dict[str, Any] = {}

@@ -68,14 +68,14 @@ class MotionResidual:
     """Offset of the moving pixels from the projected robot.
 
     Attributes:
-        shift_px: (x, y) from the drawn robot to the moving pixels, in pixels of the recorded
+        shift_px: (x, y) shift from the drawn robot to the moving pixels, in pixels of the recorded
             images; NaN where it could not be measured.
-        match: mean correlation of drawn and seen motion there, -1 .. 1.
+        match: mean correlation of drawn and seen motion under that shift, -1 .. 1.
         match_here: correlation where the robot is drawn.
         contrast: z-score of the best shift among all shifts.
         lag_s: delay of the images against the joint states at which the motions fit best [s].
-        lag_gain: how much better they fit there than without a delay, as a share, in that half
-            of the recording in which it is less; below zero where a half fits worse.
+        lag_gain: improvement of the fit by that delay, as a fraction, in the half of the recording
+            in which it is less; below zero where a half fits worse.
         best_change: change of the camera that fits best among those tried, and its match.
         num_pairs: pairs of frames in which the robot moves.
         reason: reason why it could not be measured; empty if it was.
@@ -111,10 +111,10 @@ def measure_residual(
     Args:
         track: frames of a camera that stands still.
         camera: calibration of the camera at the size of the frames.
-        robot: gives the links' poses.
+        robot: robot whose link poses are drawn.
         shapes: shapes of the links.
-        joints: measured positions.
-        search: search range.
+        joints: measured joint positions.
+        search: limits of the search.
     """
     if camera.mount_link in moving_links(robot):
         return MotionResidual(
@@ -271,7 +271,7 @@ def _correlate(
     Args:
         seen: change of each pixel, a pair of frames each, with a rim.
         drawn: (2 P, H, W) silhouettes of the link in the frames of the pairs.
-        whole: (2 P, H, W) those of the robot.
+        whole: (2 P, H, W) silhouettes of the whole robot in the same frames.
         radius: radius of the search [px].
     """
     size = (2 * radius + 1,) * 2

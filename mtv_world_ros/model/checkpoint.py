@@ -39,7 +39,7 @@ class Checkpoint:
 
     Attributes:
         name: name or path as it was given.
-        folder: the folder.
+        folder: folder of the checkpoint.
         card: contents of its `world_model.json`.
         adapter: LoRA adapter that is used with it, in place of its own; None = its own, if any.
     """

@@ -27,8 +27,8 @@ class Conditioning:
     """Latents a chunk is denoised under.
 
     Attributes:
-        control: (B, V, C, F, h, w) of the control's video, in step with the denoised latents;
-            zero where the control feeds none.
+        control: (B, V, C, F, h, w) latents of the control's video, in step with the denoised
+            latents; zero where the control feeds none.
         start_control: (B, V, C, h, w) latents of the control's frame 0.
         start: (B, V, C, F, h, w) the start image's channel slot.
         reference: (B, V, C, h, w) latents of the start image.
@@ -131,7 +131,7 @@ class ControlBatch:
         num_frames: number of frames, T.
         video: (B, V, 1 + T, H, W, 3) uint8 RGB.
         context: (B, L) int64, `PADDING` = no token, or (B, L, size) float32, NaN = none.
-        frame: (B, 1 + T, size) float32.
+        frame: (B, 1 + T, size) float32 vector of each frame.
     """
 
     num_frames: int

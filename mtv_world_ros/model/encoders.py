@@ -97,7 +97,7 @@ class ImageEncoder:
     on one encode it once.
 
     Args:
-        model: transformers' `CLIPVisionModel`.
+        model: CLIP's image model, transformers' `CLIPVisionModel`.
         source: the checkpoint it came from.
         num_kept: images whose tokens are kept.
     """

@@ -34,8 +34,8 @@ def build_autoencoder(config: Mapping[str, Any]) -> Autoencoder:
     """Return the autoencoder of a preset or config file, without trained weights.
 
     Args:
-        config: its arguments; `_class_name` is `SpaceToDepthAutoencoder` (default) or
-            `AutoencoderKLWan`.
+        config: arguments of the autoencoder; `_class_name` is `SpaceToDepthAutoencoder` (default)
+            or `AutoencoderKLWan`.
 
     Raises:
         CheckpointError: another class.
@@ -50,8 +50,8 @@ def build_scheduler(config: Mapping[str, Any]) -> Scheduler:
     """Return the noise schedule of a preset or config file.
 
     Args:
-        config: its arguments; `_class_name` is `FlowMatchEulerDiscreteScheduler` (default) or
-            `UniPCMultistepScheduler`.
+        config: arguments of the scheduler; `_class_name` is `FlowMatchEulerDiscreteScheduler`
+            (default) or `UniPCMultistepScheduler`.
 
     Raises:
         CheckpointError: another class, or UniPC without flow matching.
@@ -70,7 +70,8 @@ def check_video(autoencoder: Autoencoder, transformer: Any, spec: WorldModelSpec
     """Check that a chunk divides into latents and tokens.
 
     Args:
-        autoencoder: its kind decides.
+        autoencoder: autoencoder whose compression decides; `SpaceToDepthAutoencoder` divides every
+            chunk.
         transformer: configuration of the transformer.
         spec: size and number of frames.
 

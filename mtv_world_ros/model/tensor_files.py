@@ -30,7 +30,7 @@ class StoredTensor:
     Attributes:
         shape: shape of the tensor.
         dtype: number format in safetensors' words, e.g. `BF16`.
-        read: reads it.
+        read: function that reads the tensor.
     """
 
     shape: tuple[int, ...]

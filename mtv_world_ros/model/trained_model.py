@@ -49,7 +49,7 @@ class TrainedModel:
         adapter: folder of a LoRA adapter for the transformer.
         object_motion: folder of the contact settings and the arms' response, for foresight.
         robot: folder of the robot that the model was trained on, and of the default calibration.
-        control: how plans enter the model, to be saved; loaded with a robot, see
+        control: control that is saved with the model; loaded with a robot, see
             `control.registry.load_control`.
     """
 

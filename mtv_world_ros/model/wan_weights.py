@@ -137,10 +137,10 @@ class PartReport:
     """Result of importing one part: tensors written, new and left out.
 
     Attributes:
-        part: e.g. `transformer`.
-        source: file or folder they came from.
-        loaded: tensors written.
-        parameters: numbers in them.
+        part: name of the part, e.g. `transformer`.
+        source: file or folder that the tensors came from.
+        loaded: number of tensors written.
+        parameters: number of values in these tensors.
         dtypes: number formats of the tensors.
         new: tensors that the source lacks, zero now.
         unused: tensors that were left out, and why.

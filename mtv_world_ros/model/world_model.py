@@ -74,10 +74,10 @@ def sample_latents(
         scheduler: noise levels, shift and step rule.
         conditioning: conditioning of one chunk (batch 1).
         seed: seed of the noise.
-        num_inference_steps: denoising steps.
+        num_inference_steps: denoising steps a chunk.
         should_stop: asked between steps.
-        guidance_scale: how far to go from what `conditioning.negative_text` gives to what
-            `conditioning.text` gives; 1 = no guidance, and half the work.
+        guidance_scale: factor of the difference between the predictions for `conditioning.text`
+            and for `conditioning.negative_text`; 1 = no guidance, and half the work.
 
     Raises:
         RolloutPreempted: `should_stop` said so between two steps.
@@ -165,7 +165,7 @@ class DiffusionWorldModel:
 
     Args:
         checkpoint: the trained parts.
-        device: e.g. `cpu` or `cuda`.
+        device: PyTorch device, e.g. `cpu` or `cuda`.
         dtype: dtype of the transformer's computations.
         serving: options that make the model faster or smaller.
 

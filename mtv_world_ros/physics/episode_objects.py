@@ -198,7 +198,7 @@ class ObjectForesight:
         """Return the objects of masks in the frames of an observation, at the model's size.
 
         Args:
-            source: the same observation at the recorded size.
+            source: the observation at the recorded size.
             names: names of the O objects.
             frames: (V, H, W, 3) uint8 RGB.
             masks: (V, O, H, W) masks of the objects.

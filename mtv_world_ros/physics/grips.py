@@ -106,8 +106,8 @@ class GripCourse:
         """Return the grips at a row, and where the solids are then.
 
         Args:
-            row: the row.
-            grips: number of a solid -> its grip at the row before.
+            row: number of the row.
+            grips: grip at the row before, by number of the solid.
             poses: (O, 4, 4) T_base_solid where nothing but contact holds the solids [m].
             solids: the O solids as found.
         """

@@ -250,8 +250,8 @@ class FoundObjects:
         """Return the objects after each part of a plan, which show the same motion as before.
 
         Args:
-            parts: (1 + T * `tracked.commands_a_step`, J) each [rad or m], evenly spaced; row 0
-                where the robot is by then.
+            parts: (1 + T * `tracked.commands_a_step`, J) joint positions of each part [rad or m],
+                evenly spaced; row 0 where the robot is by then.
         """
         found: list[FoundObjects] = []
         for positions in parts:

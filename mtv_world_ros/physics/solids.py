@@ -70,11 +70,11 @@ class Solid:
 
     Attributes:
         centre: (3,) centre of its bounding box [m].
-        size: (3,) along its own x, y and z [m].
+        size: (3,) extents along its own x, y and z [m].
         yaw: rotation about z [rad].
         is_round: whether the solid is a cylinder.
         is_open: whether the solid is hollow and open at the top.
-        is_hidden: something hid a part of it when it was found again.
+        is_hidden: whether something hid a part of it when it was found again.
         fills: (V,) fraction of the outline that the mask fills in each view; 0 = not seen.
         error_px: root mean square distance of its outline from those of the masks.
     """

@@ -31,7 +31,8 @@ class Judge:
     Attributes:
         title: heading of its row in the table of what a picture is worth.
         column: head of its column in the optimism table; empty = it has none.
-        episodes: what it judges, in the ranking's own tables; empty = it is not there.
+        episodes: words for the rollouts that it judges, in the ranking's own tables; empty = it is
+            not there.
     """
 
     title: str
@@ -78,7 +79,7 @@ class Score:
 
     Attributes:
         value: the number.
-        interval: 95 %.
+        interval: 95 % interval of the number.
         count: policies, rollouts, failures or flips, depending on the measure.
         hits: successes of a rate; of estimates, their sum.
         num_unknown: rollouts of a rate without an estimate.
@@ -241,7 +242,7 @@ def area_interval(
 
     Args:
         said: (N,) estimates; of two, the first area less the second one is taken.
-        real: (N,) outcomes.
+        real: (N,) true outcomes.
         scenes: scene of each of the N rollouts; all of a scene are left out together.
 
     Returns:

@@ -41,7 +41,7 @@ class Thing:
 
     Attributes:
         name: name of the object in the instruction.
-        centre: (3,) [m].
+        centre: (3,) position of the centre [m].
         size: full extents (x, y, z) [m].
         is_rim_held: whether it is taken by its rim, not across the middle.
     """
@@ -152,7 +152,7 @@ def things_in(
         names: names of the O objects.
         masks: (V, O, H, W) masks of one frame.
         cameras: V cameras at the masks' size.
-        poses: V poses T_base_camera (4, 4).
+        poses: (4, 4) poses T_base_camera of the V cameras [m].
     """
     things = {}
     for name, seen in zip(names, masks.swapaxes(0, 1), strict=True):

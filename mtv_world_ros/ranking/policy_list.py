@@ -179,7 +179,7 @@ def check_tasks(policies: Sequence[ListedPolicy], tasks: Sequence[Task]) -> None
         tasks: tasks of the ranking.
 
     Raises:
-        ConfigError: a policy is for other tasks than those of the ranking, or defines one of them
+        ConfigError: a policy is for other tasks than those of the ranking, or defines such a task
             differently.
     """
     wanted = {task.name: task for task in tasks}

@@ -39,11 +39,11 @@ class Optimism:
     """Scores of all judges over a ranking's rollouts and over those of each fault kind.
 
     Attributes:
-        results: one a rollout; some of the policy `expert`.
-        flips: of rollouts whose true outcome is another than the expert's in the same scene, by
-            name: whether the imagined last frame is nearer to what really happened than to what
-            happened under the expert's commands, where objects are in either. Arms do not count:
-            they follow the commands in imagination as well.
+        results: results of the rollouts; those of the policy `expert` are the reference.
+        flips: verdicts on rollouts whose true outcome differs from the expert's in the same scene,
+            by name of the rollout: whether the imagined last frame is nearer to what really
+            happened than to what happened under the expert's commands, where objects are in
+            either. Arms do not count: they follow the commands in imagination as well.
     """
 
     results: Sequence[Result]
@@ -95,7 +95,7 @@ class Summary:
     """A ranking's results as numbers.
 
     Attributes:
-        results: one a rollout.
+        results: results of the rollouts.
         failed: rollouts without a result, and why.
         num_true: episodes of each task whose true outcomes the powered estimates may use.
         provenance: command, checkpoint and machine, by heading.

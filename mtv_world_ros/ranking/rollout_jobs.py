@@ -89,7 +89,7 @@ class StoredEstimate:
 
     Attributes:
         probability: NaN = abstains.
-        interval: (low, high).
+        interval: 95 % interval (low, high) of the probability.
         jaccard: (V, O) J of the objects with where they should be; NaN where not known.
         reasons: evidence of the estimate, or why it abstains.
     """
@@ -186,17 +186,16 @@ class Result:
         task: name of the task.
         index: number of the episode within the task.
         seed: random seed of the episode, the policy and the denoising noise.
-        ever: the task was done at some time, in the simulator.
-        final: it held at the end; this is what counts as success.
+        ever: whether the task was done at some time, in the simulator.
+        final: whether the task was done at the end, in the simulator; this counts as success.
         imagined: the estimate at the end of the imagined episode.
         foreseen: the share of its foreseen motions that succeed.
         pictures: the estimate from the imagined frames alone, with no motion foreseen.
-        seen: the same estimator on the simulator's own frames: what is wrong with it is not the
-            world model's fault.
+        seen: estimate on the simulator's own frames: its errors are not the world model's.
         no_picture: the rule that sees the commands and the first frame alone.
         num_chunks: answers executed in the simulator.
         num_imagined: answers executed in imagination.
-        is_over: something else than the limit ended the episode, in both.
+        is_over: whether something else than the limit ended the episode, in both worlds.
         seconds: time by stage [s].
         end: reason why the simulated episode ended; empty = not known.
         imagined_end: reason why the imagined episode ended.

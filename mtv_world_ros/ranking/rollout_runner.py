@@ -46,7 +46,7 @@ class RolloutConfig:
         clips: keep each rollout as a video, a contact sheet and frames; takes as long as
             imagining it.
         physics: physics of the simulator, a key of `config/physics.yaml`.
-        make_policy: makes a policy for an episode.
+        make_policy: function that returns the policy of an episode.
     """
 
     num_inference_steps: int = 1
@@ -80,7 +80,7 @@ class RolloutRunner:
         self._sim = SimEpisode(pipeline.robot, self._expert.home, physics=config.physics)
 
     def score(self, job: Job) -> Result:
-        """Return what a policy reached.
+        """Return the result of a policy on an episode in both worlds.
 
         Raises:
             PolicyError: the policy cannot answer.
@@ -89,7 +89,7 @@ class RolloutRunner:
         return self.imagine(job, self.simulate(job))
 
     def simulate(self, job: Job) -> SimulatedRollout:
-        """Return what a policy reached in the simulator."""
+        """Return the rollout of a policy in the simulator."""
         task = job.load_task()
         policy = self.config.make_policy(job.policy, task, job.seed, self._expert)
         spec = self.pipeline.spec
@@ -107,7 +107,7 @@ class RolloutRunner:
         )
 
     def imagine(self, job: Job, real: SimulatedRollout) -> Result:
-        """Return what a policy reached, of a rollout that was simulated already."""
+        """Return the result of a policy whose rollout was simulated already."""
         world = real.world
         begun = time.perf_counter()
         observed = self._begin(real, job)
@@ -251,7 +251,7 @@ class ComparisonRunner:
     """Runs jobs in the imagination of several checkpoints; each is simulated once.
 
     Args:
-        runners: one per checkpoint; their models have the same frame rate.
+        runners: runners of the checkpoints, one each; their models have the same frame rate.
     """
 
     def __init__(self, runners: Sequence[RolloutRunner]) -> None:
@@ -264,7 +264,7 @@ class ComparisonRunner:
             )
 
     def score(self, wanted: WantedJob) -> Results:
-        """Return what a policy reached, as the checkpoints imagine it that are asked for."""
+        """Return the results of a policy on an episode, one for each checkpoint that lacks it."""
         job, real = wanted.job, self._runners[0].simulate(wanted.job)
         return Results(
             tuple(

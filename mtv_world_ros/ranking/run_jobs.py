@@ -29,7 +29,8 @@ class RankedCheckpoint:
     """A checkpoint that imagines the rollouts.
 
     Attributes:
-        make_pipeline: called once in every process; has to be picklable for more than one.
+        make_pipeline: function that returns the pipeline; called once in every process; has to be
+            picklable for more than one.
         out: results go into its folder `rollouts`.
         settings: settings that the results depend on, e.g. the checkpoint.
     """
@@ -64,8 +65,8 @@ def run_jobs(
         ray_address: address of a Ray cluster; empty = a running or a new one; None = no Ray.
         overwrite: replace results of other settings.
         show_progress: draw a progress bar, on a terminal.
-        watch: is called with the first checkpoint's results, those of an earlier run at first,
-            then each as it comes.
+        watch: called with the first checkpoint's results: at first with those of an earlier run,
+            then with each as it comes.
 
     Raises:
         ConfigError: less than one worker, Ray is not installed, or the checkpoints' frame rates

@@ -52,9 +52,9 @@ class Dot:
     Attributes:
         label: label on the left.
         value: value in [0, 1].
-        interval: (low, high).
+        interval: 95 % interval (low, high).
         colour: variable of the style sheet.
-        is_filled: drawn full, not as a ring.
+        is_filled: whether the dot is drawn full, not as a ring.
     """
 
     label: str
@@ -141,7 +141,7 @@ def line_chart(
     """Return values in [0, 1] over time, the last line on top.
 
     Args:
-        title: for those who cannot see it.
+        title: description of the chart for readers who cannot see it.
         lines: the curves.
         seconds: time of each frame [s].
         y_label: name and unit of the values.

@@ -44,7 +44,7 @@ class Line(NamedTuple):
 
 
 def labels(summaries: Sequence[EvaluationSummary]) -> list[str]:
-    """Return what the rows of checkpoints are called."""
+    """Return the names of the rows of checkpoints."""
     return [summary.label or summary.name for summary in summaries]
 
 
@@ -100,7 +100,7 @@ def task_tables(rows: Sequence[Line], views: Sequence[str]) -> list[Table]:
 
 
 def markdown(summaries: Sequence[EvaluationSummary]) -> str:
-    """Return both tables with what they mean."""
+    """Return both tables and their explanation in Markdown."""
     names, views = labels(summaries), all_views(summaries)
     rows = lines(summaries, names)
     numbers = ', '.join(

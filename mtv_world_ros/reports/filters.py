@@ -14,7 +14,7 @@ class Filter:
 
     Attributes:
         key: part of its id and of the classes; letters only.
-        label: heading.
+        label: heading of the filter.
         options: choices in addition to `all`.
         within: another filter; its selected option limits the cards that this filter compares.
     """

@@ -115,7 +115,7 @@ def scores(evaluated: EvaluationSummary, key: str) -> dict[str, float]:
 
 
 def ranked_by(evaluations: Sequence[EvaluationSummary]) -> tuple[str, str, dict[str, float]]:
-    """Return what episodes are ranked by: words, the number's name, its mean by episode.
+    """Return the measure that episodes are ranked by: its words, its name, its mean by episode.
 
     J of the objects that move, where any episode has it, else J of all objects; the mean over the
     evaluations that scored the episode.

@@ -78,7 +78,7 @@ class LiveRanking:
     Args:
         stream: recording of the viewer, which is served or saved already.
         folder: folder of the ranking.
-        file: that is written; None = a page for browsers.
+        file: path of the file that is written; None = a page for browsers.
     """
 
     def __init__(self, stream: Any, folder: Path, file: Path | None = None) -> None:

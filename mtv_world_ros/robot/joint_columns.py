@@ -73,7 +73,7 @@ class ColumnEntry(Schema):
         return self
 
     def of(self, joint: str, unit: Unit, robot: RobotModel) -> JointColumn:
-        """Return what it says of a joint of a robot, whose unit is `unit` by default."""
+        """Return the column of a joint of a robot with its factor; `unit` is the default unit."""
         if self.column is None:
             return JointColumn(joint=joint, column=None, offset=self.constant or 0.0)
         if self.from_ and self.to:

@@ -34,7 +34,7 @@ class Tool:
         gripper_joint: joint that opens the gripper, or None.
         gripper_closed: position of the gripper joint when closed [rad or m].
         gripper_open: position of the gripper joint when open [rad or m].
-        finger_travel_m: how far each finger is from the tool point along the tool's y axis when
+        finger_travel_m: distance of each finger from the tool point along the tool's y axis when
             the gripper is open [m]; None = fingers are not drawn, and taken to be 40 mm away.
     """
 
@@ -77,9 +77,9 @@ class Kinematics:
     Attributes:
         links: T_base_link (T, 4, 4) by name [m].
         tools: (A, T, 4, 4) T_base_tool of the tool centre points [m].
-        arm_points: for each arm points (N, T, 3) along it: the origins of the joints that carry
-            its tool, from the base on, and the tool centre point; lines between them are a
-            skeleton of the arm [m].
+        arm_points: (N, T, 3) points along each arm [m]: the origins of the joints that carry its
+            tool, from the base on, and the tool centre point; lines between them are a skeleton of
+            the arm.
     """
 
     links: Mapping[str, FloatArray]
@@ -92,9 +92,10 @@ class RobotModel:
 
     Args:
         name: name of the robot.
-        model: its Pinocchio model; joints that are neither commanded nor mimics rest at zero.
+        model: Pinocchio model of the robot; joints that are neither commanded nor mimics rest at
+            zero.
         joint_names: J commanded joints, in the order of all position vectors.
-        tools: one per arm.
+        tools: tools of the robot, one per arm, in the order of all A axes.
         base_link: link in which all poses are given.
         mimics: joints that follow commanded ones.
         speed_limits: largest speeds by joint, in place of those of the model [rad/s or m/s].
@@ -106,7 +107,7 @@ class RobotModel:
         upper: (J,) largest positions [rad or m].
         velocity_limits: (J,) largest speeds [rad/s or m/s]; inf where not given, which a URDF
             may also write as 0.
-        tools: one per arm, in the order of all A axes.
+        tools: tools of the robot, one per arm, in the order of all A axes.
         mimics: joints that follow commanded ones.
         speed_limits: speeds that were given in place of those of the model.
         pinocchio_model: the model, with every joint of the description.

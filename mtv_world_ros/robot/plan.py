@@ -46,12 +46,13 @@ class Plan:
     `Plan.of` makes it from what a policy sends; code that is given a plan checks nothing again.
 
     Attributes:
-        trajectory: the robot's joints in its order; times count from the observation [s].
+        trajectory: trajectory of the robot's joints in its order; times count from the observation
+            [s].
         start_positions: (J,) joint positions at the observation [rad or m].
         stamp_ns: stamp of the observation [ns].
         given: the trajectory as it was sent.
         given_ns: stamp that the times of `given` count from [ns].
-        robot: the robot.
+        robot: robot that the trajectory was matched to.
         limits: limits that the plan was held to.
     """
 

@@ -53,7 +53,8 @@ def check_speeds(
 
     Args:
         robot: the robot.
-        plan: its joints in its order, in their limits; times count from now [s].
+        plan: trajectory of the robot's joints in its order, within their limits; times count from
+            now [s].
         start_positions: (J,) present positions of the joints [rad or m].
         tolerance: distance outside the limits up to which points are accepted [rad or m].
 

@@ -127,8 +127,8 @@ def interpolated(
     """Return rows (T, J) of increasing times (T,) at wanted ones (N,); held before and after.
 
     Args:
-        wanted: (N,) [s].
-        times: (T,) [s].
+        wanted: (N,) times of the result [s].
+        times: (T,) times of the given values [s].
         rows: (T, J) positions [rad or m].
         is_endless: (J,) joints that turn without end. Drivers report these within a turn; between
             +pi and -pi the short way is taken, and the turn of the nearer row is kept.

@@ -32,7 +32,7 @@ PolicyMaker = Callable[[EpisodeOrigin], Policy]
 
 
 def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
-    """Return what makes the policy of a name.
+    """Return the function that makes the policy of a name for an episode.
 
     Args:
         name: YAML file, name of one in `config/policies`, or a scripted policy such as
@@ -73,7 +73,7 @@ def asked_describer(file: str | Path | None) -> Describer | None:
 
 
 def assemble_describer(config: DescriberConfig | str | Path | None = None) -> Describer:
-    """Return what names the objects of a scene; by default the instruction's words alone.
+    """Return the describer of a scene's objects; by default that of the instruction's words.
 
     Args:
         config: a configuration, or a YAML file like `config/describer.yaml`.

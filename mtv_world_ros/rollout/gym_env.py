@@ -82,7 +82,7 @@ class WorldEnv(gymnasium.Env[State, NDArray[np.float32]]):
 
         Args:
             seed: seed of the world; None = one that is drawn.
-            options: unused.
+            options: not used.
         """
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(2**31)) if seed is None else seed

@@ -104,7 +104,7 @@ def recorded_start(path: Path, pipeline: Pipeline, start_s: float = 0.0) -> Epis
     """Return a moment of a recorded episode.
 
     Args:
-        path: rosbag2 folder.
+        path: folder of the rosbag2 episode.
         pipeline: names the views and the joints.
         start_s: time since the first frame of the first view [s].
 

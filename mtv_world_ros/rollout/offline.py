@@ -32,8 +32,8 @@ class ReplaySummary:
 
     Attributes:
         out: folder with the predictions.
-        num_trajectories: imagined.
-        num_chunks: imagined.
+        num_trajectories: number of imagined trajectories.
+        num_chunks: number of imagined chunks.
         num_frames: frames a view written.
         model_s: time spent in the pipeline [s].
         video_s: time the written frames cover [s].
@@ -93,7 +93,7 @@ def replay_offline(
     rejects that one alone, with its reason in the summary and in `/world_model/report`.
 
     Args:
-        pipeline: imagines.
+        pipeline: pipeline that imagines.
         episode_path: rosbag2 folder or .mcap file, also one that was cut off.
         out: folder for the predictions; appears only when all is written.
         source: topics and robot of an episode that is not in this package's format.
@@ -212,8 +212,8 @@ def judge(pipeline: Pipeline, recording: Recording) -> SuccessEstimate:
 
     Args:
         pipeline: finds the objects and judges; see `Pipeline.load`.
-        recording: V views on the model's clock, e.g. of `load_recording(path, pipeline.spec,
-            pipeline.robot)`.
+        recording: recording of V views on the model's clock, e.g. of `load_recording(path,
+            pipeline.spec, pipeline.robot)`.
 
     Raises:
         EpisodeError: the recording is shorter than a frame of the model, or has a gap.

@@ -81,7 +81,7 @@ class WorldModel(Protocol):
             positions: (1 + T, J) the plan itself, for models that take no drawing, such as a
                 simulator: row 0 where the robot stands, row k command k [rad or m].
             seed: seed of the noise.
-            num_inference_steps: denoising steps.
+            num_inference_steps: denoising steps a chunk.
             should_stop: asked between steps.
             history: the frames before the start frame; None = the episode begins there.
 
@@ -94,21 +94,21 @@ class WorldModel(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pipeline:
-    """Imagine and judges; stateless: `begin` returns the rollout, which holds the state.
+    """The main path around a world model; it has no state: `begin` returns a rollout, which has.
 
     Attributes:
         robot: joints, limits and tools.
         world_model: predicts chunks.
         segmenter: finds the objects' masks.
         estimator: judges the outcome.
-        control: how the plan enters the model; must be what the model was trained with.
+        control: way in which the plan enters the model; must be that of the model's training.
         objects: names of the objects; empty = the describer's.
         describer: names the objects of an episode's first frame; None = the instruction's words.
         horizon: measured J by horizon; None = not measured.
         object_motion: foresees object motions, for controls that show them; None = the imagined
             frames alone decide.
         camera_checker: compares the first frames with the arm's outline; None = no check.
-        grounds: what estimates that are not calibrated may rest on.
+        grounds: reasons for which estimates that are not calibrated abstain.
         drawing: draws the plan for people where the control itself is no video.
         checks_place: futures are drawn from a wide prior where contact parameters were not fitted
             in the robot cell of the observation; False for fits, which state a bare estimate.
@@ -170,8 +170,7 @@ class Pipeline:
             segmenter: name, `module:Class` or file of examples; see `choose_segmenter`.
             describer: YAML file of what names the objects of the first real frame; empty = the
                 words of the instruction.
-            serving: what makes the model faster or smaller, e.g. `compile=true`; see
-                `ServingOptions`.
+            serving: options for speed and memory, e.g. `compile=true`; see `ServingOptions`.
             calibrated: use the checkpoint's calibration of the success estimate, where it has one,
                 and abstain where an estimate rests on nothing; False = the bare estimate.
             adapter: LoRA adapter to use in place of the checkpoint's own.
@@ -350,8 +349,8 @@ class Pipeline:
         """Return the names of the objects of a rollout.
 
         Args:
-            options: may name them; else the pipeline does, its describer, the recorded episode,
-                or the instruction.
+            options: options of the rollout; its names come first, then the pipeline's, its
+                describer's, those of the recorded episode, those of the instruction.
             first_frame: returns the first real frame (H, W, 3) uint8 RGB, for the describer.
 
         Raises:
@@ -467,9 +466,10 @@ class Pipeline:
         """Return masks and estimate of real frames, and the rollout's state after them.
 
         Args:
-            state: before them.
-            frames: (V, T, H, W, 3) uint8 RGB after it, at the model's size and frame rate.
-            positions: (1 + T, J) measured [rad or m]; row 0 at the state.
+            state: state of the rollout before the frames.
+            frames: (V, T, H, W, 3) uint8 RGB frames after that state, at the model's size and
+                frame rate.
+            positions: (1 + T, J) measured joint positions [rad or m]; row 0 at the state.
             options: names of the objects, and the instruction.
         """
         start_masks = self.find(state, options)

@@ -58,7 +58,7 @@ class Prediction:
         imagined_seconds: time from the last real frame to the last predicted one [s].
         horizon: measured J by horizon; None = not measured.
         segmenter: name of what found the masks.
-        num_inference_steps: denoising steps.
+        num_inference_steps: denoising steps of the chunk.
         foreseen: (K, 1 + T, O, 3) centres of the objects in each future at the chunk's start and
             at its frames [m]; None = nothing was foreseen.
         in_view: (V,) share of the states in which the view shows a tool.

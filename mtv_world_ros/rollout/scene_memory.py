@@ -30,7 +30,8 @@ class SceneMemorySettings:
     Attributes:
         arm_margin: distance from the drawn robot within which the model's picture counts: cables,
             what a gripper holds, shadows [fraction of the image width].
-        object_margin: the same around objects that may have moved [fraction of the image width].
+        object_margin: distance from objects that may have moved, within which the model's picture
+            counts [fraction of the image width].
         blend: width of the passage between memory and model [fraction of the image width].
         min_saturation: smallest difference between the colour channels of a mark that is looked
             for, of 255: white ones look like things.
@@ -77,7 +78,7 @@ class SceneKeeper:
     Args:
         robot: the robot of the rollouts.
         parts: shapes of its links.
-        settings: what counts as covered.
+        settings: margins around robot and objects, and limits of marks.
     """
 
     def __init__(
@@ -107,7 +108,7 @@ class SceneKeeper:
         """Return the memory after real frames.
 
         Args:
-            memory: before them; None = nothing was seen.
+            memory: memory before the frames; None = nothing was seen.
             motion: motion of the robot with `links`, T states.
             frames: (V, T, H, W, 3) uint8 RGB at these states.
             masks: masks of the objects in these frames.
@@ -180,7 +181,8 @@ class SceneKeeper:
             memory: memory of the background.
             frames: (V, T, H, W, 3) uint8 RGB as the model predicts them.
             drawn: (V, T, H, W, 3) the trajectory video.
-            unmarked: (V, T, H, W, 4) what it shows, without marks.
+            unmarked: (V, T, H, W, 4) robot and objects of the trajectory video without marks: RGB
+                and cover.
         """
         cover = unmarked[..., 3:].astype(np.float32) / 255
         behind = np.where(memory.known[..., None], memory.pictures, 0)[:, None]

@@ -37,7 +37,7 @@ def parameter(default: Any, text: str, within: Span | None = None) -> Any:
     Args:
         default: default of the parameter.
         text: meaning of the parameter, in Markdown.
-        within: least and greatest value.
+        within: least and greatest allowed value.
     """
     low, high = within or (None, None)
     return Field(default, description=text, ge=low, le=high)
@@ -322,7 +322,7 @@ def declare_one(
     """Declare one parameter and returns its value.
 
     Args:
-        node: owner.
+        node: node that gets the parameter.
         name: name of the parameter.
         default: default of the parameter, which gives the type.
         described: range and meaning.

@@ -73,9 +73,9 @@ def run(
     Fast DDS is set to send soon again what a reliable subscriber missed, unless it has a profile.
 
     Args:
-        make: makes the node; where it has `close()`, that ends it.
+        make: function that returns the node; where it has `close()`, that ends it.
         args: command line with the program's name; default: the process' own.
-        spin: runs the node's callbacks until shutdown.
+        spin: function that runs the node's callbacks until shutdown.
         signals: signals that rclpy handles; NO = the node has handlers of its own.
         help_text: printed instead if the command line has `--help`.
         name: name of the node, before remapping; needed for `own_paths`.

@@ -44,7 +44,7 @@ def load_mujoco(*, rendering: bool = True) -> ModuleType:
     """Return the `mujoco` module, with `MUJOCO_GL` set to a backend whose library exists.
 
     Args:
-        rendering: also make sure that images can be rendered; physics alone needs no OpenGL.
+        rendering: whether images will be rendered; physics alone needs no OpenGL.
 
     Raises:
         SimulatorError: no usable OpenGL library; the text names the package to install.

@@ -84,7 +84,7 @@ def scene_of(episode: Episode, workcell: Workcell) -> Scene:
     """Return the scene that a simulated episode holds, else the one that its seed draws.
 
     Args:
-        episode: simulated.
+        episode: episode of the simulator.
         workcell: workcell of the robot that it was recorded with.
 
     Raises:

@@ -43,12 +43,12 @@ class SimulatedWorld:
         start: first observation of the episode.
         observation: the newest observation.
         chunks: the observed chunks, one per answer of the policy.
-        commands: (C, J) that were executed at the control rate, one array an answer.
+        commands: (C, J) executed commands at the control rate, one array an answer [rad or m].
         physics_s: time that the physics took [s].
         rendering_s: time that pictures took, and building the scene [s].
 
     Args:
-        sim: the simulator.
+        sim: simulator of the episode.
         task: the task, or the name of a bundled one.
         fps: frame rate of the model [Hz]; pictures are taken at this rate, answers executed for
             whole frames.

@@ -66,7 +66,7 @@ def situation_of(scene: Scene, task: Task, poses: FloatArray, openings: FloatArr
 
     Args:
         scene: scene of O objects.
-        task: has the goals.
+        task: task that has the goals.
         poses: T_base_object (T, O, 4, 4) [m].
         openings: (A, T) openings of the grippers.
     """
@@ -85,14 +85,14 @@ class SimEpisode:
     """Physics and cameras of one episode at a time.
 
     Args:
-        robot: one that has a workcell.
+        robot: robot that has a workcell.
         home: (J,) joint positions at reset [rad or m].
         config: randomised quantities and image size; default: the workcell's.
         rendering: False runs physics alone, without OpenGL; images are then empty.
-        physics: physics of the episode, a key of `config/physics.yaml`.
+        physics: name of the physics, a key of `config/physics.yaml`.
 
     Attributes:
-        physics: that name.
+        physics: name of that physics.
         calibrated_cameras: the scene's cameras as they are calibrated.
     """
 

@@ -73,7 +73,7 @@ def variant(
     """Return the task and the randomisation of one episode; as given where `kind` is None.
 
     Args:
-        kind: one of `KINDS`, or None.
+        kind: kind of the zero-shot set, one of `KINDS`; None = an ordinary set.
         task: the task it is derived from.
         seed: the episode's random seed.
         randomization: the randomisation of training.

@@ -49,7 +49,7 @@ class Weights(Schema):
     """A logistic of F features, standardised, weighed and added up.
 
     Attributes:
-        features: F names.
+        features: names of the F features.
         means: F, subtracted; what takes the place of a feature that says nothing.
         scales: F, divided by.
         weights: F, logit per scale.
@@ -89,18 +89,18 @@ class Calibration(Weights):
     and drawn into the control: the frames show what was drawn, and are no second witness.
 
     Attributes:
-        futures: for rollouts with simulated object motion: the share of futures that succeed
-            decides; None = older file, or rollouts without simulated motion.
-        observed: for frames that were seen, not imagined, of the same episodes; None = as for
-            those that are imagined.
-        unforeseen: for imagined frames where no motion is foreseen, as of a rollout that begins
-            in mid-episode; None = as where some are.
+        futures: fit for rollouts with simulated object motion, where the share of futures that
+            succeed decides; None = older file, or rollouts without simulated motion.
+        observed: weights for frames of the same episodes that were really seen; None = those of
+            imagined frames.
+        unforeseen: weights for imagined frames without foreseen motion, as of a rollout that
+            begins in mid-episode; None = those of frames with foreseen motion.
         segmenter: name of the segmenter whose masks were fitted on.
         tasks: names of the tasks that were fitted on.
         num_episodes: number of episodes that were fitted on.
-        num_seeds: rollouts of each.
+        num_seeds: number of rollouts of each episode.
         l2: strength of the pull towards the stated weights (`estimator.STATED_WEIGHTS`).
-        scores: before and after, the latter on tasks that were left out of the fit.
+        scores: scores before and after the fit, the latter on tasks that were left out of it.
         made: command, date, machine.
         fitted_to: robot, cameras and foresight of these episodes; None = it does not say, as
             those of before 0.2.0, whose foresight was another.
@@ -163,7 +163,7 @@ class HorizonCurve(Schema):
         values: (T,) mean J.
         lower: (T,) lower end of the 95 % interval over episodes; 0 where too few reach it.
         segmenter: name of the segmenter whose masks were fitted on.
-        num_episodes: behind it.
+        num_episodes: number of episodes of the curve.
         made: command, date, machine.
     """
 

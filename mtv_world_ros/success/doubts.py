@@ -163,7 +163,7 @@ def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
 
     Args:
         estimate: estimate under the fitted physics.
-        doubt: why that does not hold.
+        doubt: reason why the fitted physics does not hold.
     """
     reasons = (doubt, *estimate.reasons)
     if not isfinite(estimate.probability):
@@ -182,9 +182,9 @@ class Grounds:
     """Basis of an uncalibrated estimate from imagined frames.
 
     Attributes:
-        foreseen: why foreseen motions are no ground, as their numbers of contact are guessed;
-            empty = they are.
-        pictures: why imagined frames alone are none; empty = they are.
+        foreseen: reason why no verdict rests on foreseen motions, e.g. guessed contact parameters;
+            empty = none.
+        pictures: reason why no verdict rests on imagined frames alone; empty = none.
     """
 
     foreseen: str = ''
@@ -195,7 +195,7 @@ class Grounds:
         """Return the grounds of a checkpoint.
 
         Args:
-            contact: doubt about its numbers of contact; empty = there is none.
+            contact: doubt about the contact parameters; empty = there is none.
             is_calibrated: whether it has a calibration, of whatever task and robot.
         """
         never = '' if is_calibrated else 'the estimate was never calibrated for this checkpoint'
@@ -206,7 +206,7 @@ class Grounds:
         )
 
     def bear(self, estimate: SuccessEstimate) -> SuccessEstimate:
-        """Return an estimate of imagined frames by what it may rest on: none if by nothing."""
+        """Return an estimate of imagined frames, or an abstention if it rests on nothing."""
         if estimate.is_calibrated or not isfinite(estimate.probability):
             return estimate
         is_foreseen = isfinite(estimate.features.get('foreseen', nan))

@@ -153,7 +153,7 @@ class SuccessEstimator:
         """Set the tasks that may be judged.
 
         Args:
-            tasks: known tasks.
+            tasks: tasks that an instruction may match.
             task: name of the one to judge; default: the one the instruction matches. Where the
                 instruction names no objects for it, they take the task's placeholders in order.
             calibration: fitted weights, used where they hold.
@@ -436,9 +436,9 @@ def _estimate(
 
     Args:
         numbers: low end of the 95 % interval, probability, high end.
-        evidence: what the views show.
-        views: the views.
-        reasons: what the estimate rests on, in words.
+        evidence: margins and Jaccard indices in the views.
+        views: masks and memory that the evidence is from.
+        reasons: evidence and doubts in words, one sentence each.
         features: numbers by name that the probability was computed from.
         is_calibrated: whether weights that were fitted here were used.
     """

@@ -186,7 +186,7 @@ def gather(views: Views, task: TaskSpec, bound: Mapping[str, str]) -> Evidence:
     """Measure how far a task's relations hold at the end of a rollout.
 
     Args:
-        views: the rollout.
+        views: masks, poses and memory of the rollout.
         task: task whose relations are evaluated.
         bound: placeholder -> name of its object.
 

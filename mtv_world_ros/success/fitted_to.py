@@ -102,7 +102,7 @@ class FittedTo(Setting):
 
     @classmethod
     def episodes(cls, setting: Setting, sets: Iterable[Sequence[CameraModel]]) -> FittedTo:
-        """Return what episodes were made with.
+        """Return the robot, foresight and cameras that episodes were made with.
 
         Args:
             setting: setting of all episodes.

@@ -55,7 +55,7 @@ class ForeseenEnds:
 def foreseen_ends(
     motions: ForeseenMotions, task: TaskSpec, bound: Mapping[str, str], starts: FloatArray
 ) -> ForeseenEnds | None:
-    """Return whether the task is done at the end of each; None = they do not tell.
+    """Return the outcome of the task at the end of each motion; None = it cannot be told.
 
     Args:
         motions: motions of the objects, in several futures.

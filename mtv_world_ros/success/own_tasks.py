@@ -1,4 +1,4 @@
-"""Tasks that are not bundled: in an episode's metadata, or in `dataset.json` beside it."""
+"""Tasks that are not bundled: in an episode's metadata, or in its data set's `dataset.json`."""
 
 from __future__ import annotations
 
@@ -93,7 +93,8 @@ def named_here(word: str | None, episodes: Iterable[Path]) -> str | TaskSpec | N
     """Return a task that a user names, as `Pipeline.load` takes it; None = the user names none.
 
     Args:
-        word: YAML file of a task, name of a bundled one, or of one that the episodes define.
+        word: YAML file of a task, name of a bundled task, or name of a task that the episodes
+            define.
         episodes: folders of the episodes.
 
     Raises:
@@ -110,7 +111,7 @@ def chosen_task(word: str | None, own: Iterable[TaskSpec]) -> TaskSpec | None:
     """Return the task that a user names; None = the user names none.
 
     Args:
-        word: YAML file of a task, name of a bundled one, or of one of `own`.
+        word: YAML file of a task, name of a bundled task, or name of one of `own`.
         own: tasks that the episodes define.
 
     Raises:

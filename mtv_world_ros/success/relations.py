@@ -292,8 +292,8 @@ class Inside(Relation):
 
     Attributes:
         target: placeholder of the container.
-        half_size_m: how far the subject's centre may be from the target's along the target's
-            sides; not given = half the target's size.
+        half_size_m: largest distance of the subject's centre from the target's along each of the
+            target's sides [m]; not given = half the target's size.
         whole: the whole subject is inside, not only its centre; without `half_size_m`.
         rise_m: height range, as in `Within`.
     """

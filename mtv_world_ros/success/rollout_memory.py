@@ -84,10 +84,10 @@ class ObservedGrasp(NamedTuple):
     Attributes:
         arm: index of the arm.
         closed_at: (3,) position of the tool when it closed [m].
-        gaps_m: (O,) how far outside an object's last unhidden mask it was [m]; negative =
-            inside, NaN = not known. The largest over the views.
-        points: (O, 3) where the objects were last seen unhidden, or now if that is clearly
-            elsewhere [m].
+        gaps_m: (O,) distance of the tool from an object's last unhidden mask, the largest over the
+            views [m]; negative = inside, NaN = not known.
+        points: (O, 3) places at which the objects were last seen unhidden, or now if that is
+            clearly elsewhere [m].
         released_at: (3,) position of the tool when it opened [m]; None = it has not.
     """
 
@@ -144,8 +144,9 @@ def remember(memory: RolloutMemory | None, footage: Footage) -> RolloutMemory:
     """Return the memory after a chunk.
 
     Args:
-        memory: before it; None = the chunk is the first, as it is where the objects have changed.
-        footage: the chunk.
+        memory: memory before the chunk; None = the chunk is the first, as it is where the objects
+            have changed.
+        footage: masks and poses of the chunk.
     """
     if memory is None or memory.names != footage.masks.names:
         memory = _begin(footage)

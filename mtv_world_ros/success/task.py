@@ -28,7 +28,7 @@ SCENES_REPLACED = (
     "scenes are no longer read from a table: a task is one file, 'config/tasks/NAME.yaml' or your "
     "own, and its entry of the table is its key 'scene' (docs/tasks.md)"
 )
-#: keys of a task's file of which no other file has one
+#: keys of a task's file that files of other kinds do not have
 _REQUIRED = {'instruction', 'relations'}
 #: words of an instruction that name nothing
 _ARTICLES = frozenset({'a', 'an', 'the'})
@@ -68,13 +68,13 @@ class TaskSpec(Schema):
     """One task.
 
     Attributes:
-        name: e.g. `stack_blocks_two`.
+        name: name of the task, e.g. `stack_blocks_two`.
         instruction: template with placeholders for the objects, `stack the {a} on the {b}`.
         relations: relations between objects; all must hold at the end.
         sizes_m: usual extents (x, y, z) of a placeholder's object, for where they are not known:
             from pictures, an object that is not named here is taken as a cube [m].
-        nouns: what a placeholder's object may be called, by its last word; not given = anything.
-            Tells tasks of one template apart.
+        nouns: allowed last words of the object's name, by placeholder; not given = any. Tells
+            tasks of one template apart.
         rims: last words of the names of objects that are held by their rim, not across the middle.
         phrasings: further templates with the same placeholders. A task that has some takes
             instructions with and without articles.
@@ -251,7 +251,7 @@ def stored_task(values: Any, where: str) -> TaskSpec:
     """Return the task of a stored definition.
 
     Args:
-        values: what `dump_task` returned, or its JSON text.
+        values: plain values of `dump_task`, or their JSON text.
         where: place of the definition, for error texts.
 
     Raises:

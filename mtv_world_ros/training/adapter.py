@@ -70,11 +70,11 @@ def save_adapter(
     The adapter itself is in diffusers' layout.
 
     Args:
-        transformer: has the adapter.
+        transformer: transformer that has the adapter.
         folder: folder to write.
         weights: weights in place of the transformer's, by name; such as averaged ones.
         card: base model and training data, as in a checkpoint.
-        control: how plans enter the model.
+        control: control of the model.
     """
     from peft.utils import get_peft_model_state_dict
 

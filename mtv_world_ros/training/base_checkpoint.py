@@ -30,9 +30,10 @@ class Base:
 
     Attributes:
         folder: folder of the checkpoint.
-        checkpoint: its parts; the transformer has a new adapter where the preset trains one.
+        checkpoint: parts of the model; the transformer has a new adapter where the preset trains
+            one.
         encoders: encoders on the device.
-        digest: identifies its transformer's weights.
+        digest: hash of the transformer's weights.
     """
 
     folder: Path

@@ -58,7 +58,7 @@ class StepCost:
 
     @property
     def memory_bytes(self) -> int:
-        """All of it."""
+        """Memory of all parts together [bytes]."""
         return self.weight_bytes + self.training_bytes + self.activation_bytes
 
     def lines(self) -> list[str]:

@@ -22,9 +22,9 @@ class TrainingLog:
     """Writer of the log; a resumed training continues it after the saved state.
 
     Args:
-        folder: gets `log.jsonl` and `tensorboard/`.
-        step: at which the training starts; later rows are dropped.
-        total: steps of the training.
+        folder: folder of `log.jsonl` and `tensorboard/`.
+        step: number of the step at which the training starts; later rows are dropped.
+        total: number of steps of the training.
         active: False writes nothing, for all processes except the main one.
         ideal_seconds: ideal seconds of a step at the machine's peak arithmetic rate; None =
             unknown.

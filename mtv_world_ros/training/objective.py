@@ -145,7 +145,7 @@ def sample_loss(
 
     Args:
         predicted: latents that the transformer predicts.
-        clean: ground truth.
+        clean: latents of the recorded frames.
         weights: positive weights, of the same shape.
         delta: error above which the Huber loss is linear; None = the squared error.
         by_sample: (B,) weights of samples; None = equal.

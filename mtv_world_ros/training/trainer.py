@@ -65,13 +65,13 @@ class StepReport:
     """Report of a step.
 
     Attributes:
-        step: its number, from 1.
+        step: number of the step, from 1.
         loss: loss over all clips of the step, of all processes.
         average: average of the recent losses.
         learning_rate: learning rate of the step.
-        grad_norm: before clipping.
-        seconds: duration, waiting included.
-        waited: seconds of it spent waiting for the batch.
+        grad_norm: norm of the gradient before clipping.
+        seconds: duration of the step, waiting included [s].
+        waited: part of the duration spent waiting for the batch [s].
     """
 
     step: int
@@ -99,14 +99,14 @@ class Trainer:
 
     Args:
         config: the preset.
-        folder: gets state, logs and checkpoints.
+        folder: folder of the training's state, logs and checkpoints.
         seed: seed of weights, noise and batches.
-        device: e.g. `cpu`, `cuda`.
+        device: PyTorch device, e.g. `cpu`, `cuda`.
         dtype: dtype of forward and backward; master weights stay float32.
         trained_on: entry of the checkpoint's card.
         processes: processes that train together; None: those that the launcher started.
         base: checkpoint to train on top of; None: all weights are new.
-        control: how plans enter the model; None = the paper's.
+        control: control of the model; None = the paper's.
 
     Raises:
         TrainingError: fewer clips per step than processes times accumulated parts.
@@ -221,7 +221,7 @@ class Trainer:
         end early.
 
         Args:
-            source: makes the clips of `clips`.
+            source: source of the batches of `clips`.
             save_every: steps between saved states.
             on_save: called with the step after each save, in the main process only.
             save_seconds: longest time between saved states [s].

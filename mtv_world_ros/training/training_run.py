@@ -99,7 +99,7 @@ def load_recordings(
         source: topics and calibration of the episodes.
         describer: names the objects; None = the names stored with the episodes, else those of
             the instructions.
-        broken: why episodes are to be left out, by path.
+        broken: reasons why episodes are left out, by path.
 
     Raises:
         TrainingError: none is usable.

@@ -65,7 +65,7 @@ def make_clip(
         rollout: frames and masks to show.
         max_bytes: the video's quality is lowered until it takes no more, down to a limit.
         tile_width: width up to which small frames are enlarged in the video [px].
-        with_sheet: also make the contact sheet.
+        with_sheet: whether the contact sheet is made, too.
     """
     shown = outlined(rollout, tile_width)
     frames = side_by_side(shown, tile_width=shown.real.shape[3])

@@ -22,8 +22,8 @@ class StoredRollout:
     """Predicted frames and recorded frames of the same times: V views, T frames, O objects.
 
     Attributes:
-        views: V names.
-        objects: O names.
+        views: names of the V views.
+        objects: names of the O objects.
         fps: frames a second.
         stretches: (T,) int, number of the stretch that each frame belongs to; where it changes,
             the imagination started anew from a recorded frame.

@@ -64,7 +64,7 @@ class Streams:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The kinds of frames that there are."""
+        """Kinds of frames in the streams."""
         return tuple(kind for kind in KINDS if any(kind == found for found, _ in self.images))
 
 
@@ -101,7 +101,7 @@ def read_streams(bags: Sequence[Path]) -> Streams:
 
 
 def shown_as(topic: str, msgtype: str) -> tuple[str, ...] | None:
-    """Return what a topic shows: image or mask of a kind and view, ...; None = nothing."""
+    """Return the kind of a topic's messages, with view or topic; None = they are not shown."""
     match = _IMAGES.match(topic)
     if match and msgtype in (IMAGE, COMPRESSED_IMAGE):
         is_mask = match['stream'] == 'mask' or '/mask/' in topic

@@ -43,8 +43,8 @@ class Comparison:
     """Recorded frames, trajectory video and predicted frames of one rollout.
 
     Attributes:
-        views: V names.
-        times: (T,) [s].
+        views: names of the V views.
+        times: (T,) times of the frames [s].
         real: (V, T, H, W, 3) uint8 RGB recorded frames.
         trajectory: (V, T, H, W, 3) uint8 RGB trajectory video.
         imagined: (V, T, H, W, 3) uint8 RGB predicted frames.
@@ -86,9 +86,10 @@ def contact_sheet(
 
     Args:
         comparison: real, drawn and imagined frames of a rollout.
-        title: heading.
-        notes: lines below.
-        num_columns: most frames in a row; spread evenly, the first and last among them.
+        title: heading of the sheet.
+        notes: lines below the heading.
+        num_columns: largest number of frames in a row; spread evenly, the first and last among
+            them.
         tile_width: width of a frame [px]; small frames are enlarged by whole factors up to it.
     """
     num_frames = len(comparison.times)

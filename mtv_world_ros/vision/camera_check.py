@@ -38,7 +38,7 @@ class CameraCheckSettings:
         max_shift: largest first shift [fraction of image width].
         search_ranges: search range for edges in each round [fraction of image width].
         blur: blur before edge detection [fraction of image width].
-        min_blur_px: smallest blur.
+        min_blur_px: smallest blur of the images [px].
         half_contrast: contrast of an edge with weight 1/2 [grey levels a pixel].
         edge_std: standard deviation of an edge's position [fraction of image width].
         min_edge_std_px: smallest standard deviation of an edge's position.
@@ -90,8 +90,8 @@ class _Outline(NamedTuple):
     """Points of an outline in the picture.
 
     Attributes:
-        pixels: (N, 2).
-        normals: (N, 2) unit, outwards.
+        pixels: (N, 2) pixels of the points.
+        normals: (N, 2) unit normals of the outline, outwards.
         points: (N, 3) points that are seen there, in the optical frame [m].
     """
 
@@ -107,9 +107,10 @@ class CameraFit:
     Attributes:
         view: name of the view.
         status: `fits`, `corrected` for this episode, `refused` as too far off, or `unchecked`.
-        T_given_found: (4, 4) found optical frame in the calibrated one; identity where not found.
-        offset_px: how far the arm is from where it should be, at the picture's size; NaN = not
-            known.
+        T_given_found: (4, 4) pose of the found optical frame in the calibrated one; identity where
+            not found.
+        offset_px: distance of the arm in the picture from where the calibration draws it, at the
+            picture's size [px]; NaN = not known.
         text: the finding in words.
     """
 
@@ -198,7 +199,7 @@ def _unchecked(view: str, why: str) -> CameraFit:
 
 
 class _Found(NamedTuple):
-    """A pose, and how far it moves what is looked at.
+    """A camera pose, and the shift in the image that it causes.
 
     Attributes:
         T: (4, 4) the found optical frame in the calibrated one.

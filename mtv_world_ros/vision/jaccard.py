@@ -23,7 +23,7 @@ def jaccard(pred: BoolArray, true: BoolArray) -> FloatArray:
     Both empty gives 1, one empty 0 (DAVIS 2017, `db_eval_iou`).
 
     Args:
-        pred: (..., H, W) bool.
+        pred: (..., H, W) bool predicted masks.
         true: (..., H, W) bool, of the same height and width.
 
     Raises:

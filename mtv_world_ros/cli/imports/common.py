@@ -58,9 +58,9 @@ def import_parser(
 
     Args:
         commands: commands of `mtv-world import`.
-        name: its word.
-        purpose: what it does, for the help.
-        mapping: sentences on the mapping file, for the help.
+        name: word of the import after `mtv-world import`.
+        purpose: sentence of the help: what the import does.
+        mapping: sentences of the help about the mapping file.
         one: a recording, e.g. `a bag`.
     """
     return commands.add_parser(
@@ -80,8 +80,8 @@ def add_common_options(
     """Add the options that all imports have, and what runs one.
 
     Args:
-        parser: of the import.
-        run: runs it and returns the exit status.
+        parser: parser of the import.
+        run: runs the import and returns the exit status.
         calibration: help of `--calibration`.
     """
     parser.add_argument('--calibration', type=Path, help=calibration)

@@ -52,7 +52,7 @@ def dump_qos(qos: Qos) -> str:
 
 
 def parse_qos(text: str) -> Qos:
-    """Return the first profile of such a list; the default where it cannot be read."""
+    """Return the first profile of a list in metadata.yaml, the default if it cannot be read."""
     try:
         entry = parse_yaml(text)[0]
         words = {key: entry[key] for key in ('reliability', 'durability', 'history')}

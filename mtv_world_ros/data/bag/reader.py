@@ -41,7 +41,7 @@ class BagMessage(NamedTuple):
 
     Attributes:
         topic: absolute topic name.
-        msgtype: e.g. `sensor_msgs/msg/Image`.
+        msgtype: type of the message, e.g. `sensor_msgs/msg/Image`.
         stamp_ns: log time [ns].
         data: CDR bytes with encapsulation header.
         publish_ns: time of publication [ns].
@@ -68,7 +68,7 @@ class BagReader:
     to there; `truncated` then says where.
 
     Attributes:
-        truncated: why the record ends early; empty where it does not. Known after a pass.
+        truncated: reason why the record ends early; empty where it does not. Known after a pass.
         problems: other problems found, one line each.
         metadata: MCAP metadata records by name. Complete after a pass.
         custom_data: `custom_data` of metadata.yaml.

@@ -44,7 +44,7 @@ class BagWriter:
     Args:
         path: folder to make.
         overwrite: replace an existing bag.
-        keep: nothing that was recorded is ever deleted: space for the index is reserved, so that
+        keep: whether everything that was recorded stays: space for the index is reserved, so that
             the bag is closed whole even on a full disk; a block that raises closes it, too.
 
     Raises:
@@ -105,7 +105,7 @@ class BagWriter:
 
         Args:
             topic: absolute topic name.
-            msgtype: e.g. `sensor_msgs/msg/Image`.
+            msgtype: type of the message, e.g. `sensor_msgs/msg/Image`.
             stamp_ns: log time [ns] (receipt; in episodes equal to the header's stamp).
             data: CDR bytes with encapsulation header, as a raw subscription gives them.
             publish_ns: time of publication [ns]; by default the log time.

@@ -129,7 +129,7 @@ def frame_features(weights: Path, device: str = 'cpu') -> FrameFeatures:
     Args:
         weights: `pt_inception-2015-12-05-*.pth` or `weights-inception-2015-12-05-*.pth`, or the
             same as safetensors.
-        device: e.g. `cpu`, `cuda`.
+        device: PyTorch device, e.g. `cpu`, `cuda`.
 
     Raises:
         ConfigError: there is no such file.
@@ -150,7 +150,7 @@ def clip_features(weights: Path, device: str = 'cpu') -> ClipFeatures:
 
     Args:
         weights: the state dict of an I3D (400 logits).
-        device: e.g. `cpu`, `cuda`.
+        device: PyTorch device, e.g. `cpu`, `cuda`.
 
     Raises:
         ConfigError: there is no such file.

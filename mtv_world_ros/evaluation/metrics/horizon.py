@@ -44,7 +44,7 @@ def horizon_curve(
     Args:
         episodes: rows of each episode.
         view: name of the view; None = all.
-        field: one of `scores.FRAME_FIELDS`.
+        field: name of the measure, one of `scores.FRAME_FIELDS`.
         min_share: frames that fewer than this share of the rollouts reach are left out.
     """
     sums, counts = _sums(_moving(episodes, view, field))

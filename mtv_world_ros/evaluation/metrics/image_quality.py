@@ -19,7 +19,7 @@ ImageQuality = Callable[[ByteArray, ByteArray], dict[str, float]]
 
 
 def image_quality(names: Sequence[str], device: str = 'cpu') -> ImageQuality | None:
-    """Return what measures the named numbers, each the mean over frames; None without names.
+    """Return the measures of the given names, each the mean over frames; None without names.
 
     PSNR [dB] of equal frames is that of an error of 1/2 of a grey level in one value, so that
     means stay finite.

@@ -43,7 +43,7 @@ class ScoreRow:
     Attributes:
         stretch: number of the stretch in the episode.
         num_frames: number of predicted frames, T.
-        view: name.
+        view: name of the view.
         name: name of the object; empty for the union of the scored objects.
         status: `ok`, or why it is not scored, or why to doubt it.
         moving: whether it really moves (see `MOVING_RULE`).

@@ -29,7 +29,7 @@ class ObjectScores:
         objects: (V, O) mean J over frames, both-empty frames counted as 1 (DAVIS).
         boundary: (V, O) mean F over frames.
         union: (V,) mean J of the union of the scored objects (the paper's formula).
-        status: V tuples of O words: `ok`, or why there is no score, or why to doubt it.
+        status: V tuples of O words: `ok`, or the reason for a missing or doubtful score.
     """
 
     names: tuple[str, ...]
@@ -87,7 +87,7 @@ def boundary_f(pred: BoolArray, true: BoolArray) -> FloatArray:
     image's diagonal away. Both empty gives 1, one empty 0 (DAVIS 2017, `db_eval_boundary`).
 
     Args:
-        pred: (..., H, W) bool.
+        pred: (..., H, W) bool predicted masks.
         true: masks of the real frames, of the same shape.
     """
     height, width = true.shape[-2:]

@@ -41,7 +41,7 @@ def draw_rates(
             between; NaN = none. All policies meet the same scenes; the tasks are taken as given,
             not as drawn.
         true: (P, K, E) true outcomes.
-        num_draws: D.
+        num_draws: number of draws, D.
         seed: seed of the draws.
     """
     rng = np.random.default_rng(seed)
@@ -249,8 +249,8 @@ class ScoreOfRates:
     """A score of how well judged rates agree with true ones.
 
     Attributes:
-        observed: of the observed rates, as it is published elsewhere. The noise of few scenes is
-            contained in it: r is too small, MMRV too large.
+        observed: score of the observed rates, as it is published elsewhere. It contains the noise
+            of few scenes: r is too small, MMRV too large.
         noise_free: estimate of the score on endless scenes of the same kind: the median of its
             posterior; NaN where there is no interval.
         interval: 95 % interval of the latter, widened to hold `observed`; NaN for fewer than
@@ -338,11 +338,11 @@ class PoweredMean:
 
     Attributes:
         value: the estimate, cut to [0, 1].
-        interval: 95 %, with the t quantile of the true values, cut to [0, 1]; NaN where these
-            are fewer than `MIN_SCENES` or do not vary.
+        interval: 95 % interval, with the t quantile of the true values, cut to [0, 1]; NaN where
+            these are fewer than `MIN_SCENES` or do not vary.
         weight: weight of the predictions (lambda), 0 = the mean of the true values alone.
-        num_true: true values.
-        num_more: predictions without a true value.
+        num_true: number of true values.
+        num_more: number of predictions without a true value.
     """
 
     value: float

@@ -68,8 +68,8 @@ def mean_interval(
         sums: (E, M) sums of the values of each episode.
         counts: (E, M) number of these values, or what else the sums are divided by; both 0 =
             the episode has none.
-        low: least value that there is.
-        high: greatest.
+        low: least possible value.
+        high: greatest possible value.
 
     Returns:
         (M,) means, NaN where there is no value; (2, M) ends of the intervals, NaN where fewer

@@ -89,10 +89,10 @@ class Reading(NamedTuple):
     """Settings that turn a change of colour into a probability of motion.
 
     Attributes:
-        brightness: the share of a colour's brightness that counts.
+        brightness: weight of the brightness of a colour, 0 to 1.
         may: distance of two colours (root mean square of their channels) from which a pixel may
             have changed.
-        surely: that from which it surely has.
+        surely: distance of two colours from which a pixel has certainly changed.
     """
 
     brightness: float
@@ -130,9 +130,9 @@ class FixedCamera:
     Args:
         track: frames of the view.
         camera: intrinsics of the camera; its pose is the guess, if there is one.
-        robot: gives the links' poses.
+        robot: robot whose link poses are drawn.
         shapes: shapes of the links.
-        joints: measured positions.
+        joints: measured joint positions.
         num_frames: number of frames that are compared, spread over the recording.
         num_corners: directions in which a part's outermost points are drawn.
 

@@ -92,7 +92,7 @@ class SeenPoint:
 
     Attributes:
         recording: number of the recording.
-        seconds: after its first joint state [s].
+        seconds: time after the recording's first joint state [s].
         position: (3,) position of the tool point, by the joint states, in the base link [m].
         pixel: (2,) pixel at which it was seen [px].
     """
@@ -109,8 +109,8 @@ class JointState:
 
     Attributes:
         poses: (4, 4) T_base_camera [m] by place.
-        lens: (3,) against that of the camera given, for `through`.
-        own_steps: (6,) by place, in `UNITS`: how far its pose has gone its own way.
+        lens: (3,) change of the lens against the given camera, for `through`.
+        own_steps: (6,) change of the pose apart from the common one, by place, in `UNITS`.
     """
 
     poses: Mapping[int, FloatArray]
@@ -134,7 +134,7 @@ class JointCamera:
     """Estimator of the camera poses of all places, and of one lens.
 
     Args:
-        recordings: one of each recording and view.
+        recordings: estimators of the single recordings, one of each recording and view.
         places: number of the place of each; views have places of their own.
         intrinsics_known: whether the lens is that of a calibration.
         views: number of the view of each; None = all are of one. Views share the lens (against

@@ -64,7 +64,8 @@ def expected_within(apart_px: FloatArray) -> float:
     NaN = not known.
 
     Args:
-        apart_px: (N,) of points that were not fitted to, taken for normal in x and y.
+        apart_px: (N,) distances of points that were not fitted to, taken for normal in x and y
+            [px].
     """
     count = len(apart_px)
     if not count:
@@ -78,16 +79,19 @@ class SharedEstimate:
 
     Attributes:
         cameras: cameras of each recording, (R,).
-        places: recordings that share a place.
-        measures: the doctor's measure of each recording.
-        guess_measures: the same of the guess; empty where there was none.
+        places: numbers of the places, for recordings that share one.
+        measures: offset of the moving pixels from the robot in each recording, as `check` measures
+            it.
+        guess_measures: such offsets under the camera poses that the user guessed; empty without a
+            guess.
         kept_guess: whether the guess fits better and is what `cameras` has.
-        focal_px: estimated, or the one given.
+        focal_px: focal length, estimated or given [px].
         bent: whether the lens' k1 was estimated, too.
         fits: (R,) correlation of drawn and seen changes of each recording.
-        apart_px: (N,) how far the seen tool points that were left out of a first fit are drawn
-            from there; the last one is to all points.
-        strays: seen points that contradict the others, and how far they are drawn from there [px].
+        apart_px: (N,) distances between drawn and seen tool points [px]: those left out of a first
+            fit, from that fit; the last one from the fit to all points.
+        strays: seen points that contradict the others, and their distances from where they are
+            drawn [px].
     """
 
     cameras: tuple[CameraModel, ...]
@@ -235,7 +239,7 @@ class _Together:
     """Views that share their lens.
 
     Args:
-        each: the views.
+        each: estimators of the single views.
         focal_known: whether the lens is that of a calibration.
     """
 
@@ -416,7 +420,7 @@ def seen_points(
     robot: RobotModel,
     shapes: Sequence[LinkShape],
 ) -> list[SeenPoint]:
-    """Return where what was seen is by the joint states.
+    """Return the positions of the seen tool points, by the joint states.
 
     Args:
         points: points by the name of the episode: (time [s], x, y [px]), or with the arm's number.
@@ -458,7 +462,7 @@ def load_points(path: Path, view: str, arms: Sequence[str] = ()) -> dict[str, li
     """Read seen tool points: `{<view>: {<episode>: [[seconds, x, y], ...]}}` [s, px].
 
     Args:
-        path: file.
+        path: path of the file.
         view: name of the view.
         arms: names of the robot's arms; a row may end with one, whose number is returned. Rows
             without are of the first arm.

@@ -132,7 +132,7 @@ class WristCamera:
     Args:
         tracks: points seen by it.
         camera: intrinsics and `mount_link`; the pose is the guess, if there is one.
-        robot: gives the link's poses.
+        robot: robot that has the camera's link.
     """
 
     def __init__(self, tracks: SceneTracks, camera: CameraModel, robot: RobotModel) -> None:
@@ -315,7 +315,7 @@ def follow_scene(
         track: frames of the camera.
         camera: intrinsics of the camera.
         robot: whose joints are meant.
-        joints: measured positions.
+        joints: measured joint positions.
 
     Raises:
         CalibrationError: too little moves, or too few points can be tracked.

@@ -24,8 +24,8 @@ def attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
     on an AMD EPYC with AVX-512 bfloat16, `experiments/training_speed.py`).
 
     Args:
-        query: (B, H, M, D).
-        key: (B, H, N, D).
+        query: (B, H, M, D) queries.
+        key: (B, H, N, D) keys.
         value: (B, H, N, P); P may differ from D.
     """
     scale = query.shape[-1] ** -0.5

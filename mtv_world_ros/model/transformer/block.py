@@ -68,7 +68,7 @@ class RunwiseBlock(WanTransformerBlock):
         """Return (B, S, D).
 
         Args:
-            hidden_states: (B, S, D).
+            hidden_states: (B, S, D) tokens.
             encoder_hidden_states: (B, N, D) tokens of images and text.
             temb: (B, R, 6, D) modulations of the runs.
             rotary_emb: cosines and sines, each (1, S, 1, d).

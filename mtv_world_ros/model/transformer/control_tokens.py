@@ -119,8 +119,8 @@ class ControlTokens(nn.Module):
     Args:
         context: fields of `control.ContextInput`; None = no such input.
         frame: fields of `control.FrameInput`; None = no such input.
-        dim: D.
-        frames_per_token: G.
+        dim: width D of a token.
+        frames_per_token: number G of frames that a token stands for.
         num_prompt_tokens: learned tokens in place of the text; 0 = the model has text.
     """
 

@@ -190,7 +190,7 @@ class ReferenceDecoder(nn.Module):
         """Return (N, out_channels, h, w) clean latents.
 
         Args:
-            tokens: (B, V, F/G, h4, w4, D).
+            tokens: (B, V, F/G, h4, w4, D) tokens.
             skips: features of the stem, fine to coarse.
             temb: (B, D) time embedding.
             keys: (R, reference_channels, h2, w2) features of the reference images.

@@ -24,7 +24,7 @@ def embed_video(transformer: Any, x: Tensor, temb: Tensor) -> tuple[Tensor, list
     """Return tokens (B, V, f, h, w, D) of x (B, V, C_in, F, H, W), and what is skipped with.
 
     Args:
-        transformer: its `patch_embedding` is used.
+        transformer: transformer whose `patch_embedding` is used.
         x: noisy latents, control and start image by channel.
         temb: (B, D) embedding of their noise level.
     """
@@ -42,7 +42,7 @@ def embed_history(transformer: Any, history: Tensor, start: Tensor, temb: Tensor
     Its control is zero: the commands that led through it are done with.
 
     Args:
-        transformer: its `patch_embedding` is used.
+        transformer: transformer whose `patch_embedding` is used.
         history: (B, V, C, P, H, W) latents.
         start: (B, V, C, F, H, W) the start-image slot of the video; its last frame's is taken.
         temb: (B, D) embedding of the history's noise level.
@@ -67,10 +67,11 @@ def embed_reference(
     ago there is none.
 
     Args:
-        transformer: its `ref_conv` (phi of the paper) is used.
+        transformer: transformer whose `ref_conv` (phi of the paper) is used.
         reference: (B, V, C, H, W) latents of the start image.
         start_control: latents of the control frame 0.
-        anchor: the same of the rollout's first frame; None = the start image is the reference.
+        anchor: (B, V, C, H, W) latents of the rollout's first frame; None = the start image is the
+            reference.
         temb: (B, D) embedding of the video's noise level.
     """
     if anchor is not None and transformer.stem != 'conv':
@@ -107,7 +108,7 @@ def unembed(
     """Return (B, V, C, F, H, W) of the kept tokens (B, V, f, h, w, D).
 
     Args:
-        transformer: its `proj_out` is used.
+        transformer: transformer whose `proj_out` is used.
         kept: the video's tokens.
         skips: skips of `embed_video`.
         temb: (B, D) embedding of the video's noise level.
@@ -131,7 +132,7 @@ class MultiViewRotaryPosEmbed(WanRotaryPosEmbed):
 
     Args:
         attention_head_dim: channels of one head.
-        patch_size: (time, height, width) of a token; kept for the base class.
+        patch_size: size (time, height, width) of a token; kept for the base class.
         max_seq_len: largest position along any axis, view offset included.
         view_offset: `width` puts view v at columns v*w .. (v+1)*w; `none` gives all views the same
             positions (the view embedding alone tells them apart).
@@ -212,7 +213,7 @@ class TokenGrid(NamedTuple):
     """The token frames of all views.
 
     Attributes:
-        tokens: (B, V, F, h, w, D).
+        tokens: (B, V, F, h, w, D) tokens.
         times: F times for the rotary embedding. The video stands at 1 .. f and the reference image
             at 0, as Wan2.1-Fun-Control was trained, whatever is before them; the history stands
             at -p .. -1.

@@ -66,11 +66,11 @@ class ArmResponse:
     """See the module.
 
     Attributes:
-        joint_names: J, of the robot.
-        compliance: (J,) 1 / k [rad / N m].
-        armature: (J,) [s^2].
-        damping: (J,) [s].
-        lead: (J,) [s].
+        joint_names: names of the robot's J joints.
+        compliance: (J,) compliance of each drive, 1 / k [rad / N m].
+        armature: (J,) armature of each drive over its stiffness [s^2].
+        damping: (J,) damping of each drive over its stiffness [s].
+        lead: (J,) time of the velocity feed-forward of each drive [s].
         floor: lowest height of fingertips, in the base frame [m]; None = not known. It stops
             joints with a compliance, which are those of a description with inertias.
 
@@ -191,9 +191,9 @@ class _Tips:
     """Fingertips near the table.
 
     Attributes:
-        heights: (P,) heights over it [m].
-        jacobians: (P, 3, J).
-        positions: (J,) that both are of.
+        heights: (P,) heights of the fingertips over the table [m].
+        jacobians: (P, 3, J) derivatives of the fingertips' positions by the joints.
+        positions: (J,) joint positions of both [rad or m].
     """
 
     heights: FloatArray

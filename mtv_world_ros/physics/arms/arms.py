@@ -46,15 +46,16 @@ class Drives:
 
     Attributes:
         names: names of the degrees of freedom.
-        columns: (D,) the robot's joints that they follow.
-        multipliers: (D,).
-        offsets: (D,) [rad or m].
+        columns: (D,) indices of the robot's joints that they follow.
+        multipliers: (D,) factors of those joints.
+        offsets: (D,) offsets [rad or m].
         fingers: (D,) whether they move a finger.
-        travels: (D,) way of a finger's tip for a unit of it [m per rad or m]; 0 = no finger.
-        stiffness: (D,) [N m/rad or N/m].
-        damping: (D,) [N m s/rad or N s/m].
-        armature: (D,) [kg m^2 or kg].
-        lead: (D,) [s].
+        travels: (D,) travel of a finger's tip for a unit of the degree of freedom [m per rad or
+            m]; 0 = no finger.
+        stiffness: (D,) stiffness [N m/rad or N/m].
+        damping: (D,) damping [N m s/rad or N s/m].
+        armature: (D,) armature [kg m^2 or kg].
+        lead: (D,) time of the velocity feed-forward [s].
     """
 
     names: tuple[str, ...]

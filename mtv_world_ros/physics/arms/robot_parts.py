@@ -64,7 +64,7 @@ class RobotParts:
     """Parts of all links, and the assumptions where the description is incomplete.
 
     Attributes:
-        parts: P.
+        parts: convex parts of the links, P.
         notes: assumptions, as text.
     """
 

@@ -54,9 +54,9 @@ class _Piece:
     Attributes:
         size: half extents (3,) of a box; radius, half height and 0 of a cylinder [m].
         at: (3,) middle of the piece in the solid [m].
-        mass: [kg].
-        yaw: about z [rad].
-        is_round: a cylinder.
+        mass: mass of the piece [kg].
+        yaw: rotation about z [rad].
+        is_round: whether the piece is a cylinder.
     """
 
     size: tuple[float, float, float]
@@ -92,7 +92,7 @@ class CompiledScene:
 
     Attributes:
         arms: arms of the robot.
-        kinds: O kinds of solids, see `kind_of`.
+        kinds: kinds of the O solids, see `kind_of`.
         model: the `MjModel`, whose numbers are replaced.
         arm_qpos: (D,) indices of the arms' positions in qpos.
         arm_dofs: (D,) indices of the arms' velocities in qvel.
@@ -180,7 +180,7 @@ class CompiledScene:
 
 
 def kind_of(solid: Solid) -> str:
-    """Return of what pieces a solid is made."""
+    """Return the kind of a solid, which decides the pieces that it is made of."""
     wide, long, high = map(float, solid.size)
     across = min(wide, long)
     if across > MIN_DISH_WIDTH_M and across > MIN_DISH_RATIO * high:
@@ -302,7 +302,7 @@ def _vessel(wide: float, high: float, rim: float, density: float) -> list[_Piece
 
 
 def _tray(wide: float, long: float, high: float, settings: ContactSettings) -> list[_Piece]:
-    """Return a box without a lid; it is heavy below."""
+    """Return the floor and the walls of a box without a lid; the floor has most of the mass."""
     x, y, wall = wide / 2, long / 2, min(settings.wall_m, wide / 2, long / 2) / 2
     half = max(high - WALL_GAP_M, MIN_THICKNESS_M) / 2
     walls = (

@@ -92,10 +92,11 @@ class BatchState:
     Attributes:
         physics: (K, N) MuJoCo's full physics states.
         arms: state of the arms in free space, as if they had touched nothing.
-        last: the course before; None = the arms rested.
-        still: (K,) rows for which all was at rest.
+        last: motion before this part of the plan; None = the arms were at rest.
+        still: (K,) number of rows in which all solids have been at rest.
         lost: reasons why futures were dropped, by number of the future.
-        grips: of each future, what measured fingers hold (`ContactSettings.grips_hold`).
+        grips: grip of each solid that measured fingers hold (`ContactSettings.grips_hold`), by
+            number of the solid, for each future.
     """
 
     physics: FloatArray
@@ -112,7 +113,7 @@ class BatchMotion:
 
     Attributes:
         points: (K, T + 1, O, 3) centres of the solids [m].
-        rotations: (K, T + 1, O, 3, 3).
+        rotations: (K, T + 1, O, 3, 3) rotation matrices of the solids.
         joints: (K, T + 1, J) joints of the robot, which what it touches may stop [rad or m].
         steps: steps of the engine that were computed, of all futures together.
     """
@@ -160,7 +161,7 @@ class Engine:
         return self._scenes[key]
 
     def begin(self, futures: Sequence[Future]) -> Batch:
-        """Return what computes futures of solids of the same kinds."""
+        """Return the batch that computes futures of solids of the same kinds."""
         return Batch(self, futures)
 
     def run(
@@ -364,7 +365,7 @@ class _Run:
         self._rows = [self._read()]
 
     def grip(self, course: GripCourse) -> None:
-        """Hold what the fingers of a course are seen to hold, from its first row on."""
+        """Hold the solids that the measured fingers of a course hold from its first row on."""
         self._grip_course = course
         self._hold(0)
         self._rows = [self._read()]
@@ -451,7 +452,7 @@ class _Run:
         self._rows.append(self._read())
 
     def motion(self) -> BatchMotion:
-        """Return what the rows were."""
+        """Return the motion of all computed rows."""
         points, rotations, joints = (np.stack(rows, 1) for rows in zip(*self._rows, strict=True))
         return BatchMotion(points=points, rotations=rotations, joints=joints, steps=self.computed)
 

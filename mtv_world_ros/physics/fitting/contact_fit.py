@@ -60,7 +60,7 @@ class FingerFitSettings:
         min_closing_fraction: a gripper that closes by a larger fraction of its travel may touch.
         max_error_fraction: errors beyond this fraction of the travel count the same: contact.
         num_candidates: candidates drawn in each round.
-        search_factors: range of each round, as a factor around the best value so far.
+        search_factors: range of each round, as a factor around the best value before it.
         max_episodes: number of episodes that are used, spread evenly.
         min_periods: shortest usable part of an episode [control periods].
         min_explained_fraction: smallest explained fraction of the errors at which fingers swing.
@@ -200,7 +200,8 @@ class ContactFitSettings:
         proposal_min_log_std: smallest standard deviation of the next round's draws.
         min_effective_draws: effective draws below which an interval is not stated.
         enough_effective_draws: effective draws below which the likelihood is tempered.
-        enough_fraction: the same limit as a fraction of all draws.
+        enough_fraction: effective draws below which the likelihood is tempered, as a fraction of
+            all draws.
         min_temper: smallest exponent of the tempered likelihood.
         max_width_ratio: a parameter whose interval is wider by this factor than with the others
             known is not told apart from them.
@@ -258,11 +259,12 @@ class ContactRecording:
 
     Attributes:
         names: names of O objects.
-        frame: the first.
-        positions: (1 + T * n, J) commanded, `PERIOD_S` apart [rad or m].
-        recorded: (1 + T * n, J) reported by the joints then.
-        displacements: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
-        grippers: before they close.
+        frame: first frame of the recording, with its masks.
+        positions: (1 + T * n, J) commanded joint positions, `PERIOD_S` apart [rad or m].
+        recorded: (1 + T * n, J) joint positions measured at these times [rad or m].
+        displacements: (1 + T, O, 3) displacements of the objects since the first step, by their
+            masks; NaN = not known [m].
+        grippers: motion of the grippers before they close.
     """
 
     names: tuple[str, ...]
@@ -286,13 +288,13 @@ class FittedNumber:
         name: name of the setting, or of a product of settings.
         value: the mean of what is likely.
         low: lower end of its 90 % interval, whatever the other numbers are.
-        high: upper end.
+        high: upper end of that interval.
         spread: standard deviation if the other numbers are as found, of factors that of the
             logarithm.
         count: recordings, or objects, that say something of it.
         of: number of recordings that were looked at.
-        counted: what `count` and `of` are.
-        apart: its interval is hardly wider than if the other numbers were known.
+        counted: word for what `count` and `of` count: recordings or objects.
+        apart: whether the interval is hardly wider than with the other numbers known.
     """
 
     name: str
@@ -315,7 +317,7 @@ class FittedNumber:
 
 
 def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> ContactRecording:
-    """Read what an episode says about contact: masks, command and joint states.
+    """Return the masks, commands and joint states of an episode, for the contact fit.
 
     Raises:
         EpisodeError: see `object_displacements`.
@@ -485,7 +487,7 @@ def settings_of_place(
     """Return settings for recordings on several tables, or without commands of their own.
 
     Args:
-        first: default settings.
+        first: settings that are adapted to the recordings.
         recordings: the E recordings.
         report: callback that gets a line of text for each difference.
     """
@@ -644,7 +646,7 @@ def _finding(
 
     Args:
         name: name of the number.
-        values: (N,) logarithms.
+        values: (N,) logarithms of the drawn values.
         likelihoods: (N, E) likelihoods of the draws, by recording.
         weights: (N,) weights of the draws, which sum to 1.
         conditional: standard deviation if the other numbers are known; None = it stands alone.
@@ -740,7 +742,7 @@ class _Trial:
 
 
 def find_delay(recordings: Sequence[ContactRecording], arms: Arms) -> FittedNumber:
-    """Return how much later joints move than commands of now would have them move."""
+    """Return the delay of the measured joints against their modelled response [s]."""
     errors = np.stack([_delay_errors(one, arms) for one in recordings])
     known = errors[np.isfinite(errors).all(-1)]
     return _resampled(
@@ -799,7 +801,7 @@ def _ray_gaps(frame: FirstFrame) -> list[float]:
 
 
 def find_table(recordings: Sequence[ContactRecording]) -> FittedNumber:
-    """Return the height at which what stands on a table ends below."""
+    """Return the height of the table, from the lower ends of objects that stand on it [m]."""
     bottoms = []
     for recording in recordings[:: max(1, len(recordings) // _FIT.max_tables)]:
         frame, points = recording.frame, recording.frame.points()

@@ -114,7 +114,8 @@ class PlayedPlan:
     Attributes:
         bag_s: time since the start of playing [s].
         stamp_ns: stamp that it was published with [ns].
-        state: one of `ENDS`; `UNANSWERED` = nothing was reported in time; empty = it is open.
+        state: end of the plan, one of `ENDS`; `UNANSWERED` = nothing was reported in time; empty =
+            it is open.
         reason: reason of a rejection or failure, with its text.
     """
 

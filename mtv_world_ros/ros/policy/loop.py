@@ -179,7 +179,7 @@ class PolicyLoop:
         joint_names: J names, in the robot's order.
         actor: asks the policy.
         frames: store of what the world model publishes.
-        outputs: see there.
+        outputs: publishers and clients of the node.
     """
 
     def __init__(

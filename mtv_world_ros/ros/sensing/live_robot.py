@@ -114,7 +114,7 @@ class Extrinsics:
     Args:
         node: owner of the subscriptions and the publisher.
         links: links of the robot, those whose pose its joint states determine.
-        events: has the present parameters.
+        events: events of the node, with its present parameters.
         publishes: whether frames that TF lacks are published.
 
     Raises:

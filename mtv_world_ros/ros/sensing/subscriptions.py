@@ -158,15 +158,15 @@ class MatchedSubscription:
     (match, reliable, best_effort) and `.depth` override the reliability and the depth.
 
     Attributes:
-        topic: resolved name.
-        num_received: messages so far.
+        topic: resolved name of the topic.
+        num_received: number of messages received.
 
     Args:
-        node: owner.
-        kind: message type.
-        topic: relative or absolute name.
+        node: node that subscribes.
+        kind: class of the message.
+        topic: relative or absolute name of the topic.
         callback: receiver of the messages; with two arguments also of rclpy's information.
-        depth: messages kept.
+        depth: number of messages in the queue.
         default: `match`, or `reliable`, `best_effort` for a plain subscription.
     """
 

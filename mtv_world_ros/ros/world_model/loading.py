@@ -48,9 +48,9 @@ class AdapterSwitch:
     A value whose adapter cannot be read or is of another model refuses the parameter.
 
     Args:
-        node: has the parameter.
+        node: node that has the parameter.
         world_model: model that takes the adapter.
-        run_between: runs a job between rollouts.
+        run_between: function that runs a job between rollouts.
 
     Raises:
         MtvWorldError: the value at start-up cannot be used.

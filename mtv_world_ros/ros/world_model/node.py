@@ -29,7 +29,7 @@ class WorldModelNode(LifecycleNode):
     """Loads when it is configured, takes plans while it is active.
 
     Args:
-        load: makes the pipeline from the parameters.
+        load: function that returns the pipeline of the parameters.
         context: ROS context of the node; default: the process' own.
 
     Raises:

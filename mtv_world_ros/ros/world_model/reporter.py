@@ -227,8 +227,8 @@ class Tally:
         """Return the diagnostic level and all problems.
 
         Args:
-            now_s: now [s].
-            num_policies: publishers of trajectories.
+            now_s: present time [s].
+            num_policies: number of publishers of trajectories.
             missing: inputs that the node lacks, as text.
         """
         level, texts = DiagnosticStatus.WARN, []

@@ -62,7 +62,7 @@ class Chunk:
     """A predicted chunk of a request.
 
     Attributes:
-        request: the request.
+        request: request that the chunk answers.
         plan: the plan from where the rollout started.
         scene: the scene it started from.
         prediction: frames, masks and estimate.
@@ -92,7 +92,7 @@ class Ended:
     """The one end of a request.
 
     Attributes:
-        request: the plan.
+        request: request that has ended.
         state: `done`, `preempted`, `rejected`, `failed` or `reset`.
         num_chunks: number of predicted chunks.
         last: last predicted chunk; None = no chunk was predicted.

@@ -74,11 +74,11 @@ def collect(
         seed: the data set's random seed.
         out: folder of the data set; one episode folder appears in it at a time.
         zero_shot: kinds of a zero-shot set (`view`, `task`, `object`); none = an ordinary set.
-        workers: processes.
+        workers: number of processes.
         config: randomisation and sampling.
         failures_of_ten: number of episodes in ten of a task that miss their grasp; none in
             zero-shot sets.
-        sheets: also write a larger contact sheet of every task.
+        sheets: whether a larger contact sheet of every task is written, too.
         progress: show a progress bar, on a terminal.
 
     Returns:

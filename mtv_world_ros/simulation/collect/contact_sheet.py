@@ -28,8 +28,8 @@ def film_strip(path: Path, num_frames: int, width: int) -> ByteArray:
     """Return frames of an episode, evenly from first to last: time to the right, views below.
 
     Args:
-        path: the episode.
-        num_frames: columns.
+        path: folder of the episode.
+        num_frames: number of columns.
         width: width of a frame in the strip [px].
 
     Returns:

@@ -169,7 +169,7 @@ def check_same_tasks(out: Path, entries: Iterable[CardEntry], tasks: Iterable[Ta
 
     Args:
         out: folder of the data set.
-        entries: its episodes.
+        entries: episodes of the data set.
         tasks: tasks of the episodes that are to be made.
 
     Raises:

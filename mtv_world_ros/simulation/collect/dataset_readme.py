@@ -156,7 +156,7 @@ def readme(out: Path, card: Mapping[str, Any], entries: Sequence[CardEntry]) -> 
 
     Args:
         out: folder of the data set.
-        card: see `card_of`.
+        card: card of the data set, see `card_of`.
         entries: episodes of the data set, at least one.
     """
     first = out / min(entry.name for entry in entries)

@@ -129,7 +129,7 @@ def simulate(
         seed: the episode's random seed.
         config: sampling of frames and commands.
         miss: the expert displaces one grasp.
-        variant: runs in place of the expert; None = the expert.
+        variant: faulty variant that acts in place of the expert; None = the expert.
 
     Raises:
         SimulatorError: the expert cannot reach a way point.
@@ -160,7 +160,7 @@ def carry_out(
     """Run commands open loop, as a controller would that is given the action chunks.
 
     Args:
-        sim: has just been reset, or given a scene.
+        sim: simulator that has just been reset, or given a scene.
         task: the task whose relations decide success.
         commands: one row per control period.
         first: the simulator's first observation.

@@ -35,7 +35,7 @@ class SteppedWorld:
         response: response of the joints; all have a compliance.
         settings: settings of contact.
         solids: the O solids on the table.
-        masses: (O,) [kg].
+        masses: (O,) masses of the objects [kg].
         home: (J,) initial rest positions of the joints [rad or m].
 
     Raises:
@@ -127,7 +127,7 @@ class DriveTargets:
 def course_of(
     arms: DrivenArms, where: FloatArray, speeds: FloatArray, swings: FloatArray
 ) -> tuple[DriveTargets, FloatArray]:
-    """Return what arms are to do in a period, and the swings (2, F) of the fingers after it.
+    """Return the targets of the arms in a period, and the swings (2, F) of the fingers after it.
 
     Args:
         arms: arms of a world.

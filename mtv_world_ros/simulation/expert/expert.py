@@ -92,16 +92,18 @@ class ExpertConfig:
         above_grasp: height of the pre-grasp over the grasp, range [m].
         lift: height of the lift, range [m].
         above_place: height of the pre-place over the place [m].
-        above_drop: the same over a container, where it is let go higher up [m].
+        above_drop: height of the pre-place over a container, where the object is let go higher up
+            [m].
         drop: height of the lowest point over a container's wall, where it is let go [m].
         retreat: rise after opening [m].
-        close_s: time to close the gripper.
-        open_s: time to open it.
-        swing_s: time of one swing of a shake.
+        close_s: time to close the gripper [s].
+        open_s: time to open the gripper [s].
+        swing_s: time of one swing of a shake [s].
         speed: mean speed of the tool between way points [m/s], before scaling.
-        least_s: shortest move between way points, before scaling.
-        motion_s: time from first to last motion of a task of one move, range; scaled to it.
-        motions_s: the same for each move of a task of several.
+        least_s: shortest move between way points, before scaling [s].
+        motion_s: range of the time from first to last motion in a task of one move, to which the
+            plan is scaled [s].
+        motions_s: range of this time for each move in a task of several [s].
         overlap_s: time before the end of a move at which the other arm may start [s].
         picking: gaps between fingers and objects.
     """

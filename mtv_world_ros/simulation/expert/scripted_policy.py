@@ -106,8 +106,9 @@ class ScriptedPolicy:
         """Return the next commands, or None where the episode is over.
 
         Args:
-            observation: its stamp counts from the episode's first one; nothing else is looked at.
-            instruction: not looked at: the scene's is carried out.
+            observation: observation; only its stamp is used, which counts from the episode's first
+                one.
+            instruction: not used: the scene's instruction is carried out.
 
         Raises:
             PolicyError: not reset, or the observation is older than the episode.
@@ -248,7 +249,7 @@ def scripted_policy(
     """Return the policy of a name, for the scene that the simulator draws for a task and a seed.
 
     Args:
-        name: e.g. `expert` or `expert-miss-0.5`; see `parse_variant`.
+        name: name of the policy, e.g. `expert` or `expert-miss-0.5`; see `parse_variant`.
         task: the task, or the name of a bundled one.
         seed: seed of the episode, as `SimEpisode.reset` takes it and a recorded episode has it.
         expert: the scripted expert, which plans.

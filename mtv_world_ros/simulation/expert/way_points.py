@@ -47,7 +47,7 @@ class Draws:
         sign: +1 or -1.
         angle: angle of a direction in the plane [rad].
         errors: (N, 3) errors of way points, standard normal.
-        openings: (N,) the same of openings.
+        openings: (N,) errors of the gripper openings, standard normal.
         play: draws anew for every plan that is tried.
         objects: (3,) centre of every object of the scene [m].
         other_home: (3,) rest position of another arm's tool [m].

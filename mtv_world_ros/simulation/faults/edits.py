@@ -63,14 +63,14 @@ def changed(
     """Return a copy of a way point, changed by a row of a program.
 
     Args:
-        stop: the other one.
+        stop: way point that is copied.
         move: the move that it belongs to.
         factor: factor of the lengths in `by`.
         weight: factor of the lengths in `by` and of angles that are added.
         place: name of the place that it is moved to.
         by: displacement, as lengths by direction [m].
         phase: phase of the move.
-        seconds: it takes; the name of a way point = as long as that.
+        seconds: time of the way point [s]; the name of a way point = as long as that one.
         **shape: `opening`, `yaw` and `lean`.
     """
     new = replace(stop, position=move.place(place)) if place else stop

@@ -33,9 +33,9 @@ class SecondArm(Schema):
         to: name of the place that it visits.
         share: fraction of the path to that place.
         level: whether the share shortens its way in the plane alone.
-        like: way point of the first arm that it is like; empty = as it rests.
-        but: changes of that way point.
-        rows: its way points, as differences from that.
+        like: way point of the first arm that the second arm copies; empty = its own rest position.
+        but: changes of that copy.
+        rows: way points of the visit, as differences from that copy.
         before: way point of the first arm before which `done` of the rows are done.
         after: way point after which they are done, or a number of way points.
         done: number of rows.
@@ -65,12 +65,13 @@ class Visit:
     """A visit of a second arm in one move.
 
     Attributes:
-        ways: its way points up to where it rests, by the share of the way there that it goes.
-        share: share of the way; less where it is out of reach.
-        meets: time from the begin of the move, before scaling [s].
-        done: number of its way points that are done then.
+        ways: way points of the visit up to the rest position, for a share of the way there.
+        share: share of the way that the arm goes; less where the place is out of reach.
+        meets: time at which `done` way points are done, from the begin of the move, before scaling
+            [s].
+        done: number of way points that are done at that time.
         waits: the first arm waits at its first way point if the second one takes longer.
-        is_timed: by a way point of the first arm.
+        is_timed: whether that time is that of a way point of the first arm.
     """
 
     ways: Callable[[float], Stops]

@@ -78,7 +78,7 @@ class WayPointFaults:
 
         Args:
             stops: way points of the move, with its faults.
-            draws: what is drawn for it.
+            draws: random draws for the move.
             home: way point at which the second arm rests.
             times: times of the way points, before scaling [s].
         """
@@ -96,7 +96,7 @@ def with_faults(
     """Return the plan (T, J) as a variant carries it out; joints stay within their limits.
 
     Args:
-        plan: equally spaced.
+        plan: trajectory of equally spaced points.
         variant: variant whose faults of commands are applied.
         robot: the robot that these joints belong to.
         rng: generator that draws the noise.

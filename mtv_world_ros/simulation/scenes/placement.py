@@ -38,7 +38,7 @@ def goal_of(move: Move, items: dict[str, SceneObject], shift: tuple[float, float
     Args:
         move: the expert's move.
         items: role -> object where it is before the move.
-        shift: drawn share (-1..1) of the goal's spread in x and y.
+        shift: drawn shift of the goal in x and y, as a share (-1..1) of its spread.
     """
     subject = items[move.subject]
     if not isinstance(move, PickPlace):

@@ -61,7 +61,8 @@ class Shape:
     Attributes:
         geoms: name of the macro of `config/mjcf/shapes.xml.j2` that draws it.
         smallest: full extents (x, y, z) of the smallest one [m].
-        largest: of the largest one; sizes in between keep to the line from one to the other.
+        largest: full extents of the largest one [m]; sizes in between lie on the line from one to
+            the other.
         grasp: grasp by a gripper; None = the object is never moved.
         colours: words of the palette that it comes in.
         step: turn about z after which it looks the same to a gripper [rad].

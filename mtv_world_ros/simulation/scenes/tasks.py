@@ -114,9 +114,9 @@ class PickPlace(Schema):
             `table` (the middle of the table).
         offset: goal centre minus the reference's centre, (x, y) [m].
         spread: half widths of the region around it that the goal is drawn from, (x, y) [m].
-        rest: where the subject comes to rest: `table`, `on` (on the reference) or `in` (dropped
-            into the reference).
-        least: no goal is nearer than this to where the subject lies [m].
+        rest: place where the subject comes to rest: `table`, `on` (on the reference) or `in`
+            (dropped into the reference).
+        least: smallest distance of the goal from where the subject lies [m].
     """
 
     subject: str
@@ -132,8 +132,8 @@ class Shake(Schema):
 
     Attributes:
         subject: role that is shaken.
-        lean: how far it leans in turn, positive towards the table's middle [rad]; the wrist has
-            less room the other way.
+        lean: angles that it leans by in turn, positive towards the table's middle [rad]; the wrist
+            has less room the other way.
         lift: height it is shaken at, over where it stood [m].
         num_swings: number of swings from one side to the other.
     """
@@ -170,7 +170,7 @@ class SceneSpec(Schema):
     Attributes:
         roles: objects; required roles come before distractors.
         moves: the expert's moves, in order.
-        mirrored: left and right of the whole scene are exchanged in every second episode.
+        mirrored: whether left and right of the whole scene are exchanged in every second episode.
         after: bundled task after which this one takes its turn in `--task all`; empty = by name.
     """
 
@@ -188,8 +188,8 @@ class Task:
         definition: instruction, and the relations that must hold at the end.
         roles: objects; required roles come before distractors.
         moves: the expert's moves, in order.
-        mirrored: left and right of the whole scene are exchanged in every second episode.
-        zero_shot: no part of `--task all`; for the zero-shot sets.
+        mirrored: whether left and right of the whole scene are exchanged in every second episode.
+        zero_shot: whether the task is for the zero-shot sets alone, and no part of `--task all`.
     """
 
     definition: TaskSpec = field(hash=False)
@@ -416,7 +416,7 @@ def stored_or_named(definition: str, name: str, where: str) -> Task:
     """Return the task of a stored definition, else the bundled task of a name.
 
     Args:
-        definition: what `own_definition` returned; empty = the name is enough.
+        definition: text of `own_definition`; empty = the name is enough.
         name: name of the task.
         where: place of the definition, for error texts.
 

@@ -79,10 +79,10 @@ class Workcell:
         bases: arm -> (x, y) of its first joint [m].
         home_tools: arm -> (3,) position of its tool at rest, pointing down [m].
         home_joints: arm -> joint positions near that pose, without the gripper [rad].
-        finger_width_m: width of a finger tip, across the fingers' travel.
-        finger_thickness_m: along it.
+        finger_width_m: width of a finger tip, across the fingers' travel [m].
+        finger_thickness_m: thickness of a finger tip, along the fingers' travel [m].
         placement: limits of its scenes.
-        cameras: nominal ones, in the order of the views.
+        cameras: nominal cameras, in the order of the views.
         table_m: height of the table [m].
         object_size: factor of the objects' sizes.
     """

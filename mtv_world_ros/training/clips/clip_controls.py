@@ -151,7 +151,7 @@ class ControlMaker:
     Attributes:
         robot: robot of the episodes.
         segmenter: finds the objects of the start frame.
-        control: how plans enter the model.
+        control: control of the model.
     """
 
     robot: RobotModel

@@ -143,7 +143,7 @@ def drop_conditions(
 
     Args:
         conditioning: conditioning of a batch.
-        augment: probabilities.
+        augment: probabilities of the drops.
         draws: random numbers of the batch.
         control_dropout: the control's own, where it is higher than `augment.control_dropout`.
     """

@@ -57,8 +57,8 @@ class LatentCache:
     at its last shard.
 
     Args:
-        root: holds caches of any settings.
-        settings: everything that the tensors of all clips depend on, as plain values.
+        root: folder of caches of any settings.
+        settings: settings that the tensors of all clips depend on, as plain values.
         shard_bytes: size at which a shard is written.
 
     Attributes:
@@ -186,7 +186,7 @@ class CachedClip:
     """A clip that a cache holds or will hold.
 
     Attributes:
-        recording: its episode.
+        recording: episode of the clip.
         start: recorded frame that it starts from.
         key: key in the cache.
     """
@@ -432,13 +432,13 @@ class CachedSource:
     """Batches from a cache: every clip once an epoch, in an order of its own each epoch.
 
     Args:
-        cache: has all clips.
+        cache: cache that has all clips.
         clips: all clips of the training.
-        objective: pixel weights.
+        objective: weights of pixels in the loss.
         text: (1, 512, text_dim) umT5 tokens of the prompt, in models with text.
-        batch_size: clips of a step, over all processes.
+        batch_size: number of clips of a step, over all processes.
         seed: seed of the order.
-        numbers: the clips of a step that this process takes; None: all.
+        numbers: positions of this process's clips in a step; None: all.
         device: device of the batches.
     """
 

@@ -34,7 +34,7 @@ def read_mapped(path: Path | str, limit: str = 'array_bytes') -> dict[str, np.nd
     checksums of mapped members are not verified.
 
     Args:
-        path: the file.
+        path: path of the file.
         limit: field of `Limits` for the size of all arrays.
 
     Raises:

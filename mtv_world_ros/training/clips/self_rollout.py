@@ -31,7 +31,7 @@ class SelfRollout:
     """Replacement of the start frames of clips that have a lead-in.
 
     Args:
-        controls: makes the inputs of what was imagined.
+        controls: maker of the control inputs of imagined frames.
         encoders: encoders on the device that trains.
         scheduler: noise levels and step rule of serving.
         num_inference_steps: denoising steps of a chunk.

@@ -22,7 +22,7 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DescribedObject:
-    """One object; what is None is not known.
+    """Description of one object; None = not known.
 
     Attributes:
         id: unique in the scene.
@@ -30,8 +30,10 @@ class DescribedObject:
             looks for.
         colour: main colour of the object.
         category: kind of object, e.g. `block`.
-        role: one of `ROLES`: what is moved, what things stand on, what things go into.
-        box: left, top, right, bottom in thousandths of the image's width and height.
+        role: role of the object, one of `ROLES`: what is moved, what things stand on, what things
+            go into.
+        box: edges (left, top, right, bottom) of the object in thousandths of the image's width and
+            height.
     """
 
     id: str

@@ -156,7 +156,7 @@ class VlmDescriber:
     """Asks once a frame; an answer that is not valid is asked for a second time, with the error.
 
     Args:
-        chat: the model.
+        chat: client of the model.
         cache: cache of answers; None = none are kept.
     """
 

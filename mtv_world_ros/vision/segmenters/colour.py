@@ -228,8 +228,8 @@ class _Images:
     Attributes:
         frames: (T, H, W, 3) uint8 RGB.
         background: (3,) the median colour, RGB.
-        inside: by word the N pixels of its hue, but for some of the palest: flat indices (N,)
-            into T, H, W, and saturations (N,).
+        inside: pixels of the hue of each colour word, but for some of the palest, by word: (N,)
+            flat indices into T, H, W, and (N,) saturations.
     """
 
     frames: ByteArray

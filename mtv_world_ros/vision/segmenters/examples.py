@@ -84,7 +84,7 @@ class Example:
         Args:
             name: name of the object.
             frame: (H, W, 3) uint8 RGB.
-            box: around it.
+            box: edges of the box around the object [px].
         """
         height, width = frame.shape[:2]
         left, top, right, bottom = (round(edge) for edge in box)
@@ -183,7 +183,7 @@ class ObjectExamples:
         return [example for example in self.examples if example.name == name]
 
     def save(self, path: Path) -> None:
-        """Write them as safetensors."""
+        """Write the examples as a safetensors file."""
         tensors: dict[str, NDArray[np.generic]] = {'elsewhere': self.elsewhere}
         for number, example in enumerate(self.examples):
             tensors |= {f'{number}.frame': np.ascontiguousarray(example.frame),
@@ -194,7 +194,7 @@ class ObjectExamples:
 
     @staticmethod
     def load(path: Path) -> ObjectExamples:
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
             ConfigError: there is no such file, or it is something else.

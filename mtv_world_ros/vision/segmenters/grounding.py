@@ -104,8 +104,8 @@ class GroundingConfig:
     """Score thresholds of detections.
 
     Attributes:
-        min_score: an object that scores less is absent.
-        sure_score: one that scores less is `low_confidence`.
+        min_score: score below which an object is absent.
+        sure_score: score below which an object is `low_confidence`.
         rival_share: another place with this share of the best score makes the object ambiguous.
         same_place: boxes of one name that overlap with at least this IoU are one place.
         same_box: boxes of two names that overlap with at least this IoU are one object, which
@@ -131,7 +131,8 @@ class Detections:
     """Detected boxes of the named objects.
 
     Attributes:
-        boxes: (O, 4) left, top, right, bottom [px]; NaN where there is none.
+        boxes: (O, 4) left, top, right and bottom edge of each object [px]; NaN where there is
+            none.
         status: O words: `ok`, `absent`, `ambiguous` or `low_confidence`.
     """
 
@@ -239,7 +240,7 @@ def box_iou(boxes: FloatArray, box: FloatArray) -> FloatArray:
 
 
 def _prompt(names: tuple[str, ...]) -> tuple[str, list[tuple[int, int]]]:
-    """Return the detector's text, `red block. blue cup.`, and where in it each name stands."""
+    """Return the detector's text, `red block. blue cup.`, and the place of each name in it."""
     text, spans = '', []
     for name in names:
         phrase = ' '.join(name.lower().replace('.', ' ').split())
@@ -249,7 +250,7 @@ def _prompt(names: tuple[str, ...]) -> tuple[str, list[tuple[int, int]]]:
 
 
 def _tokens_of(spans: list[tuple[int, int]], offsets: np.ndarray) -> list[BoolArray]:
-    """Return for each name which of the (N, 2) token offsets lie in it."""
+    """Return the numbers of the tokens in each name, by their (N, 2) character offsets."""
     begins, ends = offsets.T
     return [(begins >= first) & (ends <= last) & (begins < ends) for first, last in spans]
 

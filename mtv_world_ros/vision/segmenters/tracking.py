@@ -56,7 +56,7 @@ class ObjectTrack:
     """One object in one view.
 
     Attributes:
-        masks: (T, H, W) bool.
+        masks: (T, H, W) bool masks of the object.
         status: a word of `ObjectMasks.status`.
     """
 
@@ -104,7 +104,7 @@ def track(
         first: (H, W) mask of the object just before frame 0, if known.
         config: thresholds for joining and tracking pieces of a colour.
         taken: (T, H, W) pixels that another object of the same colour holds.
-        out: (T, H, W) all False, takes the masks; None = a new array.
+        out: (T, H, W) array of False that takes the masks; None = a new array.
     """
     if taken is not None:
         pixels = pixels & ~taken
@@ -161,7 +161,7 @@ class _Patch(NamedTuple):
 
 
 def _patch(frame: BoolArray) -> _Patch:
-    """Return the patch of what is set in a frame (H, W).
+    """Return the patch that covers the pixels set in a frame (H, W).
 
     Begins at even pixels, empty if nothing is.
 
@@ -194,7 +194,7 @@ def _find(patch: _Patch, state: _State, config: TrackingConfig, mask: BoolArray)
         patch: pixels of the object's colour.
         state: state of the track.
         config: thresholds for joining and tracking pieces of a colour.
-        mask: (H, W) all False; the object is set in it.
+        mask: (H, W) array of False in which the object is set.
 
     Returns:
         Whether it was found.
