@@ -23,7 +23,10 @@ is another than the expert's in the same scene, the share in which the last imag
 what really happened than to what the expert's commands make happen, where objects are. The last table is
 of the node's watch, which compares the end of every executed chunk (here where objects truly are) with
 the futures of the fitted parameters: how many rollouts it takes to say that the physics is another one,
-over random orders.
+over random orders. The same ends may confirm the fitted parameters in a cell in which nothing was fitted
+(`ContactConfirmation`): the page has how many rollouts that takes, over random orders in which tasks are
+mixed or come one after the other, and what verdicts are worth from the first rollout on, by the wide prior
+until then. Shares are means over the orders. *False success* is there of all failures.
 """  # noqa: E501
 
 from __future__ import annotations
@@ -77,7 +80,14 @@ from mtv_world_ros.simulation.faults.drawn import is_drawn
 from mtv_world_ros.simulation.physics import catalogue, physics_named
 from mtv_world_ros.simulation.scenes.tasks import task_named
 from mtv_world_ros.simulation.simulator import CONTROL_PERIOD_S, SimEpisode
-from mtv_world_ros.success.doubts import Grounds, NEAR_M, PhysicsWatch, unforeseen
+from mtv_world_ros.success.doubts import (
+    ContactConfirmation,
+    Grounds,
+    NEAR_M,
+    PhysicsWatch,
+    shrunk,
+    unforeseen,
+)
 from mtv_world_ros.success.estimator import (
     capped,
     estimate_of_futures,
@@ -105,16 +115,22 @@ WATCHED = (
     'truth', 'foreseen by', 'chunks that ended unforeseen',
     'says so after rollouts: median [5 %, 95 %]', 'orders in which it never does',
 )  # fmt: skip
+CONFIRMED = ('truth', 'tasks', 'orders that confirm', 'after rollouts: median [5 %, 95 %]',
+             'no verdict', 'false success', 'from .9 on succeed', 'ECE')  # fmt: skip
 FLIPPED = ('truth', 'imagined by', 'flips of contact that are imagined')
 FORESEEN, PICTURES, BOTH = 'foreseen motions alone', 'pictures alone', 'both'
 REAL, RULE, FITTED = 'real frames', 'no-picture rule', 'foreseen motions, fitted there'
 AS_FITTED = 'foreseen motions, as if fitted here'
+#: truths in which everything looks as in `nominal` before it moves
+SAME_PICTURE = ('bold', 'mass_triple', 'dart')
 #: judges that rest on futures alone
 OF_FUTURES = (FORESEEN, AS_FITTED, FITTED)
 #: a robot cell in which nothing was fitted
 _ELSEWHERE = 'another robot cell'
 #: random orders of rollouts in which the watch sees them
 _ORDERS = 100
+#: random orders of rollouts in which fitted parameters are confirmed
+CONFIRMING_ORDERS = 200
 #: what pictures are made for
 IMAGINED = (PICTURES, BOTH)
 Job = tuple[str, str, int, int, str]
@@ -683,6 +699,101 @@ def needed(apart: Sequence[Sequence[float]], order: Iterable[int]) -> int:
     return 0
 
 
+def confirmed_rows(
+    options: argparse.Namespace, pipelines: dict[str, Pipeline], found: Sequence[dict[str, Any]]
+) -> list[list[str]]:
+    """Return what becomes of a robot cell in which nothing was fitted, in each physics."""
+    (name, pipeline), *_ = pipelines.items()
+    # the wide prior foresees the same wherever the first picture is the same
+    twins = {tuple(r['job'][1:]): r for r in found if r['job'][0] in SAME_PICTURE}
+    rows = []
+    for physics in options.physics.split(','):
+        is_nominal = physics == NOMINAL
+        lines = [r for r in found if r['job'][0] == physics]
+        unfitted = [twins.get(tuple(r['job'][1:])) if is_nominal else r for r in lines]
+        lines = [r for r, other in zip(lines, unfitted, strict=True) if other is not None]
+        judge = FORESEEN if is_nominal else AS_FITTED
+        said = [r['said'][name].get(judge, {}) for r in lines]
+        if not lines or not all('apart' in one for one in said):
+            continue
+        fitted = [estimated(pipeline, judge, one, physics) for one in said]
+        prior = [
+            estimated(pipeline, FORESEEN, r['said'][name][FORESEEN], r['job'][0])
+            for r in unfitted
+            if r is not None
+        ]
+        apart = [one['apart'] for one in said]
+        for title, is_mixed in (('mixed', True), ('one after the other', False)):
+            cells = confirmed_cells(lines, apart, fitted, prior, is_mixed=is_mixed)
+            rows.append([physics, title, *cells])
+    return rows
+
+
+def confirmed_cells(
+    lines: Sequence[dict[str, Any]],
+    apart: Sequence[Sequence[float]],
+    fitted: Sequence[ShareEstimate],
+    prior: Sequence[ShareEstimate],
+    *,
+    is_mixed: bool,
+) -> list[str]:
+    """Return the rest of a row of N rollouts.
+
+    Args:
+        lines: lines of the log.
+        apart: distances of the chunks' ends from the futures of the fitted parameters [m].
+        fitted: estimates with these parameters.
+        prior: estimates with the wide prior.
+        is_mixed: whether tasks take turns; else one comes after the other.
+    """
+    rng, real = np.random.default_rng(0), np.array([r['final'] for r in lines], np.bool_)
+    tasks = [r['job'][1] for r in lines]
+    names = sorted(set(tasks))
+    first, said, true = [], [], []
+    for _ in range(CONFIRMING_ORDERS):
+        order = rng.permutation(len(lines))
+        if not is_mixed:
+            rank = dict(zip(rng.permutation(names), range(len(names)), strict=True))
+            order = np.array(sorted(order, key=lambda number: rank[tasks[number]]))
+        watch, test, confirmed = PhysicsWatch(), ContactConfirmation(), 0
+        for count, number in enumerate(order, 1):
+            trust = test.trust(tasks[number]).is_confirmed and not watch.doubt
+            one = fitted[number] if trust else prior[number]
+            confirmed = confirmed or count * trust
+            if watch.doubt and isfinite(one.probability):
+                middle, interval = shrunk(one.probability, one[1:])
+                one = ShareEstimate(middle, *interval)
+            said.append(one)
+            for chunk, away in enumerate(apart[number], 1):
+                away_m = nan if away is None else away
+                watch.take(away_m, count)
+                is_last = chunk == len(apart[number])
+                test.take(away_m, count, tasks[number], is_last=is_last)
+        first.append(confirmed)
+        true.append(real[order])
+    return _over_orders(np.array(first), np.array(said), np.concatenate(true))
+
+
+def _over_orders(first: np.ndarray, said: np.ndarray, real: np.ndarray) -> list[str]:
+    """Return cells.
+
+    Args:
+        first: (K,) rollout from which on parameters were confirmed in each order; 0 = never.
+        said: (K * N, 3) probabilities and intervals.
+        real: (K * N,) whether the rollouts succeed.
+    """
+    calls = np.array([verdict(one[0], tuple(one[1:])) for one in said])
+    known, sure, after = np.isfinite(said[:, 0]), said[:, 0] >= 0.9, '–'
+    if first.any():
+        low, middle, high = np.percentile(first[first > 0] - 1, (5, 50, 95))
+        after = f'{middle:.0f} [{low:.0f}, {high:.0f}]'
+    wrong = f'{(calls[~real] == 1).mean():.3f}' if (~real).any() else '–'
+    held = f'{real[sure].mean():.2f}' if sure.any() else '–'
+    error = expected_calibration_error(said[known, 0], real[known])
+    return [f'{(first > 0).sum()} of {len(first)}', after, f'{np.isnan(calls).mean():.2f}',
+            wrong, held, f'{error:.2f}']  # fmt: skip
+
+
 def main() -> None:
     """Print a row for each physics and judge, and write them as a page."""
     options = parse_arguments(__doc__, 1, more)
@@ -714,6 +825,8 @@ def main() -> None:
                 table(FLIPPED, flip_rows(options, found, list(pipelines))),
                 'Executed chunks against the futures:',
                 table(WATCHED, watch_rows(options, found, list(pipelines))),
+                'Confirmed by how rollouts end:',
+                table(CONFIRMED, confirmed_rows(options, pipelines, found)),
             ]
         ),
         options,

@@ -21,6 +21,9 @@ rate lies, to half a rollout, within the mean 95 % interval of its estimates; or
 sampling error, if the 95 % Wilson interval of the rate reaches the mean interval. Given is the share
 of rollouts in covered groups. The picture has the groups of `nominal`, of `bold`, and of all truths
 but `nominal` together.
+
+The last table is of robot cells in which nothing was fitted, where the ends of rollouts may confirm
+the fitted parameters; see `shifted_worlds.py`. Nominal is taken as such a cell, too.
 """  # noqa: E501
 
 from __future__ import annotations
@@ -44,6 +47,8 @@ from shifted_worlds import (
     across,
     AS_FITTED,
     BOTH,
+    CONFIRMED,
+    confirmed_rows,
     estimated,
     FITTED,
     FORESEEN,
@@ -53,6 +58,7 @@ from shifted_worlds import (
     RULE,
     ruled,
     run,
+    SAME_PICTURE,
     Scenes,
     watch_rows,
     WATCHED,
@@ -152,10 +158,6 @@ def before(
         rows.append(line)
         estimates.append(_before(calibration, said))
     return found
-
-
-#: truths in which everything looks as in `nominal` before it moves
-SAME_PICTURE = ('bold', 'mass_triple', 'dart')
 
 
 def _before(calibration: Calibration, said: Line) -> ShareEstimate:
@@ -315,6 +317,20 @@ def reliability(
     figure.savefig(file)
 
 
+def over_truths(rows: Sequence[Sequence[str]]) -> str:
+    """Return means over all truths but the nominal one, of rows of `confirmed_rows`."""
+    lines = []
+    for tasks in dict.fromkeys(one[1] for one in rows):
+        others = [one for one in rows if one[1] == tasks and one[0] != NOMINAL]
+        if others:
+            unknown, error = (np.mean([float(one[k]) for one in others]) for k in (4, 7))
+            lines.append(
+                f'Mean of {len(others)} truths but the nominal one, tasks {tasks}: no verdict '
+                f'{unknown:.2f}, ECE {error:.2f}.'
+            )
+    return '\n'.join(lines)
+
+
 def main() -> None:
     """Run what is missing, and print and write the tables."""
     options = parse_arguments(__doc__, 1, more)
@@ -347,6 +363,7 @@ def main() -> None:
     reliability(found, folder / picture)
     asked = ('seeds', 'physics', 'pictures', 'size', 'scenes', 'policies', 'tasks', 'before')
     command = ' '.join(f'--{k} {getattr(options, k)}' for k in asked if getattr(options, k))
+    confirmed = confirmed_rows(options, pipelines, lines)
     parts = [
         (__doc__ or '').split('\n' * 2, 2)[-1].strip(),
         f'{len(lines)} rollouts.',
@@ -360,6 +377,9 @@ def main() -> None:
         f'![Reliability diagram]({picture})',
         'Executed chunks against the futures of the fitted parameters:',
         table(WATCHED, watch_rows(options, lines, list(pipelines))),
+        'Robot cells in which nothing was fitted, confirmed by how rollouts end:',
+        table(CONFIRMED, confirmed),
+        over_truths(confirmed),
     ]
     publish(
         'unseen_faults',

@@ -5,13 +5,19 @@ Shape letters: V views, O objects, K futures, T frames, H W pixels, J joints.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mtv_world_ros.cameras.motion import Motion
-from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks, Observation
+from mtv_world_ros.core.data_types import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    ObjectMasks,
+    Observation,
+)
 from mtv_world_ros.core.errors import RolloutPreempted
 from mtv_world_ros.core.images import resize_frames, resize_labels
 from mtv_world_ros.physics.foreseen_motions import foreseen_of, ForeseenMotions
@@ -51,6 +57,44 @@ class ObjectForesight:
         What they look like where nothing hides them is kept.
         """
         return replace(self, source=source, found=None)
+
+    def as_fitted(self) -> ObjectForesight:
+        """Return objects that are foreseen with the fitted contact parameters, not their prior.
+
+        Objects whose simulation has begun go on as they are.
+        """
+        if self.model is None or self.found is not None or self.model.is_fitted:
+            return self
+        model = self.model.as_fitted()
+        whole = {names: found.simulated_by(model) for names, found in self._whole.items()}
+        return replace(self, model=model, _whole=whole)
+
+    def ends_by(
+        self,
+        model: ObjectMotionModel,
+        plans: Sequence[ChunkPlan],
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> FloatArray | None:
+        """Return centres (K, 1 + T, O, 3) in the futures of another model [m]; None = unknown.
+
+        Args:
+            model: motion model, e.g. one with other contact parameters.
+            plans: the chunks since the objects were found; the centres are those of the last one.
+            should_stop: polled while futures are simulated; true cancels.
+
+        Raises:
+            RolloutPreempted: `should_stop` said so.
+        """
+        if self.found is None:
+            return None
+        found = self.found.simulated_by(model)
+        for plan in plans:
+            found = found.after(
+                plan.fine_positions(found.tracked.step_s, found.tracked.commands_a_step),
+                should_stop,
+            )
+        motions = replace(self, found=found).motions(plans[-1], is_begun=True)
+        return None if motions is None else motions.at_frames(plans[-1])
 
     def foresee(
         self,

@@ -135,6 +135,10 @@ class TrackedObjects(Protocol):
         """Return True if contact parameters were fitted in this robot cell."""
         ...
 
+    def simulated_by(self, model: Any) -> TrackedObjects:
+        """Return the objects as they were found, to be simulated by another model."""
+        ...
+
     def advance(
         self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
     ) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
@@ -154,7 +158,13 @@ class TrackedObjects(Protocol):
 
 
 class ObjectMotionModel(Protocol):
-    """Foresees object motions under commanded joints."""
+    """Foresees object motions under commanded joints.
+
+    Attributes:
+        is_fitted: contact parameters were fitted in the robot cell, or confirmed there.
+    """
+
+    is_fitted: bool
 
     def find(
         self,
@@ -195,6 +205,10 @@ class ObjectMotionModel(Protocol):
 
     def at_place(self, place: str) -> ObjectMotionModel:
         """Return the model for a robot cell, with wide priors if it was fitted elsewhere."""
+        ...
+
+    def as_fitted(self) -> ObjectMotionModel:
+        """Return the model with the fitted parameters in place of the prior around them."""
         ...
 
 
@@ -245,6 +259,11 @@ class FoundObjects:
         cuts = np.where(hidden[:, None, None, None], whole.cuts, self.cuts)
         poses = np.where(hidden[:, None, None], whole.poses, self.poses)
         return replace(self, cuts=cuts, poses=poses)
+
+    def simulated_by(self, model: ObjectMotionModel) -> FoundObjects:
+        """Return the objects as they were found, to be simulated by another model."""
+        tracked = self.tracked.simulated_by(model)
+        return replace(self, tracked=tracked, motions=(), positions=None, part_row=0)
 
     def foresee(self, parts: Iterable[FloatArray]) -> tuple[FoundObjects, ...]:
         """Return the objects after each part of a plan, which show the same motion as before.

@@ -64,8 +64,11 @@ class SolidForesight:
         threads: int = 1,
     ) -> None:
         self.robot, self.response, self.settings = robot, response, settings
-        #: contact parameters were fitted in the robot cell; else futures draw them from the prior
+        #: contact parameters were fitted in the robot cell, or confirmed there; else futures draw
+        #: them from the prior
         self.is_fitted = True
+        #: settings before the prior took their place
+        self._as_fitted = settings
         self._threads = threads
         self.engine = Engine(Arms(robot, response), threads)
         self.engine.scene_of(())
@@ -78,7 +81,7 @@ class SolidForesight:
     def with_robot(self, robot: RobotModel) -> SolidForesight:
         """Return the same for a robot of the same joints and tools."""
         other = SolidForesight(robot, self.response, self.settings, self._threads)
-        other.is_fitted = self.is_fitted
+        other.is_fitted, other._as_fitted = self.is_fitted, self._as_fitted
         return other
 
     def at_place(self, place: str) -> SolidForesight:
@@ -91,6 +94,14 @@ class SolidForesight:
             return self
         other = copy.copy(self)
         other.settings, other.is_fitted = self.settings.as_prior(), False
+        return other
+
+    def as_fitted(self) -> SolidForesight:
+        """Return the foresight with the fitted parameters in place of the prior around them."""
+        if self.is_fitted:
+            return self
+        other = copy.copy(self)
+        other.settings, other.is_fitted = self._as_fitted, True
         return other
 
     def find(
@@ -268,6 +279,15 @@ class TrackedSolids:
         lost, count = self.state.lost, self.foresight.settings.num_motions
         why = max(set(lost.values()), key=list(lost.values()).count)
         return (*doubts, f'{len(lost)} of {count} foreseen futures do not count: {why}')
+
+    def simulated_by(self, model: SolidForesight) -> TrackedSolids:
+        """Return the objects as they were found, to be simulated by another model.
+
+        Args:
+            model: foresight of the same robot; it takes the table of this one.
+        """
+        on_table = model._on_table(self.foresight.settings.table_m)
+        return replace(self, foresight=on_table, batch=None, state=None)
 
     def advance(
         self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False

@@ -9,6 +9,7 @@ import warnings
 
 from mtv_world_ros.core.errors import ConfigError, nearest
 from mtv_world_ros.robot.plan import PlanLimits
+from mtv_world_ros.success.doubts import ContactTrust
 from mtv_world_ros.success.task import TaskSpec
 
 #: keyword of version 0.1.0 for `RolloutOptions.limits.tolerance`
@@ -39,6 +40,7 @@ class RolloutOptions:
         should_stop: called between denoising steps and between chunks; True = the rollout stops.
         doubt: reason why the fitted physics does not hold here, which widens the estimate; empty
             = no contradiction was observed.
+        contact: evidence on contact parameters that were fitted in another robot cell.
     """
 
     instruction: str = ''
@@ -51,6 +53,7 @@ class RolloutOptions:
     limits: PlanLimits = PlanLimits()
     should_stop: Callable[[], bool] = never
     doubt: str = ''
+    contact: ContactTrust = ContactTrust()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'objects', tuple(self.objects))

@@ -40,7 +40,7 @@ from mtv_world_ros.rollout.scene_memory import SceneKeeper, SceneMemory
 from mtv_world_ros.rollout.state import RolloutState
 from mtv_world_ros.success.calibration import Calibration, Fits, HorizonCurve, load_fits
 from mtv_world_ros.success.doubts import doubted, Grounds, widened
-from mtv_world_ros.success.estimator import JudgedChunk, SuccessEstimator
+from mtv_world_ros.success.estimator import JudgedChunk, SuccessEstimator, verdict_word
 from mtv_world_ros.success.fitted_to import Setting
 from mtv_world_ros.success.own_tasks import bundled_tasks, chosen_task
 from mtv_world_ros.success.rollout_memory import footage_of
@@ -374,7 +374,10 @@ class Pipeline:
         in_view = motion.tools_in_view()
         start_masks = self.find(state, options)
         clock.lap('start masks')
-        objects = state.objects.foresee(
+        objects = state.objects
+        if options.contact.is_confirmed:
+            objects = objects.as_fitted()
+        objects = objects.foresee(
             plan,
             start,
             options.objects,
@@ -451,6 +454,7 @@ class Pipeline:
             segmenter=self.segmenter.name,
             num_inference_steps=num_steps,
             foreseen=None if foreseen is None else foreseen.at_frames(plan),
+            objects=objects,
             in_view=in_view,
             seconds=MappingProxyType(clock.seconds),
         )
@@ -575,9 +579,13 @@ class Pipeline:
         )
         estimate = judged.estimate if is_real else self.grounds.bear(judged.estimate)
         estimate = doubted(estimate, check.notes, check.refusal)
-        return judged._replace(
-            estimate=widened(estimate, options.doubt) if options.doubt else estimate
-        )
+        if options.doubt:
+            estimate = widened(estimate, options.doubt)
+        if foreseen is not None and options.contact.text:
+            is_open = verdict_word(estimate.probability, estimate.interval) == 'open'
+            word = 'open: ' if is_open and not options.contact.is_confirmed else ''
+            estimate = doubted(estimate, (f'{word}{options.contact.text}',))
+        return judged._replace(estimate=estimate)
 
     def _majority(self, state: RolloutState, options: RolloutOptions) -> Majority:
         """Return the rule that selects futures of majority outcome, for pictures and estimate."""

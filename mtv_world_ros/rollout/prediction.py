@@ -18,6 +18,7 @@ from mtv_world_ros.core.data_types import (
     Observation,
     SuccessEstimate,
 )
+from mtv_world_ros.physics.episode_objects import ObjectForesight
 from mtv_world_ros.success.calibration import HorizonCurve
 
 #: 97.5 % quantiles of Student's t for 1 ... 9 degrees of freedom; 2 bounds it from there on
@@ -61,6 +62,7 @@ class Prediction:
         num_inference_steps: denoising steps of the chunk.
         foreseen: (K, 1 + T, O, 3) centres of the objects in each future at the chunk's start and
             at its frames [m]; None = nothing was foreseen.
+        objects: the objects and their foreseen motion until the chunk's end.
         in_view: (V,) share of the states in which the view shows a tool.
         seconds: time spent by stage [s].
     """
@@ -81,6 +83,7 @@ class Prediction:
     segmenter: str = ''
     num_inference_steps: int = 0
     foreseen: FloatArray | None = None
+    objects: ObjectForesight | None = None
     in_view: FloatArray
     seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 

@@ -87,7 +87,8 @@ class ObservationSettings(Schema):
         '',
         'Name of this robot cell, as in `mtv-world fit contact --place`. Where contact parameters '
         'were fitted in another one, futures are drawn from a wide prior, and most successes stay '
-        "open. Simulated episodes are of 'simulator/PHYSICS'.",
+        'open until ten executed plans ended as foreseen. Simulated episodes are of '
+        "'simulator/PHYSICS'.",
     )
 
 

@@ -17,7 +17,7 @@ from mtv_world_ros.physics.contact_settings import (
 )
 from mtv_world_ros.physics.engine.futures import draw_futures
 from mtv_world_ros.physics.fitting.contact_fit import _joint_draws
-from mtv_world_ros.physics.solid_foresight import SolidForesight
+from mtv_world_ros.physics.solid_foresight import SolidForesight, TrackedSolids
 from mtv_world_ros.physics.solids import Solid
 from mtv_world_ros.robot.file import load_robot
 
@@ -128,3 +128,32 @@ def test_foresight_of_another_robot_cell_draws_from_the_prior(settings):
     assert foresight.is_fitted and foresight.settings == settings
     assert not elsewhere.with_robot(ROBOT).is_fitted
     assert elsewhere.at_place('simulator/nominal') is elsewhere
+
+
+def test_the_prior_can_be_taken_back_and_found_objects_are_simulated_anew(settings):
+    few = settings.replace(num_motions=3)
+    fitted = SolidForesight(ROBOT, None, few)
+    elsewhere = fitted.at_place('cell 3')
+    again = elsewhere.as_fitted()
+    assert again.is_fitted and again.settings == few and fitted.as_fitted() is fitted
+    assert elsewhere.with_robot(ROBOT).as_fitted().settings == few
+    positions = np.tile(np.clip(0.0, ROBOT.lower, ROBOT.upper), (11, 1))
+
+    def tracked(foresight):
+        return TrackedSolids(foresight=foresight, names=('block',), solids=(BLOCK,))
+
+    def grips(objects):
+        return [future.settings.grip_friction for future in objects.futures()]
+
+    expected, of_fit = tracked(fitted).advance(positions)
+    _, of_prior = tracked(elsewhere).advance(positions)
+    assert grips(of_prior)[1:] == [draw.grip_friction for draw in elsewhere.settings.draws[:2]]
+    anew = of_prior.simulated_by(fitted.with_robot(ROBOT))  # by a simulator of its own
+    assert anew.batch is None and anew.is_fitted and not of_prior.is_fitted
+    assert grips(anew) == grips(of_fit) != grips(of_prior)
+    found, _ = anew.advance(positions)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one.points, other.points, atol=1e-12)
+    # the table of the place stays
+    low = tracked(elsewhere._on_table(-0.01)).simulated_by(fitted)
+    assert low.foresight.settings == few.replace(table_m=-0.01)

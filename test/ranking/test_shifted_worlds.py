@@ -86,3 +86,38 @@ def test_an_end_that_looks_like_the_experts_is_no_flip(benchmark):
     for grey, expected in ((150, True), (60, False)):
         imagined = benchmark.packed(np.full((1, 4, 4, 3), grey, np.uint8))
         assert benchmark.is_flip(faulty, expert, imagined) is expected
+
+
+OPEN, SURE = (0.89, 0.1, 0.99), (0.98, 0.87, 1.0)
+
+
+def cells(benchmark, aways, tasks=('a',), is_mixed=True):
+    """Return the cells of rollouts that succeed, one an end and task, which only the fit says."""
+    rows = [
+        {'job': ['bold', task, 0, 0, 'expert'], 'final': True} for _ in aways for task in tasks
+    ]
+    apart = [[away] for away in aways for _ in tasks]
+    fitted, prior = ([benchmark.ShareEstimate(*one)] * len(rows) for one in (SURE, OPEN))
+    return benchmark.confirmed_cells(rows, apart, fitted, prior, is_mixed=is_mixed)
+
+
+def test_verdicts_come_back_after_ten_rollouts_that_ended_as_foreseen(benchmark):
+    assert cells(benchmark, [0.0] * 40) == [
+        '200 of 200',
+        '10 [10, 10]',
+        '0.25',
+        '–',
+        '1.00',
+        '0.04',
+    ]
+    # ends that were not foreseen: nothing is confirmed, and estimates shrink once that is noticed
+    never = cells(benchmark, [0.2] * 40)
+    assert never[:5] == ['0 of 200', '–', '1.00', '–', '–']
+    # rollouts in which nothing moved tell nothing
+    assert cells(benchmark, [None] * 40)[:3] == ['0 of 200', '–', '1.00']
+
+
+def test_each_task_is_open_until_an_end_of_its_own_was_as_foreseen(benchmark):
+    # ten of the first task, then one of each other task: 12 of 60
+    found = cells(benchmark, [0.0] * 20, ('a', 'b', 'c'), is_mixed=False)
+    assert found[:3] == ['200 of 200', '10 [10, 10]', '0.20']

@@ -14,7 +14,9 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Float32MultiArray
 
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
+from mtv_world_ros.core.errors import RolloutPreempted
 from mtv_world_ros.core.images import resize_frames
+from mtv_world_ros.physics.object_motion import ObjectMotionModel
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
@@ -26,7 +28,13 @@ from mtv_world_ros.ros.node_events import NodeEvents
 from mtv_world_ros.ros.sensing.samples import Samples
 from mtv_world_ros.ros.status_publisher import create_publisher
 from mtv_world_ros.ros.world_model.worker import Chunk, Request, Result
-from mtv_world_ros.success.doubts import PhysicsWatch, unforeseen
+from mtv_world_ros.success.doubts import (
+    ContactConfirmation,
+    ContactTrust,
+    PhysicsWatch,
+    unforeseen,
+)
+from mtv_world_ros.success.estimator import NOT_FITTED_HERE
 from mtv_world_ros.vision.jaccard import held_masks, mean_of_known, object_jaccard
 
 #: chunks that wait for their real frames; the oldest is given up for a newer one
@@ -93,7 +101,8 @@ class LiveFidelity:
     Chunks of imagine mode are not compared: nobody executes them.
 
     Attributes:
-        watch: tests whether executed plans ended as foreseen.
+        watch: tests whether executed plans ended as the fitted contact parameters foresee.
+        confirmation: tests whether parameters of another robot cell hold in this one.
 
     Args:
         node: owner of the publisher.
@@ -107,7 +116,9 @@ class LiveFidelity:
         pipeline: Pipeline,
         events: NodeEvents,
     ) -> None:
-        self.watch = PhysicsWatch()
+        self.watch, self.confirmation = PhysicsWatch(), ContactConfirmation()
+        self._place = ''
+        self._fitted: ObjectMotionModel | None = None
         # imagined frames begin chunks, too, and cameras were checked before
         self._pipeline, self._spec = replace(pipeline, camera_checker=None), pipeline.spec
         self._events = events
@@ -154,7 +165,7 @@ class LiveFidelity:
 
     def use_robot(self, robot: RobotModel) -> None:
         """Observe with another description of the same robot from the next chunk on."""
-        self._pipeline = self._pipeline.with_robot(robot)
+        self._pipeline, self._fitted = self._pipeline.with_robot(robot), None
 
     def see(self, view: str, message: Image | CompressedImage) -> None:
         """Take a real image; it is looked at in the thread."""
@@ -262,13 +273,74 @@ class LiveFidelity:
             num_frames=len(indices),
         )
         self._results.append(scored)
-        # futures of a prior foresee nearly everything: they are no test of the fit
-        is_fitted = self.is_fitted_at(prediction.start.place)
-        is_whole = len(indices) == len(prediction.video.times)
-        if prediction.foreseen is not None and is_fitted and is_whole:
-            away_m = unforeseen(prediction.foreseen, episode.seen_points(len(indices)))
-            self.watch.take(away_m, expected.chunk.request.rollout)
+        if len(indices) == len(prediction.video.times):
+            self._test_physics(expected.chunk, episode.seen_points(len(indices)))
         self._done.trigger()
+
+    def _test_physics(self, chunk: Chunk, seen: FloatArray) -> None:
+        """Compare the end of an executed chunk with the futures of the fitted parameters.
+
+        Futures of the prior foresee nearly everything: they are no test.
+
+        Args:
+            chunk: the imagined chunk.
+            seen: (1 + T, O, 3) where masks showed the objects [m].
+        """
+        prediction, request = chunk.prediction, chunk.request
+        objects, foreseen = prediction.objects, prediction.foreseen
+        if objects is None or objects.found is None or foreseen is None:
+            return
+        if not objects.found.tracked.is_fitted:
+            plans = chunk.plan.chunks(self._spec)[: prediction.chunk + 1]
+            try:
+                foreseen = objects.ends_by(self._fitted_model(), plans, lambda: self._closing)
+            except RolloutPreempted:
+                return
+        if foreseen is None:
+            return
+        self._use_place(prediction.start.place)
+        away_m = unforeseen(foreseen, seen)
+        self.watch.take(away_m, request.rollout)
+        is_last = prediction.chunk + 1 == prediction.num_chunks
+        self.confirmation.take(away_m, request.rollout, request.instruction, is_last=is_last)
+
+    def _fitted_model(self) -> ObjectMotionModel:
+        """Return foresight with the fitted parameters; its simulator is this thread's own."""
+        if self._fitted is None:
+            model = self._pipeline.object_motion
+            assert model is not None  # something was foreseen
+            self._fitted = model.with_robot(self._pipeline.robot)
+        return self._fitted
+
+    def _use_place(self, place: str) -> None:
+        """Begin the tests anew in another robot cell."""
+        if place != self._place:
+            self._place, self.confirmation = place, ContactConfirmation()
+            self.watch.forget()
+
+    def trust(self, place: str, instruction: str) -> ContactTrust:
+        """Return the evidence on contact parameters that were fitted in another robot cell.
+
+        Args:
+            place: name of this robot cell; empty = not stated.
+            instruction: text for the robot.
+        """
+        if self.is_fitted_at(place):
+            return ContactTrust()
+        if place != self._place:
+            return ContactConfirmation().trust(instruction)
+        trust = self.confirmation.trust(instruction)
+        return replace(trust, is_confirmed=trust.is_confirmed and not self.watch.doubt)
+
+    def physics_text(self, place: str) -> str:
+        """Text about the contact parameters in a robot cell, for `/diagnostics`."""
+        is_here = place == self._place
+        if self.is_fitted_at(place):
+            return self.watch.text
+        if is_here and self.watch.doubt:
+            return self.watch.doubt
+        tested = self.confirmation if is_here else ContactConfirmation()
+        return f'{tested.text}; {NOT_FITTED_HERE}' if tested.num_missing else tested.text
 
     def _real_episode(self, chunk: Chunk) -> Rollout:
         """Return the real frames of the chunk's rollout; a new episode if some are missing."""

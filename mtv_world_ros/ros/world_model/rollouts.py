@@ -45,7 +45,6 @@ from mtv_world_ros.ros.world_model.loading import (
 from mtv_world_ros.ros.world_model.prediction_publisher import PredictionPublisher
 from mtv_world_ros.ros.world_model.reporter import Reporter
 from mtv_world_ros.ros.world_model.worker import Request, RolloutWorker
-from mtv_world_ros.success.estimator import NOT_FITTED_HERE
 
 #: measured joints may be beyond their limits by this, and by this share of their range
 _MEASURED_SLACK = 0.1
@@ -270,6 +269,7 @@ class Rollouts:
         )
         self._fidelity = LiveFidelity(node, pipeline, self)
         self._worker.doubt = lambda: self._fidelity.watch.doubt
+        self._worker.contact = lambda words: self._fidelity.trust(settings().place, words)
         undo.callback(self._fidelity.close)
         self._publisher = PredictionPublisher(node, self._spec, self._robot.joint_names, self)
         self._arrived: deque[_Arrived] = deque()
@@ -361,8 +361,7 @@ class Rollouts:
 
     def _physics_text(self) -> str:
         """Text about the contact parameters for `/diagnostics`."""
-        is_fitted = self._fidelity.is_fitted_at(self.settings().place)
-        return self._fidelity.watch.text if is_fitted else NOT_FITTED_HERE
+        return self._fidelity.physics_text(self.settings().place)
 
     def on_results(self) -> None:
         """Wake the executor, which publishes the results; called from any thread."""

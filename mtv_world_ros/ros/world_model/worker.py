@@ -22,6 +22,7 @@ from mtv_world_ros.ros.messages.conversions import NANO
 from mtv_world_ros.ros.messages.rejection import Reason
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.observations import SensedScene
+from mtv_world_ros.success.doubts import ContactTrust
 from mtv_world_ros.vision.camera_check import CameraCheck
 
 #: a thread that is stuck in the model is not waited for longer than this at the end [s]
@@ -119,6 +120,8 @@ class RolloutWorker:
     Attributes:
         camera_check: result of the camera check on the newest episode's first frames.
         doubt: returns why the fitted physics does not hold here; empty = it may hold.
+        contact: returns the evidence on contact parameters of another robot cell, for an
+            instruction.
 
     Args:
         pipeline: the main path.
@@ -130,6 +133,7 @@ class RolloutWorker:
         self._notify = notify
         self.camera_check = CameraCheck()
         self.doubt: Callable[[], str] = str
+        self.contact: Callable[[str], ContactTrust] = lambda _: ContactTrust()
         self._changed = Condition()
         self._pending: Request | None = None
         self._running: Request | None = None
@@ -407,6 +411,7 @@ class RolloutWorker:
             limits=settings.plan_limits,
             should_stop=self._should_stop,
             doubt='' if request.imagine else self.doubt(),
+            contact=self.contact(request.instruction),
         )
 
     def _begin(self, request: Request, options: RolloutOptions) -> tuple[SensedScene, Rollout]:
