@@ -39,7 +39,7 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.core.images import write_png
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import load_recording, Recording
-from mtv_world_ros.data.recordings import commands_until
+from mtv_world_ros.data.recordings import commands_at, commands_until
 from mtv_world_ros.evaluation.imagined_stretches import (
     imagine_stretch,
     predicted_frames,
@@ -161,7 +161,11 @@ def _foreseen(
     episode = pipeline.begin(recording.observation(0), options)
     if stretch.start:
         rows = np.arange(stretch.start + 1)
-        episode.observe(recording.frames[:, rows[1:]], recording.positions[rows])
+        episode.observe(
+            recording.frames[:, rows[1:]],
+            recording.positions[rows],
+            commands=commands_at(recording, rows),
+        )
         episode = episode.branch(recording.observation(stretch.start))
     seconds = stretch.num_frames / pipeline.spec.fps
     deque(episode.extend(commands_until(recording, stretch.start, seconds)), maxlen=0)

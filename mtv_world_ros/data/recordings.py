@@ -166,6 +166,19 @@ def commands_until(recording: Recording, start: int, seconds: float) -> JointTra
     return cut_off(commands_from(recording, start), recording.positions[start], seconds)
 
 
+def commands_at(recording: Recording, rows: np.ndarray) -> FloatArray:
+    """Return the joint positions (N, J) last commanded at rows, or measured before any [rad or m].
+
+    Args:
+        recording: recorded frames, joints and commands.
+        rows: (N,) numbers of frames.
+    """
+    commands = recording.commands
+    due = np.searchsorted(commands.times, recording.times[rows], side='right') - 1
+    last = commands.positions[np.maximum(due, 0)]
+    return np.where(due[:, None] >= 0, last, recording.positions[rows])
+
+
 def described_objects(
     path: Path, describer: Describer, view: str, source: EpisodeSource = DEFAULT
 ) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from mtv_world_ros.core.data_types import (
 )
 from mtv_world_ros.core.errors import ConfigError, EpisodeError
 from mtv_world_ros.data.recording import frame_indices, Recording
-from mtv_world_ros.data.recordings import commands_until
+from mtv_world_ros.data.recordings import commands_at, commands_until
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.prediction import Prediction
@@ -178,7 +178,11 @@ def _begin(
     seconds = float(recording.times[stretch.start] - recording.times[0])
     rows = frame_indices(recording, 0, pipeline.spec, round(seconds * pipeline.spec.fps))
     if rows is not None:  # else there are gaps
-        episode.observe(recording.frames[:, rows[1:]], recording.positions[rows])
+        episode.observe(
+            recording.frames[:, rows[1:]],
+            recording.positions[rows],
+            commands=commands_at(recording, rows),
+        )
     return episode.branch(recording.observation(stretch.start))
 
 

@@ -21,6 +21,7 @@ from mtv_world_ros.core.data_types import (
 from mtv_world_ros.core.errors import RolloutPreempted
 from mtv_world_ros.core.images import resize_frames, resize_labels
 from mtv_world_ros.physics.foreseen_motions import foreseen_of, ForeseenMotions
+from mtv_world_ros.physics.grips import FingerState, watch_fingers
 from mtv_world_ros.physics.object_motion import FoundObjects, ObjectMotionModel
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import ChunkPlan
@@ -41,6 +42,7 @@ class ObjectForesight:
         first: first real observation of the episode, at the cameras' size.
         source: newest real observation, at the cameras' size.
         found: the objects in `source` and their motion since; None = not looked for yet.
+        fingers: motion of the fingers until `source`, as measured; None = not known.
     """
 
     model: ObjectMotionModel | None
@@ -49,6 +51,7 @@ class ObjectForesight:
     first: Observation
     source: Observation
     found: FoundObjects | None = None
+    fingers: FingerState | None = None
     _whole: dict[tuple[str, ...], FoundObjects] = field(default_factory=dict)
 
     def branch(self, source: Observation) -> ObjectForesight:
@@ -96,6 +99,21 @@ class ObjectForesight:
         motions = replace(self, found=found).motions(plans[-1], is_begun=True)
         return None if motions is None else motions.at_frames(plans[-1])
 
+    def watched(
+        self, positions: FloatArray, period_s: float, commands: FloatArray | None = None
+    ) -> ObjectForesight:
+        """Return the objects after measured joint positions.
+
+        Args:
+            positions: (1 + T, J) measured [rad or m]; row 0 where the robot stood before.
+            period_s: time between two rows [s].
+            commands: (1 + T, J) commanded at the same times [rad or m]; None = not known.
+        """
+        openings = self.robot.gripper_openings(positions)
+        commanded = None if commands is None else self.robot.gripper_openings(commands)
+        _, fingers = watch_fingers(openings, period_s, self.fingers, commanded)
+        return replace(self, fingers=fingers)
+
     def foresee(
         self,
         plan: ChunkPlan,
@@ -126,7 +144,9 @@ class ObjectForesight:
             return self
         found = self.found
         if found is None or found.names != names:
+            fingers = self.fingers if found is None else found.tracked.fingers
             found = self._find(observation, names, start_masks)
+            found = replace(found, tracked=found.tracked.with_fingers(fingers))
             if should_stop():
                 raise RolloutPreempted('stopped while objects were looked for')
         shown = found.shown

@@ -1,8 +1,10 @@
 """Grips that measured fingers show: what stops them short of shut is held, and goes along.
 
 Recordings whose commands are measured positions say when a gripper holds something: its fingers
-stop on the way. Contact computed from masks and cameras that are off by a centimetre drops such an
-object; here it keeps its pose in the tool until the fingers open.
+close, stop on the way and stay there. Contact computed from masks and cameras that are off by a
+centimetre drops such an object; here it keeps its pose in the tool until the fingers open.
+Fingers that rest half open hold nothing, unless they closed before or a command to close is not
+followed.
 
 Shape letters: S rows, A arms, O solids.
 """
@@ -26,23 +28,135 @@ class GripSettings:
     Attributes:
         max_opening: largest opening of a gripper that holds something [fraction of its range].
         min_opening: smallest opening of one that is not shut on nothing [fraction of its range].
-        max_step: largest change of the opening between two rows of fingers that have stopped
+        closes_by: decrease of the opening since the fingers last opened at which they have
+            closed; also the distance from a command to close at which it is not followed
             [fraction of the range].
+        rest_change: largest change of the opening of fingers that rest [fraction of the range].
+        min_rest_s: time for which fingers rest that something stopped; a gripper that turns
+            around on its way stands still for a moment [s].
         opens_by: increase of the opening at which a gripper lets go [fraction of its range].
         reach_m: largest distance of the tool point from the outline of what it holds: the error of
             the cameras [m].
         max_width_ratio: largest narrow side of what fits between the fingers [widest opening].
+        max_gap_m: largest distance of the fingers from each other beyond the longest side of what
+            they hold: the error of its size [m].
     """
 
     max_opening: float = 0.8
     min_opening: float = 0.03
-    max_step: float = 0.03
+    closes_by: float = 0.05
+    rest_change: float = 0.015
+    min_rest_s: float = 0.5
     opens_by: float = 0.06
     reach_m: float = 0.025
     max_width_ratio: float = 1.1
+    max_gap_m: float = 0.015
 
 
 _SETTINGS = GripSettings()
+#: tolerance of sums of row periods [s]
+_TIME_TOLERANCE_S = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FingerState:
+    """Motion of the fingers of A grippers until now, as measured.
+
+    Attributes:
+        widest: (A,) largest opening since the fingers last opened [fraction of the range].
+        narrowest: (A,) smallest opening since then [fraction of the range].
+        rest: (A,) opening that the fingers have stayed near [fraction of the range].
+        rest_s: (A,) time for which they have stayed near that opening [s].
+        is_refused: (A,) whether they rest although they are commanded to close further.
+    """
+
+    widest: FloatArray
+    narrowest: FloatArray
+    rest: FloatArray
+    rest_s: FloatArray
+    is_refused: BoolArray
+
+    @classmethod
+    def at(cls, openings: FloatArray) -> FingerState:
+        """Return the state of fingers of which only the openings (A,) are known."""
+        return cls(
+            widest=openings,
+            narrowest=openings,
+            rest=openings,
+            rest_s=np.zeros(len(openings)),
+            is_refused=np.zeros(len(openings), np.bool_),
+        )
+
+    def after(
+        self,
+        openings: FloatArray,
+        passed_s: float,
+        commanded: FloatArray | None = None,
+        settings: GripSettings = _SETTINGS,
+    ) -> FingerState:
+        """Return the state at the next openings.
+
+        Args:
+            openings: (A,) measured [fraction of the range].
+            passed_s: time since the state [s].
+            commanded: (A,) commanded openings [fraction of the range]; None = not known.
+            settings: definition of a grip.
+        """
+        has_opened = openings > self.narrowest + settings.opens_by
+        is_widest = has_opened | (openings > self.widest)
+        is_moving = np.abs(openings - self.rest) > settings.rest_change
+        rest_s = np.where(is_moving, 0.0, self.rest_s + passed_s)
+        is_refused = self.is_refused & ~is_moving
+        if commanded is not None:
+            is_refused |= (openings - commanded >= settings.closes_by) & _rests(rest_s, settings)
+        return FingerState(
+            widest=np.where(is_widest, openings, self.widest),
+            narrowest=np.where(is_widest, openings, np.minimum(self.narrowest, openings)),
+            rest=np.where(is_moving, openings, self.rest),
+            rest_s=rest_s,
+            is_refused=is_refused,
+        )
+
+    def are_stopped(self, settings: GripSettings = _SETTINGS) -> BoolArray:
+        """Return whether something stops the fingers short of shut (A,)."""
+        is_between = (self.rest > settings.min_opening) & (self.rest < settings.max_opening)
+        has_closed = self.widest - self.rest >= settings.closes_by
+        return is_between & (has_closed | self.is_refused) & _rests(self.rest_s, settings)
+
+
+def _rests(rest_s: FloatArray, settings: GripSettings) -> BoolArray:
+    return rest_s >= settings.min_rest_s - _TIME_TOLERANCE_S
+
+
+def watch_fingers(
+    openings: FloatArray,
+    period_s: float,
+    fingers: FingerState | None = None,
+    commanded: FloatArray | None = None,
+    settings: GripSettings = _SETTINGS,
+) -> tuple[BoolArray, FingerState]:
+    """Return when something stops the fingers short of shut (A, S), and their state at the end.
+
+    Something does if they have closed, or a command to close further is not followed, and they
+    rest for long enough; the rows of a rest count from its first one on.
+
+    Args:
+        openings: (A, S) measured openings, 0 closed to 1 open.
+        period_s: time between two rows [s].
+        fingers: state at row 0; None = what was before is not known.
+        commanded: (A, S) commanded openings; None = not known.
+        settings: definition of a grip.
+    """
+    state = FingerState.at(openings[:, 0]) if fingers is None else fingers
+    stopped = np.zeros(openings.shape, np.bool_)
+    since = np.zeros(len(openings), np.int64)
+    for row, now in enumerate(openings.T):
+        told = None if commanded is None else commanded[:, row]
+        state = state.after(now, period_s if row else 0.0, told, settings)
+        since[state.rest_s == 0.0] = row
+        for arm in np.flatnonzero(state.are_stopped(settings)):
+            stopped[arm, since[arm] : row + 1] = True
+    return stopped, state
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,8 +181,9 @@ class GripCourse:
     Attributes:
         tools: (A, S, 4, 4) T_base_tool [m].
         openings: (A, S) openings of the grippers, 0 closed to 1 open.
-        stopped: (A, S) whether fingers stand still on something.
+        stopped: (A, S) whether something stops the fingers short of shut.
         widths: (A,) widest distance of the fingers [m].
+        fingers: state of the fingers at the last row.
         settings: definition of a grip.
     """
 
@@ -76,23 +191,35 @@ class GripCourse:
     openings: FloatArray
     stopped: BoolArray
     widths: FloatArray
+    fingers: FingerState
     settings: GripSettings = _SETTINGS
 
     @classmethod
     def of(
-        cls, robot: RobotModel, positions: FloatArray, settings: GripSettings = _SETTINGS
+        cls,
+        robot: RobotModel,
+        positions: FloatArray,
+        period_s: float,
+        fingers: FingerState | None = None,
+        settings: GripSettings = _SETTINGS,
     ) -> GripCourse:
-        """Return the course of measured joint positions (S, J) [rad or m]."""
+        """Return the course of measured joint positions.
+
+        Args:
+            robot: robot with the grippers.
+            positions: (S, J) [rad or m].
+            period_s: time between two rows [s].
+            fingers: state of the fingers at row 0; None = what was before is not known.
+            settings: definition of a grip.
+        """
         openings = np.asarray(robot.gripper_openings(positions))
-        steps = np.abs(np.diff(openings, axis=1, append=openings[:, -1:]))
-        before = np.abs(np.diff(openings, axis=1, prepend=openings[:, :1]))
-        between = (openings > settings.min_opening) & (openings < settings.max_opening)
-        still = (steps < settings.max_step) & (before < settings.max_step)
+        stopped, fingers = watch_fingers(openings, period_s, fingers, settings=settings)
         return cls(
             tools=robot.tool_poses(positions),
             openings=openings,
-            stopped=between & still,
+            stopped=stopped,
             widths=2 * robot.finger_gaps(_wide_open(robot))[0],
+            fingers=fingers,
             settings=settings,
         )
 
@@ -138,9 +265,11 @@ class GripCourse:
     ) -> int | None:
         """Number of the solid between the fingers; None = no solid is there."""
         settings, tool = self.settings, self.tools[arm, row]
+        gap = self.openings[arm, row] * self.widths[arm]
         near: list[tuple[float, int]] = []
         for item, solid in enumerate(solids):
-            if item in kept or min(solid.size[:2]) > settings.max_width_ratio * self.widths[arm]:
+            is_too_wide = min(solid.size[:2]) > settings.max_width_ratio * self.widths[arm]
+            if item in kept or is_too_wide or gap > max(solid.size) + settings.max_gap_m:
                 continue
             local = np.linalg.inv(poses[item]) @ tool[:, 3]
             outside = np.maximum(np.abs(local[:3]) - np.asarray(solid.size) / 2, 0.0)

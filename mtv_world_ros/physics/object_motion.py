@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, CameraModel, FloatArray
+from mtv_world_ros.physics.grips import FingerState
 from mtv_world_ros.robot.model import RobotModel
 
 #: displacement below which an object stands still [m]
@@ -137,6 +138,15 @@ class TrackedObjects(Protocol):
 
     def simulated_by(self, model: Any) -> TrackedObjects:
         """Return the objects as they were found, to be simulated by another model."""
+        ...
+
+    @property
+    def fingers(self) -> FingerState | None:
+        """Motion of the fingers until now; None = not known."""
+        ...
+
+    def with_fingers(self, fingers: FingerState | None) -> TrackedObjects:
+        """Return the objects with the motion of the fingers before the first plan."""
         ...
 
     def advance(

@@ -18,6 +18,7 @@ from mtv_world_ros.physics.arms.arms import Arms
 from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.physics.engine.engine import Batch, BatchState, Engine
 from mtv_world_ros.physics.engine.futures import draw_futures, Future, STANDS_M
+from mtv_world_ros.physics.grips import FingerState
 from mtv_world_ros.physics.object_motion import ObjectMotion
 from mtv_world_ros.physics.solids import bottom_of, find_solid, fit_solid, is_box, is_vessel, Solid
 from mtv_world_ros.robot.model import RobotModel
@@ -219,6 +220,7 @@ class TrackedSolids:
         turned: (O, 3, 3) rotation from the origin to where the objects were found.
         batch: simulation of the futures; None = nothing has moved yet.
         state: present state of the futures.
+        seen_fingers: measured motion of the fingers before the futures; None = not known.
     """
 
     foresight: SolidForesight
@@ -230,6 +232,16 @@ class TrackedSolids:
     turned: FloatArray | None = None
     batch: Batch | None = None
     state: BatchState | None = None
+    seen_fingers: FingerState | None = None
+
+    @property
+    def fingers(self) -> FingerState | None:
+        """Motion of the fingers until now; None = not known."""
+        return self.seen_fingers if self.state is None else self.state.fingers
+
+    def with_fingers(self, fingers: FingerState | None) -> TrackedSolids:
+        """Return the objects with the motion of the fingers before the first plan."""
+        return replace(self, seen_fingers=fingers)
 
     @property
     def step_s(self) -> float:
@@ -310,7 +322,8 @@ class TrackedSolids:
         doubts = (
             self.doubts if self.batch else {**self._floating(batch, positions[0]), **self.doubts}
         )
-        motion, state = batch.advance(positions, COMMANDS_A_STEP, self.state, should_stop)
+        before = self.state or batch.start(positions[0], self.seen_fingers)
+        motion, state = batch.advance(positions, COMMANDS_A_STEP, before, should_stop)
         num, known = self.foresight.settings.num_motions, self._known
         points = np.full((num, rows + 1, len(self.solids), 3), np.nan)
         turns = np.tile(np.eye(3), (num, rows + 1, len(self.solids), 1, 1))

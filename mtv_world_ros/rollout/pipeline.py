@@ -466,6 +466,7 @@ class Pipeline:
         frames: ByteArray,
         positions: FloatArray,
         options: RolloutOptions,
+        commands: FloatArray | None = None,
     ) -> tuple[ObservedChunk, RolloutState]:
         """Return masks and estimate of real frames, and the rollout's state after them.
 
@@ -475,6 +476,7 @@ class Pipeline:
                 frame rate.
             positions: (1 + T, J) measured joint positions [rad or m]; row 0 at the state.
             options: names of the objects, and the instruction.
+            commands: (1 + T, J) commanded at the same times [rad or m]; None = not known.
         """
         start_masks = self.find(state, options)
         masks = self.follow(state, start_masks, frames, options)
@@ -490,7 +492,7 @@ class Pipeline:
             stamp_ns,
             self.spec.num_history,
             memory,
-            state.objects,
+            state.objects.watched(positions, 1 / self.spec.fps, commands),
             background,
             masks,
         )

@@ -75,6 +75,7 @@ class ChunkMaker(Protocol):
         frames: ByteArray,
         positions: FloatArray,
         options: RolloutOptions,
+        commands: FloatArray | None = None,
     ) -> tuple[ObservedChunk, RolloutState]:
         """Return masks and estimate of real frames, and the state after them."""
         ...
@@ -167,6 +168,7 @@ class Rollout:
         frames: ByteArray,
         positions: FloatArray,
         cameras: tuple[CameraModel, ...] | None = None,
+        commands: FloatArray | None = None,
     ) -> ObservedChunk:
         """Take real frames instead of imagining some; the episode then stands at the last one.
 
@@ -176,10 +178,14 @@ class Rollout:
             positions: (1 + T, J) measured [rad or m]; row 0 where the robot stood before. So a
                 gripper that something holds apart is not taken to be open.
             cameras: cameras at the last frame, at the model's size; None = as before.
+            commands: (1 + T, J) commanded at the same times [rad or m]: fingers that do not
+                follow them hold something; None = not known.
         """
         spec = self.pipeline.spec
         frames = np.stack([resize_frames(view, spec.width, spec.height) for view in frames])
-        chunk, state = self.pipeline.observe(self._states[0], frames, positions, self._named())
+        chunk, state = self.pipeline.observe(
+            self._states[0], frames, positions, self._named(), commands
+        )
         self._states = (state.seen_by(cameras),)
         return chunk
 

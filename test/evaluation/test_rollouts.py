@@ -27,7 +27,7 @@ def test_recorded_frames_are_judged_with_the_joints_that_were_measured(
     """What stops a gripper shows there, and not in the commands."""
     judged = []
 
-    def observe(self, frames, positions):
+    def observe(self, frames, positions, commands=None):
         judged.append((frames, positions))
         return SimpleNamespace(success='estimate')
 

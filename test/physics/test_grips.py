@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mtv_world_ros.physics.grips import GripCourse
+from mtv_world_ros.physics.grips import FingerState, GripCourse, watch_fingers
 from mtv_world_ros.physics.solids import Solid
 from test.support import small_scene
 
@@ -24,8 +24,8 @@ def picking(shut=HELD_AT):
     return np.stack([height, np.where(times < 2.2, closing, 0.04)], -1)
 
 
-def held_in(robot, positions, block=BLOCK):
-    course = GripCourse.of(robot, positions)
+def held_in(robot, positions, block=BLOCK, fingers=None):
+    course = GripCourse.of(robot, positions, 0.1, fingers)
     grips, poses = {}, np.eye(4)[None].copy()
     poses[0, :3, 3] = block.centre
     rows = []
@@ -52,6 +52,7 @@ def test_a_block_between_fingers_that_stopped_goes_along_until_they_open(lift):
         (0.04, BLOCK),  # they never closed
         (HELD_AT, replace(BLOCK, centre=np.array([0.1, 0.0, 0.02]))),  # it lies elsewhere
         (HELD_AT, replace(BLOCK, size=np.array([0.2, 0.2, 0.02]))),  # a plate fits between none
+        (0.03, replace(BLOCK, size=np.array([0.01, 0.02, 0.02]))),  # they stop far outside of it
     ],
 )
 def test_nothing_is_held_by_other_fingers(lift, shut, block):
@@ -80,3 +81,62 @@ def test_a_grip_goes_on_in_the_next_part_of_a_plan(lift):
     assert all(0 in grips for grips in state.grips)
     second, _ = batch.advance(commands[60:101], 5, state)
     np.testing.assert_allclose(second.points[:, -1], whole.points[:, -1], atol=1e-6)
+
+
+def test_fingers_that_rest_half_open_hold_nothing(lift):
+    positions = np.tile([0.02, HELD_AT], (20, 1))
+    positions[10:, 0] = 0.1  # the hand rises beside the block
+    assert not any(held for held, _ in held_in(lift, positions))
+
+
+def test_fingers_that_were_seen_to_close_hold_from_the_first_row_on(lift):
+    _, fingers = watch_fingers(lift.gripper_openings(picking()[:51]), 0.02)
+    positions = np.tile([0.02, HELD_AT], (5, 1))
+    assert all(held for held, _ in held_in(lift, positions, fingers=fingers))
+
+
+@pytest.mark.parametrize('told', [0.0, HELD_AT])
+def test_fingers_that_do_not_follow_a_command_to_close_hold(lift, told):
+    positions, commands = np.tile([[0.02, HELD_AT]], (6, 1)), np.tile([[0.02, told]], (6, 1))
+    openings = lift.gripper_openings(positions)
+    stopped, fingers = watch_fingers(openings, 0.1, commanded=lift.gripper_openings(commands))
+    assert stopped.all() == (told == 0.0) and stopped.any() == (told == 0.0)
+    # nor does the next plan show commands: its positions are measured
+    assert all(held == (told == 0.0) for held, _ in held_in(lift, positions, fingers=fingers))
+
+
+@pytest.mark.parametrize(
+    ('openings', 'first', 'last'),
+    [
+        # a 2F-85 at 5 Hz: closed on a block, carried it, let it go
+        ([1, 0.97, 0.72, 0.68, 0.61, 0.55, *[0.41] * 9, 0.42, 0.47, 0.53, 0.77, 1, 1], 6, 15),
+        # closed in two steps on a second block after the first was let go
+        ([1, 0.6, *[0.42] * 4, 0.47, 0.77, 1, 0.6, *[0.33] * 4, 0.44, 1, 1], 10, 13),
+        ([1, 0.97, 0.7, 0.69, 0.69, 0.74, 0.8, 1, 1], None, None),  # turned around on its way
+        ([1, 0.93, 0.85, 0.61, 0.57, 0.57, 0.61, 0.86], None, None),  # and so did this
+        ([1, 0.7, 0.4, 0.27, 0.25, 0.26], None, None),  # may still close when the recording ends
+        ([0.41] * 9, None, None),  # half open from the start
+        ([0.2, 0.3, 0.41, *[0.5] * 6], None, None),  # opened half way
+        ([1, 0.6, 0.3, 0.1, *[0.02] * 8], None, None),  # shut
+        ([0.5, 0.5, 0.5, 0.4, *[0.33] * 5], 4, 8),  # began half open, then closed on something
+    ],
+)
+def test_stops_of_fingers(openings, first, last):
+    stopped, _ = watch_fingers(np.array([openings], float), 0.2)
+    rows = np.flatnonzero(stopped[0])
+    assert (rows[-1] if len(rows) else None) == last
+    if first == 10:  # the earlier stop counts as well
+        assert rows.tolist() == [2, 3, 4, 5, 10, 11, 12, 13]
+    elif first is not None:
+        assert rows.tolist() == list(range(first, last + 1))
+
+
+def test_the_state_of_fingers_does_not_depend_on_how_rows_are_cut():
+    openings = np.array([[1, 0.97, 0.72, 0.55, 0.41, 0.41, 0.41, 0.41, 0.41, 0.5, 0.7]])
+    whole, end = watch_fingers(openings, 0.2)
+    first, state = watch_fingers(openings[:, :6], 0.2)
+    second, then = watch_fingers(openings[:, 5:], 0.2, state)
+    assert not first.any() and second[0, :4].all()  # known once they have rested for long enough
+    assert whole[0].tolist() == [*[False] * 4, *[True] * 5, False, False]
+    for name in FingerState.__slots__:
+        np.testing.assert_array_equal(getattr(then, name), getattr(end, name))

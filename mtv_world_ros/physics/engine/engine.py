@@ -26,7 +26,7 @@ from mtv_world_ros.physics.engine.drive_inputs import (
     SUBSTEPS,
 )
 from mtv_world_ros.physics.engine.futures import Future
-from mtv_world_ros.physics.grips import Grip, GripCourse
+from mtv_world_ros.physics.grips import FingerState, Grip, GripCourse
 from mtv_world_ros.physics.mujoco_import import mujoco, Rollout
 
 
@@ -97,6 +97,7 @@ class BatchState:
         lost: reasons why futures were dropped, by number of the future.
         grips: grip of each solid that measured fingers hold (`ContactSettings.grips_hold`), by
             number of the solid, for each future.
+        fingers: measured motion of the fingers until now; None = not known.
     """
 
     physics: FloatArray
@@ -105,6 +106,7 @@ class BatchState:
     last: FreeMotion | None = None
     lost: dict[int, str] = field(default_factory=dict)
     grips: tuple[dict[int, Grip], ...] = ()
+    fingers: FingerState | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,8 +213,13 @@ class Batch:
             self._scene.positions(at, self.futures[0].solids), at[None]
         )
 
-    def start(self, positions: FloatArray) -> BatchState:
-        """Return the start of the futures, with the robot at rest at joints (J,)."""
+    def start(self, positions: FloatArray, fingers: FingerState | None = None) -> BatchState:
+        """Return the start of the futures, with the robot at rest at joints (J,).
+
+        Args:
+            positions: joint positions [rad or m].
+            fingers: measured motion of the fingers before; None = not known.
+        """
         scene, model = self._scene, self._models[0]
         at = scene.arms.drives.spread(positions)
         physics = np.zeros((len(self.futures), mujoco.mj_stateSize(model, FULL)))
@@ -222,6 +229,7 @@ class Batch:
             physics=physics,
             arms=self._planner.begin(positions),
             still=np.full(len(physics), _SLEEP.num_still_rows),
+            fingers=fingers,
         )
 
     def advance(
@@ -247,9 +255,16 @@ class Batch:
         courses = [course.late(delay, state.last) for delay in self._delays]
         rows = (len(commands) - 1) // every
         run = _Run(self._scene, self.futures, courses, every * SUBSTEPS, state)
+        fingers = state.fingers
         if self.futures[0].settings.grips_hold:
-            robot = self._scene.arms.robot
-            run.grip(GripCourse.of(robot, commands[: 1 + rows * every : every]))
+            grips = GripCourse.of(
+                self._scene.arms.robot,
+                commands[: 1 + rows * every : every],
+                every * PERIOD_S,
+                fingers,
+            )
+            fingers = grips.fingers
+            run.grip(grips)
         cap_s = time.monotonic() + SLOWDOWN_LIMIT * rows * every * PERIOD_S + EXTRA_S
 
         def check() -> None:
@@ -269,6 +284,7 @@ class Batch:
             still=run.still,
             lost=run.lost,
             grips=tuple(run.grips),
+            fingers=fingers,
         )
 
     def _advance_row(self, run: _Run, row: int, check: Callable[[], None]) -> None:
