@@ -19,6 +19,9 @@ from mtv_world_ros.data.episode import UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_cameras import is_imported, views_without_info, write_cameras
 from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.data.episode_writer import EpisodeWriter
+from mtv_world_ros.inspection.cameras import shared_camera
+from mtv_world_ros.inspection.motion_residual import MotionResidual
+from mtv_world_ros.inspection.places import CameraPlaces
 from mtv_world_ros.robot.file import load_robot, robot_path
 
 START_NS, PERIOD_NS, FRAMES, SIZE = 10**18, 2 * 10**8, 5, (64, 48)
@@ -193,6 +196,96 @@ def test_apply_gives_episodes_that_were_calibrated_before_their_camera_info(tmp_
         assert Counter(m.topic for m in BagReader(path).messages())['/door/camera_info'] == FRAMES
     assert main(command) == 0
     assert 'CameraInfo now' not in capsys.readouterr().out
+
+
+#: measures of a recording: its pose fits, does not fit, or nothing could be measured
+GOOD = MotionResidual(shift_px=(0.1, 0.0), match=0.6, match_here=0.6)
+POOR = MotionResidual(shift_px=(0.1, 0.0), match=0.2, match_here=0.2)
+UNMEASURED = MotionResidual(reason='the robot hardly moves')
+
+
+@pytest.fixture
+def measured_as(monkeypatch):
+    """Let `fit camera` find cameras whose measures are those given, by view and recording."""
+
+    def measured_as(measures, places=(0, 1)):
+        def estimate(episodes, views, *_, **__):
+            count = len(episodes)
+            return [
+                shared_camera.SharedEstimate(
+                    cameras=(camera(view),) * count,
+                    places=CameraPlaces(
+                        place=np.array(places[:count]), apart=np.zeros((count, count)), matches={}
+                    ),
+                    measures=tuple(measures[view]),
+                    guess_measures=(),
+                    kept_guess=False,
+                    focal_px=70.0,
+                    bent=False,
+                    fits=np.ones(count),
+                    apart_px=np.zeros(0),
+                    strays=(),
+                )
+                for view in views
+            ]
+
+        monkeypatch.setattr(shared_camera, 'estimate_shared', estimate)
+
+    return measured_as
+
+
+@pytest.mark.parametrize('option', ['--apply', '--apply-doubted'])
+@pytest.mark.parametrize(
+    ('measures', 'places', 'written'),
+    [
+        ({'door': [GOOD, GOOD], 'side': [GOOD, GOOD]}, (0, 1), ['a door side', 'b door side']),
+        ({'door': [POOR, POOR], 'side': [POOR, POOR]}, (0, 1), ['a', 'b']),
+        ({'door': [GOOD, POOR], 'side': [GOOD, UNMEASURED]}, (0, 1), ['a door side', 'b']),
+        # the camera did not move between them, and was measured in the other one
+        ({'door': [GOOD, POOR], 'side': [GOOD, UNMEASURED]}, (0, 0), ['a door side', 'b side']),
+    ],
+)
+def test_apply_writes_poses_that_are_not_doubted_and_fails_where_some_are(
+    tmp_path, capsys, monkeypatch, measured_as, option, measures, places, written
+):
+    monkeypatch.chdir(tmp_path)
+    for name in ('a', 'b'):
+        write(tmp_path / 'data' / name)
+    measured_as(measures, places)
+    status = main(['fit', 'camera', 'data', '--view', 'door,side', '--robot', 'franka', option])
+    if option == '--apply-doubted':
+        written = ['a door side', 'b door side']
+    said = capsys.readouterr()
+    for words in written:
+        name, *views = words.split()
+        file = tmp_path / 'data' / name / 'calibration.yaml'
+        assert sorted(load_calibration(file) if file.is_file() else {}) == views
+        topics = BagReader(file.parent).topics()
+        assert [view for view in ('door', 'side') if f'/{view}/camera_info' in topics] == views
+        for view in {'door', 'side'} - set(views):
+            assert f'{name}: {view} not written, as it is doubted' in said.out
+    num_left = 4 - sum(len(words.split()) - 1 for words in written)
+    assert status == (1 if num_left else 0)
+    assert ('--apply-doubted' in said.err) == (num_left > 0)
+
+
+def test_a_doubted_pose_does_not_matter_where_the_episode_keeps_its_own(
+    tmp_path, capsys, monkeypatch, measured_as
+):
+    monkeypatch.chdir(tmp_path)
+    for name in ('a', 'b'):
+        write(tmp_path / 'data' / name)
+    own = camera('door', x=0.7)
+    save_calibration(tmp_path / 'data' / 'a' / 'calibration.yaml', {'door': own})
+    measured_as({'door': [POOR, GOOD]})
+    command = ['fit', 'camera', 'data', '--view', 'door', '--robot', 'franka', '--apply']
+    assert main(command) == 0
+    assert 'doubted and were not' not in capsys.readouterr().err
+    kept = load_calibration(tmp_path / 'data' / 'a' / 'calibration.yaml')['door']
+    np.testing.assert_allclose(kept.T_mount_camera, own.T_mount_camera)
+    assert main([*command, '--overwrite']) == 1
+    kept = load_calibration(tmp_path / 'data' / 'a' / 'calibration.yaml')['door']
+    np.testing.assert_allclose(kept.T_mount_camera, own.T_mount_camera)
 
 
 def test_apply_leaves_the_bag_of_a_users_own_recording_and_says_what_makes_an_episode(

@@ -382,13 +382,15 @@ class ThreeWays:
     step_s, commands_a_step, reasons, refusal, doubts = 0.1, 1, (), '', {}
     is_fitted = True
     sizes = np.full((3, 2, 3), 0.04)
-
-    reasons = ()
+    fingers = None
 
     def __init__(self, *ways: float) -> None:
         self._ways = ways
 
     def find(self, names, masks, cameras, poses):
+        return self
+
+    def with_fingers(self, fingers):
         return self
 
     def advance(self, positions, should_stop=None):
@@ -442,6 +444,11 @@ class DriftingObjects:
         self, log: list[int], num_steps: int = 0, same: tuple[bool, bool] = (True, True)
     ) -> None:
         self._log, self._num_steps, self._same = log, num_steps, same
+        self.given, self.fingers = [], None
+
+    def with_fingers(self, fingers):
+        self.given.append(fingers)
+        return self
 
     def find(self, names, masks, cameras, poses):
         assert masks.shape[:2] == (len(cameras), 2) and len(poses) == len(cameras)
@@ -476,6 +483,34 @@ def test_objects_move_on_from_chunk_to_chunk_and_are_found_again_in_real_frames(
     episode.observe(recording.frames[:, 17:25], recording.positions[16:25])
     list(episode.extend(part_of(commands(recording, 3.2), 1.6, 3.2)))
     assert log == [0, 16, 32, 1, 16]
+
+
+def test_objects_are_foreseen_with_how_the_fingers_moved_in_the_real_frames(
+    recording, world_model
+):
+    objects = DriftingObjects([])
+    pipeline = with_motion(world_model, objects)
+    episode = pipeline.begin(observe(recording), RolloutOptions(instruction=recording.instruction))
+    column = YAM.joint_names.index(YAM.tools[0].gripper_joint)
+    positions, ends = recording.positions[:9].copy(), YAM.tools[0]
+    half = (ends.gripper_open + ends.gripper_closed) / 2
+    positions[:, column] = [ends.gripper_open, *[half] * 8]
+    list(episode.extend(commands(recording, 1.6)))
+    episode.observe(recording.frames[:, 1:9], positions)
+    list(episode.extend(part_of(commands(recording, 3.2), 1.6, 3.2)))
+    unknown, fingers = objects.given
+    assert unknown is None and fingers.are_stopped().tolist() == [True, False]
+    assert fingers.widest[0] == 1.0 and fingers.rest[0] == pytest.approx(0.5)
+    assert fingers.rest_s[0] == pytest.approx(7 / SPEC.fps)
+    # commands that are followed tell nothing more, such that are not hold from the start
+    again = pipeline.begin(observe(recording), RolloutOptions(instruction=recording.instruction))
+    shut = positions.copy()
+    shut[:, column] = ends.gripper_closed
+    positions[:, column] = half
+    again.observe(recording.frames[:, 1:9], positions, commands=positions)
+    assert not again._states[0].objects.fingers.are_stopped().any()
+    again.observe(recording.frames[:, 1:9], positions, commands=shut)
+    assert again._states[0].objects.fingers.are_stopped().tolist() == [True, False]
 
 
 @pytest.mark.parametrize('found_again', [True, False])
@@ -677,9 +712,13 @@ class SlidingObjects:
 
     step_s, commands_a_step, reasons, refusal, doubts = 0.1, 1, (), '', {}
     is_fitted = True
+    fingers = None
 
     def __init__(self, points: np.ndarray, steps: int = 0) -> None:
         self.points, self.steps = points, steps
+
+    def with_fingers(self, fingers):
+        return self
 
     @property
     def sizes(self) -> np.ndarray:

@@ -84,7 +84,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--apply',
         action='store_true',
         help='write the cameras into the imported recordings, where they have none: poses into '
-        'calibration.yaml, CameraInfo into the bag',
+        'calibration.yaml, CameraInfo into the bag; doubted poses are not written',
+    )
+    parser.add_argument(
+        '--apply-doubted',
+        action='store_true',
+        help='as --apply, and doubted poses are written as well',
     )
     add_options(parser, 'overwrite')
     parser.add_argument(
@@ -125,6 +130,7 @@ def _calibrate_camera(arguments: argparse.Namespace) -> int:
     if not arguments.views or arguments.same_focal and len(arguments.views) < 2:
         least = 'two views, e.g. --view front,side' if arguments.same_focal else 'a view'
         raise ConfigError(f"--view '{','.join(arguments.views)}': name at least {least}")
+    arguments.apply |= arguments.apply_doubted
     if is_shared(arguments):
         return calibrate_shared(arguments)
     arguments.episode, arguments.view = arguments.episodes[0], arguments.views[0]

@@ -84,7 +84,7 @@ def calibrate_shared(arguments: argparse.Namespace) -> int:
     for group in groups:
         found = _estimate(arguments, group, points, episodes, robot, shape.parts)
         if arguments.apply:
-            by_view = {one.cameras[0].view: one.cameras for one in found}
+            by_view = {one.cameras[0].view: one for one in found}
             status = max(status, _apply(arguments, episodes, by_view))
     return status
 
@@ -323,26 +323,68 @@ def _write(
 def _apply(
     arguments: argparse.Namespace,
     episodes: Sequence[Episode],
-    found: dict[str, tuple[CameraModel, ...]],
+    found: dict[str, SharedEstimate],
 ) -> int:
     """Write cameras into the episodes: `found`, where they have none or are to be replaced.
 
-    Cameras that an episode has already get their CameraInfo, where the bag lacks it.
+    Cameras that an episode has already get their CameraInfo, where the bag lacks it. Doubted poses
+    are not written without `--apply-doubted`.
 
     Returns:
-        The exit status: 1 if an episode could not be written, which is said on stderr.
+        The exit status: 1 if an episode could not be written or a pose was not, which is said on
+        stderr.
     """
     from mtv_world_ros.core.errors import MtvWorldError
 
-    status = 0
+    status, num_doubted, num_all = 0, 0, 0
     for number, episode in enumerate(episodes):
-        cameras = {view: each[number] for view, each in found.items()}
         try:
-            print(_write_into(episode, cameras, arguments.views, overwrite=arguments.overwrite))
+            cameras, doubted = _relied_on(arguments, episode, found, number)
+            num_doubted, num_all = num_doubted + len(doubted), num_all + len(cameras | doubted)
+            words = [f'{view} not written, as it is doubted' for view in doubted]
+            if cameras or not found:
+                line = _write_into(
+                    episode, cameras, arguments.views, overwrite=arguments.overwrite
+                )
+                print('; '.join([line, *words]))
+            else:
+                print(f'{episode.info.path.name}: {"; ".join(words)}')
         except MtvWorldError as error:
             sys.stderr.write(f'mtv-world: {error}\n')
             status = 1
+    if num_doubted:
+        sys.stderr.write(
+            f'mtv-world: {num_doubted} of {num_all} poses of {", ".join(found)} are doubted (the '
+            'reasons stand above) and were not written. Look at the pictures; give seen points '
+            '(--click, then --points), or record the arm while every joint moves over most of its '
+            'range. --apply-doubted writes these poses all the same.\n'
+        )
+        status = 1
     return status
+
+
+def _relied_on(
+    arguments: argparse.Namespace,
+    episode: Episode,
+    found: dict[str, SharedEstimate],
+    number: int,
+) -> tuple[dict[str, CameraModel], dict[str, str]]:
+    """Return the cameras to write into an episode, and the views whose doubts forbid it.
+
+    Cameras that the episode keeps anyway are among the first.
+    """
+    from mtv_world_ros.data.episode_cameras import calibrated_views
+
+    kept = set() if arguments.overwrite else calibrated_views(episode.info.path).keys()
+    doubts = {
+        view: objection
+        for view, one in found.items()
+        if view not in kept and (objection := one.objection(number))
+    }
+    if arguments.apply_doubted:
+        doubts = {}
+    cameras = {view: one.cameras[number] for view, one in found.items() if view not in doubts}
+    return cameras, doubts
 
 
 def _write_into(

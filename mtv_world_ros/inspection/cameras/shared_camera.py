@@ -125,6 +125,18 @@ class SharedEstimate:
             return f'the robot moves {apart:.1%} of the width beside where it is drawn'
         return ''
 
+    def objection(self, number: int) -> str:
+        """Return the reason why the pose of a recording is not to be relied on; empty = it is.
+
+        A pose that could not be checked in a recording is good if it was in another recording of
+        the same place.
+        """
+        same = np.flatnonzero(self.places.place == self.places.place[number])
+        is_checked = not self.measures[number].reason
+        if not is_checked and any(not self.doubts(int(other)) for other in same):
+            return ''
+        return self.doubts(number)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _View:
