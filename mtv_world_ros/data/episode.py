@@ -24,6 +24,8 @@ INSTRUCTION = '/instruction'
 OBJECT_POSES = '/object_poses'
 #: poses of cameras that move against the robot's links
 TF = '/tf'
+#: poses of cameras that stand still in a link
+TF_STATIC = '/tf_static'
 #: name of the MCAP metadata record with task, outcome and objects
 METADATA_NAME = 'mtv_world'
 #: key of the metadata that names the segmenter of the masks, where they are not the simulator's

@@ -1,4 +1,4 @@
-"""Cameras that are written into recorded episodes: calibration.yaml and CameraInfo in the bag."""
+"""Cameras that are written into recorded episodes: calibration.yaml, CameraInfo and /tf_static."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.copying import copy_companions, copy_metadata, write_copies
 from mtv_world_ros.data.bag.image_decoding import to_rgb
+from mtv_world_ros.data.bag.metadata import LATCHED
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.data.episode import (
@@ -23,6 +24,8 @@ from mtv_world_ros.data.episode import (
     image_topic,
     METADATA_NAME,
     optical_frame,
+    TF,
+    TF_STATIC,
     UNKNOWN_CAMERAS,
 )
 
@@ -64,8 +67,9 @@ def write_cameras(
 ) -> bool:
     """Write cameras into an episode; those of other views, and all other messages, stay.
 
-    The bag gets a CameraInfo with each image of the views, in place of what it had. The folder is
-    made anew and takes the name of the old one at the end, so that an interrupted call leaves the
+    The bag gets a CameraInfo with each image of the views, and their poses on /tf_static, in place
+    of what it had; cameras that move in their link keep their poses of /tf. The folder is made
+    anew and takes the name of the old one at the end, so that an interrupted call leaves the
     episode as it was. An episode that has these cameras already is left alone.
 
     Args:
@@ -89,6 +93,8 @@ def write_cameras(
     ):
         return False
     with BagWriter(path, overwrite=True) as writer:
+        if TF_STATIC not in content.reader.declared():
+            writer.declare(TF_STATIC, messages.TF_MESSAGE, LATCHED)
         for _ in write_copies(content.reader, writer, content.with_infos_of(shown)):
             pass
         copy_metadata(content.reader, writer)
@@ -109,6 +115,9 @@ class _Content:
         num_images: number of images, by view.
         infos: serialised CameraInfos of each view without their headers, each value once.
         num_infos: number of CameraInfos, by view.
+        frames: optical frame of the first image, by view.
+        moving: frames that /tf moves.
+        static: transforms of /tf_static by their child frame, the newest of each.
     """
 
     reader: BagReader
@@ -116,20 +125,62 @@ class _Content:
     num_images: dict[str, int] = field(default_factory=dict)
     infos: dict[str, set[bytes]] = field(default_factory=dict)
     num_infos: dict[str, int] = field(default_factory=dict)
+    frames: dict[str, str] = field(default_factory=dict)
+    moving: set[str] = field(default_factory=set)
+    static: dict[str, Any] = field(default_factory=dict)
 
     def has_infos_of(self, cameras: Mapping[str, CameraModel]) -> bool:
-        """Return whether the images have the CameraInfo of these cameras, and no other one."""
-        return all(
+        """Return whether the bag has CameraInfo and pose of these cameras, and no other ones."""
+        has_infos = all(
             self.infos.get(view) == {_without_header(messages.make_camera_info(0, camera, ''))}
             and self.num_infos[view] == self.num_images[view]
             for view, camera in cameras.items()
         )
+        wanted = self._transforms_of(cameras, 0)
+        return has_infos and all(
+            child in self.static and _same_transform(self.static[child], transform)
+            for child, transform in wanted.items()
+        )
+
+    def add_transforms(self, message: BagMessage) -> None:
+        """Take the transforms of a message of /tf or /tf_static."""
+        transforms = messages.deserialize(message.msgtype, message.data).transforms
+        found = {transform.child_frame_id: transform for transform in transforms}
+        if message.topic == TF:
+            self.moving |= found.keys()
+        else:
+            self.static |= found
+
+    def _transforms_of(self, cameras: Mapping[str, CameraModel], stamp_ns: int) -> dict[str, Any]:
+        """Return the transforms of the cameras that stand still, by their frames."""
+        framed = {self.frames[view]: camera for view, camera in cameras.items()}
+        return {
+            frame: messages.make_transform(
+                stamp_ns, camera.mount_link, frame, camera.T_mount_camera
+            )
+            for frame, camera in framed.items()
+            if frame not in self.moving
+        }
 
     def with_infos_of(self, cameras: Mapping[str, CameraModel]) -> Iterator[BagMessage]:
-        """Yield the messages, each image of these cameras after its new CameraInfo."""
+        """Yield the messages, each image of these cameras after its new CameraInfo.
+
+        All static transforms come first, in one message: a latched topic keeps the last one alone.
+        """
         images = {topic: cameras[view] for view, topic in self.topics.items()}
-        old = {camera_info_topic(view) for view in cameras}
+        old = {camera_info_topic(view) for view in cameras} | {TF_STATIC}
+        is_first = True
         for message in self.reader.messages():
+            if is_first:
+                transforms = self.static | self._transforms_of(cameras, message.stamp_ns)
+                static = messages.make(messages.TF_MESSAGE, transforms=list(transforms.values()))
+                is_first = False
+                if transforms:
+                    yield message._replace(
+                        topic=TF_STATIC,
+                        msgtype=messages.TF_MESSAGE,
+                        data=messages.serialize(messages.TF_MESSAGE, static),
+                    )
             if message.topic in images:
                 yield _info_of(message, images[message.topic])
             if message.topic not in old:
@@ -157,11 +208,15 @@ def _read(path: Path, cameras: Mapping[str, CameraModel]) -> _Content:
         raise EpisodeError(f"'{path}' has no images of view '{missing[0]}'")
     images = {topic: view for view, topic in content.topics.items()}
     infos = {camera_info_topic(view): view for view in cameras}
-    for message in reader.messages({*images, *infos}):
-        if message.topic in images:
+    for message in reader.messages({*images, *infos, TF, TF_STATIC}):
+        if message.topic in (TF, TF_STATIC):
+            content.add_transforms(message)
+        elif message.topic in images:
             view = images[message.topic]
             if view not in content.num_images:
                 _check_size(path, cameras[view], message)
+                image = messages.deserialize(message.msgtype, message.data)
+                content.frames[view] = image.header.frame_id or optical_frame(view)
             content.num_images[view] = content.num_images.get(view, 0) + 1
         else:
             view = infos[message.topic]
@@ -215,6 +270,11 @@ def _info_of(image: BagMessage, camera: CameraModel) -> BagMessage:
         msgtype=messages.CAMERA_INFO,
         data=messages.serialize(messages.CAMERA_INFO, info),
     )
+
+
+def _same_transform(one: Any, other: Any) -> bool:
+    """Return whether two transforms have equal frames and values; stamps do not count."""
+    return one.header.frame_id == other.header.frame_id and one.transform == other.transform
 
 
 def _without_header(info: Any) -> bytes:

@@ -45,6 +45,8 @@ from mtv_world_ros.data.episode import (
     ObjectPoses,
     optical_frame,
     parse_info,
+    TF,
+    TF_STATIC,
     Track,
 )
 from mtv_world_ros.data.joint_plans import (
@@ -87,8 +89,7 @@ STREAMS = {
     'instruction': INSTRUCTION,
     'object_poses': OBJECT_POSES,
 }
-STATIC_TF = '/tf_static'
-TF_TOPICS = ('/tf', STATIC_TF)
+TF_TOPICS = (TF, TF_STATIC)
 #: frames further away from all joint states share no moment with them [s]
 MAX_FRAME_AWAY_S = 0.5
 NANO = 1_000_000_000
@@ -273,7 +274,7 @@ class _EpisodeReader:
             if topic == self.topics.instruction:  # the last one before it still holds
                 earlier = np.flatnonzero(arrived < self.window.begin_ns)
                 rows = [*earlier[-1:].tolist(), *rows]
-            if topic == STATIC_TF or topic in infos and not rows:
+            if topic == TF_STATIC or topic in infos and not rows:
                 continue
             self.received[topic] = [self.received[topic][k] for k in rows]
             self.arrived[topic] = arrived[rows]

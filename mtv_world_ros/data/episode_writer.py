@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ from mtv_world_ros.data.episode import (
     OBJECT_POSES,
     optical_frame,
     TF,
+    TF_STATIC,
 )
 
 
@@ -43,7 +44,9 @@ class EpisodeWriter(BagWriter):
         task: name of the task.
         instruction: text for the robot; `write_instruction` records it as a topic.
         robot: name of the robot.
-        cameras: calibrated views, written to calibration.yaml in the folder.
+        cameras: calibrated views, written to calibration.yaml in the folder; where CameraInfo is
+            written, /tf_static gets the poses of those that stand still in their mount link.
+        moving: views whose camera moves in its mount link, see `write_camera_pose`.
         seed: seed the episode is made from.
         objects: names of the objects; masks number them from 1.
         metadata: further text by key.
@@ -59,6 +62,7 @@ class EpisodeWriter(BagWriter):
         instruction: str,
         robot: str,
         cameras: Sequence[CameraModel] = (),
+        moving: Collection[str] = (),
         seed: int | None = None,
         objects: Sequence[str] = (),
         metadata: Mapping[str, str] | None = None,
@@ -71,6 +75,7 @@ class EpisodeWriter(BagWriter):
         self.outcome = 'unknown'
         self.metadata: dict[str, str] = dict(metadata or {})
         self._jpeg_quality = jpeg_quality
+        self._still = [camera for camera in cameras if camera.view not in moving]
         if cameras:
             by_view = {camera.view: camera for camera in cameras}
             try:
@@ -109,7 +114,18 @@ class EpisodeWriter(BagWriter):
         self.write_message(mask_topic(view), messages.COMPRESSED_IMAGE, stamp_ns, message)
 
     def write_camera_info(self, view: str, stamp_ns: int, camera: CameraModel) -> None:
-        """Record the view's intrinsics."""
+        """Record the view's intrinsics; the first ones with the poses of all still cameras."""
+        if self._still:  # in one message, as a latched topic keeps the last one alone
+            transforms = [
+                messages.make_transform(
+                    stamp_ns, still.mount_link, optical_frame(still.view), still.T_mount_camera
+                )
+                for still in self._still
+            ]
+            self._still = []
+            self.declare(TF_STATIC, messages.TF_MESSAGE, LATCHED)
+            static = messages.make(messages.TF_MESSAGE, transforms=transforms)
+            self.write_message(TF_STATIC, messages.TF_MESSAGE, stamp_ns, static)
         message = messages.make_camera_info(stamp_ns, camera, optical_frame(view))
         self.write_message(camera_info_topic(view), messages.CAMERA_INFO, stamp_ns, message)
 

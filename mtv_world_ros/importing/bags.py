@@ -377,6 +377,7 @@ def write_imported(
         instruction=instruction,
         robot=robot.name,
         cameras=[episode.cameras[v] for v in episode.views if v not in episode.unknown],
+        moving=episode.camera_tracks,
         objects=names,
         metadata=_metadata(episode, source, key),
         jpeg_quality=mapping.jpeg_quality,

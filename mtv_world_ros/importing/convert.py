@@ -239,6 +239,7 @@ def convert_episode(
             instruction=texts[0],
             robot=mapping.robot.name,
             cameras=list(cameras.values()),
+            moving=tracks,
             objects=stage.names(
                 out.name, texts[0], lambda: next(iter(first.values())), given=mapping.objects
             ),

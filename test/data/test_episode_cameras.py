@@ -61,6 +61,73 @@ def write(path, infos=(), cameras=()):
     return path
 
 
+def static_poses(path):
+    """Parent, translation and quaternion of each frame of the only message of /tf_static."""
+    ((_, message),) = found_by_rosbags(path, '/tf_static')
+    poses = {}
+    for one in message.transforms:
+        place, turn = one.transform.translation, one.transform.rotation
+        poses[one.child_frame_id] = (
+            one.header.frame_id,
+            [place.x, place.y, place.z],
+            [turn.x, turn.y, turn.z, turn.w],
+        )
+    return poses
+
+
+def test_tf_has_the_poses_of_written_cameras_as_of_a_robot_that_publishes_them(tmp_path):
+    path = write(tmp_path / 'e')
+    assert write_cameras(path, {'door': camera('door')})
+    # a camera that looks down: half a turn about x
+    expected = ('table', pytest.approx([0.3, 0, 1]), pytest.approx([1, 0, 0, 0]))
+    assert static_poses(path) == {'door_optical_frame': expected}
+    assert not write_cameras(path, {'door': camera('door')})
+    assert write_cameras(path, {'side': camera('side', x=0.7)})
+    assert write_cameras(path, {'door': camera('door', x=0.4)})
+    poses = static_poses(path)
+    assert sorted(poses) == ['door_optical_frame', 'side_optical_frame']
+    assert poses['door_optical_frame'][1][0] == pytest.approx(0.4)
+    metadata = (path / 'metadata.yaml').read_text()
+    name = metadata.index('name: /tf_static')
+    assert 'durability: transient_local' in metadata[name : name + 600]
+    # without the file, the poses are those of TF
+    (path / 'calibration.yaml').unlink()
+    found = read_episode(path).cameras
+    assert found['door'].mount_link == 'table'
+    np.testing.assert_allclose(found['side'].T_mount_camera, camera('side', x=0.7).T_mount_camera)
+
+
+def test_an_episode_with_camera_info_but_without_tf_gets_its_poses(tmp_path):
+    path = write(tmp_path / 'e', infos=[camera('door')])
+    save_calibration(path / 'calibration.yaml', {'door': camera('door')})
+    assert write_cameras(path, {}, {'door': camera('door')})
+    assert list(static_poses(path)) == ['door_optical_frame']
+    assert not write_cameras(path, {}, {'door': camera('door')})
+
+
+def test_a_camera_that_tf_moves_gets_no_static_pose(tmp_path):
+    robot = load_robot(robot_path('franka'))
+    cameras = [camera('door'), camera('side')]
+    with EpisodeWriter(
+        tmp_path / 'e', task='', instruction='', robot='franka', cameras=cameras, moving=['door']
+    ) as writer:
+        for k in range(FRAMES):
+            stamp = START_NS + k * PERIOD_NS
+            writer.write_joint_states(stamp, robot.joint_names, np.full(8, 0.02))
+            for view in ('door', 'side'):
+                writer.write_camera_info(view, stamp, camera(view))
+                writer.write_image(view, stamp, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+            pose = camera('door', x=0.3 + 0.01 * k).T_mount_camera
+            writer.write_camera_pose('door', stamp, 'table', pose)
+    path = tmp_path / 'e'
+    assert list(static_poses(path)) == ['side_optical_frame']
+    assert write_cameras(path, {'side': camera('side', x=0.5)}, {'door': camera('door')})
+    assert list(static_poses(path)) == ['side_optical_frame']
+    read = read_episode(path)
+    np.testing.assert_allclose(read.camera_tracks['door'][:, 0, 3], 0.3 + 0.01 * np.arange(FRAMES))
+    assert list(read.camera_tracks) == ['door']
+
+
 def found_by_rosbags(path, topic):
     """Log times and messages of a topic by an independent reader."""
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -73,8 +140,8 @@ def found_by_rosbags(path, topic):
 
 
 def others(path, *views):
-    """Messages of all topics but the CameraInfo of some views."""
-    topics = {f'/{view}/camera_info' for view in views}
+    """Messages of all topics but the CameraInfo of some views, and static poses."""
+    topics = {'/tf_static', *(f'/{view}/camera_info' for view in views)}
     return [message for message in BagReader(path).messages() if message.topic not in topics]
 
 

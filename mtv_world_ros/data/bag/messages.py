@@ -29,6 +29,7 @@ STRING = 'std_msgs/msg/String'
 POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
 POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
 TF_MESSAGE = 'tf2_msgs/msg/TFMessage'
+TRANSFORM_STAMPED = 'geometry_msgs/msg/TransformStamped'
 
 #: `format` of colour images in JPEG, as image_transport writes it
 JPEG = 'rgb8; jpeg compressed bgr8'
@@ -237,11 +238,16 @@ def parse_pose(item: Any) -> NDArray[np.float64]:
 
 def make_tf(stamp_ns: int, parent: str, child: str, T_parent_child: ArrayLike) -> Any:
     """Return the tf2_msgs/TFMessage with one transform."""
+    return make(TF_MESSAGE, transforms=[make_transform(stamp_ns, parent, child, T_parent_child)])
+
+
+def make_transform(stamp_ns: int, parent: str, child: str, T_parent_child: ArrayLike) -> Any:
+    """Return a geometry_msgs/TransformStamped."""
     T = np.asarray(T_parent_child, np.float64)
     x, y, z, w = quaternion(T[:3, :3]).tolist()
     place = dict(zip('xyz', T[:3, 3].tolist(), strict=True))
-    transform = make(
-        'geometry_msgs/msg/TransformStamped',
+    return make(
+        TRANSFORM_STAMPED,
         header=make_header(stamp_ns, parent),
         child_frame_id=child,
         transform=make(
@@ -250,7 +256,6 @@ def make_tf(stamp_ns: int, parent: str, child: str, T_parent_child: ArrayLike) -
             rotation=make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w),
         ),
     )
-    return make(TF_MESSAGE, transforms=[transform])
 
 
 def make_joint_trajectory(stamp_ns: int, trajectory: JointTrajectory) -> Any:

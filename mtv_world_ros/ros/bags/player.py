@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import heapq
 from pathlib import Path
@@ -17,6 +17,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
@@ -112,6 +113,7 @@ class PlayedPlan:
     """A trajectory that was published, and how it ended.
 
     Attributes:
+        topic: topic it was published on.
         bag_s: time since the start of playing [s].
         stamp_ns: stamp that it was published with [ns].
         state: end of the plan, one of `ENDS`; `UNANSWERED` = nothing was reported in time; empty =
@@ -119,6 +121,7 @@ class PlayedPlan:
         reason: reason of a rejection or failure, with its text.
     """
 
+    topic: str
     bag_s: float
     stamp_ns: int
     state: str = ''
@@ -145,6 +148,22 @@ def describe_failed(plans: Sequence[PlayedPlan]) -> str:
         shown += f' and {rest} more' if rest > 0 else ''
         lines.append(f'  {len(times)} {state}, at {shown} s{": " if reason else ""}{reason}')
     return '\n'.join(lines)
+
+
+def describe_left_out(counts: Mapping[str, int], read: Collection[str]) -> str:
+    """Return which trajectory topics no answer was expected on, and how they are named for one.
+
+    Args:
+        counts: number of plans by topic, of the topics that the node does not read.
+        read: trajectory topics that it reads.
+    """
+    shown = ', '.join(f"'{topic}' ({count} plans)" for topic, count in sorted(counts.items()))
+    topic, name = min(counts), min(read)
+    return (
+        f'no answer is expected on {shown}: the node reads {", ".join(sorted(read))}. It imagines '
+        f'plans of another topic where that is played under this name: --topics without {name}, '
+        f'and --ros-args -r {topic}:={name}'
+    )
 
 
 class Player(Node):
@@ -198,6 +217,7 @@ class Player(Node):
         self._wait_for_ends()
         self._wait_for_frames()
         self._flush()
+        self._say_left_out()
         counted = ', '.join(f'{number} {what}' for what, number in self._counts.items())
         self.get_logger().info(f'played {counted or "nothing"}')
         failed = describe_failed(self._plans)
@@ -288,11 +308,7 @@ class Player(Node):
         return topic if self.get_namespace() == '/' else topic.lstrip('/')
 
     def _wait_for_subscribers(self) -> None:
-        needed = self._options.wait_for or [
-            publisher.topic_name
-            for publisher in self._outputs.values()
-            if publisher.msg_type is message_class(TRAJECTORY)
-        ]
+        needed = self._options.wait_for or self._plan_topics()
         end_s = time.monotonic() + self._options.wait_timeout
         say_s = time.monotonic() + _SILENT_S
         while unsubscribed := self._unsubscribed(needed):
@@ -313,8 +329,11 @@ class Player(Node):
     def _unsubscribed(self, topics: list[str]) -> list[str]:
         """Return topics without a subscriber, by the ROS graph and by other nodes' diagnostics."""
         unsubscribed = [topic for topic in topics if not self.count_subscribers(topic)]
+        if not self._options.wait_for and len(unsubscribed) < len(topics):
+            topics = [topic for topic in topics if topic not in unsubscribed]
+            unsubscribed = []  # of several trajectory topics a node may read one
         if self._options.lock_step and not unsubscribed:
-            node = self.resolve_topic_name(self._options.report_topic).rpartition('/')[0]
+            node = self._reports.rpartition('/')[0]
             unsubscribed = [] if self._peers.state(node) else [f'/diagnostics of {node}']
         return unsubscribed or self._peers.unconnected(topics)
 
@@ -347,7 +366,8 @@ class Player(Node):
             if message.msgtype != TRAJECTORY:
                 continue
             bag_s = (message.stamp_ns - self._first_ns) / NANO
-            self._plans.append(PlayedPlan(bag_s=bag_s, stamp_ns=stamp_ns))
+            topic = self._outputs[message.topic].topic_name
+            self._plans.append(PlayedPlan(topic=topic, bag_s=bag_s, stamp_ns=stamp_ns))
             self._was_reported = self._was_reported or self._is_reported()
             if self._options.lock_step:
                 self._wait_for_answer(timeline, message.stamp_ns, stamp_ns)
@@ -426,7 +446,48 @@ class Player(Node):
                 self._ends.remove(end)
                 reason = ': '.join(filter(None, (end.get('reason', ''), end.get('text', ''))))
                 self._end(index, end['state'], reason)
-        return [plan for plan in self._plans if plan.is_open]
+        unread = self._unread_topics()
+        return [plan for plan in self._plans if plan.is_open and plan.topic not in unread]
+
+    def _plan_topics(self) -> list[str]:
+        """Return the trajectory topics that are played, by their full names."""
+        return [
+            publisher.topic_name
+            for publisher in self._outputs.values()
+            if publisher.msg_type is message_class(TRAJECTORY)
+        ]
+
+    def _unread_topics(self) -> set[str]:
+        """Return the trajectory topics that the node that reports does not read.
+
+        Empty where it reads none of them itself: what reads them for it is not known.
+        """
+        topics = set(self._plan_topics())
+        if len(topics) < 2:
+            return set()
+        reporters = _nodes(self.get_publishers_info_by_topic(self._reports))
+        read = {
+            topic
+            for topic in topics
+            if reporters & _nodes(self.get_subscriptions_info_by_topic(topic))
+        }
+        return topics - read if read else set()
+
+    def _say_left_out(self) -> None:
+        """Take out the plans that the node did not read, and log which."""
+        unread = self._unread_topics()
+        counts = Counter(plan.topic for plan in self._plans if plan.is_open)
+        if not counts:
+            return
+        self._plans = [plan for plan in self._plans if not plan.is_open]
+        self._counts['not read'] = counts.total()
+        read = set(self._plan_topics()) - unread
+        self.get_logger().warning(describe_left_out(counts, read))
+
+    @property
+    def _reports(self) -> str:
+        """Full name of the topic of reports."""
+        return self.resolve_topic_name(self._options.report_topic)
 
     def _end(self, index: int, state: str, reason: str) -> None:
         """Set how a plan ended."""
@@ -440,8 +501,9 @@ class Player(Node):
     def _give_up(self, reason: str = '') -> None:
         """End the plans that wait for an answer: they are unanswered."""
         reason = reason or f'no answer within {self._options.answer_timeout:g} s'
+        unread = self._unread_topics()
         for index, plan in enumerate(self._plans):
-            if plan.is_open:
+            if plan.is_open and plan.topic not in unread:
                 self._end(index, UNANSWERED, reason)
 
     def _wait_for_answer(self, timeline: Timeline, bag_ns: int, stamp_ns: int) -> None:
@@ -454,6 +516,8 @@ class Player(Node):
         timeline.pause(time.monotonic_ns() - begin_ns)
         self._give_up()
         plan = self._plans[-1]
+        if plan.is_open:  # on a topic that the node does not read
+            return
         self.get_logger().info(f'trajectory is answered: {plan.state}')
         if plan.state != 'done':
             text = f'{plan.state} {plan.reason}'.strip()
@@ -467,13 +531,17 @@ class Player(Node):
         end_s = time.monotonic() + self._options.answer_timeout
         while self._open_plans() and time.monotonic() < end_s:
             if not self._is_reported():
-                topic = self.resolve_topic_name(self._options.report_topic)
-                self._give_up(f"no answer, and nobody publishes '{topic}' any more")
+                self._give_up(f"no answer, and nobody publishes '{self._reports}' any more")
                 break
             if self._timeline is not None:
                 self._publish_clock(self._timeline.bag_time(time.monotonic_ns()))
             self._executor.spin_once(timeout_sec=_CLOCK_PERIOD_NS / NANO)
         self._give_up()
+
+
+def _nodes(endpoints: Iterable[TopicEndpointInfo]) -> set[tuple[str, str]]:
+    """Return namespace and name of the nodes of publishers or subscriptions."""
+    return {(endpoint.node_namespace, endpoint.node_name) for endpoint in endpoints}
 
 
 def in_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:

@@ -4,6 +4,7 @@ from mtv_world_ros.data.bag.reader import BagMessage
 from mtv_world_ros.ros.bags import player
 from mtv_world_ros.ros.bags.player import (
     describe_failed,
+    describe_left_out,
     in_order,
     PlayedPlan,
     Timeline,
@@ -56,7 +57,13 @@ def test_a_system_clock_that_is_set_changes_stamps_and_not_the_pace(monkeypatch)
 
 def test_plans_that_were_not_imagined_are_listed_by_reason_and_others_are_no_failure():
     def plan(bag_s, state, reason=''):
-        return PlayedPlan(bag_s=bag_s, stamp_ns=round(bag_s * NANO), state=state, reason=reason)
+        return PlayedPlan(
+            topic='/joint_trajectory',
+            bag_s=bag_s,
+            stamp_ns=round(bag_s * NANO),
+            state=state,
+            reason=reason,
+        )
 
     good = [plan(0.0, 'done'), plan(0.8, 'preempted')]
     assert describe_failed(good) == ''
@@ -70,3 +77,10 @@ def test_plans_that_were_not_imagined_are_listed_by_reason_and_others_are_no_fai
     ]
     many = describe_failed([plan(float(k), 'rejected', bare) for k in range(11)])
     assert '11 rejected, at 0.00, ' in many and '7.00 and 3 more s: ' in many
+
+
+def test_topics_that_the_node_does_not_read_are_named_with_what_makes_it_read_them():
+    said = describe_left_out({'/right/plan': 3, '/left/plan': 12}, ['/joint_trajectory'])
+    assert "'/left/plan' (12 plans), '/right/plan' (3 plans)" in said
+    assert 'the node reads /joint_trajectory' in said
+    assert said.endswith('--ros-args -r /left/plan:=/joint_trajectory')

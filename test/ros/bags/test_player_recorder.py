@@ -9,8 +9,10 @@ import subprocess
 import sys
 import time
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 import pytest
+import rclpy
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import CompressedImage, JointState
 from std_msgs.msg import String
@@ -18,6 +20,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.core.data_types import JointTrajectory as Trajectory
+from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode import PLACE
 from mtv_world_ros.data.episode_writer import EpisodeWriter
@@ -47,7 +50,8 @@ def bare_episode(tmp_path_factory, ros):
     return write_episode(tmp_path_factory.mktemp('bare'), ros, has_infos=False)
 
 
-def write_episode(folder, ros, *, has_infos=True):
+def write_episode(folder, ros, *, has_infos=True, others=()):
+    """Write an episode; `others` are further topics with its plans."""
     cameras = load_calibration(ros.make_calibration(folder / 'calibration.yaml'))
     with EpisodeWriter(
         folder / 'episode',
@@ -66,6 +70,9 @@ def write_episode(folder, ros, *, has_infos=True):
                 rows = np.repeat(ros.HOME[None], 4, axis=0)
                 plan = Trajectory(joint_names=ros.JOINTS, times=times, positions=rows)
                 writer.write_trajectory(stamp_ns, plan)
+                for topic in others:
+                    message = messages.make_joint_trajectory(stamp_ns + 1, plan)
+                    writer.write_message(topic, messages.JOINT_TRAJECTORY, stamp_ns, message)
             for view, camera in cameras.items():
                 if has_infos:
                     writer.write_camera_info(view, stamp_ns, camera)
@@ -280,6 +287,45 @@ def test_plans_of_a_node_that_ended_meanwhile_are_a_failure(episode, launch, cli
     code, said = finish(player)
     assert code == 1, said
     assert "2 unanswered, at 0.00, 0.40 s: no answer, and nobody publishes '/ended/report'" in said
+    assert 'Traceback' not in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('options', [('--lock-step',), ()])
+def test_only_plans_that_the_reporting_node_reads_are_to_be_answered(
+    options, tmp_path, launch, client, ros
+):
+    """A recording of two arms with a topic each, and a recorder that listens to both."""
+    path = write_episode(tmp_path, ros, others=['/left/plan'])
+    model, listener = (rclpy.create_node(n, context=client.context) for n in ('fake', 'listener'))
+    reports = model.create_publisher(DiagnosticArray, '/fake/report', 10)
+    diagnostics = model.create_publisher(DiagnosticArray, '/diagnostics', 10)
+
+    def publish(publisher, **values):
+        pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+        publisher.publish(DiagnosticArray(status=[DiagnosticStatus(name='fake', values=pairs)]))
+
+    def answer(plan):
+        stamp_ns = str(to_ns(plan.header.stamp))
+        publish(reports, state='done', trajectory_stamp_ns=stamp_ns)
+
+    model.create_subscription(JointTrajectory, '/joint_trajectory', answer, 10)
+    model.create_timer(0.1, lambda: publish(diagnostics, state='active'))
+    listener.create_subscription(JointTrajectory, '/left/plan', lambda plan: None, 10)
+    client.executor.add_node(model)
+    client.executor.add_node(listener)
+    try:
+        options = ('--answer-timeout', '5', '--report-topic', '/fake/report', *options)
+        player = launch('player', path, *options)
+        client.wait(lambda: player.poll() is not None, 'the end of the player', 40)
+        code, said = finish(player)
+    finally:
+        for one in (model, listener):
+            client.executor.remove_node(one)
+            one.destroy_node()
+    assert code == 0, said
+    assert '2 done' in said and '2 not read' in said, said
+    assert "no answer is expected on '/left/plan' (2 plans): the node reads /joint_traj" in said
     assert 'Traceback' not in said
 
 
