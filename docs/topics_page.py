@@ -41,6 +41,7 @@ TOPICS = {
     'joint_states': 'measured joint positions, by name',
     'joint_trajectory': 'plan that is imagined: commanded joint positions',
     'instruction': 'text for the robot (transient local)',
+    'objects': 'names of the objects, comma-separated; empty = none are known (transient local)',
     'robot_description': 'URDF, as `robot_state_publisher` publishes it (transient local)',
     '/tf': 'poses of moving frames, where tf2_msgs is installed',
     '/tf_static': 'poses of fixed frames, where tf2_msgs is installed; the node adds frames of '

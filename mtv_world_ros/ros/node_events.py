@@ -50,6 +50,10 @@ class NodeEvents(SensingEvents, Protocol):
         """Take the instruction."""
         ...
 
+    def on_objects(self, message: String) -> None:
+        """Take the names of the objects."""
+        ...
+
     def on_plan(self, plan: JointTrajectoryMsg | Goal, transport_s: float = 0.0) -> None:
         """Take a plan of the topic or of the action, and how long it was under way [s]."""
         ...

@@ -172,7 +172,8 @@ class Settings(LiveSettings, NodeSettings):
     )
     objects: Names = parameter(
         (),
-        "Names of the objects, e.g. red block; `['']` = the ones that `describer` names.",
+        "Names of the objects, e.g. red block; `['']` = the ones that `describer` names, else "
+        'those of the topic `objects`.',
     )
     seed: int = parameter(0, 'Seed of the noise; chunk k uses seed + k.', (0, 2**31 - 1))
     num_seeds: int = parameter(

@@ -20,6 +20,7 @@ from rclpy.qos import QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
 
 from mtv_world_ros.core.errors import (
     CalibrationError,
@@ -28,7 +29,7 @@ from mtv_world_ros.core.errors import (
     TrajectoryError,
 )
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
-from mtv_world_ros.data.episode import CALIBRATION_FILE, METADATA_NAME, parse_info
+from mtv_world_ros.data.episode import CALIBRATION_FILE, EpisodeInfo, METADATA_NAME, parse_info
 from mtv_world_ros.data.episode_cameras import views_without_info
 from mtv_world_ros.ros.messages.conversions import (
     has_header,
@@ -44,6 +45,8 @@ from mtv_world_ros.ros.qos_profiles import is_latched, LATCHED
 from mtv_world_ros.ros.run_node import run
 
 TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
+#: names of the objects of the episode that is played, comma-separated
+OBJECTS = '/objects'
 #: recorders write messages this much out of order at most
 _WINDOW_NS = 2 * NANO
 #: topics whose last message late subscribers get
@@ -189,6 +192,7 @@ class Player(Node):
         self._was_reported = False
         self._unpublished: set[tuple[str, str]] = set()
         self.create_subscription(DiagnosticArray, options.report_topic, self._on_report, 100)
+        self._objects = self._offer_objects(types)
         self._hint = self._describe_cameras(types)
         self._say_parameters(types)
         self._executor = SingleThreadedExecutor()
@@ -205,6 +209,7 @@ class Player(Node):
             ConfigError: nobody subscribes.
             TrajectoryError: plans were rejected, failed or not answered.
         """
+        self._publish_objects()
         if not self._options.no_wait:
             self._wait_for_subscribers()
         while True:
@@ -280,22 +285,51 @@ class Player(Node):
         """Log the parameters of the node that this episode needs: no topic carries them."""
         if TRAJECTORY not in {types[topic] for topic in self._outputs}:
             return
-        values = self._reader.metadata.get(METADATA_NAME, {})
-        try:
-            info = parse_info(self._options.episode, values)
-        except EpisodeError as error:  # which keeps no topic from being played
-            self.get_logger().warning(str(error))
-            return
-        if info.objects:
-            self.get_logger().info(
-                'the objects of this episode have names: world_model takes them with -p '
-                f'"objects:={list(info.objects)}", else from its describer or the instruction'
-            )
-        if info.place:
+        info = self._info()
+        if info is not None and info.place:
             self.get_logger().info(
                 f"this episode was recorded in the robot cell '{info.place}': world_model is told "
                 f"with -p 'place:={info.place}'; in a cell where contact was not fitted, verdicts "
                 'are given more seldom'
+            )
+
+    def _info(self) -> EpisodeInfo | None:
+        """Return task, objects and place of the episode; None = they cannot be read."""
+        values = self._reader.metadata.get(METADATA_NAME, {})
+        try:
+            return parse_info(self._options.episode, values)
+        except EpisodeError as error:  # which keeps no topic from being played
+            self.get_logger().warning(str(error), once=True)
+            return None
+
+    def _offer_objects(self, types: dict[str, str]) -> Publisher | None:
+        """Return the publisher of the objects' names, which the node judges with.
+
+        None = no plans are played, or the bag has that topic. Episodes without names publish that
+        there are none, so that those of another episode are not kept.
+        """
+        played = {types[topic] for topic in self._outputs}
+        if TRAJECTORY not in played or OBJECTS in self._outputs:
+            return None
+        return self.create_publisher(String, self._played_name(OBJECTS), LATCHED)
+
+    def _publish_objects(self) -> None:
+        """Publish the names that are stored with the episode."""
+        info = self._info()
+        if self._objects is None or info is None:
+            return
+        if any(',' in name for name in info.objects):
+            self.get_logger().warning(
+                f'the names {list(info.objects)} have commas, and are not published on '
+                f"'{self._objects.topic_name}', where commas separate names: give them to "
+                'world_model as its parameter objects'
+            )
+            return
+        self._objects.publish(String(data=', '.join(info.objects)))
+        if info.objects:
+            self.get_logger().info(
+                f"the objects of this episode are on '{self._objects.topic_name}': "
+                f'{", ".join(info.objects)}'
             )
 
     def _offer(self, msgtype: str, topic: str) -> Publisher:

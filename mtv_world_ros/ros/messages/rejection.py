@@ -38,6 +38,7 @@ class Reason(StrEnum):
     JOINT_LIMITS = 'joint_limits'
     JOINT_SPEEDS = 'joint_speeds'
     INSTRUCTION_TOO_LONG = 'instruction_too_long'
+    OBJECTS_TOO_LONG = 'objects_too_long'
     NO_CLOCK = 'no_clock'
     NOT_ACTIVE = 'not_active'
     WORLD_MODEL_MISSING = 'world_model_missing'

@@ -31,19 +31,19 @@ _LOWEST = (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
 #: plans that wait while the node is busy: one that is dropped would get no end
 PLANS_KEPT = 1000
 #: small, urgent topics that have ports of their own; joint states may come at 1 kHz
-OWN_PATHS = (('joint_trajectory', 'instruction', SERVICES), ('joint_states',))
+OWN_PATHS = (('joint_trajectory', 'instruction', 'objects', SERVICES), ('joint_states',))
 _HIGHEST = (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Inputs:
-    """Subscriptions to the cameras, joint states, instruction and trajectories.
+    """Subscriptions to the cameras, joint states, instruction, object names and trajectories.
 
     Args:
         node: owner of the subscriptions.
         views: names of the views; parameters give each its camera topic.
         compressed: whether images come as JPEG or PNG.
         buffer: buffer of images, camera infos and joint states.
-        events: takes instructions and plans.
+        events: takes instructions, names of objects and plans.
 
     Raises:
         ConfigError: a QoS override is invalid, or a port was taken by another program.
@@ -68,6 +68,8 @@ class Inputs:
         self._all = [*self._observations]
         instruction = events.guarded(events.on_instruction)
         self._all.append(MatchedSubscription(node, String, 'instruction', instruction, depth=1))
+        objects = events.guarded(events.on_objects)
+        self._all.append(MatchedSubscription(node, String, 'objects', objects, depth=1))
         take = events.guarded(events.on_plan)
 
         def handle(message: JointTrajectory, info: Mapping[str, int]) -> None:

@@ -56,6 +56,7 @@ class RequestMaker:
     Attributes:
         imagine: whether rollouts start from the last predicted frames.
         instruction: text for the robot.
+        stored_objects: names of the objects that came with the recording.
         num_requests: number of requests made.
         robot: robot that the trajectories command.
 
@@ -78,6 +79,7 @@ class RequestMaker:
         self.num_requests = 0
         self.imagine = settings().mode == 'imagine'
         self.instruction: str | None = None
+        self.stored_objects: tuple[str, ...] = ()
 
     def make(self, message: JointTrajectoryMsg, now_ns: int, received_s: float) -> Request:
         """Return the request.
@@ -113,6 +115,7 @@ class RequestMaker:
             settings=settings,
             received_s=received_s,
             received_ns=now_ns,
+            stored_objects=self.stored_objects,
         )
 
     def is_stop(self, message: JointTrajectoryMsg) -> bool:
@@ -388,6 +391,13 @@ class Rollouts:
         with rejected_as(Reason.INSTRUCTION_TOO_LONG):
             check_limit('instruction_characters', len(message.data), 'the instruction')
         self._maker.instruction = message.data
+
+    def on_objects(self, message: String) -> None:
+        """Take the names of the objects, comma-separated, for the plans to come."""
+        with rejected_as(Reason.OBJECTS_TOO_LONG):
+            check_limit('instruction_characters', len(message.data), 'the names of the objects')
+        names = (name.strip() for name in message.data.split(','))
+        self._maker.stored_objects = tuple(dict.fromkeys(filter(None, names)))
 
     def on_plan(self, plan: JointTrajectoryMsg | Goal, transport_s: float = 0.0) -> None:
         """Queue a plan, so that images that came with it are stored before it is checked."""

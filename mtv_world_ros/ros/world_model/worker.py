@@ -41,6 +41,7 @@ class Request:
         imagine: whether to start from the last predicted frames if there are newer ones, and
             whether the next request shall.
         instruction: text for the robot.
+        stored_objects: names of the objects that came with the recording; empty = none did.
         settings: the parameters when it came in. In imagine mode the seed counts one up with
             every chunk after a reset, over requests too.
         received_s: when it came in [s], of `time.monotonic`.
@@ -56,6 +57,7 @@ class Request:
     settings: Settings
     received_s: float
     received_ns: int = 0
+    stored_objects: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -405,6 +407,7 @@ class RolloutWorker:
         return RolloutOptions(
             instruction=request.instruction,
             objects=settings.objects,
+            stored_objects=request.stored_objects,
             seed=settings.seed,
             num_seeds=settings.num_seeds,
             num_inference_steps=settings.num_inference_steps,

@@ -190,6 +190,7 @@ def test_stamps_are_moved_to_now_but_stay_in_step(episode, launch, ros):
         client.subscribe(JointState, '/joint_states', depth=100)
         client.subscribe(JointTrajectory, '/plan', depth=100)
         client.subscribe(String, '/instruction', depth=1)
+        client.subscribe(String, '/objects', depth=1)
         begin_ns = time.time_ns()
         player = launch(
             'player', episode, '--rate', '2', '--ros-args', '-r', '/joint_trajectory:=/plan'
@@ -199,7 +200,8 @@ def test_stamps_are_moved_to_now_but_stay_in_step(episode, launch, ros):
         client.wait(lambda: len(client.received[IMAGE]) == NUM_STEPS, 'images')
         code, said = finish(player)
         assert code == 0, said
-        assert """-p "objects:=['red block', 'blue block']\"""" in said
+        assert "the objects of this episode are on '/objects': red block, blue block" in said
+        assert client.received['/objects'][-1].data == 'red block, blue block'
         assert 'world_model takes them with -p calibration_file:=FILE' in said
         assert "world_model is told with -p 'place:=bench'" in said
         stamps = {

@@ -338,6 +338,21 @@ def send_joints(client, ros, positions):
         client.spin_for(0.05)
 
 
+def test_names_of_objects_are_those_of_their_topic_until_it_says_that_there_are_none(
+    node, client, ros
+):
+    for text, names in (
+        ('blue block,  red block, blue block', 'blue block, red block'),
+        ('', 'red block'),  # of the instruction
+    ):
+        client.publish('/objects', ros.STRING(data=text))
+        client.publish('/instruction', ros.STRING(data='lift the red block'))
+        client.spin_for(0.2)
+        expect_goes_on(client)
+        found = client.report_values('chunk')[-1]['objects']
+        assert found == names
+
+
 def test_input_that_froze_the_node_is_refused_at_once(node, client, ros):
     since = time.monotonic()
     names = [f'joint{n}' for n in range(20_000)]
@@ -347,6 +362,9 @@ def test_input_that_froze_the_node_is_refused_at_once(node, client, ros):
     client.publish('/instruction', ros.STRING(data='put the ' * 1900))
     expect_counted(client, 'instruction_too_long', before)
     client.publish('/instruction', ros.STRING(data=('put the red ' * 300)))
+    before = rejections(client, 'objects_too_long')
+    client.publish('/objects', ros.STRING(data='a block, ' * 1900))
+    expect_counted(client, 'objects_too_long', before)
     expect_goes_on(client)
     assert time.monotonic() - since < 20
 
