@@ -13,7 +13,7 @@ from typing import Any, TYPE_CHECKING
 
 from mtv_world_ros.cli.bundled_help import presets
 from mtv_world_ros.cli.shared_options import add_options, number_or_0
-from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 
 if TYPE_CHECKING:
     import torch
@@ -155,8 +155,9 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
     # importing torch takes seconds: what is often mistyped is checked before
-    if not arguments.dataset.is_dir():
-        select(arguments.dataset)  # says that it holds no episodes
+    for dataset in (arguments.dataset, arguments.held_out):
+        if dataset is not None and not dataset.is_dir():
+            select(dataset)  # says that it holds no episodes
     initial = Checkpoint.open(arguments.init) if arguments.init else None
     from mtv_world_ros.model.runtime import check_device, choose_dtype
 
@@ -191,7 +192,7 @@ def _train(arguments: argparse.Namespace) -> int:
         held_out=_held_out(arguments, paths, dtype, source),
     )
     print(f'{f"adapter for {arguments.init}" if config.lora.rank else "checkpoint"}: {folder}')
-    if not config.lora.rank and _lacks_contact(folder, config.video.robot):
+    if not config.lora.rank and _lacks_contact(folder):
         views = ','.join(config.video.views)
         words = [str(arguments.dataset), '--checkpoint', str(folder)]
         words += ['--robot', str(config.video.robot), '--views', views]
@@ -212,33 +213,37 @@ UNSEEN = 'EPISODES'
 def _evaluation_advice(
     arguments: argparse.Namespace, model: Sequence[str], trained_on: Sequence[Path], out: Path
 ) -> list[str]:
-    """Return the lines that say how to evaluate a checkpoint on what it was not trained on."""
+    """Return the lines that say how to evaluate a checkpoint on episodes not trained on.
+
+    A data set of which no episode can be used is named; the training is done all the same.
+    """
     from mtv_world_ros.data.splits import select
 
-    dataset = arguments.held_out or arguments.dataset
+    dataset, why, both = arguments.held_out or arguments.dataset, '', set[Path]()
     seen = {path.resolve() for path in trained_on}
-    both = seen & {path.resolve() for path in select(dataset).paths}
-    words = [model[0], UNSEEN if both else str(dataset), *model[1:], '--out', str(out)]
+    try:
+        both = seen & {path.resolve() for path in select(dataset).paths}
+    except MtvWorldError as error:
+        why = str(error)
+    if both:
+        why = f"it was on {len(both)} of '{dataset}', which tells how well it remembers them"
+    words = [model[0], UNSEEN if why else str(dataset), *model[1:], '--out', str(out)]
     for option in ('segmenter', 'describer', 'topics', 'calibration'):
         value = getattr(arguments, option)
         if value and value != 'auto':
             words += [f'--{option}', str(value)]
     lines = [f'evaluate it with: {shlex.join(["mtv-world", "evaluate", *words])}']
-    if both:
-        lines.append(
-            f'({UNSEEN}: a folder of episodes that it was not trained on; it was on {len(both)} '
-            f"of '{dataset}', which tells how well it remembers them)"
-        )
+    if why:
+        lines.append(f'({UNSEEN}: a folder of episodes that it was not trained on; {why})')
     return lines
 
 
-def _lacks_contact(folder: Path, robot: Path | str) -> bool:
+def _lacks_contact(folder: Path) -> bool:
     """Return whether a checkpoint draws objects, and nothing says how they move."""
     from mtv_world_ros.model.checkpoint import Checkpoint
-    from mtv_world_ros.robot.file import load_robot, robot_path
 
     opened = Checkpoint.open(folder)
-    control = opened.load_control(load_robot(robot_path(robot)))
+    control = opened.load_control(opened.load_robot())  # the file that was given may be gone
     return control.shows_objects and opened.object_motion is None
 
 

@@ -12,10 +12,11 @@ from pyarrow import parquet
 import pytest
 
 from mtv_world_ros.cli import main
+from mtv_world_ros.cli.imports.common import _import_status
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode import UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import read_episode, read_info
-from mtv_world_ros.importing.convert import import_dataset, read_frames
+from mtv_world_ros.importing.convert import import_dataset, ImportSummary, read_frames
 from mtv_world_ros.importing.lerobot import LeRobotDataset
 from mtv_world_ros.importing.mapping import guess_mapping, load_mapping
 
@@ -260,6 +261,21 @@ def test_one_reason_of_many_episodes_is_one_line(datasets, make_mapping, tmp_pat
     assert main(['import', 'lerobot', *arguments]) == 1
     lines = [line for line in capsys.readouterr().err.splitlines() if 'no column' in line]
     assert len(lines) == 1 and lines[0].startswith('episode 0, episode 1: ')
+
+
+def test_names_of_many_recordings_are_a_list_below_what_is_said_of_them(capsys):
+    summary = ImportSummary[int](
+        failed=dict.fromkeys(range(40), 'the same fault') | {40: 'another fault'},
+        warnings={0: ('odd',), 1: ('odd',)},
+    )
+    assert _import_status(summary, lambda number: f'episode {number}') == 1
+    said = capsys.readouterr().err.splitlines()
+    assert said[:2] == ['episode 0, episode 1: odd', '40 recordings: the same fault']
+    assert said[-1] == 'episode 40: another fault'
+    listed = said[2:-1]
+    assert all(line.startswith('    episode') and len(line) < 100 for line in listed)
+    names = ' '.join(line.strip() for line in listed).split(', ')
+    assert names == [f'episode {number}' for number in range(40)]
 
 
 #: an arm with the joints of an SO-101; its shape does not matter here

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 import json
 from pathlib import Path
+import re
+import shlex
 import shutil
 
 import pytest
 
 from mtv_world_ros.cli import main
+from mtv_world_ros.cli.train import _evaluation_advice
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.training.training_config import TrainingRun
@@ -16,6 +20,8 @@ from mtv_world_ros.training.training_run import HeldOut, HeldOutScores, train
 from mtv_world_ros.viewing.video import decode_video
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 from test.support.sources import ONE_STEP
+
+NOT_GIVEN = {'describer': None, 'topics': None, 'calibration': None}
 
 
 def test_the_best_checkpoint_by_the_judge_is_kept(episode, tiny, robot, tmp_path):
@@ -69,6 +75,64 @@ def test_without_held_out_episodes_the_command_says_what_to_give(episode, tmp_pa
     command = ['train', str(episode.parent), '--out', str(tmp_path), '--sample-every', '5']
     assert main(command) == 1
     assert 'no split val or test; give --held-out DIR' in capsys.readouterr().err
+
+
+def test_held_out_episodes_that_are_not_there_are_an_error_before_the_training(
+    episode, tmp_path, capsys
+):
+    missing = tmp_path / 'missing'
+    command = ['train', str(episode.parent), '--out', str(tmp_path / 'run')]
+    assert main([*command, '--held-out', str(missing), *ONE_STEP]) == 1
+    assert f"'{missing}' holds no episodes" in capsys.readouterr().err
+    assert not (tmp_path / 'run').exists()
+
+
+@pytest.mark.parametrize(
+    ('card', 'has_episodes', 'says'),
+    [
+        ({'splits': {'train': ['seen'], 'test': ['gone']}}, True, "'test' of '.*' has no episode"),
+        ({}, False, "holds no episodes"),
+        ({'splits': 1}, True, "is not a data set card"),
+        ({}, True, "it was on 1 of '.*', which tells how well it remembers them"),
+    ],
+)  # fmt: skip
+def test_a_training_ends_with_advice_whatever_became_of_its_data_set(
+    card, has_episodes, says, episode, tmp_path
+):
+    data = tmp_path / 'data'
+    data.mkdir()
+    if has_episodes:
+        (data / 'seen').symlink_to(episode)
+    (data / 'dataset.json').write_text(json.dumps(card))
+    given = Namespace(
+        dataset=data,
+        held_out=None,
+        segmenter='auto',
+        describer=None,
+        topics=None,
+        calibration=None,
+    )
+    line, why = _evaluation_advice(given, ['run/checkpoint'], [data / 'seen'], Path('out'))
+    assert line == 'evaluate it with: mtv-world evaluate run/checkpoint EPISODES --out out'
+    assert why.startswith('(EPISODES: a folder of episodes that it was not trained on; ')
+    assert re.search(says, why)
+
+
+def test_a_training_ends_with_its_held_out_episodes_where_there_are_some(episode, tmp_path):
+    data = tmp_path / 'data'
+    data.mkdir()
+    (data / 'unseen').symlink_to(episode)
+    given = Namespace(
+        dataset=None,
+        held_out=data,
+        segmenter='sam2',
+        describer=None,
+        topics=None,
+        calibration=None,
+    )
+    lines = _evaluation_advice(given, ['base', '--adapter', 'run'], [], Path('out'))
+    words = ['evaluate', 'base', str(data), '--adapter', 'run', '--out', 'out']
+    assert lines == [f'evaluate it with: mtv-world {shlex.join(words)} --segmenter sam2']
 
 
 def test_a_negative_interval_is_refused():

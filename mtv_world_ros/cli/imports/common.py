@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 import sys
+import textwrap
 from typing import Any, TYPE_CHECKING
 
 from mtv_world_ros.cli.bundled_help import segmenters
@@ -15,6 +16,10 @@ from mtv_world_ros.core.errors import ConfigError
 
 #: folder of the robot in OUT
 ROBOT_FOLDER = 'robot'
+#: width from which names of recordings are printed as a list [characters]
+_LIST_WIDTH = 95
+#: stands for a space at which a list is not wrapped
+_NO_BREAK = '\N{NO-BREAK SPACE}'
 #: wraps recordings in a progress bar
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 #: makes the stage that names and segments the objects of recordings
@@ -221,18 +226,29 @@ def _stage_without_boxes(arguments: argparse.Namespace) -> ObjectStage:
 
 def _import_status(summary: ImportSummary[Any], name: Callable[[Any], str]) -> int:
     """Print what came of an import, with the names of its recordings; return the exit status."""
-    recordings: dict[str, list[str]] = {}  # by warning
-    for one, lines in summary.warnings.items():
-        for line in lines:
-            recordings.setdefault(line, []).append(name(one))
-    for line, names in recordings.items():
-        print(f'{", ".join(names)}: {line}', file=sys.stderr)
+    _print_each((name(one), line) for one, lines in summary.warnings.items() for line in lines)
     for note in summary.robot_notes:
         print(f'robot: {note}', file=sys.stderr)
     print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')
-    failed: dict[str, list[str]] = {}  # by reason
-    for one, reason in summary.failed.items():
-        failed.setdefault(reason, []).append(name(one))
-    for reason, names in failed.items():
-        print(f'{", ".join(names)}: {reason}', file=sys.stderr)
+    _print_each((name(one), reason) for one, reason in summary.failed.items())
     return 1 if summary.failed else 0
+
+
+def _print_each(told: Iterable[tuple[str, str]]) -> None:
+    """Print pairs of a recording and a text to standard error, each text once.
+
+    Names of many recordings follow their text as a list.
+    """
+    recordings: dict[str, list[str]] = {}
+    for name, text in told:
+        recordings.setdefault(text, []).append(name)
+    for text, names in recordings.items():
+        listed = ', '.join(names)
+        if len(listed) > _LIST_WIDTH:
+            whole = [name.replace(' ', _NO_BREAK) for name in names]
+            lines = textwrap.wrap(
+                ', '.join(whole), _LIST_WIDTH, break_long_words=False, break_on_hyphens=False
+            )
+            text = '\n    '.join([text, *lines]).replace(_NO_BREAK, ' ')
+            listed = f'{len(names)} recordings'
+        print(f'{listed}: {text}', file=sys.stderr)

@@ -43,6 +43,8 @@ Load = Callable[[PolicySettings, RobotModel], PolicyMaker]
 _TICK_S = 0.02
 #: time after which a reset without an answer is asked for again [s]
 _ASK_AGAIN_S = 4.0
+#: number of requests whose answers are waited for: a slow answer to an earlier one counts, too
+_MAX_ASKED = 3
 
 
 def load_named_policy(settings: PolicySettings, robot: RobotModel) -> PolicyMaker:
@@ -259,8 +261,8 @@ class WorldModelReset:
 
     def ask(self) -> None:
         """Ask for a reset; `check` refuses until it is done."""
-        self._asked = [self._client.call_async(Trigger.Request())]
-        self._asked_s = time.monotonic()
+        self._keep(0)
+        self._send()
 
     def check(self) -> None:
         """Refuse to go on until the reset that was asked for is done.
@@ -272,16 +274,27 @@ class WorldModelReset:
             return
         answers = [future.result() for future in self._asked if future.done()]
         if any(answer is not None and answer.success for answer in answers):
-            self._asked = []
+            self._keep(0)
             return
         if time.monotonic() > self._asked_s + _ASK_AGAIN_S:  # an answer may get lost
-            self._asked.append(self._client.call_async(Trigger.Request()))
-            self._asked_s = time.monotonic()
+            self._keep(_MAX_ASKED - 1)
+            self._send()
         said = next((f': {a.message}' for a in answers if a is not None and a.message), '')
         raise Rejection(
             Reason.WORLD_MODEL_MISSING,
             f"'{self._client.srv_name}' has not reset the world model yet{said}",
         )
+
+    def _send(self) -> None:
+        self._asked.append(self._client.call_async(Trigger.Request()))
+        self._asked_s = time.monotonic()
+
+    def _keep(self, num: int) -> None:
+        """Give up all requests but the newest: rclpy holds a request until it has an answer."""
+        given_up = self._asked[: len(self._asked) - num]
+        self._asked = self._asked[len(given_up) :]
+        for future in given_up:
+            future.cancel()
 
 
 def main(args: Sequence[str] | None = None, load: Load = load_named_policy) -> int:
