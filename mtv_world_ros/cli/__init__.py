@@ -65,6 +65,8 @@ _GROUPS = {
 }
 _OWN = 'mtv_world_ros.'
 _DESCRIPTION = 'An online embodied world model for ROS 2.'
+#: second line of `mtv-world --help`
+_BEGIN = 'Begin with `mtv-world demo`. `mtv-world COMMAND --help` has the options of a command.'
 _USAGE = 'mtv-world [-h] [--version] COMMAND ...'
 _EMPTY = "it is empty; leave it out, or give a path or a name ('.' is the present folder)"
 _ADVICE = {
@@ -162,7 +164,7 @@ def _choices(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPars
 
 def _overview() -> str:
     """Return the text of `mtv-world --help`: the table of commands under its headings."""
-    lines = [f'usage: {_USAGE}', '', f'{_DESCRIPTION} `mtv-world COMMAND --help` has the options.']
+    lines = [f'usage: {_USAGE}', '', _DESCRIPTION, _BEGIN]
     for section in SECTIONS:
         lines += ['', f'{section}:']
         named = {name: entry.help for name, entry in COMMANDS.items() if entry.section == section}

@@ -40,7 +40,7 @@ COMMANDS = {
         'imagine', 'run a policy for whole episodes in the world model', 'Run', 'add_imagine'
     ),
     'foresee': CommandEntry(
-        'foresee', 'simulate where objects go under commands, by physics without a model', 'Run'
+        'foresee', 'foresee object motion under recorded commands by physics alone', 'Run'
     ),
     'train': CommandEntry('train', 'train a world model on a folder of episodes', 'Learn'),
     'fit contact': CommandEntry(

@@ -116,13 +116,15 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
         type=Path,
         nargs='+',
         default=[],
-        help='recorded episodes whose first frames to start from, or a folder of them',
+        help='recorded episodes that imagination starts from, or a folder of them',
     )
-    parser.add_argument('--live', action='store_true', help='start from what the cameras show')
+    parser.add_argument('--live', action='store_true', help='start from what the cameras show now')
     parser.add_argument(
         '--count', type=int, default=0, help='number of episodes; default: each once'
     )
-    parser.add_argument('--start', type=float, default=0.0, help='recorded time to start at [s]')
+    parser.add_argument(
+        '--start', type=float, default=0.0, help='time in the recording to start at [s]'
+    )
     parser.add_argument(
         '--max-chunks',
         type=int,
@@ -141,7 +143,10 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
         'recording states; with --live the parameter `place`',
     )
     parser.add_argument(
-        '--out', type=Path, default=Path('out/imagine'), help='default: out/imagine'
+        '--out',
+        type=Path,
+        default=Path('out/imagine'),
+        help='folder of the results; default: out/imagine',
     )
     parser.add_argument(
         '--no-video', dest='video', action='store_false', help='write no comparison.mp4'

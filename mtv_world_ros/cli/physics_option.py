@@ -13,8 +13,9 @@ def add_physics(parser: argparse.ArgumentParser) -> None:
         '--physics',
         default='nominal',
         metavar='NAME',
-        help="what is true in the simulator, of config/physics.yaml: 'nominal', which flatters, "
-        'or a shift such as bold or delay_100ms; the world model is told nothing of it',
+        help='physics of the simulator, a name in config/physics.yaml: nominal (default), in '
+        'which the bundled model was fitted, so that agreement flatters, or a shift such as bold '
+        'or delay_100ms, which the world model does not know',
     )
 
 

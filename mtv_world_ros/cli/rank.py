@@ -33,11 +33,10 @@ if TYPE_CHECKING:
     from mtv_world_ros.robot.model import RobotModel
 
 _DESCRIPTION = """\
-Run policies on the same episodes in the simulator and in imagination, and say how well the two
-agree. DIR gets ranking.json, ranking.md, ranking.html, flips.png (six commands that change what
-happens, real and imagined) and three files for every rollout: the result, the last real frames
-over the last imagined ones, and where objects are. Running the same command again goes on where it
-was stopped.
+Run policies on the same episodes in the simulator and in imagination, and measure how well the two
+agree. DIR gets the report (ranking.html, ranking.md, ranking.json), flips.png (six commands that
+change the outcome, real and imagined) and the folder rollouts: result, last frames and video of
+each rollout. The same command continues a ranking that was stopped.
 """
 _EPILOG = """\
 A scripted policy is `expert`, followed by faults with their sizes, e.g.
@@ -73,8 +72,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--faults',
         type=_fault_set,
         metavar='{train,calibrate,test,drawn:SEED}',
-        help='the optimism benchmark: the expert and each fault kind of this split in small and '
-        'large; kinds of test are in no training and no calibration; drawn:SEED composes new ones',
+        help='rank the expert and each fault kind of a split at a small and a large size (the '
+        'optimism benchmark); kinds of test are in no training and no calibration; drawn:SEED '
+        'composes new kinds',
     )
     parser.add_argument(
         '--tasks',
@@ -98,14 +98,16 @@ def add(commands: argparse._SubParsersAction) -> None:
         nargs='?',
         const='',
         metavar='ADDRESS',
-        help='fan out with Ray; default address: RAY_ADDRESS, else a new one on this machine',
+        help='run on a Ray cluster; default address: RAY_ADDRESS, else a new cluster on this '
+        'machine',
     )
     parser.add_argument(
         '--true-episodes',
         type=int,
         default=5,
         metavar='M',
-        help='the prediction-powered rates use the true outcomes of the first M of each task',
+        help='number of episodes of each task whose true outcomes the prediction-powered rates '
+        'use; default: 5',
     )
     parser.add_argument(
         '--max-chunks',
@@ -118,7 +120,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         type=int,
         default=0,
         metavar='N',
-        help='an episode also ends when the task is done, or the estimate abstains, after N '
+        help='end an episode also when the task is done, or the estimate abstains, after N '
         'answers in a row; default: only the policy and --max-chunks end it',
     )
     parser.add_argument(

@@ -62,7 +62,7 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
         '--threads': {
             'type': number_or_0,
             'default': 0,
-            'help': 'CPU threads; 0 = all but one, but both of two',
+            'help': 'CPU threads; 0 = all cores but one (of two cores: both)',
         },
         '--no-foresight': {
             'dest': 'foresight',
@@ -73,8 +73,8 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
         '--no-camera-check': {
             'dest': 'camera_check',
             'action': 'store_false',
-            'help': "neither compare the first frames with the arm's outline nor correct the "
-            'cameras',
+            'help': "skip the comparison of the first frames with the arm's outline, and the "
+            'correction of the cameras',
         },
         '--steps': {
             'type': number_or_0,
@@ -135,8 +135,8 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
         '--describer': {
             'type': Path,
             'metavar': 'YAML',
-            'help': 'how objects are named (see config/describer.yaml); default: the names '
-            'stored with the episode, else the colour words of its instruction',
+            'help': 'file of what names the objects (see config/describer.yaml); default: the '
+            'names stored with the episode, else the colour words of its instruction',
         }
     },
     'checkpoint': {

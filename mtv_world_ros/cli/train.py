@@ -37,14 +37,20 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         'dataset', type=Path, nargs='?', help='folder of episodes; left out with --dry-run'
     )
-    parser.add_argument('--out', type=Path, help='folder of the run; one that is there is resumed')
+    parser.add_argument(
+        '--out', type=Path, help='folder of the run; an earlier run in it is resumed'
+    )
     parser.add_argument('--preset', default='small', help=f'training preset: {presets()}')
     parser.add_argument('--views', help="names of the views, e.g. low,high; default: the preset's")
     parser.add_argument(
-        '--object-mask', choices=('on', 'off'), help='object masks in the trajectory video'
+        '--object-mask',
+        choices=('on', 'off'),
+        help="draw object masks into the trajectory video; default: the preset's",
     )
     parser.add_argument(
-        '--dry-run', action='store_true', help='print memory and arithmetic of a step, then exit'
+        '--dry-run',
+        action='store_true',
+        help='print the memory and arithmetic that a step takes, then exit',
     )
     parser.add_argument(
         '--init', help="checkpoint to start from: a folder, 'bundled' or 'bundled-paper'"
@@ -53,7 +59,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--latent-cache',
         type=Path,
         metavar='DIR',
-        help="folder of outputs of Wan's autoencoder and CLIP, computed once; runs may share it",
+        help="folder that keeps the outputs of Wan's autoencoder and CLIP, so that they are "
+        'computed once; runs may share it',
     )
     add_options(parser, 'source')
     parser.add_argument(
@@ -82,7 +89,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--doctor',
         type=Path,
         metavar='DIR',
-        help='folder that mtv-world check wrote about these episodes; broken ones are left out',
+        help='report folder of mtv-world check about these episodes; broken ones are left out',
     )
     add_options(parser, 'describer segmenter dtype')
     parser.add_argument(
@@ -125,7 +132,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--held-out',
         type=Path,
         metavar='DIR',
-        help="data set of the held-out episodes (its split 'val', else 'test'); default: DATASET",
+        help="data set of held-out episodes (its split 'val', else 'test'), for --sample-every "
+        'and the evaluation afterwards; default: DATASET',
     )
     parser.add_argument(
         '--held-out-episodes',
