@@ -93,6 +93,11 @@ class CalibratedView(Schema):
     quaternion_xyzw: ListOf[Quaternion] = Field(
         default=(), description='rotation of the optical frame in `mount_link`, without a matrix'
     )
+    error_px: Annotated[float, Field(gt=0, le=1e4)] | None = Field(
+        default=None,
+        description='standard error of where a point is drawn, in x and in y, at this size [px]; '
+        '`fit camera` states it; null = not known',
+    )
 
     def camera(self, view: str) -> CameraModel:
         """Return the camera.
@@ -113,6 +118,7 @@ class CalibratedView(Schema):
             distortion=np.array(self.distortion),
             mount_link=self.mount_link,
             T_mount_camera=pose(self.position, self.quaternion_xyzw) if T is None else T,
+            error_px=self.error_px,
         )
 
 
@@ -121,7 +127,7 @@ def load_calibration(path: Path | str) -> dict[str, CameraModel]:
 
     Each view has `width`, `height`, `K` (3 x 3 or fx, fy, cx, cy), optional
     `distortion_model` and `distortion`, `mount_link`, and the pose of the optical frame in it:
-    `T_mount_camera` (4 x 4) or `position` and `quaternion_xyzw`.
+    `T_mount_camera` (4 x 4) or `position` and `quaternion_xyzw`; optional `error_px`.
 
     Raises:
         CalibrationError: names the file, the view and what is wrong.
@@ -148,6 +154,7 @@ def save_calibration(path: Path | str, cameras: Mapping[str, CameraModel]) -> No
             'distortion': camera.distortion.tolist(),
             'mount_link': camera.mount_link,
             'T_mount_camera': camera.T_mount_camera.tolist(),
+            **({} if camera.error_px is None else {'error_px': camera.error_px}),
         }
         for view, camera in cameras.items()
     }

@@ -121,7 +121,8 @@ def scaled(camera: CameraModel, width: int, height: int) -> CameraModel:
         return camera
     sx, sy = width / camera.width, height / camera.height
     S = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
-    return replace(camera, width=width, height=height, K=S @ camera.K)
+    error = None if camera.error_px is None else camera.error_px * sx
+    return replace(camera, width=width, height=height, K=S @ camera.K, error_px=error)
 
 
 def with_camera_info(
@@ -162,6 +163,7 @@ def with_camera_info(
         K=np.asarray(K, dtype=float).reshape(3, 3),
         distortion_model=distortion_model,
         distortion=coefficients,
+        error_px=None if camera.error_px is None else camera.error_px * width / camera.width,
     )
     _check_consistent(informed)
     return informed

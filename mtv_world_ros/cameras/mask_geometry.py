@@ -26,12 +26,15 @@ class Location:
     Attributes:
         point: (3,) point in the base frame [m].
         residual_px: distance of the views' rays where they pass each other, in pixels.
-        sigma_m: position error that the centroid's error, or the larger residual, causes [m].
+        sigma_m: position error that the centroid's error and the stated error of the cameras, or
+            the larger residual, cause [m].
+        pixel_m: mean width of a pixel at the point [m].
     """
 
     point: FloatArray
     residual_px: float
     sigma_m: float
+    pixel_m: float = float('nan')
 
 
 def centroids(masks: BoolArray) -> FloatArray:
@@ -61,12 +64,20 @@ def locate(
     used = [cameras[view] for view in seen]
     poses = [T_base_camera[view] for view in seen]
     point, residual = triangulate(used, poses, pixels[seen])
-    noise = max(residual, CENTROID_NOISE_PX)
-    metres = [
-        noise * _depth(pose, point) / camera.K[0, 0]
-        for camera, pose in zip(used, poses, strict=True)
+    # rays that meet show errors across one plane alone: the stated error counts all the same
+    noise = [
+        max(residual, float(np.hypot(CENTROID_NOISE_PX, camera.error_px or 0.0)))
+        for camera in used
     ]
-    return Location(point=point, residual_px=residual, sigma_m=float(np.mean(metres)))
+    metres = [
+        _depth(pose, point) / camera.K[0, 0] for camera, pose in zip(used, poses, strict=True)
+    ]
+    return Location(
+        point=point,
+        residual_px=residual,
+        sigma_m=float(np.mean(np.multiply(noise, metres))),
+        pixel_m=float(np.mean(metres)),
+    )
 
 
 def locate_all(

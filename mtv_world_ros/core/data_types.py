@@ -82,6 +82,8 @@ class CameraModel:
             empty for `none`.
         mount_link: robot link that carries the camera; the base link for a fixed camera.
         T_mount_camera: (4, 4) pose of the optical frame (x right, y down, z ahead) [m].
+        error_px: standard error of where a point is drawn, in x and in y, as the calibration
+            states it [px]; None = it states none.
     """
 
     view: str
@@ -92,6 +94,7 @@ class CameraModel:
     distortion: FloatArray = ()  # type: ignore[assignment]
     mount_link: str
     T_mount_camera: FloatArray
+    error_px: float | None = None
 
     def __post_init__(self) -> None:
         freeze_array(self, 'K', (3, 3), np.float64, CalibrationError)

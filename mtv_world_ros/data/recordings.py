@@ -253,7 +253,7 @@ def _key(path: Path, spec: WorldModelSpec, robot: RobotModel, source: EpisodeSou
 _TEXT = ('task', 'outcome', 'instruction', 'objects', 'masks_by', 'place', 'stamp_ns')
 _ARRAYS = ('times', 'frames', 'positions', 'object_ids', 'object_poses')
 _OF_COMMANDS = ('times', 'positions', 'velocities')
-_OF_CAMERA = ('view', 'width', 'height', 'distortion_model', 'mount_link')
+_OF_CAMERA = ('view', 'width', 'height', 'distortion_model', 'mount_link', 'error_px')
 
 
 def _save(file: BytesIO, recording: Recording) -> None:

@@ -32,11 +32,12 @@ def test_cameras_come_back_to_the_last_bit(tmp_path):
         view: CameraModel(
             view=view, width=384, height=288, mount_link=link, T_mount_camera=T,
             K=np.array([[400 / 3, 0, 191.5], [0, 400 / 7, 143.5], [0, 0, 1]]),
-            distortion_model=model, distortion=generator.normal(size=count),
+            distortion_model=model, distortion=generator.normal(size=count), error_px=error,
         )
-        for view, link, model, count in (
-            ('low', 'base', 'plumb_bob', 5), ('wrist', 'left_link_6', 'rational_polynomial', 8),
-            ('high', 'base', 'none', 0),
+        for view, link, model, count, error in (
+            ('low', 'base', 'plumb_bob', 5, 2 / 3),
+            ('wrist', 'left_link_6', 'rational_polynomial', 8, None),
+            ('high', 'base', 'none', 0, 0.9),
         )
     }  # fmt: skip
     path = tmp_path / 'calibration.yaml'
@@ -46,7 +47,7 @@ def test_cameras_come_back_to_the_last_bit(tmp_path):
     for view, camera in cameras.items():
         for field in ('K', 'distortion', 'T_mount_camera'):
             np.testing.assert_array_equal(getattr(loaded[view], field), getattr(camera, field))
-        for field in ('view', 'width', 'height', 'distortion_model', 'mount_link'):
+        for field in ('view', 'width', 'height', 'distortion_model', 'mount_link', 'error_px'):
             assert getattr(loaded[view], field) == getattr(camera, field)
     assert [file.name for file in tmp_path.iterdir()] == ['calibration.yaml']
 
@@ -67,6 +68,8 @@ def test_position_quaternion_and_four_intrinsics_are_accepted(tmp_path):
         ({'K': [0, 0, 1, 1]}, "view 'low'.*not calibrated"),
         ({'K': 'auto'}, "view 'low'"),
         ({'width': 'wide'}, "view 'low'.*wide"),
+        ({'error_px': -1}, "view 'low'.*error_px"),
+        ({'error_px': 'small'}, "view 'low'.*error_px"),
         ({'position': None}, "either 'T_mount_camera', or 'position' and"),
         ({'T_mount_camera': np.eye(4).tolist()}, "either 'T_mount_camera', or"),
         ({'quaternion_xyzw': [0, 0, 0, 0]}, 'no quaternion'),

@@ -1,11 +1,13 @@
 """Leans and extents of objects from their masks."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
-from mtv_world_ros.cameras.camera import project
-from mtv_world_ros.cameras.mask_geometry import axis_lean, upright_extents
+from mtv_world_ros.cameras.camera import project, scaled, with_camera_info
+from mtv_world_ros.cameras.mask_geometry import axis_lean, locate, upright_extents
 from mtv_world_ros.core.data_types import CameraModel
 from mtv_world_ros.core.transforms import looking_along
 
@@ -108,3 +110,40 @@ def test_extents_count_the_largest_part_and_the_views_that_see_it():
     both = upright_extents([camera, camera], [pose, pose], np.stack([spotted, empty]), PLACE)
     assert both == pytest.approx(alone)
     assert np.isnan(upright_extents([camera], [pose], empty[None], PLACE)).all()
+
+
+#: standard error of where points are drawn with cameras that are turned a little [px]
+TURN_ERROR_PX = 1.2
+
+
+@pytest.mark.parametrize('states_error', [True, False])
+def test_the_stated_error_of_a_position_covers_that_of_the_cameras(states_error):
+    """Cameras that were turned since: rays may meet, and still pass beside the object."""
+    generator, inside, count = np.random.default_rng(5), 0, 300
+    true = [make_camera((0.6, y, 0.5), (0.0, 0.0)) for y in (-0.1, 0.9)]
+    stated = [replace(one, error_px=TURN_ERROR_PX if states_error else None) for one, _ in true]
+    for _ in range(count):
+        point = PLACE + generator.uniform(-0.1, 0.1, 3)
+        pixels, poses = [], []
+        for camera, pose in true:
+            pixels.append(project(camera, pose, point)[0])
+            turn, _ = cv2.Rodrigues(generator.normal(0, TURN_ERROR_PX / camera.K[0, 0], 3))
+            poses.append(pose @ np.block([[turn, np.zeros((3, 1))], [np.zeros((1, 3)), 1.0]]))
+        found = locate(stated, poses, np.array(pixels))
+        # across the line of sight an error of s in x and in y is within 2.45 s 19 times of 20
+        inside += np.linalg.norm(found.point - point) < 2.45 * found.sigma_m
+        assert found.sigma_m >= 0.9 * found.pixel_m * (TURN_ERROR_PX if states_error else 0.3)
+    assert (inside / count > 0.9) == states_error
+
+
+def test_the_stated_error_of_a_camera_grows_with_its_picture():
+    camera, pose = make_camera((0.6, 0.3, 0.5))
+    stated = replace(camera, error_px=0.9)
+    double = scaled(stated, 2 * camera.width, 2 * camera.height)
+    assert double.error_px == pytest.approx(1.8)
+    assert scaled(camera, 2 * camera.width, 2 * camera.height).error_px is None
+    informed = with_camera_info(
+        stated, width=double.width, height=double.height, K=double.K,
+        distortion_model='none', distortion=(),
+    )  # fmt: skip
+    assert informed.error_px == pytest.approx(1.8)

@@ -14,6 +14,7 @@ from mtv_world_ros.core.errors import CalibrationError
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.inspection.camera_pose import displaced_pose
 from mtv_world_ros.inspection.cameras import joint_camera
+from mtv_world_ros.inspection.cameras.shared_camera import expected_within, stated_error
 from mtv_world_ros.inspection.places import background, find_places, turn_between
 from test.support.crane import (
     load,
@@ -204,3 +205,15 @@ def test_one_focal_length_is_of_two_views_or_more(recorded, capsys):
     assert 'at least two views' in capsys.readouterr().err
     assert main(['fit', 'camera', str(paths[0]), '--view', ',']) == 1
     assert 'at least a view' in capsys.readouterr().err
+
+
+def test_the_stated_error_holds_for_95_of_100_points_however_few_were_left_out():
+    generator, inside = np.random.default_rng(3), []
+    for count in (3, 11, 40):
+        for _ in range(400):
+            seen = np.linalg.norm(generator.normal(0, 0.8, (count, 2)), axis=1)
+            error = stated_error(seen)
+            assert 2.4477 * error == pytest.approx(expected_within(seen), rel=1e-3)
+            inside.append(np.linalg.norm(generator.normal(0, 0.8, 2)) < 2.4477 * error)
+    assert 0.93 < np.mean(inside) < 0.97
+    assert stated_error(np.zeros(0)) is None

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
 from mtv_world_ros.cameras.camera import project
@@ -71,6 +72,15 @@ def expected_within(apart_px: FloatArray) -> float:
     if not count:
         return np.nan
     return float(np.sqrt(np.mean(apart_px**2) * f_distribution.ppf(0.95, 2, 2 * count)))
+
+
+def stated_error(apart_px: FloatArray) -> float | None:
+    """Return the standard error in x and in y of where points are drawn [px]; None = not known.
+
+    95 % of points are within `expected_within` with this error.
+    """
+    within = expected_within(apart_px)
+    return float(within / np.sqrt(chi2.ppf(0.95, 2))) if within > 0 else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -361,8 +371,9 @@ def _judged(
     kept = bool(before) and _mean_match(before) > _mean_match(measures)
     tested = view.cameras if kept else placed(without)
     best = view.cameras if kept else ends
+    apart_px = np.array([_apart(point, tested[point.recording]) for point in view.left_out])
     return SharedEstimate(
-        cameras=tuple(best),
+        cameras=tuple(replace(camera, error_px=stated_error(apart_px)) for camera in best),
         places=view.places,
         measures=before if kept else measures,
         guess_measures=before,
@@ -370,7 +381,7 @@ def _judged(
         focal_px=float(best[0].K[0, 0]),
         bent=bool(state.lens[2]) and not kept,
         fits=view.joint.fits(view.given if kept else state),
-        apart_px=np.array([_apart(point, tested[point.recording]) for point in view.left_out]),
+        apart_px=apart_px,
         strays=_strays([*view.points, *view.left_out], best),
     )
 

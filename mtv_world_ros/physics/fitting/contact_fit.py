@@ -794,8 +794,8 @@ def _ray_gaps(frame: FirstFrame) -> list[float]:
         areas = frame.masks[:, item].sum((-2, -1)).astype(np.float64)
         edge = block_size(frame.cameras, frame.poses, areas, place.point)
         # each ray passes the point between them at half the gap
-        own = (CENTROID_NOISE_PX / max(place.residual_px, CENTROID_NOISE_PX)) ** 2
-        gap = 2 * place.sigma_m * np.sqrt(1 - own)
+        beyond_px = np.sqrt(max(place.residual_px**2 - CENTROID_NOISE_PX**2, 0.0))
+        gap = 2 * place.pixel_m * beyond_px
         gaps.append(gap if edge < _FIT.max_small_size_m else np.nan)
     return gaps
 
