@@ -6,6 +6,7 @@ from dataclasses import fields
 import io
 import json
 import os
+import re
 import struct
 import time
 import tracemalloc
@@ -156,8 +157,11 @@ def test_json_is_bounded(tmp_path, monkeypatch):
 
 def test_every_limit_is_documented():
     page = share_path('docs', 'troubleshooting.md').read_text()
+    entries = re.findall(r'^ +(\w+): ((?:.+\n)(?: {12}.+\n)*)', Limits.__doc__, re.MULTILINE)
+    texts = {name: ' '.join(text.split()).rstrip('.') for name, text in entries}
     for field in fields(Limits):
-        assert f'| `MTV_WORLD_MAX_{field.name.upper()}` | {field.default} |' in page
+        variable, text = f'MTV_WORLD_MAX_{field.name.upper()}', texts[field.name]
+        assert f'| `{variable}` | {field.default} | {text} |' in page
 
 
 @pytest.mark.parametrize('text', ['', '-1', '0', 'many', '1e6', '٣'])

@@ -372,13 +372,13 @@ def task_named(name: str) -> Task:
             without a scene.
     """
     if name not in TASKS:
-        judged = {spec.name: spec for spec in bundled_tasks()}
-        if name in judged:
-            return Task.of(judged[name], f"'{name}'")
-        raise SimulatorError(
-            f"unknown task '{name}'{nearest(name, TASKS)}; known are {', '.join(sorted(TASKS))}, "
-            'or give the YAML file of a task'
-        )
+        known = f'{", ".join(sorted(TASKS))}, or give the YAML file of a task'
+        if name in {task.name for task in bundled_tasks()}:
+            raise SimulatorError(
+                f"task '{name}' has no scene: it can be judged, but not simulated; those with a "
+                f'scene are {known}'
+            )
+        raise SimulatorError(f"unknown task '{name}'{nearest(name, TASKS)}; known are {known}")
     return TASKS[name]
 
 
