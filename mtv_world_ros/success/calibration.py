@@ -129,6 +129,21 @@ class Calibration(Weights):
         """True if the weights were fitted to rollouts without foreseen object motion."""
         return self.fitted_to is not None and not self.fitted_to.foresight
 
+    @property
+    def optimism(self) -> str:
+        """Share of failures that the fit's judgements of pictures alone call a success, in words.
+
+        Each task is left out of the fit that judges it. Empty where motion is foreseen, or where
+        the file does not say.
+        """
+        rate = self.scores.get('after', {}).get('false_success_rate')
+        if not self.is_of_pictures or rate is None or not isfinite(rate):
+            return ''
+        return (
+            f'{rate:.0%} of the failures that it judged of tasks left out of the fit were called '
+            'a success'
+        )
+
     def objection(self, task: str, segmenter: str) -> str:
         """Return why the weights do not hold for a task and segmenter; empty = they hold."""
         if segmenter != self.segmenter:

@@ -387,10 +387,11 @@ class SuccessEstimator:
         assert calibration is not None
         called = f'uncalibrated: {elsewhere}; weights' if elsewhere else 'calibrated:'
         given = 'frames that were seen' if is_real else 'the world model'
+        optimism = '' if is_real else calibration.optimism
         return (
             f'{called} fitted on {calibration.num_episodes} episodes of '
             f'{len(calibration.tasks)} tasks, given {given}'
-        )
+        ) + (f'; {optimism}' if optimism else '')
 
 
 def _released(task: TaskSpec, views: Views, subjects: Sequence[int]) -> float:

@@ -250,6 +250,33 @@ def test_elsewhere_fitted_weights_are_used_and_called_uncalibrated():
         assert found.probability == 0.5
 
 
+@pytest.mark.parametrize(
+    ('foresight', 'rate', 'is_real', 'is_stated'),
+    [
+        ('', 0.27, False, True),
+        ('', 0.27, True, False),  # nothing is wrong with frames that were seen
+        ('a digest', 0.27, False, False),  # futures decide there
+        ('', None, False, False),
+    ],
+)
+def test_an_estimate_of_pictures_states_how_optimistic_its_fit_was(
+    foresight, rate, is_real, is_stated
+):
+    shown = put_to_the_left()
+    here = Setting(robot='one', tools=((0.0, 0.0, 0.0),), foresight=foresight)
+    calibration = CALIBRATION.replace(
+        fitted_to=FittedTo.episodes(here, [shown.cameras]),
+        scores={'after': {'false_success_rate': rate}},
+    )
+    estimator = SuccessEstimator(
+        load_tasks(share_path('config', 'tasks')),
+        calibration=calibration,
+        segmenter=Named('colour'),
+    )
+    found = estimator.estimate(shown, LEFT, is_real=is_real).estimate
+    assert ('27% of the failures' in found.reasons[-1]) == is_stated
+
+
 def test_frames_that_were_seen_have_weights_of_their_own():
     seen = Weights(features=('margin',), means=(1.0,), scales=(2.0,), weights=(0.0,), bias=2.0)
     task = CALIBRATION.replace(observed=seen)
