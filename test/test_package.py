@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 from importlib import metadata
 import importlib.util
 import os
@@ -283,6 +284,16 @@ def test_no_file_names_a_path_of_one_machine():
 
 def test_no_large_file_is_tracked():
     assert not [str(path) for path in _tracked_files() if path.stat().st_size > 12_000_000]
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    """Circles of `TYPE_CHECKING` and of imports within functions count, too."""
+    grimp = pytest.importorskip('grimp', reason='import-linter is not installed')
+    graph = grimp.build_graph('mtv_world_ros', cache_dir=None)
+    imported = {name: graph.find_modules_directly_imported_by(name) for name in graph.modules}
+    assert len(imported) > 300
+    order = list(graphlib.TopologicalSorter(imported).static_order())  # raises at a circle
+    assert order.index('mtv_world_ros.core.errors') < order.index('mtv_world_ros.cli')
 
 
 def test_readme_has_no_open_ends_and_its_links_lead_somewhere():

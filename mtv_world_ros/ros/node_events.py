@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, TYPE_CHECKING
+from typing import Any, Protocol
 
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import String
@@ -11,12 +11,9 @@ from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.ros.parameters import LiveSettings, Settings
-
-if TYPE_CHECKING:
-    from mtv_world_ros.ros.world_model.follow_joint_trajectory import Goal
-    from mtv_world_ros.ros.world_model.live_fidelity import ScoredChunk
-    from mtv_world_ros.ros.world_model.prediction_publisher import Sent
-    from mtv_world_ros.ros.world_model.worker import Chunk, Ended
+from mtv_world_ros.ros.world_model.chunk_outcomes import ScoredChunk, Sent
+from mtv_world_ros.ros.world_model.goal import Goal
+from mtv_world_ros.ros.world_model.worker import Chunk, Ended
 
 
 class SensingEvents(Protocol):

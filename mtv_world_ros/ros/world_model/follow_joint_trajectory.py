@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 import importlib
 from math import isnan
 from typing import Any
@@ -15,7 +14,6 @@ from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMsg
 from trajectory_msgs.msg import JointTrajectoryPoint
 
 from mtv_world_ros.core.data_types import FloatArray
@@ -23,56 +21,12 @@ from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.node_events import NodeEvents
+from mtv_world_ros.ros.world_model.goal import Goal
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request, Result
 
 NAME = '~/follow_joint_trajectory'
 #: positions are compared to the digits that a message keeps
 _ROUNDING = 1e-9
-
-
-@dataclass(eq=False, kw_only=True)
-class Goal:
-    """A goal that was accepted.
-
-    Attributes:
-        handle: rclpy's goal handle.
-        request: the plan that it became; None = it waits to become one.
-        violation: name of the code and text of a tolerance that is violated.
-    """
-
-    handle: ServerGoalHandle
-    request: Request | None = None
-    violation: tuple[str, str] | None = None
-
-    @property
-    def message(self) -> JointTrajectoryMsg:
-        """Its trajectory."""
-        return self.handle.request.trajectory
-
-    def check(self, joint_names: Sequence[str]) -> None:
-        """Refuse what no plan on the topic can have.
-
-        Args:
-            joint_names: joint names of the robot.
-
-        Raises:
-            Rejection: joints of several degrees of freedom, or a tolerance of another joint.
-        """
-        goal = self.handle.request
-        if goal.multi_dof_trajectory.joint_names or goal.multi_dof_trajectory.points:
-            raise Rejection(
-                Reason.TRAJECTORY_MALFORMED,
-                'joints of several degrees of freedom are not imagined; leave '
-                'multi_dof_trajectory empty',
-            )
-        named = {one.name for one in (*goal.path_tolerance, *goal.goal_tolerance)}
-        others = sorted(named - (set(goal.trajectory.joint_names) & set(joint_names)))
-        if others:
-            raise Rejection(
-                Reason.JOINT_NAMES,
-                f'tolerances name the joints {others}, which are no joints of the robot that the '
-                'trajectory moves',
-            )
 
 
 class FollowJointTrajectory:

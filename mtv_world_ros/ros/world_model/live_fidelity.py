@@ -13,7 +13,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Float32MultiArray
 
-from mtv_world_ros.core.data_types import ByteArray, FloatArray
+from mtv_world_ros.core.data_types import ByteArray
 from mtv_world_ros.core.errors import RolloutPreempted
 from mtv_world_ros.core.images import resize_frames
 from mtv_world_ros.physics.object_motion import ObjectMotionModel
@@ -27,6 +27,7 @@ from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.node_events import NodeEvents
 from mtv_world_ros.ros.sensing.samples import Samples
 from mtv_world_ros.ros.status_publisher import create_publisher
+from mtv_world_ros.ros.world_model.chunk_outcomes import ScoredChunk
 from mtv_world_ros.ros.world_model.worker import Chunk, Request, Result
 from mtv_world_ros.success.doubts import (
     ContactConfirmation,
@@ -61,30 +62,6 @@ class Expected:
         self.stamps = [
             prediction.stamp_ns + round(float(t) * NANO) for t in prediction.video.times
         ]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScoredChunk:
-    """Comparison of a chunk with the real frames: V views, O objects.
-
-    Attributes:
-        chunk: the imagined chunk.
-        names: names of the O objects.
-        jaccard: (V, O) mean J over the compared frames, NaN = not scored.
-        copy: (V, O) J of the chunk's first masks, held.
-        num_frames: number of compared frames.
-    """
-
-    chunk: Chunk
-    names: tuple[str, ...]
-    jaccard: FloatArray
-    copy: FloatArray
-    num_frames: int
-
-    @property
-    def mean(self) -> float:
-        """Mean J over views and objects, NaN where none is scored."""
-        return float(mean_of_known(self.jaccard))
 
 
 class _SeenRollout(NamedTuple):

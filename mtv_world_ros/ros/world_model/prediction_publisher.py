@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 import time
 from typing import NamedTuple
 
@@ -26,6 +25,7 @@ from mtv_world_ros.ros.messages.conversions import (
 from mtv_world_ros.ros.messages.image_messages import scale_camera_info, to_compressed, to_image
 from mtv_world_ros.ros.node_events import ignore_sent, NodeEvents
 from mtv_world_ros.ros.status_publisher import create_publisher
+from mtv_world_ros.ros.world_model.chunk_outcomes import Sent
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Result
 
 
@@ -89,26 +89,6 @@ _BURST_PERIOD_S = 0.0005
 _BURST_PAUSE_S = 0.1
 #: how often the clock is looked at while a frame waits for its time [s]
 _LOOK_PERIOD_S = 0.01
-
-
-@dataclass(slots=True)
-class Sent:
-    """Fate of the frames of a chunk: published, dropped, pre-empted.
-
-    Attributes:
-        publish_s: time spent on publishing [s].
-        out_s: (N,) when each frame that was published went out [s], of `time.monotonic`.
-        leads_s: (N,) lead of publishing a frame before its stamp [s], by the node's clock.
-    """
-
-    publish_s: float = 0.0
-    out_s: list[float] = field(default_factory=list)
-    leads_s: list[float] = field(default_factory=list)
-
-    @property
-    def num_frames(self) -> int:
-        """Frames published."""
-        return len(self.out_s)
 
 
 class PredictionPublisher:

@@ -17,8 +17,8 @@ from mtv_world_ros.core.data_types import SuccessEstimate
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.status_publisher import StatusPublisher
-from mtv_world_ros.ros.world_model.live_fidelity import ScoredChunk
-from mtv_world_ros.ros.world_model.prediction_publisher import Sent, stamp_of
+from mtv_world_ros.ros.world_model.chunk_outcomes import ScoredChunk, Sent
+from mtv_world_ros.ros.world_model.prediction_publisher import stamp_of
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request
 
 _LEVELS = {

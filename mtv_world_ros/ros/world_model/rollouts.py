@@ -32,9 +32,9 @@ from mtv_world_ros.ros.sensing.subscriptions import Inputs
 from mtv_world_ros.ros.world_model.follow_joint_trajectory import (
     find_action,
     FollowJointTrajectory,
-    Goal,
     NAME,
 )
+from mtv_world_ros.ros.world_model.goal import Goal
 from mtv_world_ros.ros.world_model.live_fidelity import LiveFidelity
 from mtv_world_ros.ros.world_model.loading import (
     AdapterSwitch,
