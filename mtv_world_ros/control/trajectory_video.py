@@ -502,8 +502,8 @@ class TrajectoryVideo(Control):
     """The paper's control: trails of the tools and the objects' first masks in every view.
 
     The frames are encoded as video latents and concatenated by channel.
-    Options of `config` also draw the links, the fingers, the arm's own pixels, and the objects
-    where they are expected to be.
+    Options of the section `rendering` also draw the links, the fingers, the arm's own pixels, and
+    the objects where they are expected to be.
 
     Attributes:
         config: widths, colours and fading; a model is served with what it was trained with.
