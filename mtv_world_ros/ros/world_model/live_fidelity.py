@@ -13,7 +13,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Float32MultiArray
 
-from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.core.errors import RolloutPreempted
 from mtv_world_ros.core.images import resize_frames
 from mtv_world_ros.physics.object_motion import ObjectMotionModel
