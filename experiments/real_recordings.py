@@ -1,19 +1,22 @@
 """What do real recordings show, and what is imagined of them whole? Verdicts, carried objects, sharpness.
 
     python experiments/real_recordings.py verdicts EPISODES [--task TASK.yaml] [--every 8]
+    python experiments/real_recordings.py grips EPISODES [--robot ROBOT]
     python experiments/real_recordings.py carried EPISODES --checkpoint CHECKPOINT
     python experiments/real_recordings.py rollouts EPISODES --checkpoint CHECKPOINT [--memory off]
-                                                   [--out out/real_rollouts]
+                                [--foresight off] [--out out/real_rollouts]
 
 EPISODES is a folder of imported recordings whose cameras are known (`mtv-world fit camera --apply`)
 and whose objects were found (`import ... --objects`).
 
 `verdicts` judges recorded frames by the masks of the import: whole, and cut off after every N
 frames, so that most cuts are failures; somebody who looks at the frames says which verdicts are
-right. `carried` compares where objects are foreseen in each chunk, from the recorded frame that it
+right. `grips` prints when something stops the fingers, which somebody compares with the frames; of
+simulated episodes it counts the frames in which an object goes along with a tool, and in which all
+are far from it, with the stops among them. `carried` compares where objects are foreseen in each chunk, from the recorded frame that it
 starts from, with their recorded masks and with the first frame held; no picture is imagined.
 `rollouts` imagines recordings whole from their first frame: J of the arm in the first chunk and in
-all, PSNR, and J of moving objects, with and without the memory of the background. It writes the
+all, PSNR, and J of moving objects, with and without the memory of the background, and foreseen objects. It writes the
 scores of each chunk and a contact sheet of each recording; run again, it goes on where it stopped.
 """  # noqa: E501
 
@@ -30,11 +33,18 @@ import subprocess
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from page import table
 
 from mtv_world_ros.cameras.camera import camera_poses
 from mtv_world_ros.cameras.motion import Motion
-from mtv_world_ros.core.data_types import ByteArray, FloatArray, SuccessEstimate, WorldModelSpec
+from mtv_world_ros.core.data_types import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    SuccessEstimate,
+    WorldModelSpec,
+)
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.core.images import write_png
 from mtv_world_ros.data.episode_reader import list_episodes
@@ -50,7 +60,8 @@ from mtv_world_ros.evaluation.metrics.arm_masks import arm_scenes
 from mtv_world_ros.evaluation.metrics.jaccard_scores import find_masks, true_masks
 from mtv_world_ros.evaluation.metrics.statistics import mean_interval
 from mtv_world_ros.model.checkpoint import Checkpoint
-from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.physics.grips import watch_fingers
+from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
@@ -108,6 +119,68 @@ def verdict_row(name: str, until_s: float, found: SuccessEstimate) -> tuple[str,
         verdict_word(found.probability, found.interval),
         found.reasons[0],
     )
+
+
+def print_grips(arguments: argparse.Namespace) -> None:
+    """Print the stops of fingers, and of simulated episodes how they agree with the objects."""
+    folder: Path = arguments.episodes
+    width, height = RECORDED_SIZE
+    spec = WorldModelSpec(
+        views=arguments.views, fps=RECORDED_FPS, num_frames=8, width=width, height=height, robot=''
+    )
+    robot = load_robot(robot_path(arguments.robot or folder / 'robot' / 'robot.yaml'))
+    rows, counts = [], np.zeros((2, 2), np.int64)
+    for path in list_episodes(folder):
+        recording = load_recording(path, spec, robot)
+        openings = np.asarray(robot.gripper_openings(recording.positions))
+        commanded = robot.gripper_openings(commands_at(recording, np.arange(len(recording.times))))
+        stopped, _ = watch_fingers(openings, 1 / RECORDED_FPS, commanded=commanded)
+        for arm, of_arm in enumerate(stopped):
+            for first, last in runs_of(of_arm):
+                begin, end = recording.times[[first, last]] - recording.times[0]
+                opening = f'{openings[arm, first : last + 1].mean():.2f}'
+                rows.append((path.name, str(arm), f'{begin:.1f}', f'{end:.1f}', opening))
+        if recording.object_poses is not None and not recording.masks_by:
+            tools = robot.tool_poses(recording.positions)
+            for of_tool, of_arm in zip(tools, stopped, strict=True):
+                counts += agreement(of_tool, recording.object_poses, of_arm)
+    print(table(('recording', 'arm', 'from [s]', 'to [s]', 'opening'), rows))
+    if counts.any():
+        (moves, held), (away, wrong) = counts
+        print(f'objects that go along: {moves} frames, {held} of them stops; ', end='')
+        print(f'all objects far away: {away} frames, {wrong} of them stops')
+
+
+def runs_of(mask: BoolArray) -> list[tuple[int, int]]:
+    """Return the first and last row of each run of a mask (N,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]
+
+
+#: distance that an object goes from one frame to the next at least, to be carried [m]
+CARRIED_M = 0.008
+#: change of its place in the tool meanwhile at most [m]
+SAME_PLACE_M = 0.004
+#: distance of a carried object from the tool point at most; of one that is far away at least [m]
+NEAR_M, FAR_M = 0.06, 0.08
+
+
+def agreement(tools: FloatArray, objects: FloatArray, stopped: BoolArray) -> NDArray[np.int64]:
+    """Return counts (2, 2): frames with a carried object, far objects; all, and stops among them.
+
+    Args:
+        tools: (N, 4, 4) T_base_tool [m].
+        objects: (N, O, 4, 4) T_base_object [m].
+        stopped: (N,) frames in which something stops the fingers.
+    """
+    points = objects[..., :3, 3]
+    inside = np.linalg.inv(tools)[:, None] @ objects
+    way = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+    change = np.linalg.norm(np.diff(inside[..., :3, 3], axis=0), axis=-1)
+    away = np.linalg.norm(points - tools[:, None, :3, 3], axis=-1)[1:]
+    carried = ((way > CARRIED_M) & (change < SAME_PLACE_M) & (away < NEAR_M)).any(-1)
+    far = (away > FAR_M).all(-1)
+    return np.array([[rows.sum(), (rows & stopped[1:]).sum()] for rows in (carried, far)])
 
 
 class HeldFrames:
@@ -195,11 +268,14 @@ def imagine_whole(arguments: argparse.Namespace) -> None:
     pipeline = open_pipeline(arguments)
     if arguments.memory == 'off':
         pipeline = replace(pipeline, scene_keeper=None)
+    if arguments.foresight == 'off':
+        pipeline = replace(pipeline, object_motion=None)
     made_with = {
         'checkpoint': Checkpoint.open(arguments.checkpoint).digest(),
         'code': code_version(),
         'seed': arguments.seed,
         'memory': arguments.memory,
+        'foresight': arguments.foresight,
     }
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
@@ -369,9 +445,9 @@ def _moving(
 
 
 def main() -> None:
-    """Run one of the three measurements."""
+    """Run one of the measurements."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n', 1)[0])
-    parser.add_argument('what', choices=('verdicts', 'carried', 'rollouts'))
+    parser.add_argument('what', choices=('verdicts', 'grips', 'carried', 'rollouts'))
     parser.add_argument('episodes', type=Path)
     parser.add_argument(
         '--views', type=lambda text: tuple(text.split(',')), default=('ext1', 'ext2')
@@ -379,13 +455,18 @@ def main() -> None:
     parser.add_argument('--task', type=Path, nargs='*', default=[])
     parser.add_argument('--every', type=int, default=8, help='frames between two cuts')
     parser.add_argument('--checkpoint', default='')
+    parser.add_argument('--robot', help='of grips: YAML or bundled; default: of EPISODES')
     parser.add_argument('--memory', choices=('on', 'off'), default='on')
+    parser.add_argument('--foresight', choices=('on', 'off'), default='on')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--out', type=Path, default=Path('out/real_rollouts'))
     arguments = parser.parse_args()
-    {'verdicts': judge_recorded, 'carried': compare_carried, 'rollouts': imagine_whole}[
-        arguments.what
-    ](arguments)
+    {
+        'verdicts': judge_recorded,
+        'grips': print_grips,
+        'carried': compare_carried,
+        'rollouts': imagine_whole,
+    }[arguments.what](arguments)
 
 
 if __name__ == '__main__':

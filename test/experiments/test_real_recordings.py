@@ -78,3 +78,14 @@ def test_a_verdict_is_a_word_only_where_its_interval_allows_it(
     )
     row = script.verdict_row('0001', 3.04, found)
     assert row[1] == '3.0' and row[3:] == (word, 'over it')
+
+
+def test_stops_of_fingers_are_compared_with_objects_that_go_along(script):
+    tools, cup, box = (np.tile(np.eye(4), (6, 1, 1)) for _ in range(3))
+    tools[:, 0, 3] = [0.0, 0.0, 0.02, 0.04, 0.06, 0.5]
+    cup[:, 0, 3] = [0.01, 0.01, 0.03, 0.05, 0.05, 0.05]  # let go after the third step
+    box[:, 1, 3] = 1.0
+    stopped = np.array([False, True, True, False, False, True])
+    counts = script.agreement(tools, np.stack([cup, box], axis=1), stopped)
+    assert counts.tolist() == [[2, 1], [1, 1]]
+    assert script.runs_of(stopped) == [(1, 2), (5, 5)]
