@@ -223,7 +223,7 @@ def _evaluation_advice(
 ) -> list[str]:
     """Return the lines that say how to evaluate a checkpoint on episodes not trained on.
 
-    A data set of which no episode can be used is named; the training is done all the same.
+    A data set without usable episodes is named; it is no error, since the training is done.
     """
     from mtv_world_ros.data.splits import select
 

@@ -78,7 +78,7 @@ class FingerState:
 
     @classmethod
     def at(cls, openings: FloatArray) -> FingerState:
-        """Return the state of fingers of which only the openings (A,) are known."""
+        """Return the state of fingers whose openings (A,) alone are known."""
         return cls(
             widest=openings,
             narrowest=openings,

@@ -44,7 +44,7 @@ class ConfirmationSettings:
     Attributes:
         unforeseen_fraction: fraction of rollouts with an unforeseen end if the parameters hold,
             for which the test is fastest.
-        other_unforeseen_fraction: smallest fraction of them if the parameters do not hold.
+        other_unforeseen_fraction: smallest such fraction if the parameters do not hold.
         false_acceptance: largest probability that parameters which do not hold are ever confirmed.
     """
 
@@ -162,10 +162,10 @@ class PhysicsWatch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContactTrust:
-    """Whether contact parameters that were fitted elsewhere are taken as fitted here.
+    """Trust in contact parameters that were fitted in another robot cell.
 
     Attributes:
-        is_confirmed: executed plans confirmed them in this robot cell, for this task.
+        is_confirmed: whether executed plans confirmed them in this robot cell, for this task.
         text: evidence for the reader of an estimate; empty = nothing was compared.
     """
 

@@ -494,7 +494,7 @@ class Player(Node):
     def _unread_topics(self) -> set[str]:
         """Return the trajectory topics that the node that reports does not read.
 
-        Empty where it reads none of them itself: what reads them for it is not known.
+        Empty where it reads none itself: another node then reads plans for it, not known which.
         """
         topics = set(self._plan_topics())
         if len(topics) < 2:

@@ -1,4 +1,4 @@
-"""What becomes of an imagined chunk: its frames go out, and it is compared with real ones."""
+"""Outcomes of imagined chunks: their frames go out, and they are compared with real ones."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from mtv_world_ros.vision.segmenters.weights import SegmenterOptions, WEIGHTS_VA
 
 
 class Auto:
-    """As `sam2` where its weights are present, else as `colour`."""
+    """Segmenter `sam2` where its weights are present, else `colour`."""
 
     @staticmethod
     def create(options: SegmenterOptions) -> Segmenter:
