@@ -30,9 +30,9 @@ def fingerprint(
         adapter: LoRA adapter that is used with it.
         task: name or file of the task that is judged, or its definition.
     """
-    from mtv_world_ros.success.calibration import CALIBRATION, HORIZON
+    from mtv_world_ros.success.calibration import FIT_FILES
 
-    without = () if calibrated else (CALIBRATION, HORIZON)
+    without = () if calibrated else FIT_FILES
     parts = [f'{checkpoint} ({checkpoint.digest(without)[:8]})']
     files = [] if adapter is None else [('adapter', adapter)]
     if isinstance(task, TaskSpec):

@@ -211,6 +211,12 @@ class HorizonCurve(Schema):
 
 #: in a checkpoint's folder
 _FILES: dict[type[Schema], str] = {Calibration: CALIBRATION, HorizonCurve: HORIZON}
+#: names of all files that fits write, of both kinds of rollouts
+FIT_FILES = tuple(
+    str(Path(name).with_stem(Path(name).stem + end))
+    for name in _FILES.values()
+    for end in ('', PICTURES)
+)
 
 
 def fit_path(folder: Path, kind: type[Schema], *, of_pictures: bool = False) -> Path:
