@@ -1,0 +1,48 @@
+"""Masks of start frames that remember the episode."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope='module')
+def borders() -> ModuleType:
+    """The experiment as a module."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / 'experiments'))
+        return __import__('chunk_borders')
+
+
+def rectangle(top: int, left: int, height: int, width: int) -> np.ndarray:
+    mask = np.zeros((20, 24), np.bool_)
+    mask[top : top + height, left : left + width] = True
+    return mask
+
+
+def test_a_half_hidden_object_gets_its_whole_shape_where_its_visible_corner_is(borders):
+    whole = np.logical_or(rectangle(2, 3, 6, 2), rectangle(6, 3, 2, 6))  # an L
+    moved = np.roll(whole, (7, 9), (0, 1))
+    visible = moved & rectangle(11, 12, 6, 6)  # its foot and some of its stem
+    assert visible.sum() < whole.sum()
+    np.testing.assert_array_equal(borders.placed(whole, visible), moved)
+
+
+def test_a_shape_that_agrees_with_no_place_is_not_drawn(borders):
+    whole = rectangle(2, 3, 2, 2)
+    visible = rectangle(5, 2, 1, 18)
+    np.testing.assert_array_equal(borders.placed(whole, visible), visible)
+
+
+def test_differences_are_paired_by_episode_and_leave_out_what_does_not_move(borders):
+    # t interval of (.1, .2, .3) by hand: .2 +- 4.303 * .1 / sqrt(3)
+    found = {'a': 0.1, 'b': 0.5, 'c': 0.4, 'still': np.nan}
+    other = {'a': 0.2, 'b': 0.7, 'c': 0.7, 'still': np.nan}
+    first, second = borders.differences({'found': found, 'carried': other})
+    assert first[1:3] == ('3', '0.3333') and second[1:3] == ('3', '0.5333')
+    assert second[3] == '+0.2000 [-0.0484, +0.4484]'
