@@ -68,9 +68,7 @@ class ObjectForesight:
         """
         if self.model is None or self.found is not None or self.model.is_fitted:
             return self
-        model = self.model.as_fitted()
-        whole = {names: found.simulated_by(model) for names, found in self._whole.items()}
-        return replace(self, model=model, _whole=whole)
+        return replace(self, model=self.model.as_fitted())
 
     def ends_by(
         self,
@@ -249,7 +247,10 @@ class ObjectForesight:
                 start_masks = self.segmenter.segment(frames[:, None], names)
             found = self._found_in(self.first, names, frames, start_masks.masks[:, :, 0])
             self._whole[names] = replace(found, is_whole=True)
-        return self._whole[names]
+        found = self._whole[names]
+        assert self.model is not None
+        is_same = found.tracked.is_fitted == self.model.is_fitted
+        return found if is_same else found.simulated_by(self.model)
 
     def _found_in(
         self,

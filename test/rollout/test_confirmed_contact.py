@@ -32,22 +32,34 @@ def recording(pipeline):
     return load_recording(share_path('resource', 'demo_episode'), pipeline.spec, pipeline.robot)
 
 
-def imagined(pipeline, recording, place, contact):
-    """Return the predictions of the recorded commands in a robot cell."""
-    start = Observation(
+def observed(recording, place):
+    """Return the first observation in a robot cell."""
+    return Observation(
         cameras=recording.cameras,
         frames=recording.frames[:, 0],
         positions=recording.positions[0],
         stamp_ns=1,
         place=place,
     )
-    options = RolloutOptions(
+
+
+def options(recording, contact):
+    return RolloutOptions(
         instruction=recording.instruction, num_inference_steps=1, contact=contact
     )
+
+
+def plan(recording):
+    """Return the recorded commands."""
     commands = recording.commands
     kept = commands.times > 1e-6
-    plan = replace(commands, times=commands.times[kept], positions=commands.positions[kept])
-    return list(pipeline.begin(start, options).extend(plan))
+    return replace(commands, times=commands.times[kept], positions=commands.positions[kept])
+
+
+def imagined(pipeline, recording, place, contact):
+    """Return the predictions of the recorded commands in a robot cell."""
+    begun = pipeline.begin(observed(recording, place), options(recording, contact))
+    return list(begun.extend(plan(recording)))
 
 
 def word(prediction):
@@ -72,16 +84,24 @@ def test_a_verdict_is_open_in_another_cell_until_its_contact_is_confirmed(pipeli
 
 
 @pytest.mark.slow
+def test_later_plans_of_an_episode_follow_a_confirmation_and_its_withdrawal(pipeline, recording):
+    start = observed(recording, 'cell 3')
+    begun, words = pipeline.begin(start, options(recording, WAITING)), []
+    for contact in (WAITING, CONFIRMED, WAITING):
+        later = begun.branch(replace(start, stamp_ns=2))
+        later.options = options(recording, contact)
+        words.append(word(list(later.extend(plan(recording)))[-1]))
+    assert words == ['open', 'success', 'open']
+
+
+@pytest.mark.slow
 def test_executed_plans_are_compared_with_futures_of_the_fitted_parameters(pipeline, recording):
     """Futures of the prior would foresee nearly everything."""
     fitted = imagined(pipeline, recording, 'simulator/nominal', ContactTrust())
     elsewhere = imagined(pipeline, recording, 'cell 3', ContactTrust())
     model = pipeline.object_motion.with_robot(pipeline.robot)
-    commands = recording.commands
-    kept = commands.times > 1e-6
-    given = replace(commands, times=commands.times[kept], positions=commands.positions[kept])
     start = replace(elsewhere[0].start, stamp_ns=1)
-    chunks = Plan.of(given, pipeline.robot, start).chunks(pipeline.spec)
+    chunks = Plan.of(plan(recording), pipeline.robot, start).chunks(pipeline.spec)
     for number, (one, other) in enumerate(zip(elsewhere, fitted, strict=True), start=1):
         found = one.objects.ends_by(model, chunks[:number])
         np.testing.assert_allclose(found, other.foreseen, atol=1e-9)

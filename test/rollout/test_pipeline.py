@@ -738,6 +738,8 @@ class SlidingObjects:
 class SlidingModel:
     """Finds objects where their masks are; remembers the sizes of the masks."""
 
+    is_fitted = True
+
     def __init__(self) -> None:
         self.sizes: list[tuple[int, ...]] = []
 

@@ -250,9 +250,9 @@ class LiveFidelity:
             num_frames=len(indices),
         )
         self._results.append(scored)
+        self._done.trigger()
         if len(indices) == len(prediction.video.times):
             self._test_physics(expected.chunk, episode.seen_points(len(indices)))
-        self._done.trigger()
 
     def _test_physics(self, chunk: Chunk, seen: FloatArray) -> None:
         """Compare the end of an executed chunk with the futures of the fitted parameters.
@@ -306,8 +306,8 @@ class LiveFidelity:
             return ContactTrust()
         if place != self._place:
             return ContactConfirmation().trust(instruction)
-        trust = self.confirmation.trust(instruction)
-        return replace(trust, is_confirmed=trust.is_confirmed and not self.watch.doubt)
+        # while the watch doubts, its reason is given
+        return ContactTrust() if self.watch.doubt else self.confirmation.trust(instruction)
 
     def physics_text(self, place: str) -> str:
         """Text about the contact parameters in a robot cell, for `/diagnostics`."""
