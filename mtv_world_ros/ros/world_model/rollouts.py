@@ -272,7 +272,7 @@ class Rollouts:
         )
         self._fidelity = LiveFidelity(node, pipeline, self)
         self._worker.doubt = lambda: self._fidelity.watch.doubt
-        self._worker.contact = lambda words: self._fidelity.trust(settings().place, words)
+        self._worker.contact = self._fidelity.trust
         undo.callback(self._fidelity.close)
         self._publisher = PredictionPublisher(node, self._spec, self._robot.joint_names, self)
         self._arrived: deque[_Arrived] = deque()

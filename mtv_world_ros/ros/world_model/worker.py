@@ -122,8 +122,8 @@ class RolloutWorker:
     Attributes:
         camera_check: result of the camera check on the newest episode's first frames.
         doubt: returns why the fitted physics does not hold here; empty = it may hold.
-        contact: returns the evidence on contact parameters of another robot cell, for an
-            instruction.
+        contact: returns the evidence on contact parameters of another robot cell, for the name of
+            this cell and an instruction.
 
     Args:
         pipeline: the main path.
@@ -135,7 +135,7 @@ class RolloutWorker:
         self._notify = notify
         self.camera_check = CameraCheck()
         self.doubt: Callable[[], str] = str
-        self.contact: Callable[[str], ContactTrust] = lambda _: ContactTrust()
+        self.contact: Callable[[str, str], ContactTrust] = lambda *_: ContactTrust()
         self._changed = Condition()
         self._pending: Request | None = None
         self._running: Request | None = None
@@ -414,7 +414,7 @@ class RolloutWorker:
             limits=settings.plan_limits,
             should_stop=self._should_stop,
             doubt='' if request.imagine else self.doubt(),
-            contact=self.contact(request.instruction),
+            contact=self.contact(settings.place, request.instruction),
         )
 
     def _begin(self, request: Request, options: RolloutOptions) -> tuple[SensedScene, Rollout]:
