@@ -124,8 +124,10 @@ class SceneKeeper:
         # what showed an object and is covered since may be empty by now
         shows_object = np.zeros_like(known)
         if memory is not None and memory.masks.shape[-2:] == known.shape[-2:]:
-            shows_object = self._near(memory.masks.any(1), self._settings.object_margin)
-        found = self._near(masks.masks.any(1), self._settings.object_margin)
+            shows_object = self._near(
+                np.asarray(memory.masks.any(1)), self._settings.object_margin
+            )
+        found = self._near(np.asarray(masks.masks.any(1)), self._settings.object_margin)
         for frame in range(frames.shape[1]):
             free = ~arms[:, frame] & self._stands_still(motion)[:, None, None]
             pictures[free], known = frames[:, frame][free], known | free
