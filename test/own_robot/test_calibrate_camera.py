@@ -19,6 +19,7 @@ from mtv_world_ros.inspection.cameras.wrist_camera import follow_scene, WristCam
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.robot.shape import load_shape
 from test.support.crane import load, make_cameras, make_positions, write_episode
+from test.support.unknown_cameras import forget_poses
 
 
 @pytest.mark.slow
@@ -151,7 +152,7 @@ def test_a_camera_without_any_calibration_is_found(wrist, tmp_path):
     robot, palm, path = wrist
     bag = tmp_path / 'bag'
     shutil.copytree(path, bag)
-    (bag / 'calibration.yaml').unlink()
+    forget_poses(bag)
     out = tmp_path / 'found.yaml'
     command = ['fit', 'camera', str(bag), '--view', 'palm', '--robot', str(robot.file)]
     assert main([*command, '--out', str(out)]) == 1  # no guess in the recording
