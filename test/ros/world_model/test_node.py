@@ -51,7 +51,7 @@ def forget(node, client):
     client.set(pace='burst', stamp_mode='target', seed=0)
     client.imagine(False)
     client.reset()
-    client.wait_for_all(FRAME_TOPICS)
+    client.settle(FRAME_TOPICS)
     for topic in OUTPUTS:
         client.received[topic].clear()
 
@@ -77,6 +77,16 @@ def test_every_frame_arrives_in_order_stamped_in_the_future(client):
         assert first_pixels == [[42, k] for k in range(NUM_FRAMES)]
     assert client.received[PREDICTED['low']][0].header.frame_id == 'low_optical_frame'
     assert client.received[PREDICTED['high']][0].header.frame_id == 'high_optical_frame'
+
+
+def test_a_frame_that_one_test_lost_is_not_awaited_by_the_next(client, ros, monkeypatch):
+    monkeypatch.setattr(ros, 'ANSWER_LOST_S', 0.2)
+    client.imagine_one(scene='sent')
+    client.wait_for_all(FRAME_TOPICS)
+    client.totals[PREDICTED['low']] -= 1
+    client.settle(FRAME_TOPICS)
+    client.imagine_one(scene='sent')
+    client.wait_for_all(FRAME_TOPICS)
 
 
 def test_camera_info_goes_with_every_image_at_its_size(client):
