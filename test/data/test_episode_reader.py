@@ -12,6 +12,7 @@ import yaml
 from mtv_world_ros.core.errors import CalibrationError, EpisodeError, MtvWorldError
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
 from mtv_world_ros.data.episode_writer import EpisodeWriter
+from test.support.unknown_cameras import forget_poses
 
 START_NS, PERIOD_NS, FRAMES = 1_700_000_000_000_000_000, 100_000_000, 8
 
@@ -129,7 +130,9 @@ def test_a_cut_episode_is_read_up_to_the_cut_and_says_so(make_episode, tmp_path)
 
 def test_without_calibration_the_file_to_add_is_named(make_episode):
     path = make_episode('bare')
-    (path / 'calibration.yaml').rename(path / 'elsewhere.yaml')
+    calibration = (path / 'calibration.yaml').read_text()
+    forget_poses(path)
+    (path / 'elsewhere.yaml').write_text(calibration)
     with pytest.raises(CalibrationError, match=r'bare/calibration.yaml.*poses'):
         read_episode(path)
     assert read(path).cameras == {}

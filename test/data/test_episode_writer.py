@@ -51,6 +51,7 @@ def test_independent_readers_find_every_value_that_was_written(read, episode_pat
     found = read(episode_path)
     assert {topic: len(items) for topic, items in found.items()} == {
         '/instruction': 1,
+        '/tf_static': 1,
         '/joint_trajectory': 1,
         '/joint_states': FRAMES,
         **{
@@ -110,6 +111,7 @@ def test_ros_itself_reads_the_recorded_bytes(episode_path):
     last = {
         message.topic: serialization.deserialize_message(message.data, types[message.msgtype])
         for message in BagReader(episode_path).messages()
+        if message.topic != '/tf_static'  # tf2_msgs has no wheel
     }
     assert last['/instruction'].data == 'stack the red block on the blue block'
     assert list(last['/joint_states'].position) == [7.0, 7 / 3, -7.0]
@@ -124,10 +126,10 @@ def test_metadata_yaml_is_version_9_and_counts_what_is_there(episode_path):
     assert information['version'] == 9
     assert information['storage_identifier'] == 'mcap'
     assert information['relative_file_paths'] == ['episode_0.mcap']
-    assert information['message_count'] == 2 + 7 * FRAMES
+    assert information['message_count'] == 3 + 7 * FRAMES
     assert information['starting_time'] == {'nanoseconds_since_epoch': START_NS}
     assert information['duration'] == {'nanoseconds': 7 * PERIOD_NS}
-    assert information['files'][0]['message_count'] == 2 + 7 * FRAMES
+    assert information['files'][0]['message_count'] == 3 + 7 * FRAMES
     assert information['compression_mode'] == information['compression_format'] == ''
     counts = {
         entry['topic_metadata']['name']: entry['message_count']
@@ -171,8 +173,9 @@ def test_the_mcap_file_is_what_foxglove_and_rosbag2_expect(episode_path):
         'sensor_msgs/msg/JointState',
         'trajectory_msgs/msg/JointTrajectory',
         'std_msgs/msg/String',
+        'tf2_msgs/msg/TFMessage',
     }
-    assert summary.statistics.message_count == 2 + 7 * FRAMES
+    assert summary.statistics.message_count == 3 + 7 * FRAMES
     assert {index.compression for index in summary.chunk_indexes} == {'zstd'}
     assert records['mtv_world'] == {
         'task': 'stack_blocks_two',

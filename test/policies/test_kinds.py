@@ -21,6 +21,7 @@ from mtv_world_ros.ranking.policy_list import (
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.rollout.assembly import assemble_policy
 from mtv_world_ros.simulation.expert.expert import Expert
+from mtv_world_ros.simulation.scenes.tasks import task_named
 from test.support.policy_servers import observe
 
 ROBOT = load_robot(robot_path('yam_bimanual'))
@@ -128,9 +129,9 @@ def test_a_ranking_takes_it_with_its_server_in_every_worker(tmp_path):
         check_single_clients(listed[:1], 2)
     check_single_clients(listed[1:2], 2)
     make = pickle.loads(pickle.dumps(ListedPolicies(listed, tmp_path)))  # noqa: S301
-    expert = Expert(ROBOT)
-    np.testing.assert_allclose(moved(make('ours', 'shake_bottle', 3, expert)), 0.2)
-    np.testing.assert_allclose(moved(make('each', 'shake_bottle', 3, expert)), 3)
+    expert, task = Expert(ROBOT), task_named('shake_bottle')
+    np.testing.assert_allclose(moved(make('ours', task, 3, expert)), 0.2)
+    np.testing.assert_allclose(moved(make('each', task, 3, expert)), 3)
 
 
 @pytest.mark.parametrize(

@@ -198,6 +198,7 @@ def test_stamps_are_moved_to_now_but_stay_in_step(episode, launch, ros):
         client.wait(lambda: len(client.received['/plan']) == 2, 'two plans')
         client.wait(lambda: len(client.received['/joint_states']) == NUM_STEPS, 'joint states')
         client.wait(lambda: len(client.received[IMAGE]) == NUM_STEPS, 'images')
+        client.wait(lambda: client.received['/objects'], 'the names of objects')
         code, said = finish(player)
         assert code == 0, said
         assert "the objects of this episode are on '/objects': red block, blue block" in said
