@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+import re
 
 import numpy as np
 import pytest
@@ -967,6 +968,27 @@ def test_without_foresight_the_fits_to_such_rollouts_are_used(recording, world_m
     (chunk,) = imagine(replace(whole, picture_fits=Fits()).without_foresight(), recording, 1.6)
     assert np.isnan(chunk.success.probability)
     assert 'never calibrated' in chunk.success.reasons[0]
+
+
+def test_the_bundled_checkpoint_has_a_fit_to_rollouts_without_foresight():
+    folder = share_path('resource', 'checkpoint')
+    usual, alone = load_fits(folder), load_fits(folder, of_pictures=True)
+    assert alone.calibration.is_of_pictures and not usual.calibration.is_of_pictures
+    assert alone.calibration.num_episodes == usual.calibration.num_episodes  # the same data
+    assert re.match(r'\d+% of the failures', alone.calibration.optimism)
+    assert alone.horizon.trusted_seconds(0.8) < usual.horizon.trusted_seconds(0.8)
+
+
+@pytest.mark.slow
+def test_every_switch_that_takes_foresight_away_uses_the_fit_of_its_own_kind():
+    whole = Pipeline.load(segmenter='colour', num_threads=1)
+    switched = whole.without_foresight()
+    loaded = Pipeline.load(segmenter='colour', num_threads=1, foresight=False)
+    own = load_fits(share_path('resource', 'checkpoint'), of_pictures=True)
+    for alone in (switched, loaded):
+        assert alone.estimator.calibration == own.calibration
+        assert alone.horizon == own.horizon
+        assert alone.grounds == Grounds.of('', True)
 
 
 class FollowsOnly:

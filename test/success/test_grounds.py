@@ -16,7 +16,7 @@ from mtv_world_ros.physics.checkpoint_files import load_contact, save_contact
 from mtv_world_ros.physics.contact_settings import ContactOrigin
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
-from mtv_world_ros.success.calibration import CALIBRATION
+from mtv_world_ros.success.calibration import Calibration, fit_path
 from mtv_world_ros.success.doubts import Grounds
 
 FOUND = ContactOrigin(by='mtv-world fit contact', recordings=8, telling=3)
@@ -77,7 +77,8 @@ def test_an_estimate_that_abstains_keeps_its_reason():
 def own(tmp_path):
     """A checkpoint of one's own, of which nothing was calibrated."""
     copytree(share_path('resource', 'checkpoint'), tmp_path / 'own')
-    (tmp_path / 'own' / CALIBRATION).unlink()
+    for of_pictures in (False, True):
+        fit_path(tmp_path / 'own', Calibration, of_pictures=of_pictures).unlink()
     return tmp_path / 'own'
 
 
