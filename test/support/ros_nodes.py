@@ -153,12 +153,19 @@ class Client:
         for kept in (self.publishers, self.services, self.received):
             kept.clear()
 
-    def subscribe(self, kind, topic, depth=NUM_FRAMES, reliability=ReliabilityPolicy.RELIABLE):
+    def subscribe(
+        self,
+        kind,
+        topic,
+        depth=NUM_FRAMES,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.VOLATILE,
+    ):
         def keep(message):
             self.received[topic].append(message)
             self.totals[topic] += 1
 
-        profile = QoSProfile(depth=depth, reliability=reliability)
+        profile = QoSProfile(depth=depth, reliability=reliability, durability=durability)
         self.node.create_subscription(kind, topic, keep, profile)
 
     def publish(self, topic, message, *, latched=False):

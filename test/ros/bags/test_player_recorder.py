@@ -13,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 import pytest
 import rclpy
+from rclpy.qos import DurabilityPolicy
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import CompressedImage, JointState
 from std_msgs.msg import String
@@ -190,7 +191,7 @@ def test_stamps_are_moved_to_now_but_stay_in_step(episode, launch, ros):
         client.subscribe(JointState, '/joint_states', depth=100)
         client.subscribe(JointTrajectory, '/plan', depth=100)
         client.subscribe(String, '/instruction', depth=1)
-        client.subscribe(String, '/objects', depth=1)
+        client.subscribe(String, '/objects', depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         begin_ns = time.time_ns()
         player = launch(
             'player', episode, '--rate', '2', '--ros-args', '-r', '/joint_trajectory:=/plan'

@@ -269,8 +269,7 @@ def test_refuses_joint_states_that_cannot_be(node, client, ros, case):
     expect_goes_on(client)
 
 
-def test_refuses_views_that_are_out_of_sync(node, client, ros):
-    assert client.set(max_view_skew_s=0.001) == ''
+def send_views_out_of_sync(client, ros):
     stamp_ns = client.now_ns()
     for offset_ns in range(-16_000_000, 0, 2_000_000):  # nothing older is kept
         client.publish('/low/image_raw', ros.make_image('low', stamp_ns + offset_ns))
@@ -278,7 +277,15 @@ def test_refuses_views_that_are_out_of_sync(node, client, ros):
         client.publish('/high/image_raw', high)
         client.spin_for(0.02)
     client.send_scene(stamp_ns, image_low=None, image_high=None)
-    ended = client.imagine_one(scene='sent')
+
+
+def test_refuses_views_that_are_out_of_sync(node, client, ros):
+    assert client.set(max_view_skew_s=0.001) == ''
+    for _ in range(3):  # on a busy machine a plan may overtake the images
+        send_views_out_of_sync(client, ros)
+        ended = client.imagine_one(scene='sent')
+        if ended['state'] == 'rejected':
+            break
     assert client.set(max_view_skew_s=0.05) == ''
     assert ended['reason'] == 'views_out_of_sync'
     assert "'max_view_skew_s' allows 0.001 s" in ended['text']
