@@ -35,35 +35,56 @@ def client(node, client, ros):
     return client
 
 
+def readers(node):
+    """Those that a node knows of the action's feedback."""
+    infos = node.get_subscriptions_info_by_topic(f'{NAME}/_action/feedback')
+    return {bytes(info.endpoint_gid) for info in infos}
+
+
 class Controller:
     """A client of the action, as MoveIt has one."""
 
-    def __init__(self, client):
+    def __init__(self, client, node):
         self.client = client
         self.messages = importlib.import_module('control_msgs.action').FollowJointTrajectory
         tolerance = importlib.import_module('control_msgs.msg').JointTolerance
         self.tolerance = lambda name, position: tolerance(name=name, position=position)
         self.actions = ActionClient(client.node, self.messages, NAME)
+        # rclpy's own client drops feedback that a result overtakes
+        self.subscription = client.node.create_subscription(
+            self.messages.Impl.FeedbackMessage, f'{NAME}/_action/feedback', self.keep, 10
+        )
         client.wait(self.actions.server_is_ready, 'the action')
         # the node discovers this client's readers a moment later; before, feedback is lost
+        client.wait(lambda: readers(client.node) <= readers(node), 'readers of feedback')
         client.spin_for(0.5)
-        self.feedback = []
+        self.received, self.goals = [], set()
 
     def send(self, trajectory, **fields):
         """Send a goal; return its handle once it is accepted."""
         goal = self.messages.Goal(trajectory=trajectory, **fields)
-        asked = self.actions.send_goal_async(goal, self.keep)
+        asked = self.actions.send_goal_async(goal)
         self.client.wait(asked.done, 'acceptance')
         assert asked.result().accepted
+        self.goals.add(bytes(asked.result().goal_id.uuid))
         return asked.result()
 
     def keep(self, message):
-        self.feedback.append(message.feedback)
+        self.received.append(message)
+
+    @property
+    def feedback(self):
+        """Feedback of this client's goals."""
+        return [m.feedback for m in self.received if bytes(m.goal_id.uuid) in self.goals]
 
     def wait_for_feedback(self, count):
         """Return what came; a result may overtake it, for it takes another way."""
         self.client.wait(lambda: len(self.feedback) >= count, 'feedback')
         return self.feedback
+
+    def close(self):
+        self.actions.destroy()
+        self.client.node.destroy_subscription(self.subscription)
 
     def result(self, handle):
         """Return status, code and text of a goal's end."""
@@ -74,16 +95,16 @@ class Controller:
 
 
 @pytest.fixture
-def new_controller(client):
+def new_controller(client, node):
     made = []
 
     def new_controller():
-        made.append(Controller(client))
+        made.append(Controller(client, node.node))
         return made[-1]
 
     yield new_controller
     for controller in made:
-        controller.actions.destroy()
+        controller.close()
 
 
 def code(controller, name):
