@@ -347,7 +347,7 @@ def mean_rows(scores: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str, 
             value = sum(score[key] for key in plus) - sum(score[key] for key in minus)
             if not isnan(value):
                 by_recording.setdefault(score['recording'], []).append(value)
-        means = np.array([np.mean(values) for values in by_recording.values()])
+        means = np.array([np.mean(v) for v in by_recording.values()], np.float64)
         mean, ends = mean_interval(
             means[:, None], np.ones((len(means), 1)), low=-np.inf, high=np.inf
         )

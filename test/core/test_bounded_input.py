@@ -157,7 +157,8 @@ def test_json_is_bounded(tmp_path, monkeypatch):
 
 def test_every_limit_is_documented():
     page = share_path('docs', 'troubleshooting.md').read_text()
-    entries = re.findall(r'^ +(\w+): ((?:.+\n)(?: {12}.+\n)*)', Limits.__doc__, re.MULTILINE)
+    words = Limits.__doc__ or ''
+    entries = re.findall(r'^ +(\w+): ((?:.+\n)(?: {12}.+\n)*)', words, re.MULTILINE)
     texts = {name: ' '.join(text.split()).rstrip('.') for name, text in entries}
     for field in fields(Limits):
         variable, text = f'MTV_WORLD_MAX_{field.name.upper()}', texts[field.name]

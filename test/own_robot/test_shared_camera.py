@@ -115,6 +115,7 @@ def test_seen_points_start_a_search_where_nothing_is_known(recorded, tmp_path, c
         found = read_episode(path).cameras['door']
         assert error_px(robot, true[number], found, number) < 3
         assert error_px(robot, true[number], found, number, 0.95) < float(within[1])
+        assert found.error_px is not None
         assert 2.4477 * found.error_px == pytest.approx(float(within[1]), abs=0.06)
         assert abs(found.K[0, 0] / true[number].K[0, 0] - 1) < 0.07
 
@@ -213,6 +214,7 @@ def test_the_stated_error_holds_for_95_of_100_points_however_few_were_left_out()
         for _ in range(400):
             seen = np.linalg.norm(generator.normal(0, 0.8, (count, 2)), axis=1)
             error = stated_error(seen)
+            assert error is not None
             assert 2.4477 * error == pytest.approx(expected_within(seen), rel=1e-3)
             inside.append(np.linalg.norm(generator.normal(0, 0.8, 2)) < 2.4477 * error)
     assert 0.93 < np.mean(inside) < 0.97
