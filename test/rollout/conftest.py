@@ -1,5 +1,10 @@
-"""The small episodes, for every test of the replay."""
+"""The small episodes, for every test of the replay, and the bundled model on its episode."""
 
+import pytest
+
+import mtv_world_ros
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.data.recording import load_recording
 from test.support.gantry import make_camera, one_arm
 from test.support.small_episodes import episodes, make_episode, make_pipeline, oracle, recordings
 
@@ -12,3 +17,13 @@ __all__ = [
     'oracle',
     'recordings',
 ]
+
+
+@pytest.fixture(scope='module')
+def pipeline():
+    return mtv_world_ros.Pipeline.load(segmenter='colour', num_threads=1)
+
+
+@pytest.fixture(scope='module')
+def recording(pipeline):
+    return load_recording(share_path('resource', 'demo_episode'), pipeline.spec, pipeline.robot)

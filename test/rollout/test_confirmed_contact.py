@@ -7,10 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import mtv_world_ros
 from mtv_world_ros.core.data_types import Observation
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.robot.plan import Plan
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.success.doubts import ContactTrust
@@ -20,16 +17,6 @@ WAITING = ContactTrust(text='contact of this cell is not confirmed: 4 of 10 ends
 CONFIRMED = ContactTrust(
     is_confirmed=True, text='contact of this cell is confirmed: 10 of 10 ends as foreseen'
 )
-
-
-@pytest.fixture(scope='module')
-def pipeline():
-    return mtv_world_ros.Pipeline.load(segmenter='colour', num_threads=1)
-
-
-@pytest.fixture(scope='module')
-def recording(pipeline):
-    return load_recording(share_path('resource', 'demo_episode'), pipeline.spec, pipeline.robot)
 
 
 def observed(recording, place):

@@ -8,20 +8,8 @@ import pytest
 
 import mtv_world_ros
 from mtv_world_ros.core.errors import EpisodeError
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
-
-
-@pytest.fixture(scope='module')
-def pipeline():
-    return mtv_world_ros.Pipeline.load(segmenter='colour', num_threads=1)
-
-
-@pytest.fixture(scope='module')
-def recording(pipeline):
-    return load_recording(share_path('resource', 'demo_episode'), pipeline.spec, pipeline.robot)
 
 
 def test_a_recorded_success_is_judged_as_one_and_its_beginning_is_not(pipeline, recording):
