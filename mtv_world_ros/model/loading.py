@@ -6,7 +6,12 @@ from dataclasses import replace
 
 from mtv_world_ros.control.control import InputLayout, VIDEO_ONLY
 from mtv_world_ros.model.checkpoint import Checkpoint
-from mtv_world_ros.model.runtime import check_device, choose_dtype, set_num_threads
+from mtv_world_ros.model.runtime import (
+    check_device,
+    choose_dtype,
+    keep_freed_memory,
+    set_num_threads,
+)
 from mtv_world_ros.model.serving import ServingOptions
 from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.model.world_model import DiffusionWorldModel
@@ -40,4 +45,7 @@ def load_world_model(
         inputs = layout.transformer_arguments()
         if inputs and loaded.transformer.control_tokens is None:  # the adapter brings the weights
             loaded.transformer.add_control_inputs(**inputs)
-    return DiffusionWorldModel(loaded, device=device, dtype=number_format, serving=options)
+    model = DiffusionWorldModel(loaded, device=device, dtype=number_format, serving=options)
+    if model.device.type == 'cpu':
+        keep_freed_memory()
+    return model

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from typing import TypeVar
 
@@ -13,6 +14,9 @@ from mtv_world_ros.model.transformer.attention import cpu_multiplies_bfloat16
 
 Module = TypeVar('Module', bound=nn.Module)
 
+#: settings of glibc's allocator (`malloc.h`), and variables by which a user sets them
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
+_ALLOCATOR_VARIABLES = ('MALLOC_MMAP_MAX_', 'MALLOC_TRIM_THRESHOLD_', 'GLIBC_TUNABLES')
 _DTYPES = {'float32': torch.float32, 'bfloat16': torch.bfloat16}
 
 
@@ -20,6 +24,24 @@ def set_num_threads(num_threads: int) -> None:
     """Limit torch's threads; 0 = all usable cores but one for callbacks, or both of two."""
     usable = len(os.sched_getaffinity(0))
     torch.set_num_threads(num_threads or max(min(usable, 2), usable - 1))
+
+
+def keep_freed_memory() -> bool:
+    """Let this process keep freed memory for later tensors; return whether glibc does so now.
+
+    By default glibc returns the memory of a large tensor to the system when it is freed, and the
+    system clears the pages of the next one: a tenth of a training step on a CPU and a sixth of a
+    chunk (`experiments/cpu_speed.py`). Call it when the model is loaded, so that memory that
+    loading alone needs is returned. Nothing happens with another allocator, or where the user has
+    set glibc's own variables (`MALLOC_MMAP_MAX_`, `MALLOC_TRIM_THRESHOLD_`, `GLIBC_TUNABLES`).
+    """
+    if any(name in os.environ for name in _ALLOCATOR_VARIABLES):
+        return False
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):  # not glibc
+        return False
+    return bool(mallopt(_M_MMAP_MAX, 0) and mallopt(_M_TRIM_THRESHOLD, 2**31 - 1))
 
 
 def check_device(name: str) -> None:

@@ -21,7 +21,7 @@ from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER, OPTIONAL_KEYS, ROBOT_
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import check_history
 from mtv_world_ros.model.parts import build_autoencoder, build_scheduler
-from mtv_world_ros.model.runtime import place
+from mtv_world_ros.model.runtime import keep_freed_memory, place
 from mtv_world_ros.model.serving import compile_blocks
 from mtv_world_ros.model.trained_model import load_trained_model, save_trained_model, TrainedModel
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
@@ -231,6 +231,8 @@ class Trainer:
             TrainingError: the loss is not finite, the device is out of memory, a state cannot be
                 written, or another process is gone; the last saved state stays whole.
         """
+        if self.device.type == 'cpu':
+            keep_freed_memory()
         rollout = self._self_rollout(source)
         saved, stops = time.monotonic(), False
         while self.step < self.config.optimizer.steps and not stops:
