@@ -14,7 +14,9 @@ The learning rate is constant after a short warm-up, so that a stage does not de
 it; the checkpoints hold moving averages of the weights.
 
 Table 2 needs real recordings as `mtv-world import videos`, `import bag` or `import lerobot` makes
-them: `--real data/lab --real-view ext1 --real-segmenter data/lab/objects.safetensors`.
+them: `--real data/lab --real-view ext1 --real-segmenter data/lab/objects.safetensors`. With
+`--real-init 2000` the full method is also trained on them from its weights of that stage of the
+simulated episodes; the controls made of a robot's numbers do not fit another robot.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import fcntl
 from itertools import pairwise
 from math import ceil, isfinite, nan
@@ -80,8 +82,8 @@ REAL_TEST_SHARE = 4
 #: small models of real recordings: frames of 16:9, chunks of 1.6 s, colours as they are
 REAL_SETTINGS = (
     'video.num_frames=8', 'video.width=160', 'video.height=96', 'augment.colour_permutation=0',
-    'transformer.num_views=1',
 )  # fmt: skip
+ONE_VIEW = 'transformer.num_views=1'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,6 +97,7 @@ class Row:
         views: it is trained and tested on; empty = both, of real episodes the given one.
         object_mask: whether the trajectory video carries the masks of the first frame.
         is_real: trained on the real recordings, for Table 2.
+        starts_from: row of the simulated episodes whose weights it starts from; empty = new ones.
     """
 
     name: str
@@ -103,9 +106,10 @@ class Row:
     views: tuple[str, ...] = ()
     object_mask: bool = True
     is_real: bool = False
+    starts_from: str = ''
 
 
-ROWS = (
+_SIMULATED = (
     # World-Eval supports one view, the paper's View 2
     Row(name='policy2vec', title='World-Eval (policy2vec)', control='policy2vec', views=('high',)),
     Row(name='ee_mlp', title='Ctrl-World (ee_mlp)', control='ee_mlp'),
@@ -114,15 +118,25 @@ ROWS = (
     Row(name='single_view_high', title='Single-View', views=('high',)),
     Row(name='without_mask', title='w/o Mask', object_mask=False),
     Row(name='mtv_world', title='MTV-World (trajectory_video)'),
-    Row(name='real_ee_mlp', title='Ctrl-World (ee_mlp)', control='ee_mlp', is_real=True),
-    Row(
-        name='real_fast_tokens',
-        title='Fast-Token (fast_tokens)',
-        control='fast_tokens',
-        is_real=True,
-    ),
-    Row(name='real_mtv_world', title='MTV-World (trajectory_video)', is_real=True),
 )
+#: rows of Table 2 from worst to best by the paper
+_REAL = ('ee_mlp', 'fast_tokens', 'mtv_world')
+ROWS = (
+    *_SIMULATED,
+    *(
+        replace(row, name=f'real_{row.name}', is_real=True)
+        for row in _SIMULATED
+        if row.name in _REAL
+    ),
+    # numbers of one robot's joints mean nothing for another: drawn trajectories alone carry over
+    Row(
+        name='real_mtv_world_after_simulation',
+        title='MTV-World after the simulated episodes',
+        is_real=True,
+        starts_from='mtv_world',
+    ),
+)
+ROWS_SIMULATED = tuple(row.name for row in _SIMULATED)
 #: the row whose model is tested on the zero-shot episodes, and the title of that row
 FULL, ZERO_SHOT = 'mtv_world', 'Zero-Shot'
 HELD = 'First frame held'
@@ -138,8 +152,9 @@ PAPER_ORDER: tuple[tuple[Mapping[str, str], Mapping[str, float]], ...] = (
     (dict.fromkeys(VIEWS, 'without_mask'), {'low': 54.8, 'high': 42.6}),
     (dict.fromkeys(VIEWS, 'mtv_world'), {'low': 54.9, 'high': 45.0}),
 )
-#: rows of Table 2 from worst to best by the paper
-REAL_ORDER = ('real_ee_mlp', 'real_fast_tokens', 'real_mtv_world')
+#: rows of Table 2 from worst to best by the paper, and all of them
+REAL_ORDER = tuple(f'real_{name}' for name in _REAL)
+TABLE_2 = (*REAL_ORDER, 'real_mtv_world_after_simulation')
 #: rows of Table 1 (without the ablations), and of Table 3 in the paper's order
 TABLE_1 = ('policy2vec', 'ee_mlp', 'fast_tokens', 'mtv_world')
 _ABOUT = (
@@ -179,7 +194,11 @@ class PaperTables:
         self.options, self._run = options, run
         self.out: Path = options.out
         self._did_something = False
-        self.rows = chosen_rows(options.rows, has_real=options.real is not None)
+        self.rows = chosen_rows(
+            options.rows,
+            has_real=options.real is not None,
+            has_start=options.real_init is not None,
+        )
         self.seeds: list[int] = options.seeds
 
     @property
@@ -380,8 +399,10 @@ class PaperTables:
         if row.is_real:
             robot = options.real_robot or options.real / 'robot' / 'robot.yaml'
             found += [*REAL_SETTINGS, f'video.robot={robot}', f'video.views=[{options.real_view}]']
+            # weights of two views know the first
+            found += [] if row.starts_from else [ONE_VIEW]
         elif row.views:
-            found += [f'video.views=[{",".join(row.views)}]', 'transformer.num_views=1']
+            found += [f'video.views=[{",".join(row.views)}]', ONE_VIEW]
         if row.control != TRAJECTORY_VIDEO:
             found.append(f'video.control={row.control}')
         return [*found, f'video.object_mask={str(row.object_mask).lower()}', *options.set]
@@ -407,10 +428,28 @@ class PaperTables:
         ]  # fmt: skip
         if row.is_real:
             words += self._real_segmenter()
+        if row.starts_from:
+            words += ['--init', str(self._start(row, seed))]
         # the learning rate of a step must not depend on how many more there are
         schedule = [f'optimizer.warmup_steps={WARMUP_STEPS}', 'optimizer.decay_share=0.0']
         sets = [*schedule, *self._overrides(row), f'optimizer.steps={self.steps(stage)}']
         return [*words, *(f'--set={text}' for text in sets)]
+
+    def _start(self, row: Row, seed: int) -> Path:
+        """Return the checkpoint that a row starts from.
+
+        Raises:
+            ConfigError: the row of the simulated episodes has no such stage so far.
+        """
+        source = next(one for one in ROWS if one.name == row.starts_from)
+        checkpoint = self.stage_folder(source, seed, self.options.real_init) / 'checkpoint'
+        if trained_steps(checkpoint) is None:
+            raise ConfigError(
+                f"row '{row.name}' starts from row '{source.name}' with "
+                f'{self.options.real_init} clips (--real-init), which is not trained so far; '
+                'name that stage in --clips, and run the same command again'
+            )
+        return checkpoint
 
     def _evaluation(
         self, row: Row, seed: int, checkpoint: Path, dataset: Path, out: Path
@@ -494,39 +533,40 @@ class Sections:
             f'{options.preset}, learning rate constant after {WARMUP_STEPS} steps, averaged '
             f'weights; commit {commit()}; {machine()}.\n\n{_ABOUT}'
         )
-        found, which = self._last(is_real=False)
+        found, which = self._last(ROWS_SIMULATED)
         yield f'## Table 1: methods by view, {which}\n\n{found.methods(TABLE_1, VIEWS).markdown()}'
-        yield f'## Do they react to their actions? {which}\n\n{found.reactions().markdown()}'
+        reactions = found.reactions(ROWS_SIMULATED).markdown()
+        yield f'## Do they react to their actions? {which}\n\n{reactions}'
         yield f"## The paper's order, {which}\n\n{_ORDER}\n\n{found.order().markdown()}"
         for key, words in (('j_union', 'J x 100'), ('j_moving', 'J moving x 100')):
             table = found.by_task(key).markdown()
             yield f'## Table 3: {words} by task and view, {which}\n\n{table}'
-        if self._rows(is_real=True):
-            found, which = self._last(is_real=True)
+        if self._rows(TABLE_2):
+            found, which = self._last(TABLE_2)
             yield (
                 f'## Table 2: real recordings, one view, {which}\n\n'
-                f'{found.methods(REAL_ORDER, found.real_views).markdown()}\n\n'
-                f'{found.reactions(is_real=True).markdown()}\n\n'
+                f'{found.methods(TABLE_2, found.real_views).markdown()}\n\n'
+                f'{found.reactions(TABLE_2).markdown()}\n\n'
                 f'{found.real_order().markdown()}'
             )
         yield f'## Learning curve\n\n{self._curve().markdown()}'
         yield f'## Clips and time\n\n{self._times().text()}'
 
-    def _rows(self, *, is_real: bool) -> list[Row]:
-        """Return the rows that are asked for or there."""
+    def _rows(self, names: Sequence[str]) -> list[Row]:
+        """Return the rows of these names that are asked for or there."""
         return [
             row
             for row in ROWS
-            if row.is_real == is_real
+            if row.name in names
             and (
                 row in self._run.rows
                 or any(r.evaluations(row.name) for r in self._results.values())
             )
         ]
 
-    def _last(self, *, is_real: bool) -> tuple[Results, str]:
+    def _last(self, names: Sequence[str]) -> tuple[Results, str]:
         """Return the last stage that all rows have, else the first, and words for a heading."""
-        rows = self._rows(is_real=is_real)
+        rows = self._rows(names)
         finished = [s for s in self._stages if rows and all(map(self._results[s].has, rows))]
         stage = finished[-1] if finished else self._stages[0]
         results = self._results[stage]
@@ -658,12 +698,12 @@ class Results:
         found = [distance(folder / 'test_features.npz', view) for folder in folders]
         return joined([one for one in found if one is not None], 1)
 
-    def reactions(self, *, is_real: bool = False) -> Table:
+    def reactions(self, names: Sequence[str]) -> Table:
         """Return J of moving objects with true and other commands, and whether they differ."""
         rows = [
-            [f'{row.title} ({row.name})', *self.reaction(row.name)]
-            for row in ROWS
-            if row.is_real == is_real and self.evaluations(row.name)
+            [f'{self._rows[name].title} ({name})', *self.reaction(name)]
+            for name in names
+            if self.evaluations(name)
         ]
         return Table(head=['Method', *REACTION_HEAD], rows=rows)
 
@@ -684,7 +724,7 @@ class Results:
     @property
     def real_views(self) -> tuple[str, ...]:
         """The view of the real recordings."""
-        found = [e for name in REAL_ORDER for e in self.evaluations(name)]
+        found = [e for name in TABLE_2 for e in self.evaluations(name)]
         return found[0].spec.views if found else (self._run.options.real_view,)
 
     def order(self) -> Table:
@@ -799,15 +839,23 @@ def joined(found: Sequence[Estimate], digits: int, factor: float = 1.0) -> str:
     return text if not isfinite(low) else f'{text} [{low:.{digits}f}, {high:.{digits}f}]'
 
 
-def chosen_rows(names: Sequence[str] | None, *, has_real: bool) -> list[Row]:
+def chosen_rows(
+    names: Sequence[str] | None, *, has_real: bool, has_start: bool = False
+) -> list[Row]:
     """Return the rows to train: those named, else all that there are data for.
 
+    Args:
+        names: of rows; None = all.
+        has_real: whether there are real recordings.
+        has_start: whether it is said from which stage rows start that start from others.
+
     Raises:
-        ConfigError: no such row, or a real one without recordings.
+        ConfigError: no such row, or a real one without recordings or without a start.
     """
     known = {row.name: row for row in ROWS}
     if names is None:
-        return [row for row in ROWS if has_real or not row.is_real]
+        real = [row for row in ROWS if row.is_real and (has_start or not row.starts_from)]
+        return [*_SIMULATED, *(real if has_real else [])]
     for name in names:
         if name not in known:
             raise ConfigError(
@@ -816,6 +864,11 @@ def chosen_rows(names: Sequence[str] | None, *, has_real: bool) -> list[Row]:
         if known[name].is_real and not has_real:
             raise ConfigError(
                 f"row '{name}' is trained on real recordings: give --real FOLDER and --real-view"
+            )
+        if known[name].starts_from and not has_start:
+            raise ConfigError(
+                f"row '{name}' starts from the weights of '{known[name].starts_from}': give "
+                '--real-init CLIPS, the stage to take them from'
             )
     return [row for row in ROWS if row.name in names]
 
@@ -985,6 +1038,12 @@ def parser() -> argparse.ArgumentParser:
     add('--real-view', help='the view of Table 2')
     add('--real-robot', type=Path, help='default: robot/robot.yaml in REAL')
     add('--real-segmenter', type=Path, help='objects.safetensors of the import')
+    add(
+        '--real-init',
+        type=int,
+        metavar='CLIPS',
+        help='stage of the simulated row whose weights the last row of Table 2 starts from',
+    )
     add('--preset', default='paper', help='name or YAML file')
     add('--set', action='append', default=[], metavar='SECTION.KEY=VALUE', help='of all rows')
     add('--device', default='cpu', help='of trainings and tests, e.g. cuda')

@@ -59,7 +59,8 @@ class ActionScaling:
         if names != self.names:
             raise CheckpointError(
                 f'the model was trained on the numbers {list(self.names)}, the robot has '
-                f"{list(names)}; set 'robot_file' to the robot that it was trained with"
+                f'{list(names)}: such a control fits no other robot. Use the robot that it was '
+                'trained with (robot_file of the node, video.robot of a training), or train anew'
             )
 
     def state(self) -> dict[str, Any]:
@@ -79,9 +80,9 @@ class ActionScaling:
                 f'scaling of {len(names)} numbers has limits of shapes {low.shape} and '
                 f'{high.shape}; they must be finite, one of each a number'
             )
-        if names != self.names:
-            self.check(names)
-        return ActionScaling(names=names, low=low, high=high, clip=self.clip)
+        fitted = ActionScaling(names=names, low=low, high=high, clip=self.clip)
+        fitted.check(self.names)
+        return fitted
 
 
 def joint_features(motion: Motion) -> FloatArray:

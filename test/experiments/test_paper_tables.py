@@ -313,11 +313,30 @@ def test_a_stage_below_what_a_row_was_trained_for_is_left_out(
     [
         ('mtv_wrld', r"no row \(did you mean 'mtv_world'\?\)"),
         ('real_mtv_world', 'give --real FOLDER and --real-view'),
+        ('real_mtv_world_after_simulation', 'give --real FOLDER and --real-view'),
     ],
 )
 def test_rows_that_cannot_be_trained_are_refused(tables: ModuleType, rows: str, message: str):
     with pytest.raises(ConfigError, match=message):
         tables.chosen_rows([rows], has_real=False)
+
+
+def test_a_row_that_starts_from_another_needs_its_stage(
+    tables: ModuleType, data: Path, tmp_path: Path
+):
+    name = 'real_mtv_world_after_simulation'
+    words = ['--out', str(tmp_path), '--data', str(data), '--clips', '8', '--real', str(data),
+             '--real-view', 'ext1']  # fmt: skip
+    with pytest.raises(ConfigError, match='give --real-init CLIPS'):
+        tables.chosen_rows([name], has_real=True)
+    assert name not in [row.name for row in tables.chosen_rows(None, has_real=True)]
+
+    options = tables.parser().parse_args([*words, '--real-init', '8'])
+    run = tables.PaperTables(options, Recorder(lambda words: 1))
+    last = run.rows[-1]
+    assert last.name == name
+    with pytest.raises(ConfigError, match=r"'mtv_world' with 8 clips .* not trained so far"):
+        run._training(last, 0, 8)
 
 
 def test_weights_of_another_network_are_refused_before_anything_is_trained(
@@ -367,7 +386,7 @@ def test_all_rows_have_the_same_budget_and_differ_in_what_they_are_named_after(
     )  # fmt: skip
     run = tables.PaperTables(options, Recorder(lambda words: 1))
     found = {row.name: ' '.join(run._training(row, 0, 8000)) for row in run.rows}
-    assert len(found) == len(tables.ROWS)
+    assert len(found) == len(tables.ROWS) - 1  # without --real-init
     assert all('optimizer.steps=4000' in words for words in found.values())
     assert all('--device cuda ' in words for words in found.values())
     for control in ('policy2vec', 'ee_mlp', 'fast_tokens'):

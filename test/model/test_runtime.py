@@ -15,7 +15,7 @@ _FAULTS = """
 import resource, torch
 from mtv_world_ros.model.runtime import keep_freed_memory
 print(keep_freed_memory())
-for _ in range(2):
+for _ in range(8):  # the heap grows to its size
     torch.ones(2**24)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 for _ in range(8):
