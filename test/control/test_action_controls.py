@@ -178,7 +178,8 @@ def test_plans_of_another_robot_are_refused(options, motions, tmp_path):
     file = tmp_path / CONTROL_FILE
     name = motions[0].robot.joint_names[0]
     file.write_text(file.read_text().replace(f'"{name}"', '"shoulder"'))
-    with pytest.raises(CheckpointError, match="trained on the numbers.*'shoulder'.*the robot has.*robot_file"):
+    wrong_way_round_would_fail = "trained on the numbers.*'shoulder'.*the robot has.*robot_file"
+    with pytest.raises(CheckpointError, match=wrong_way_round_would_fail):
         load_control('policy2vec', options, tmp_path)
 
 
