@@ -6,7 +6,8 @@
 Each measurement is a process of its own, since one cannot take back how it holds memory, and all
 take turns. A training step is of the preset `small` from new weights, by `make` of
 `training_speed.py`; a chunk is of `bundled-paper` and begins with a frame of its own. CPU time of
-one thread. `--checkout` names another checkout of this repository, of which steps are measured.
+one thread. Chunks come after the steps: what held memory gives them is not seen here.
+`--checkout` names another checkout of this repository, of which steps are measured.
 """
 
 from __future__ import annotations

@@ -37,6 +37,7 @@ OLD_TAG = 'v0.1.0'
 DESCRIBES = {
     'camera_calibration': ('mtv_world_ros/inspection',),
     'camera_check': ('mtv_world_ros/vision',),
+    'cpu_speed': ('mtv_world_ros/model', 'mtv_world_ros/training'),
     'doctor': ('mtv_world_ros/inspection',),
     'foresight': ('mtv_world_ros/ros',),
     'interval_coverage': ('mtv_world_ros/evaluation/metrics',),

@@ -30,8 +30,8 @@ def keep_freed_memory() -> bool:
     """Let this process keep freed memory for later tensors; return whether glibc does so now.
 
     By default glibc returns the memory of a large tensor to the system when it is freed, and the
-    system clears the pages of the next one: a tenth of a training step on a CPU and a sixth of a
-    chunk (`experiments/cpu_speed.py`). Call it when the model is loaded, so that memory that
+    system clears the pages of the next one: a seventh of a training step on a CPU
+    (`experiments/cpu_speed.py`). Call it when the model is loaded, so that memory that
     loading alone needs is returned. Nothing happens with another allocator, or where the user has
     set glibc's own variables (`MALLOC_MMAP_MAX_`, `MALLOC_TRIM_THRESHOLD_`, `GLIBC_TUNABLES`).
     """
