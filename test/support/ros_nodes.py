@@ -71,6 +71,9 @@ ANSWER_LOST_S = 10.0
 #: a client that no service matches in this time is made anew, in a participant that discovers all
 #: services again: what discovery has lost once, a participant never learns [s]
 MATCH_AGAIN_S = 12.0
+#: messages that subscriptions of tests keep: chunks are published in bursts, while a busy machine
+#: takes long to take them
+KEPT = 100
 TIMEOUT_S = 60.0  # a busy machine takes long to start a node
 
 
@@ -157,7 +160,7 @@ class Client:
         self,
         kind,
         topic,
-        depth=NUM_FRAMES,
+        depth=KEPT,
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.VOLATILE,
     ):
@@ -217,7 +220,7 @@ class Client:
             caller.executor.spin_once(timeout_sec=0)
         self.executor.spin_once(timeout_sec=0.02)
 
-    def connect_outputs(self, topics, timeout_s=TIMEOUT_S, depth=NUM_FRAMES):
+    def connect_outputs(self, topics, timeout_s=TIMEOUT_S, depth=KEPT):
         """Subscribe to `{topic: type}` and wait for their publishers."""
         for topic, kind in topics.items():
             self.subscribe(kind, topic, depth)
