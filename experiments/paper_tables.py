@@ -538,6 +538,7 @@ class Sections:
         reactions = found.reactions(ROWS_SIMULATED).markdown()
         yield f'## Do they react to their actions? {which}\n\n{reactions}'
         yield f"## The paper's order, {which}\n\n{_ORDER}\n\n{found.order().markdown()}"
+        yield from self._further(found)
         for key, words in (('j_union', 'J x 100'), ('j_moving', 'J moving x 100')):
             table = found.by_task(key).markdown()
             yield f'## Table 3: {words} by task and view, {which}\n\n{table}'
@@ -573,6 +574,25 @@ class Sections:
         there = sum(map(results.has, rows))
         part = '' if there == len(rows) else f', {there} of {len(rows)} rows so far'
         return results, f'{stage} clips a row{part}'
+
+    def _further(self, complete: Results) -> Iterator[str]:
+        """Yield methods and order of the last stage that some rows have, if it is a later one."""
+        for stage in reversed(self._stages):
+            found = self._results[stage]
+            if found is complete:
+                return
+            ready = [name for name in ROWS_SIMULATED if found.evaluations(name)]
+            if len(ready) > 1:
+                heading = f'{stage} clips a row, {len(ready)} of {len(ROWS_SIMULATED)} rows so far'
+                yield f'## Table 1: {heading}\n\n{found.methods(TABLE_1, VIEWS).markdown()}'
+                order = found.order()
+                rows = [
+                    row
+                    for row in order.rows
+                    if all(found.evaluations(str(name)) for name in row[:2])
+                ]
+                yield f"## The paper's order: {heading}\n\n{replace(order, rows=rows).markdown()}"
+                return
 
     def _curve(self) -> Table:
         """Return J of moving objects of all rows and stages, with true and other commands."""

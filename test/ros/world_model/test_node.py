@@ -430,9 +430,7 @@ def test_a_chunk_waits_for_a_reliable_subscriber_of_one_chunks_depth(client, ros
         client.send_scene()
         client.send_trajectory()
         time.sleep(1.0)  # the subscriber does something else while the burst comes
-        viewer.wait(
-            lambda: all(len(viewer.received[t]) >= NUM_FRAMES for t in topics), 'a chunk'
-        )
+        viewer.wait(lambda: all(len(viewer.received[t]) >= NUM_FRAMES for t in topics), 'a chunk')
         for topic in topics:
             assert len(viewer.received[topic]) == NUM_FRAMES
             assert set(np.diff(stamps(viewer.received[topic]))) == {FRAME_NS}
