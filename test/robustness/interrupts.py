@@ -284,6 +284,8 @@ class Attack:
         lines = [line for line in self._log().splitlines() if line.strip()]
         if not status or (lines and 'mtv-world: stopped' in lines[-1]):
             return ''
+        if status < 0 and not lines and not out.exists():
+            return ''  # it was still being imported, where the signal itself ends it
         return self._differences(out) and f'its last lines are {lines[-2:]}'
 
     def _check_processes(self) -> str:
