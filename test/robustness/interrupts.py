@@ -227,6 +227,19 @@ def content(path: Path) -> Any:
     return None
 
 
+def wait_until_imported(process: subprocess.Popen) -> None:
+    """Wait until a command handles signals, or ends.
+
+    A signal while it is still imported ends it without a word, as it is meant to.
+    """
+    while process.poll() is None:
+        status = Path(f'/proc/{process.pid}/status').read_text()
+        caught = int(status.partition('SigCgt:')[2].split()[0], 16)
+        if caught >> (signal.SIGTERM - 1) & 1:
+            return
+        time.sleep(0.01)
+
+
 class Attack:
     """Interrupts one command.
 
@@ -256,7 +269,9 @@ class Attack:
             try:
                 process.wait(after_s)
             except subprocess.TimeoutExpired:
-                (os.killpg if is_group else os.kill)(process.pid, number)
+                wait_until_imported(process)
+                if process.poll() is None:
+                    (os.killpg if is_group else os.kill)(process.pid, number)
             sent_s = time.monotonic()
             try:
                 status = process.wait(FROZEN_S)
@@ -284,8 +299,6 @@ class Attack:
         lines = [line for line in self._log().splitlines() if line.strip()]
         if not status or (lines and 'mtv-world: stopped' in lines[-1]):
             return ''
-        if status < 0 and not lines and not out.exists():
-            return ''  # it was still being imported, where the signal itself ends it
         return self._differences(out) and f'its last lines are {lines[-2:]}'
 
     def _check_processes(self) -> str:

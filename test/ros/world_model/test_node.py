@@ -423,15 +423,17 @@ def test_diagnostics_say_how_it_is(client):
 
 
 def test_a_chunk_waits_for_a_reliable_subscriber_of_one_chunks_depth(client, ros):
-    viewer, topics = ros.Client(), list(PREDICTED.values())
+    viewer = ros.Client()
     try:
-        viewer.connect_outputs(dict.fromkeys(topics, Image), depth=NUM_FRAMES)
-        _wait_until_known(client, topics)
+        viewer.connect_outputs({t: OUTPUTS[t] for t in FRAME_TOPICS}, depth=NUM_FRAMES)
+        _wait_until_known(client, FRAME_TOPICS)
         client.send_scene()
         client.send_trajectory()
         time.sleep(1.0)  # the subscriber does something else while the burst comes
-        viewer.wait(lambda: all(len(viewer.received[t]) >= NUM_FRAMES for t in topics), 'a chunk')
-        for topic in topics:
+        for topic in FRAME_TOPICS:
+            wait_for_frames(viewer, NUM_FRAMES, topic)
+        client.wait_for_all(FRAME_TOPICS)
+        for topic in FRAME_TOPICS:
             assert len(viewer.received[topic]) == NUM_FRAMES
             assert set(np.diff(stamps(viewer.received[topic]))) == {FRAME_NS}
     finally:
