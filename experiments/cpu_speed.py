@@ -114,7 +114,7 @@ def step_times(options: argparse.Namespace, checkout: Path) -> dict[str, Any]:
 
 
 def chunk_times(options: argparse.Namespace) -> dict[str, Any]:
-    """Return CPU times [s] of chunks of `bundled-paper`; the frames of the last are written."""
+    """Return CPU times [s] of chunks of `bundled-paper`; the frames of the first are written."""
     from mtv_world_ros.control.control import ControlInputs
     from mtv_world_ros.core.files import share_path
     from mtv_world_ros.data.recording import load_recording
@@ -147,7 +147,7 @@ def chunk_times(options: argparse.Namespace) -> dict[str, Any]:
             should_stop=lambda: False,
         )
         times.append(time.process_time() - begun)
-        if len(times) == 1:  # later ones begin with other frames, so that differences add up
+        if len(times) == 1:  # differences of later ones add up: they begin with these frames
             np.save(options.work / f'{_file_name(options.only)}.npy', frames)
     return {'chunk': times[WARM_UP:]}
 

@@ -14,8 +14,11 @@ from mtv_world_ros.model.transformer.attention import cpu_multiplies_bfloat16
 
 Module = TypeVar('Module', bound=nn.Module)
 
-#: settings of glibc's allocator (`malloc.h`), and variables by which a user sets them
-_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
+#: number of glibc's setting of the free memory at the heap's end that is returned (`malloc.h`)
+_M_TRIM_THRESHOLD = -1
+#: number of glibc's setting of the blocks that are taken from the system one by one (`malloc.h`)
+_M_MMAP_MAX = -4
+#: environment variables of glibc's allocator
 _ALLOCATOR_VARIABLES = ('MALLOC_MMAP_MAX_', 'MALLOC_TRIM_THRESHOLD_', 'GLIBC_TUNABLES')
 _DTYPES = {'float32': torch.float32, 'bfloat16': torch.bfloat16}
 
