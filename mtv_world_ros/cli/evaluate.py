@@ -182,6 +182,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     write_comparison(summaries, arguments.out)
     for entry, summary in zip(entries, summaries, strict=True):
         print(f'{entry.label}: {summary.following.line}; {in_short(summary)}')
+        if summary.dreams.line:
+            print(f'{entry.label}: {summary.dreams.line}')
     print(f'tables: {" ".join(str(folder / "tables.md") for folder in folders)}')
     if arguments.report:
         from mtv_world_ros.reports.evaluation_page import write_report

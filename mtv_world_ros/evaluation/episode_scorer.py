@@ -11,7 +11,8 @@ import time
 
 import numpy as np
 
-from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.cameras.motion import Motion
+from mtv_world_ros.core.data_types import ByteArray, ObjectMasks
 from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.evaluation.imagined_stretches import (
@@ -24,6 +25,7 @@ from mtv_world_ros.evaluation.imagined_stretches import (
 )
 from mtv_world_ros.evaluation.metrics.arm_masks import arm_scenes, ArmScene
 from mtv_world_ros.evaluation.metrics.feature_store import feature_path, FeatureTaker
+from mtv_world_ros.evaluation.metrics.grasp_outcomes import grasp_outcomes, GraspOutcome
 from mtv_world_ros.evaluation.metrics.image_quality import ImageQuality
 from mtv_world_ros.evaluation.metrics.jaccard_scores import (
     find_masks,
@@ -102,6 +104,7 @@ class _Found:
 
     task: TaskSpec | None
     rows: list[ScoreRow] = field(default_factory=list)
+    grasps: list[GraspOutcome] = field(default_factory=list)
     shown: list[StoredRollout] = field(default_factory=list)
     quality: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
     pictures: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
@@ -178,6 +181,7 @@ class EpisodeScorer:
             zero_shot=job.zero_shot,
             outcome=recording.outcome,
             rows=tuple(found.rows),
+            grasps=tuple(found.grasps),
             quality=_mean_quality(found.quality),
             pictures=mean_pictures(found.pictures),
             num_chunks=len(found.pictures),
@@ -244,6 +248,7 @@ class EpisodeScorer:
         views = self.pipeline.spec.views
         with found.timed('scoring'):
             found.rows += score_rows(stretch, views, truth, predicted, others, masks)
+            found.grasps += self._grasps(recording, stretch, truth, masks)
         with found.timed('features'):
             found.quality.append((stretch.num_frames, self._quality(frames, real)))
             pictures = self._pictures(stretch, frames, shuffled, found.scenes)
@@ -259,6 +264,19 @@ class EpisodeScorer:
         )
         found.shown.append(stored)
         return chunks
+
+    def _grasps(
+        self, recording: Recording, stretch: Stretch, truth: Truth, masks: ObjectMasks
+    ) -> tuple[GraspOutcome, ...]:
+        """Return the outcomes of the grasps of a stretch, recorded and imagined."""
+        motion = Motion.of(
+            self.pipeline.robot, recording.cameras_at(stretch.start), stretch.positions
+        )
+        first = truth.first.masks[:, :, :1]
+        real, imagined = (
+            np.concatenate([first, found.masks], axis=2) for found in (truth.masks, masks)
+        )
+        return grasp_outcomes(motion, truth.names, real, imagined, stretch=stretch.index)
 
     def _imagine(
         self,

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.core.data_types import WorldModelSpec
+from mtv_world_ros.evaluation.metrics.grasp_outcomes import Dreams, GRASP_RULE
 from mtv_world_ros.evaluation.metrics.horizon import by_chunk, Curve, horizon_curve
 from mtv_world_ros.evaluation.metrics.jaccard_scores import (
     DISTANCES,
@@ -139,6 +140,7 @@ class EvaluationSummary:
             'num_episodes_with_true_masks': self.num_true,
             'moving_rule': MOVING_RULE.format(source=source),
             'follows_commands': asdict(self.following),
+            'dreams': {**asdict(self.dreams), 'grasp_rule': GRASP_RULE},
             'pictures': {
                 view or 'overall': {name: asdict(found) for name, found in estimates.items()}
                 for view, estimates in self.pictures.items()
@@ -174,6 +176,21 @@ class EvaluationSummary:
         """Verdict whether the model follows the commands, from its pictures and moving objects."""
         objects = self.estimates(None).get('margin_moving')
         return following(self.pictures[None], objects, self.num_compared)
+
+    @property
+    def dreams(self) -> Dreams:
+        """Grasps that are imagined otherwise than they end, and motion of objects."""
+        motions: dict[tuple[str, int, str], list[bool]] = {}
+        for result in self.results:
+            for row in result.rows:
+                if row.name and np.isfinite(row.j):
+                    seen = motions.setdefault(
+                        (result.episode, row.stretch, row.name), [False, False]
+                    )
+                    seen[0] |= row.moving
+                    seen[1] |= row.moving_imagined
+        grasps = [grasp for result in self.results for grasp in result.grasps]
+        return Dreams.of(grasps, [(real, imagined) for real, imagined in motions.values()])
 
     @property
     def num_compared(self) -> tuple[int, int] | None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import ByteArray, FloatArray, ObjectMasks
 from mtv_world_ros.evaluation.imagined_stretches import Stretch
+from mtv_world_ros.evaluation.metrics.grasp_outcomes import GraspOutcome
 from mtv_world_ros.evaluation.metrics.jaccard_scores import episode_means, QUALITY, ScoreRow
 from mtv_world_ros.rollout.prediction import Prediction
 from mtv_world_ros.viewing.scored_rollout import StoredRollout
@@ -42,6 +43,7 @@ class EpisodeResult:
             empty if the recorded frames were not judged.
         resumed: features of the success estimate if only the last chunk is imagined.
         has_ids: recorded object identities show which objects move.
+        grasps: outcomes of all attempts to grasp; empty in results of earlier versions.
     """
 
     episode: str
@@ -63,6 +65,7 @@ class EpisodeResult:
     features: Mapping[str, float] = field(default_factory=dict)
     observed: Mapping[str, float] = field(default_factory=dict)
     resumed: Mapping[str, float] = field(default_factory=dict)
+    grasps: tuple[GraspOutcome, ...] = ()
 
     def means(self, view: str | None) -> dict[str, float]:
         """Return the numbers of a view (None = all views) that are averaged over episodes."""
@@ -80,6 +83,7 @@ class EpisodeResult:
         """Return the inverse of `as_json`, read back from a file."""
         read: dict[str, Any] = dict(values)
         read['rows'] = tuple(ScoreRow.from_json(row) for row in values['rows'])
+        read['grasps'] = tuple(GraspOutcome(**grasp) for grasp in values.get('grasps', ()))
         read['reasons'], read['notes'] = tuple(values['reasons']), tuple(values['notes'])
         read['probability'] = np.nan if values['probability'] is None else values['probability']
         ends = values.get('interval') or (None, None)

@@ -9,6 +9,7 @@ import io
 from mtv_world_ros.core.documents import DASH, Table, with_interval
 from mtv_world_ros.core.files import write_json, write_whole
 from mtv_world_ros.evaluation.evaluation_summary import ALL, EvaluationSummary, Group, NOT_MEASURED
+from mtv_world_ros.evaluation.metrics.grasp_outcomes import GRASP_RULE
 from mtv_world_ros.evaluation.metrics.jaccard_scores import FRAME_FIELDS
 from mtv_world_ros.evaluation.metrics.picture_scores import KINDS, MARGIN_KINDS, MEASURES
 from mtv_world_ros.evaluation.metrics.statistics import Estimate, METHOD
@@ -99,6 +100,7 @@ def markdown(summary: EvaluationSummary) -> str:
         BRACKETS,
         view_table(summary),
         _why_dashes(summary),
+        dreams_table(summary),
         *group_tables(summary),
         controls_table(summary),
         chunk_table(summary),
@@ -157,6 +159,22 @@ def controls_table(summary: EvaluationSummary) -> Table:
     ]
     rows = [row for row in rows if set(row[1:]) != {DASH}]
     return Table(head=['J of objects that move', *views], rows=rows)
+
+
+def dreams_table(summary: EvaluationSummary) -> Table:
+    """Return how often imagined objects move and are grasped otherwise than the real ones."""
+    found = summary.dreams
+    rows = {
+        'missed grasps that are dreamt as grasps': found.dreamt,
+        'grasps that are imagined as missed': found.missed,
+        'objects that move in imagination and in truth, of those in imagination': found.precision,
+        'objects that move in imagination and in truth, of those in truth': found.recall,
+    }
+    return Table(
+        head=['motion of objects', 'cases (share, 95 % Wilson interval)'],
+        rows=[[words, share.text] for words, share in rows.items()],
+        caption=f'Grasps and motion of objects: {GRASP_RULE}',
+    )
 
 
 def chunk_table(summary: EvaluationSummary) -> Table | None:

@@ -76,7 +76,7 @@ def _each(
 
 
 def _tables_of_numbers(found: EvaluationSummary) -> list[Table]:
-    return [tables.view_table(found), *tables.group_tables(found)]
+    return [tables.view_table(found), tables.dreams_table(found), *tables.group_tables(found)]
 
 
 def _statuses(found: EvaluationSummary) -> Table:

@@ -11,6 +11,7 @@ import numpy as np
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, FloatArray, ObjectMasks
 from mtv_world_ros.evaluation.imagined_stretches import Stretch
 from mtv_world_ros.evaluation.metrics.object_scores import (
+    displaced_objects,
     moving_objects,
     object_scores,
     ObjectScores,
@@ -57,7 +58,8 @@ class ScoreRow:
         j_frames: (T,) J per frame.
         j_copy_frames: J per frame of the held first frame.
         j_shuffled_frames: J per frame with the actions of another episode; empty = not imagined.
-        moving_imagined: whether it moves in the predicted frames, by the same rule.
+        moving_imagined: whether it moves in the predicted frames, by the same rule, or a part of
+            it is seen elsewhere (see `displaced_objects`).
         f: mean boundary F over frames.
         f_copy: F of the held first frame.
         f_self: F of the recorded frames themselves.
@@ -239,7 +241,9 @@ def score_rows(
         masks: masks in the predicted frames; None = what is imagined to move is not known.
     """
     first = truth.first.masks[:, :, 0]
-    imagined = np.zeros_like(truth.moving) if masks is None else moving_objects(masks.masks, first)
+    imagined = np.zeros_like(truth.moving)
+    if masks is not None:
+        imagined = moving_objects(masks.masks, first) | displaced_objects(masks.masks, first)
     scores = {**others, 'copy': object_scores(held_masks(first, truth.masks), truth.masks)}
     rows = []
     for v, view in enumerate(views):

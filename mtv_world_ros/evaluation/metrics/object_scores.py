@@ -119,6 +119,33 @@ def _boundary(mask: BoolArray) -> BoolArray:
     return found
 
 
+#: an object that is seen twice has moved if this share of its first area is seen elsewhere
+COPY_AREA = 1 / 3
+#: distance from the first mask that is elsewhere [fraction of image width]
+COPY_DISTANCE = 0.03
+
+
+def displaced_objects(masks: BoolArray, first: BoolArray) -> BoolArray:
+    """Return (V, O) whether a part of an object is seen away from its first mask.
+
+    A second object that grows elsewhere while the first one stays is motion, too, which
+    `moving_objects` does not see. Frames 1..T of at least two such frames count.
+
+    Args:
+        masks: (V, O, T, H, W) masks in the frames.
+        first: (V, O, H, W) masks in frame 0.
+    """
+    size = 2 * round(COPY_DISTANCE * first.shape[-1]) + 1
+    shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    found = np.zeros(first.shape[:2], np.bool_)
+    for place in np.ndindex(found.shape):
+        near = cv2.dilate(first[place].astype(np.uint8), shape) > 0
+        away = (masks[place] & ~near).sum((-2, -1))
+        area = first[place].sum()
+        found[place] = area > 0 and (away >= COPY_AREA * area).sum() >= 2
+    return found
+
+
 def moving_objects(true: BoolArray, first: BoolArray) -> BoolArray:
     """Return (V, O) whether an object moves in the recording.
 
