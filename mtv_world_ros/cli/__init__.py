@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 import signal
 
 # Ctrl-C while the rest is imported ends the process, without a traceback; see `main` for later
@@ -44,6 +44,7 @@ from mtv_world_ros.core.processes import (  # noqa: E402
     escape_unprintable_output,
     stopped_by_sigterm,
 )
+from mtv_world_ros.core.writer_lock import only_writer  # noqa: E402
 
 if _interrupt is signal.default_int_handler:
     with suppress(ValueError):
@@ -268,12 +269,27 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
         hints = [f'{word}{nearest(word, leaf._option_string_actions)}' for word in more]
         parser.error(f'unrecognized arguments: {" ".join(hints)}')
     _check_texts(leaf, arguments)
-    for name in _OUTPUTS:
-        given = getattr(arguments, name, None)
-        path = getattr(arguments, f'default_{name}', None) if given is None else given
-        if isinstance(path, Path):
-            check_output(path, f'--{name}')
+    for path, option in _outputs(arguments):
+        check_output(path, option)
     return arguments
+
+
+def _outputs(arguments: argparse.Namespace) -> list[tuple[Path, str]]:
+    """Return the paths that a command is to write, with the options that name them."""
+    found = []
+    for name in _OUTPUTS:
+        path = getattr(arguments, name, None)
+        if path is None:
+            path = getattr(arguments, f'default_{name}', None)
+        path = path(arguments) if callable(path) else path
+        found += [(path, f'--{name}')] if isinstance(path, Path) else []
+    watched = getattr(getattr(arguments, 'watch', None), 'file', None)
+    return [*found, *([(watched, '--watch')] if isinstance(watched, Path) else [])]
+
+
+def _is_helper_rank() -> bool:
+    """Return whether `torchrun` started this process beside the one that writes."""
+    return os.environ.get('RANK', '0') != '0' and 'WORLD_SIZE' in os.environ
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -288,7 +304,9 @@ def main(argv: list[str] | None = None) -> int:
     except MtvWorldError as error:  # of the installation, or of an option that only prints
         return _said(str(error), 1)
     try:
-        with stopped_by_sigterm():
+        with stopped_by_sigterm(), ExitStack() as locks:
+            for path, option in [] if _is_helper_rank() else _outputs(arguments):
+                locks.enter_context(only_writer(path, option))
             return arguments.handler(arguments)
     except TrainingInterrupted as stopped:
         again = shlex.join(['mtv-world', *arguments.command_line])

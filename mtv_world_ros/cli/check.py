@@ -49,7 +49,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--out', type=Path, help='folder of the report; default: out/doctor/<episode>'
     )
-    parser.set_defaults(handler=_doctor, default_out=Path('out/doctor'))
+    parser.set_defaults(handler=_doctor, default_out=_default_out)
+
+
+def _default_out(arguments: argparse.Namespace) -> Path:
+    name = 'live' if arguments.episode is None else arguments.episode.resolve().name
+    return Path('out/doctor') / name
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
@@ -59,7 +64,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
         paths = _episodes_in(arguments.episode)
         if paths:
             return _check_folder(arguments, paths)
-        return _check(arguments, arguments.episode, arguments.episode.name)
+        return _check(arguments, arguments.episode)
     from mtv_world_ros.inspection.live import record_topics
 
     if not arguments.views:
@@ -71,7 +76,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
             f'recording {", ".join(arguments.views)} for {arguments.seconds:g} s', file=sys.stderr
         )
         bag = record_topics(arguments.views, Path(folder) / 'live', arguments.seconds)
-        return _check(arguments, bag, 'live')
+        return _check(arguments, bag)
 
 
 def _episodes_in(path: Path) -> list[Path]:
@@ -111,7 +116,7 @@ def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
             with_masks=True,
         ),
     )
-    out = arguments.out or Path('out/doctor') / arguments.episode.resolve().name
+    out = arguments.out or _default_out(arguments)
     picture = folder_picture(pictures)
     if picture is not None:
         write_png(out / 'episodes.png', picture)
@@ -129,7 +134,7 @@ def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
     return EXIT_STATUS[found.verdict]
 
 
-def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
+def _check(arguments: argparse.Namespace, path: Path) -> int:
     from functools import partial
 
     from tqdm import tqdm
@@ -145,7 +150,7 @@ def _check(arguments: argparse.Namespace, path: Path, name: str) -> int:
     )
     bar = partial(tqdm, desc='comparing', unit='view', disable=None)
     inspection = inspector.inspect(episode, bar)
-    out = arguments.out or Path('out/doctor') / name
+    out = arguments.out or _default_out(arguments)
     _write_inspection(inspector, episode, inspection, out)
     print(to_text(inspection))
     print(f"{inspection.verdict}: see '{out / 'report.md'}'")

@@ -49,7 +49,13 @@ def add_replay(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(
         handler=_replay,
         takes_more=lambda chosen, _: not chosen.offline,
+        default_out=_default_out,
     )
+
+
+def _default_out(arguments: argparse.Namespace) -> Path | None:
+    name = arguments.episode.resolve().name
+    return Path('out') / f'{name}_predictions' if arguments.offline else None
 
 
 def _replay(arguments: argparse.Namespace) -> int:
@@ -64,7 +70,8 @@ def _replay(arguments: argparse.Namespace) -> int:
 
     (arguments.checkpoint,) = open_checkpoints(arguments.device, arguments.checkpoint)
     arguments.task = named_here(arguments.task, [arguments.episode])
-    out = arguments.out or Path('out') / f'{arguments.episode.name}_predictions'
+    out = arguments.out or _default_out(arguments)
+    assert out is not None
     check_free(out, arguments.overwrite)
     summary = replay_offline(
         replace(pipeline_of(arguments), describer=asked_describer(arguments.describer)),

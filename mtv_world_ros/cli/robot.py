@@ -27,7 +27,11 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--out', type=Path, help='YAML to write (of a URDF); default: beside the URDF'
     )
     parser.add_argument('--picture', type=Path, help='PNG to draw; default: out/robot/<name>.png')
-    parser.set_defaults(handler=_robot, default_picture=Path('out/robot'))
+    parser.set_defaults(handler=_robot, default_picture=_default_picture)
+
+
+def _default_picture(arguments: argparse.Namespace) -> Path:
+    return Path('out/robot') / f'{Path(arguments.file).stem}.png'
 
 
 def _robot(arguments: argparse.Namespace) -> int:

@@ -20,6 +20,7 @@ import tempfile
 from typing import Any
 
 from mtv_world_ros.core.errors import ConfigError, nearest
+from mtv_world_ros.core.writer_lock import LOCK_NAME
 
 PACKAGE = 'mtv_world_ros'
 #: arguments of renameat2(2): paths as they are, and exchange both [linux/fcntl.h, linux/fs.h]
@@ -113,9 +114,9 @@ def content_digest(folder: Path, without: Collection[str] = ()) -> str:
         folder: searched recursively; or a file.
         without: names of files to leave out.
     """
-    digest = hashlib.sha256()
+    digest, left_out = hashlib.sha256(), {LOCK_NAME, *without}
     paths = [folder] if folder.is_file() else folder.rglob('*')
-    files = (path for path in paths if path.is_file() and path.name not in without)
+    files = (path for path in paths if path.is_file() and path.name not in left_out)
     for file in sorted(files):
         digest.update(file.relative_to(folder).as_posix().encode())
         with file.open('rb') as opened:
@@ -142,7 +143,9 @@ def check_free(path: Path, overwrite: bool, instead: str = '--out') -> None:
 
 def is_free(path: Path) -> bool:
     """Return True if nothing is there but, at most, an empty folder."""
-    return not any(path.iterdir()) if path.is_dir() else not path.exists()
+    if not path.is_dir():
+        return not path.exists()
+    return all(entry.name == LOCK_NAME for entry in path.iterdir())
 
 
 def check_output(path: Path, option: str = '--out') -> None:

@@ -116,7 +116,11 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--out', type=Path, help='calibration file to write; default: out/camera/<view>.yaml'
     )
-    parser.set_defaults(handler=_calibrate_camera, default_out=Path('out/camera'))
+    parser.set_defaults(handler=_calibrate_camera, default_out=_default_out)
+
+
+def _default_out(arguments: argparse.Namespace) -> Path:
+    return Path('out/camera') / f'{"_".join(arguments.views)}.yaml'
 
 
 def _interval(text: str) -> tuple[float, float]:

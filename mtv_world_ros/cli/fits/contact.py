@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.shared_options import add_options, names, number_or_0
-from mtv_world_ros.core.files import check_free, check_output
+from mtv_world_ros.core.files import check_free
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -53,11 +53,10 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--threads', type=number_or_0, default=0, help='CPU threads; 0 = all but one'
     )
     add_options(parser, 'overwrite')
-    parser.set_defaults(handler=_fit)
+    parser.set_defaults(handler=_fit, default_out=lambda given: given.checkpoint)
 
 
 def _fit(arguments: argparse.Namespace) -> int:
-    check_output(arguments.checkpoint)  # before the slow imports
     from tqdm import tqdm
 
     from mtv_world_ros.core.processes import threads_each

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +13,7 @@ from mtv_world_ros.cli.evaluate import load_pipelines, say_failed
 from mtv_world_ros.cli.shared_options import add_options, open_checkpoints, provenance
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.files import check_free
+from mtv_world_ros.core.writer_lock import only_writer
 
 if TYPE_CHECKING:
     from mtv_world_ros.data.splits import Selection
@@ -69,20 +70,31 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _calibrate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.splits import select
-    from mtv_world_ros.success.calibration import save_fit
 
     (checkpoint,) = open_checkpoints(arguments.device, arguments.checkpoint)
     _check_places(arguments, checkpoint)
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
     from mtv_world_ros.data.splits import refuse_test_kinds
-    from mtv_world_ros.evaluation.fit import calibrate, samples_of
-    from mtv_world_ros.reports.calibration_report import write_calibration_report
     from mtv_world_ros.success.own_tasks import named_here
 
     print(f'{arguments.dataset}: {selection}')
     arguments.task = named_here(arguments.task, selection.paths)
     refuse_test_kinds(selection.paths, 'calibration')
     made = {**provenance(arguments), 'dataset': f'{arguments.dataset}: {selection}'}
+    with only_writer(checkpoint.folder, '--checkpoint') if arguments.store else nullcontext():
+        return _fit_and_store(arguments, checkpoint, selection, made)
+
+
+def _fit_and_store(
+    arguments: argparse.Namespace,
+    checkpoint: Checkpoint,
+    selection: Selection,
+    made: dict[str, str],
+) -> int:
+    from mtv_world_ros.evaluation.fit import calibrate, samples_of
+    from mtv_world_ros.reports.calibration_report import write_calibration_report
+    from mtv_world_ros.success.calibration import save_fit
+
     runs = _imagine(arguments, checkpoint, selection)
     failed = say_failed([run.failed for run in runs])  # before what is too few is refused
     segmenter = str(runs[0].settings['segmenter'])

@@ -18,6 +18,7 @@ from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
 
 from mtv_world_ros.core.errors import ConfigError, EpisodeError
+from mtv_world_ros.core.writer_lock import only_writer
 from mtv_world_ros.data.bag.metadata import Qos
 from mtv_world_ros.data.bag.writer import BagWriter
 from mtv_world_ros.ros.messages.conversions import (
@@ -275,6 +276,15 @@ def main(args: Sequence[str] | None = None) -> int:
     """Record until SIGINT or SIGTERM; return the exit status."""
     arguments = list(sys.argv if args is None else ('recorder', *args))
     options = parse(remove_ros_args(arguments)[1:])
+    try:
+        with only_writer(options.out, 'folder'):
+            return _record(options, arguments)
+    except ConfigError as error:
+        sys.stderr.write(f'ConfigError: {error}\n')
+        return 1
+
+
+def _record(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     return run(
         lambda: Recorder(options),
         arguments,
