@@ -88,11 +88,14 @@ class ContextInput:
         vocabulary: number of indices; 0 = tokens are vectors.
         joins: `append`: tokens stand behind the text tokens, in an order that the model knows;
             `add`: the mean of the vectors is added to every text token.
+        hidden_size: width of an MLP of three layers that embeds vectors; 0 = two layers of the
+            transformer's width.
     """
 
     vector_size: int = 0
     vocabulary: int = 0
     joins: Literal['append', 'add'] = 'append'
+    hidden_size: int = 0
 
     def __post_init__(self) -> None:
         if (self.vector_size > 0) == (self.vocabulary > 0):
@@ -113,7 +116,7 @@ class FrameInput:
 
     Attributes:
         vector_size: length D of the vector.
-        hidden_size: width of the MLP that embeds it, at most the transformer's.
+        hidden_size: width of the MLP of three layers that embeds it.
     """
 
     vector_size: int

@@ -22,25 +22,30 @@ from mtv_world_ros.control.control import (
     InputLayout,
 )
 from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.robot.model import RobotModel
 
 #: Ctrl-World clips at the percentiles
 CLIP = 1.0
 #: width of Ctrl-World's MLP
 HIDDEN_SIZE = 1024
-#: numbers of an arm
-PARTS = ('x', 'y', 'z', 'roll', 'pitch', 'yaw', 'opening')
-#: cosine of the pitch below which yaw is not told from roll
-VERTICAL = 1e-9
+#: numbers of an arm: place, first two columns of the rotation, opening
+PARTS = (
+    'x', 'y', 'z',
+    'x_axis_x', 'x_axis_y', 'x_axis_z', 'y_axis_x', 'y_axis_y', 'y_axis_z',
+    'opening',
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EndEffectorMlp(Control):
     """Ctrl-World's control: pose and opening of every gripper, a vector a frame.
 
-    Absolute poses (x, y, z, Euler angles) and openings are scaled by the 1st and 99th percentile
-    to [-1, 1] and clipped; an MLP a frame; each frame cross-attends to its own vector alone; 5 %
-    of the training samples go without.
+    Absolute poses and openings are scaled by the 1st and 99th percentile to [-1, 1] and clipped;
+    an MLP of three layers, 1,024 wide; each frame cross-attends to its own vector alone; 5 % of
+    the training samples go without, so that `sampling.guidance_scale` guides on the control.
+    Rotations are two columns of their matrix: the Euler angles of Ctrl-World jump by 2 pi where
+    tools point straight down.
 
     Attributes:
         scaling: percentiles in the training set.
@@ -57,12 +62,12 @@ class EndEffectorMlp(Control):
 
     @property
     def layout(self) -> InputLayout:
-        """A vector of 7 numbers an arm for each frame."""
+        """A vector of 10 numbers an arm for each frame."""
         size = len(self.scaling.names)
         return InputLayout(frame=FrameInput(vector_size=size, hidden_size=HIDDEN_SIZE))
 
     def make(self, scene: ControlScene) -> ControlInputs:
-        """Return (1 + T, 7 A) scaled numbers."""
+        """Return (1 + T, 10 A) scaled numbers."""
         self.scaling.check(feature_names(scene.motion.robot))
         scaled = self.scaling.apply(tool_features(scene.motion))
         return ControlInputs(num_frames=len(scaled) - 1, frame=scaled.astype(np.float32))
@@ -77,37 +82,31 @@ class EndEffectorMlp(Control):
         return self.scaling.state()
 
     def restored(self, state: Mapping[str, Any]) -> Self:
-        """Return the control with stored percentiles."""
+        """Return the control with stored percentiles.
+
+        Raises:
+            CheckpointError: they are of another robot, or of Euler angles.
+        """
+        names = [str(name) for name in state['names']]
+        if any(name.endswith(' roll') for name in names):
+            raise CheckpointError(
+                f'the control ee_mlp of this checkpoint has Euler angles ({names}); two columns '
+                'of the rotation are in their place now. Train it again'
+            )
         return replace(self, scaling=self.scaling.restored(state))
 
 
 def feature_names(robot: RobotModel) -> tuple[str, ...]:
-    """Return the 7 A names of what `tool_features` returns."""
+    """Return the 10 A names of what `tool_features` returns."""
     return tuple(f'{tool.arm} {part}' for tool in robot.tools for part in PARTS)
 
 
 def tool_features(motion: Motion) -> FloatArray:
-    """Return (N, 7 A): per arm x, y, z [m], roll, pitch, yaw [rad] and opening in [0, 1].
+    """Return (N, 10 A): per arm x, y, z [m], two columns of the rotation, opening in [0, 1].
 
-    Poses are those of the tool points in the base frame. Angles jump at +-pi, as they do in
-    Ctrl-World.
+    Poses are those of the tool points in the base frame.
     """
-    angles = roll_pitch_yaw(motion.tools[..., :3, :3])
-    rows = np.concatenate([motion.tool_points, angles, motion.openings[..., None]], axis=-1)
+    columns = motion.tools[..., :3, :2].swapaxes(-1, -2)
+    axes = columns.reshape(*columns.shape[:-2], 6)
+    rows = np.concatenate([motion.tool_points, axes, motion.openings[..., None]], axis=-1)
     return rows.swapaxes(0, 1).reshape(len(motion.positions), -1)
-
-
-def roll_pitch_yaw(rotations: FloatArray) -> FloatArray:
-    """Return (..., 3) angles [rad] of rotations (..., 3, 3): R = Rz(yaw) Ry(pitch) Rx(roll).
-
-    Where roll and yaw turn about the same axis, straight up and down, yaw is zero.
-    """
-    r = rotations
-    level = np.hypot(r[..., 0, 0], r[..., 1, 0])
-    pitch = np.arctan2(-r[..., 2, 0], level)
-    yaw = np.where(level < VERTICAL, 0.0, np.arctan2(r[..., 1, 0], r[..., 0, 0]))
-    sine, cosine = np.sin(yaw), np.cos(yaw)
-    roll = np.arctan2(
-        sine * r[..., 0, 2] - cosine * r[..., 1, 2], cosine * r[..., 1, 1] - sine * r[..., 0, 1]
-    )
-    return np.stack([roll, pitch, yaw], axis=-1)

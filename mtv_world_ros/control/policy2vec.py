@@ -21,14 +21,17 @@ from mtv_world_ros.control.control import (
 
 #: the range of a joint that rarely moves is next to nothing, so that scaled numbers need a bound
 CLIP = 1.5
+#: width of WorldEval's MLP for fewer than 500 numbers (wan_video_dit_act_embed.py)
+HIDDEN_SIZE = 1280
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Policy2Vec(Control):
     """World-Eval's control: the mean joint command of a chunk, as one context vector.
 
-    The mean passes through an MLP (linear, GELU, linear) and is added to every text token with a
-    learned scale (0.3 at first), in both branches of guidance.
+    The mean passes through an MLP of three layers, 1,280 wide, and is added to every text token
+    with a learned scale (0.1 at first), in both branches of guidance. WorldEval itself feeds a
+    latent of its policy; the mean command is the reading of the MTV-World paper.
 
     Attributes:
         scaling: percentiles of the joint positions in the training set.
@@ -45,7 +48,9 @@ class Policy2Vec(Control):
     def layout(self) -> InputLayout:
         """One vector that is added to every text token."""
         size = len(self.scaling.names)
-        return InputLayout(context=ContextInput(vector_size=size, joins='add'))
+        return InputLayout(
+            context=ContextInput(vector_size=size, joins='add', hidden_size=HIDDEN_SIZE)
+        )
 
     def make(self, scene: ControlScene) -> ControlInputs:
         """Return the mean of the chunk's commands, (1, J)."""

@@ -41,6 +41,7 @@ class Conditioning:
         context: (B, L) indices or (B, L, size) vectors of the control, where it feeds them.
         frame: (B, 1 + T, size) vectors of the control, where it feeds them.
         control_kept: (B,) bool, False = a sample without these two; None = all have them.
+        guides_control: whether guidance leads away from the sample without its control, too.
     """
 
     control: Tensor
@@ -56,6 +57,7 @@ class Conditioning:
     context: Tensor | None = None
     frame: Tensor | None = None
     control_kept: Tensor | None = None
+    guides_control: bool = False
 
     def with_noisy_history(self, noise: Tensor) -> Conditioning:
         """Return the same with noise (B, V, C, P, h, w) mixed into the clean history."""
@@ -84,6 +86,23 @@ class Conditioning:
         return replace(self, start=self.start * same.unsqueeze(3), anchor=shown * ~same)
 
     @property
+    def unguided(self) -> Conditioning | None:
+        """Conditioning that guidance leads away from; None = there is none.
+
+        It has the negative text, and no control where the model was trained with samples without.
+        """
+        if self.guides_control:
+            kept = torch.zeros(len(self.control), dtype=torch.bool, device=self.control.device)
+            return replace(
+                self,
+                text=self.text if self.negative_text is None else self.negative_text,
+                control=torch.zeros_like(self.control),
+                start_control=torch.zeros_like(self.start_control),
+                control_kept=kept,
+            )
+        return None if self.negative_text is None else replace(self, text=self.negative_text)
+
+    @property
     def has_control_tokens(self) -> bool:
         """True if the control provides tokens for the cross-attention."""
         return self.context is not None or self.frame is not None
@@ -91,7 +110,8 @@ class Conditioning:
     def part(self, samples: slice) -> Conditioning:
         """Return that of some samples."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{n: v[samples] for n, v in values.items() if v is not None})
+        tensors = {name: v for name, v in values.items() if isinstance(v, Tensor)}
+        return replace(self, **{name: v[samples] for name, v in tensors.items()})
 
     def in_dtype(self, dtype: torch.dtype) -> Conditioning:
         """Return the same with latents and tokens in a number format."""

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from mtv_world_ros.control.control import ControlInputs
+from mtv_world_ros.control.registry import control_class
 from mtv_world_ros.core.data_types import ByteArray, FloatArray, History
 from mtv_world_ros.core.errors import CheckpointError, ModelMemoryError, RolloutPreempted
 from mtv_world_ros.model.card import check_same_model
@@ -76,8 +77,8 @@ def sample_latents(
         seed: seed of the noise.
         num_inference_steps: denoising steps a chunk.
         should_stop: asked between steps.
-        guidance_scale: factor of the difference between the predictions for `conditioning.text`
-            and for `conditioning.negative_text`; 1 = no guidance, and half the work.
+        guidance_scale: factor of the difference between the predictions for the conditioning and
+            for `conditioning.unguided`; 1 = no guidance, and half the work.
 
     Raises:
         RolloutPreempted: `should_stop` said so between two steps.
@@ -99,10 +100,8 @@ def sample_latents(
                 f'given up after {step} of {num_inference_steps} denoising steps'
             )
         out = denoise(transformer, latents, timestep, conditioning, conditioning.text)
-        if guidance_scale != 1.0 and conditioning.negative_text is not None:
-            away = denoise(
-                transformer, latents, timestep, conditioning, conditioning.negative_text
-            )
+        if guidance_scale != 1.0 and (unguided := conditioning.unguided) is not None:
+            away = denoise(transformer, latents, timestep, unguided, unguided.text)
             out = away + guidance_scale * (out - away)
         flow = flow_of(transformer, out, latents, sigmas[step].to(device))
         latents = scheduler.step(flow, timestep, latents, return_dict=False)[0]  # type: ignore[arg-type]
@@ -311,6 +310,8 @@ class DiffusionWorldModel:
     def _condition(self, start_frame: ByteArray, control: ControlInputs) -> Conditioning:
         start = self._tensor(start_frame)
         latents = condition(self.autoencoder, start, ControlBatch.of([control]).to(self.device))
+        if self.card.guidance_scale != 1.0 and control_class(self.card.control).dropout:
+            latents = replace(latents, guides_control=True)
         return self._with_context(latents, start)
 
     def _with_history(self, latents: Conditioning, history: History) -> Conditioning:

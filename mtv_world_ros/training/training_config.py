@@ -175,7 +175,8 @@ class SamplingConfig(Schema):
         default=1.0,
         ge=-1000,
         le=1000,
-        description='text guidance; 1 = none, which halves the time',
+        description='guidance on the text, and on a control that samples were trained without '
+        '(ee_mlp); 1 = none, which halves the time',
     )
     negative_prompt: str = Field(default='', description='text that guidance leads away from')
     scene_memory: bool = Field(

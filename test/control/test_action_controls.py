@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -11,7 +12,7 @@ import pytest
 
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.control.control import Control, ControlOptions, ControlScene
-from mtv_world_ros.control.ee_mlp import EndEffectorMlp, roll_pitch_yaw, tool_features
+from mtv_world_ros.control.ee_mlp import EndEffectorMlp, tool_features
 from mtv_world_ros.control.registry import CONTROL_FILE, create_control, load_control, save_control
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.robot.model import RobotModel
@@ -54,33 +55,38 @@ def fitted(name: str, options: ControlOptions, motions: list[Motion]) -> Control
     return create_control(name, options).fitted(motions)
 
 
-def test_angles_are_those_of_pinocchio():
-    rng = np.random.default_rng(0)
-    rotations = np.stack(
-        [pin.Quaternion(rng.normal(size=4)).normalized().matrix() for _ in range(50)]
-    )
-    expected = [pin.rpy.matrixToRpy(rotation) for rotation in rotations]
-    np.testing.assert_allclose(roll_pitch_yaw(rotations), expected, atol=1e-9)
-
-
-def test_straight_down_yaw_is_zero_and_the_rotation_is_kept():
-    down = pin.rpy.rpyToMatrix(0.3, np.pi / 2, 0.2)
-    angles = roll_pitch_yaw(down)
-    assert angles[2] == 0
-    np.testing.assert_allclose(pin.rpy.rpyToMatrix(*angles), down, atol=1e-9)
-
-
-def test_tool_features_are_position_angles_and_opening_arm_by_arm(robot):
+def test_tool_features_are_position_rotation_and_opening_arm_by_arm(robot):
     positions = np.stack([robot.lower, (robot.lower + robot.upper) / 2])
     features = tool_features(Motion.of(robot, (), positions))
-    assert features.shape == (2, 14)
+    assert features.shape == (2, 20)
     poses, openings = robot.tool_poses(positions), robot.gripper_openings(positions)
     for arm in (0, 1):
-        rows = features[:, 7 * arm : 7 * arm + 7]
+        rows = features[:, 10 * arm : 10 * arm + 10]
         np.testing.assert_allclose(rows[:, :3], poses[arm, :, :3, 3])
-        rotations = [pin.rpy.rpyToMatrix(*row) for row in rows[:, 3:6]]
-        np.testing.assert_allclose(rotations, poses[arm, :, :3, :3], atol=1e-9)
-        np.testing.assert_allclose(rows[:, 6], openings[arm])
+        np.testing.assert_allclose(rows[:, 3:6], poses[arm, :, :3, 0])
+        np.testing.assert_allclose(rows[:, 6:9], poses[arm, :, :3, 1])
+        np.testing.assert_allclose(rows[:, 9], openings[arm])
+
+
+def test_tool_features_do_not_jump_where_a_tool_turns_through_straight_down():
+    turns = np.linspace(-0.05, 0.05, 101)
+    tools = np.stack([pin.rpy.rpyToMatrix(np.pi + turn, turn, 0.3) for turn in turns])
+    poses = np.tile(np.eye(4), (1, len(turns), 1, 1))
+    poses[0, :, :3, :3] = tools
+    motion = SimpleNamespace(
+        tools=poses,
+        tool_points=poses[..., :3, 3],
+        openings=np.ones((1, len(turns))),
+        positions=np.zeros((len(turns), 1)),
+    )
+    assert np.abs(np.diff(tool_features(motion), axis=0)).max() < 0.005
+
+
+def test_a_checkpoint_with_euler_angles_is_refused_by_name(options, motions):
+    control = fitted('ee_mlp', options, motions)
+    state = {**control.state(), 'names': ['left roll', 'left pitch']}
+    with pytest.raises(CheckpointError, match='Euler angles.*Train it again'):
+        control.restored(state)
 
 
 def test_the_1st_and_99th_percentile_become_minus_one_and_one(options, motions):

@@ -64,7 +64,8 @@ def sample(
     model: object = None,
     **more: object,
 ) -> Tensor:
-    texts = {name: more.pop(name) for name in ('text', 'negative_text') if name in more}
+    names = ('text', 'negative_text', 'guides_control')
+    texts = {name: more.pop(name) for name in names if name in more}
     conditioning = Conditioning(
         control=CLEAN,
         start_control=CLEAN[:, :, :, 0],
@@ -126,6 +127,32 @@ def test_guidance_goes_beyond_the_prompt(scale, flow):
         negative_text=torch.full((1, 512, 1), 0.5),
         guidance_scale=scale,
     )
+    noise = torch.randn(CLEAN.shape, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(moved, noise - flow, rtol=0, atol=1e-5)
+
+
+class ControlledFlow(ConstantFlow):
+    """Predicts 2 as the flow where the control is there, 0.5 where a sample goes without."""
+
+    def __call__(
+        self,
+        noisy: Tensor,
+        timestep: Tensor,
+        *,
+        control: Tensor,
+        control_kept: Tensor | None = None,
+        **_: object,
+    ) -> Tensor:
+        del timestep
+        if control_kept is None:
+            return torch.full_like(noisy, 2.0)
+        assert not control_kept.any() and not control.any()
+        return torch.full_like(noisy, 0.5)
+
+
+@pytest.mark.parametrize(('guides', 'flow'), [(False, 2.0), (True, 0.5 + 2.0 * (2.0 - 0.5))])
+def test_guidance_goes_beyond_a_control_that_samples_were_trained_without(guides, flow):
+    moved = sample(model=ControlledFlow(), guides_control=guides, guidance_scale=2.0)
     noise = torch.randn(CLEAN.shape, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(moved, noise - flow, rtol=0, atol=1e-5)
 

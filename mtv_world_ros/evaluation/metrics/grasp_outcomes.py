@@ -230,7 +230,7 @@ def _area_along(
     mask: BoolArray, start: BoolArray, stays: BoolArray, way: FloatArray, margin: float
 ) -> float:
     """Return the area of a mask where a tool carried it, in areas of the start mask."""
-    shift = np.float32([[1, 0, round(way[0])], [0, 1, round(way[1])]])
+    shift = np.array([[1, 0, round(way[0])], [0, 1, round(way[1])]], np.float32)
     carried = cv2.warpAffine(start.astype(np.uint8), shift, start.shape[::-1]) > 0
     there = _grown(carried, round(margin)) & ~stays
     return float((mask & there).sum() / start.sum())

@@ -7,7 +7,7 @@ G video frames of one token frame.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -19,7 +19,7 @@ from mtv_world_ros.core.errors import CheckpointError
 #: index of tokens that fill up the rows of a batch
 PADDING = -1
 #: initial scale of vectors that are added to the text (World-Eval)
-ADDED_SCALE = 0.3
+ADDED_SCALE = 0.1
 #: standard deviation of new token embeddings, about that of embedded text
 TOKEN_STD = 0.5
 #: standard deviation of the codes of a frame's place in its token frame
@@ -192,7 +192,12 @@ class _ContextEmbedding(nn.Module):
     """Indices or vectors as tokens behind the text, or as one vector added to it."""
 
     def __init__(
-        self, dim: int, vector_size: int = 0, vocabulary: int = 0, joins: str = 'append'
+        self,
+        dim: int,
+        vector_size: int = 0,
+        vocabulary: int = 0,
+        joins: str = 'append',
+        hidden_size: int = 0,
     ) -> None:
         super().__init__()
         self.is_added = joins == 'add'
@@ -200,6 +205,8 @@ class _ContextEmbedding(nn.Module):
         if vocabulary:
             self.net = nn.Embedding(vocabulary, dim)
             nn.init.normal_(self.net.weight, std=TOKEN_STD)  # type: ignore[arg-type]
+        elif hidden_size:
+            self.net = _three_layers(vector_size, hidden_size, dim, nn.GELU)
         else:
             self.net = nn.Sequential(nn.Linear(vector_size, dim), nn.GELU(), nn.Linear(dim, dim))
         self.scale = nn.Parameter(torch.tensor(ADDED_SCALE)) if self.is_added else None
@@ -226,6 +233,18 @@ class _ContextEmbedding(nn.Module):
         return tokens, torch.cat([whole, counts], dim=1)
 
 
+def _three_layers(
+    vector_size: int, hidden_size: int, dim: int, activation: Callable[[], nn.Module]
+) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(vector_size, hidden_size),
+        activation(),
+        nn.Linear(hidden_size, hidden_size),
+        activation(),
+        nn.Linear(hidden_size, dim),
+    )
+
+
 def _place_codes(length: int, like: Tensor) -> Tensor:
     """Return (length, D) sines and cosines of the places, as in "Attention is all you need"."""
     half = like.shape[-1] // 2
@@ -241,14 +260,10 @@ class _FrameEmbedding(nn.Module):
         self, dim: int, frames_per_token: int, vector_size: int, hidden_size: int
     ) -> None:
         super().__init__()
-        hidden = min(hidden_size, dim)
-        self.net = nn.Sequential(
-            nn.Linear(vector_size, hidden),
-            nn.SiLU(),
-            nn.Linear(hidden, hidden),
-            nn.SiLU(),
-            nn.Linear(hidden, dim),
-        )
+        self.net = _three_layers(vector_size, hidden_size, dim, nn.SiLU)
+        hidden = [layer for layer in self.net if isinstance(layer, nn.Linear)][:-1]
+        for layer in hidden:  # as in Ctrl-World (`Action_encoder2`)
+            nn.init.kaiming_normal_(layer.weight, mode='fan_in', nonlinearity='relu')
         # which of its slot's frames a vector belongs to: attention knows no order
         self.place = nn.Parameter(PLACE_STD * torch.randn(frames_per_token, dim))
 

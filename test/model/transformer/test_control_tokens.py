@@ -11,14 +11,14 @@ import torch
 from mtv_world_ros.control.control import ContextInput, FrameInput, InputLayout
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.model.conditioning import pad_rows
-from mtv_world_ros.model.transformer.control_tokens import by_slot, Context
+from mtv_world_ros.model.transformer.control_tokens import by_slot, Context, ControlTokens
 from test.support.small_transformer import build, inputs, PATCH, SMALL
 
 FRAMES, SIZE = 4, 14
 #: with patches nothing is merged in time, so a token frame is a video frame
 KINDS = {'conv': (SMALL, {}, 0), 'patch': (PATCH, {'frames_per_token': 1}, 16)}
 LAYOUTS = {
-    'added': InputLayout(context=ContextInput(vector_size=SIZE, joins='add')),
+    'added': InputLayout(context=ContextInput(vector_size=SIZE, joins='add', hidden_size=1280)),
     'indices': InputLayout(context=ContextInput(vocabulary=1024)),
     'vectors': InputLayout(context=ContextInput(vector_size=SIZE)),
     'frame': InputLayout(frame=FrameInput(vector_size=SIZE)),
@@ -214,8 +214,10 @@ def test_one_vector_is_added_to_every_text_token():
     torch.testing.assert_close(added, added[:, :1].expand_as(added))
     embedding: Any = model.control_tokens.context
     net = embedding.net
-    hidden = torch.nn.functional.gelu(given[:, 0] @ net[0].weight.T + net[0].bias)
-    expected = embedding.scale * (hidden @ net[2].weight.T + net[2].bias)
+    hidden = given[:, 0]
+    for layer in (net[0], net[2]):
+        hidden = torch.nn.functional.gelu(hidden @ layer.weight.T + layer.bias)
+    expected = embedding.scale * (hidden @ net[4].weight.T + net[4].bias)
     torch.testing.assert_close(added[:, 0], expected)
 
 
@@ -267,3 +269,20 @@ def test_layouts_are_plain_values():
     assert arguments['frame_input'] == asdict(FrameInput(vector_size=SIZE, hidden_size=16))
     assert set(arguments) == {'context_input', 'frame_input'}
     assert InputLayout(video=True).transformer_arguments() == {}
+
+
+def test_tokens_of_different_plans_differ_as_much_as_they_would_by_kaimings_initialisation():
+    torch.manual_seed(0)
+    plans = torch.rand(64, 1 + FRAMES, 20) * 2 - 1
+    tokens = ControlTokens(
+        context=None,
+        frame={'vector_size': 20, 'hidden_size': 1024},
+        dim=192,
+        frames_per_token=4,
+        num_prompt_tokens=0,
+    )
+    assert tokens.frame is not None
+    with torch.no_grad():
+        spread = tokens.frame(plans, 1 + FRAMES // 4, None).std(0).mean()
+    # layers that keep half the variance each, and torch's default last one (1 / 3 of it)
+    assert 0.1 < float(spread) < 0.5
