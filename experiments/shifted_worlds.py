@@ -188,11 +188,15 @@ class Ahead:
         points = self.points[:, :, known]
         chunks = [slice(chunk, chunk + 2) for chunk in range(len(self.times) - 1)]
         apart = [unforeseen(points[:, chunk], real[chunk]) for chunk in chunks]
-        features = None
-        if self.ends is not None:
-            number = self.ends.num_effective
-            features = {'foreseen': foreseen_feature(self.ends), 'futures': number}
-        return {'features': features, 'apart': apart}
+        if self.ends is None:
+            return {'features': None, 'apart': apart}
+        number = self.ends.num_effective
+        return {
+            'features': {'foreseen': foreseen_feature(self.ends), 'futures': number},
+            'apart': apart,
+            'done': self.ends.done.tolist(),
+            'weights': self.ends.weights.tolist(),
+        }
 
 
 def foreseen_by(
