@@ -15,8 +15,9 @@ where `--real` says so, *real frames*, the estimate on the simulator's; where `-
 folder `FOLDER/PHYSICS` that `fit contact` wrote in that physics, *foreseen motions, fitted there*; the
 *no-picture rule*: an object sticks to a gripper that closes near it. From .75 on it is called a success,
 below .5 a failure, unless the interval reaches the opposite verdict.
-False success is of real failures that have a verdict, false failure of real successes. Intervals over
-scenes: AUROC jackknife, shares clustered Wilson. The log keeps what was done, and the same command
+*Right* is the share of what was said that is true, success and failure apart. AUROC is of rollouts with
+an estimate, and of all with .5 where there is no verdict. Intervals over scenes: AUROC jackknife, shares
+clustered Wilson. The log keeps what was done, and the same command
 goes on; physics that show the same first picture share what is imagined. `--no-camera-check` leaves
 cameras as they are told. Flips of contact, as `mtv-world rank` has them: of rollouts whose true outcome
 is another than the expert's in the same scene, the share in which the last imagined frame is nearer to
@@ -44,9 +45,11 @@ from typing import Any
 import cv2
 import numpy as np
 from page import parse_arguments, publish, table
+from plan_pairs import BEST, best_cells, NUM_PLANS, outcomes_of, pair_cells, PAIRS
 
 from mtv_world_ros.cameras.camera import camera_poses
 from mtv_world_ros.core.data_types import (
+    BoolArray,
     ByteArray,
     FloatArray,
     JointTrajectory,
@@ -80,6 +83,7 @@ from mtv_world_ros.simulation.faults.drawn import is_drawn
 from mtv_world_ros.simulation.physics import catalogue, physics_named
 from mtv_world_ros.simulation.scenes.tasks import task_named
 from mtv_world_ros.simulation.simulator import CONTROL_PERIOD_S, SimEpisode
+from mtv_world_ros.success.comparison import RULE as RULE_OF_PAIRS
 from mtv_world_ros.success.doubts import (
     ContactConfirmation,
     Grounds,
@@ -106,11 +110,12 @@ TASKS = (
     'place_bread_plate', 'move_object_two',
 )  # fmt: skip
 HEAD = (
-    'truth', 'judged by', 'n', 'succeed', 'AUROC', 'false success', 'false failure', 'no verdict',
-    'from .9 on succeed', 'ECE',
+    'truth', 'judged by', 'n', 'succeed', 'verdicts', 'right, said success', 'right, said failure',
+    'AUROC', 'AUROC, no verdict .5', 'from .9 on succeed', 'ECE',
 )  # fmt: skip
-ACROSS = ('judged by', 'truths', 'AUROC, mean', 'worst', 'false success, mean', 'worst',
-          'no verdict, mean', 'ECE, mean')  # fmt: skip
+ACROSS = ('judged by', 'truths', 'verdicts', 'right, said success', 'right, said failure',
+          'AUROC, mean (worst)', 'AUROC, no verdict .5, mean (worst)', 'from .9 on succeed',
+          'ECE, mean')  # fmt: skip
 WATCHED = (
     'truth', 'foreseen by', 'chunks that ended unforeseen',
     'says so after rollouts: median [5 %, 95 %]', 'orders in which it never does',
@@ -530,14 +535,25 @@ def estimated(pipeline: Pipeline, judge: str, said: Said, physics: str) -> Share
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What a judge reached in a physics; shares are NaN where there is none to share."""
+    """What a judge reached in a physics; areas and errors are NaN where not defined.
+
+    Attributes:
+        physics: name of the truth.
+        judge: name of the judge.
+        cells: cells of `HEAD`.
+        counts: rollouts; verdicts; success said, right of these; failure said, right of these;
+            estimates from .9 on, successes of these.
+        auroc: area under the ROC of rollouts with an estimate.
+        auroc_all: area under the ROC of all rollouts, .5 where there is no verdict.
+        calibration_error: expected calibration error.
+    """
 
     physics: str
     judge: str
     cells: list[str]
+    counts: tuple[int, ...]
     auroc: float
-    false_success: float
-    unknown: float
+    auroc_all: float
     calibration_error: float
 
 
@@ -548,43 +564,69 @@ def row(
     said = np.array([one.probability for one in estimates])
     real = np.array([r['final'] for r in rows], np.bool_)
     scenes = [(r['job'][1], r['job'][3]) for r in rows]
-    known = np.isfinite(said)
     calls = np.array([verdict(one.probability, one[1:]) for one in estimates])
-    cells = [physics, judge, str(len(rows)), str(int(real.sum()))]
-    auroc, text = nan, '–'
-    if known.any() and len(set(real[known])) == 2:
-        chosen = [scene for scene, is_known in zip(scenes, known, strict=True) if is_known]
-        auroc, (low, high) = area_interval([said[known]], real[known], chosen)
-        text = f'{auroc:.2f}' + (f' [{low:.2f}, {high:.2f}]' if isfinite(low) else '')
-    failed = ~real & np.isfinite(calls)
-    wrong = [_share(calls == 1, failed, scenes),
-             _share(calls == 0, real & np.isfinite(calls), scenes)]  # fmt: skip
-    none, sure = ~np.isfinite(calls), known & (said >= 0.9)
-    held = f'{(real & sure).sum()} of {sure.sum()}'
+    known, is_open, sure = np.isfinite(said), ~np.isfinite(calls), said >= 0.9
+    success, failure = calls == 1, calls == 0
+    area, text = _area(said, real, known, scenes)
+    area_all, text_all = _area(
+        np.where(is_open, 0.5, said), real, np.ones(len(said), np.bool_), scenes
+    )
     error = expected_calibration_error(said[known], real[known]) if known.any() else nan
-    cells += [text, *wrong, f'{none.sum()} of {len(rows)}', held, f'{error:.2f}']
-    share = float((calls[failed] == 1).mean()) if failed.any() else nan
-    return Row(physics, judge, cells, auroc, share, float(none.mean()), error)
+    counts = (
+        len(rows), int((~is_open).sum()), int(success.sum()), int((success & real).sum()),
+        int(failure.sum()), int((failure & ~real).sum()), int(sure.sum()),
+        int((sure & real).sum()),
+    )  # fmt: skip
+    cells = [
+        physics, judge, str(len(rows)), str(int(real.sum())), f'{counts[1]} of {len(rows)}',
+        _share(real, success, scenes), _share(~real, failure, scenes), text, text_all,
+        f'{counts[7]} of {counts[6]}', f'{error:.2f}' if known.any() else '–',
+    ]  # fmt: skip
+    return Row(physics, judge, cells, counts, area, area_all, error)
+
+
+def _area(
+    said: FloatArray, real: BoolArray, known: BoolArray, scenes: Sequence[tuple[str, int]]
+) -> tuple[float, str]:
+    """Return the area under the ROC of the known estimates (N,), and its text with an interval."""
+    if not known.any() or len(set(real[known])) < 2:
+        return nan, '–'
+    chosen = [scene for scene, is_known in zip(scenes, known, strict=True) if is_known]
+    area, (low, high) = area_interval([said[known]], real[known], chosen)
+    return area, f'{area:.2f}' + (f' [{low:.2f}, {high:.2f}]' if isfinite(low) else '')
 
 
 def across(rows: Sequence[Row]) -> list[list[str]]:
-    """Return a line a judge: the means over all shifted truths, and the worst."""
+    """Return a line of `ACROSS` for each judge, over all truths but the nominal one."""
     lines = []
     for judge in dict.fromkeys(r.judge for r in rows):
         of = [r for r in rows if r.judge == judge and r.physics != NOMINAL]
-        if not of:
-            continue
-        least = min(of, key=lambda r: r.auroc if isfinite(r.auroc) else 2.0)
-        most = max(of, key=lambda r: r.false_success if isfinite(r.false_success) else -1.0)
-        lines.append(
-            [judge, str(len(of)), f'{_mean([r.auroc for r in of]):.2f}',
-             f'{least.auroc:.2f} ({least.physics})',
-             f'{_mean([r.false_success for r in of]):.2f}',
-             f'{most.false_success:.2f} ({most.physics})',
-             f'{np.mean([r.unknown for r in of]):.2f}',
-             f'{_mean([r.calibration_error for r in of]):.2f}']
-        )  # fmt: skip
+        if of:
+            lines.append([judge, str(len(of)), *over_truths(of)])
     return lines
+
+
+def over_truths(rows: Sequence[Row]) -> list[str]:
+    """Return the cells of `ACROSS` after the first two, over the rows of several truths."""
+    total = np.sum([r.counts for r in rows], axis=0)
+    return [
+        f'{total[1]} of {total[0]}',
+        f'{total[3]} of {total[2]}',
+        f'{total[5]} of {total[4]}',
+        _mean_and_worst([(r.auroc, r.physics) for r in rows]),
+        _mean_and_worst([(r.auroc_all, r.physics) for r in rows]),
+        f'{total[7]} of {total[6]}',
+        f'{_mean([r.calibration_error for r in rows]):.2f}',
+    ]
+
+
+def _mean_and_worst(areas: Sequence[tuple[float, str]]) -> str:
+    """Return the mean of the known areas, and the least one with the name of its truth."""
+    known = [area for area in areas if isfinite(area[0])]
+    if not known:
+        return '–'
+    least, where = min(known)
+    return f'{np.mean([area for area, _ in known]):.2f} ({least:.2f}, `{where}`)'
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -622,6 +664,30 @@ def rows_of(
                 rows.append(row(physics, title, chosen, said))
         rows.append(row(physics, RULE, chosen, [ruled(r) for r in chosen]))
     return rows
+
+
+def compared_rows(
+    options: argparse.Namespace, pipelines: dict[str, Pipeline], found: Sequence[dict[str, Any]]
+) -> tuple[list[list[str]], list[list[str]]]:
+    """Return rows of `PAIRS` and of `BEST`: plans of one scene under common futures."""
+    (name, pipeline), *_ = pipelines.items()
+    pairs, best = [], []
+    for physics in options.physics.split(','):
+        lines = [r for r in found if r['job'][0] == physics]
+        for judge in (FORESEEN, AS_FITTED):
+            said = [r['said'][name][judge] for r in lines if judge in r['said'][name]]
+            if not said or len(said) < len(lines):
+                continue
+            outcomes = [outcomes_of(one) for one in said]
+            judged = [estimated(pipeline, judge, one, physics) for one in said]
+            is_fitted = physics == NOMINAL or judge == AS_FITTED
+            title = 'the fit in `nominal`' if is_fitted else 'the prior'
+            pairs.append([physics, title, *pair_cells(lines, outcomes, judged)])
+            for num in NUM_PLANS:
+                cells = best_cells(lines, outcomes, num)
+                if cells is not None:
+                    best.append([physics, title, str(num), *cells])
+    return pairs, best
 
 
 def ruled(line: dict[str, Any]) -> ShareEstimate:
@@ -798,6 +864,23 @@ def _over_orders(first: np.ndarray, said: np.ndarray, real: np.ndarray) -> list[
             wrong, held, f'{error:.2f}']  # fmt: skip
 
 
+def compared_text(
+    options: argparse.Namespace, pipelines: dict[str, Pipeline], found: Sequence[dict[str, Any]]
+) -> list[str]:
+    """Return the parts of the page on plans of one scene."""
+    pairs, best = compared_rows(options, pipelines, found)
+    choice = (
+        'The best of N plans of one scene, drawn in random order: the first that no other one is '
+        'better than. The share of the gain is of what the true best would gain over the first:'
+    )
+    return [
+        f'Pairs of plans of one scene. {RULE_OF_PAIRS.text}:',
+        table(PAIRS, pairs),
+        choice,
+        table(BEST, best),
+    ]
+
+
 def main() -> None:
     """Print a row for each physics and judge, and write them as a page."""
     options = parse_arguments(__doc__, 1, more)
@@ -825,6 +908,7 @@ def main() -> None:
                 table(HEAD, [r.cells for r in rows]),
                 'Over all truths but the nominal one:',
                 table(ACROSS, across(rows)),
+                *compared_text(options, pipelines, found),
                 'Flips of contact:',
                 table(FLIPPED, flip_rows(options, found, list(pipelines))),
                 'Executed chunks against the futures:',

@@ -47,12 +47,14 @@ from shifted_worlds import (
     across,
     AS_FITTED,
     BOTH,
+    compared_text,
     CONFIRMED,
     confirmed_rows,
     estimated,
     FITTED,
     FORESEEN,
     HEAD,
+    over_truths,
     Row,
     row,
     RULE,
@@ -80,11 +82,12 @@ EDGES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0 + 1e-9)
 #: judge: the estimate of before, of `--before`
 BEFORE = 'both, before'
 COVERED = ('truth', 'judged by', 'estimates', 'covered', 'up to the sampling error of rates')
-BLOCK = ('judged by', 'nominal: AUROC', 'failures called a success', 'no verdict',
-         'other truths: AUROC, mean (worst)', 'failures called a success, mean (worst)',
-         'from .9 on succeed', 'no verdict, mean')  # fmt: skip
+BLOCK = ('judged by', 'nominal: verdicts', 'right, said success', 'right, said failure',
+         'AUROC, no verdict .5', 'other truths: verdicts', 'right, said success',
+         'right, said failure', 'AUROC, mean (worst)', 'AUROC, no verdict .5, mean (worst)',
+         'from .9 on succeed')  # fmt: skip
 #: columns and judges of the table in README.md
-README_COLUMNS = (0, 1, 2, 4, 5, 7)
+README_COLUMNS = (0, 1, 2, 3, 5, 6, 7, 9)
 README_JUDGES = (f'**{BOTH}**', FORESEEN, RULE)
 _MARKED = re.compile(
     r'(<!-- unseen-faults: begin -->\n).*?(<!-- unseen-faults: end -->)', re.DOTALL
@@ -190,8 +193,9 @@ def judged(rows: Sequence[Row]) -> list[list[str]]:
         others = [r for r in of if r.physics != NOMINAL]
         if nominal is None and judge == AS_FITTED:
             nominal = next(r for r in rows if r.physics == NOMINAL and r.judge == FORESEEN)
-        cells = ['–'] * 3 if nominal is None else [nominal.cells[k] for k in (4, 5, 7)]
-        lines.append([f'**{judge}**' if judge == BOTH else judge, *cells, *_over(others)])
+        cells = ['–'] * 4 if nominal is None else [nominal.cells[k] for k in (4, 5, 6, 8)]
+        more = over_truths(others)[:6] if others else ['–'] * 6
+        lines.append([f'**{judge}**' if judge == BOTH else judge, *cells, *more])
     return lines
 
 
@@ -218,22 +222,6 @@ def readme_block(rows: Sequence[Row], num_scenes: int, count: int) -> str:
     )
     cells = [[line[k] for k in README_COLUMNS] for line in lines]
     return f'{table([BLOCK[k] for k in README_COLUMNS], cells)}\n\n{note}\n'
-
-
-def _over(rows: Sequence[Row]) -> list[str]:
-    """Return cells over several truths."""
-    if not rows:
-        return ['–'] * 4
-    least = min(rows, key=lambda r: r.auroc if isfinite(r.auroc) else 2.0)
-    most = max(rows, key=lambda r: r.false_success if isfinite(r.false_success) else -1.0)
-    wrong = [r.false_success for r in rows if isfinite(r.false_success)]
-    held = [list(map(int, r.cells[8].split(' of '))) for r in rows]
-    return [
-        f'{np.nanmean([r.auroc for r in rows]):.2f} ({least.auroc:.2f}, `{least.physics}`)',
-        f'{np.mean(wrong):.2f} ({most.false_success:.2f}, `{most.physics}`)' if wrong else '–',
-        f'{sum(a for a, _ in held)} of {sum(b for _, b in held)}',
-        f'{np.mean([r.unknown for r in rows]):.2f}',
-    ]
 
 
 def groups(
@@ -317,7 +305,7 @@ def reliability(
     figure.savefig(file)
 
 
-def over_truths(rows: Sequence[Sequence[str]]) -> str:
+def confirmed_text(rows: Sequence[Sequence[str]]) -> str:
     """Return means over all truths but the nominal one, of rows of `confirmed_rows`."""
     lines = []
     for tasks in dict.fromkeys(one[1] for one in rows):
@@ -372,6 +360,7 @@ def main() -> None:
         table(HEAD, [r.cells for r in sorted(rows, key=lambda r: r.physics != NOMINAL)]),
         'Over all truths but the nominal one:',
         table(ACROSS, across(rows)),
+        *compared_text(options, pipelines, lines),
         'Coverage of the 95 % intervals:',
         table(COVERED, covered),
         f'![Reliability diagram]({picture})',
@@ -379,7 +368,7 @@ def main() -> None:
         table(WATCHED, watch_rows(options, lines, list(pipelines))),
         'Robot cells in which nothing was fitted, confirmed by how rollouts end:',
         table(CONFIRMED, confirmed),
-        over_truths(confirmed),
+        confirmed_text(confirmed),
     ]
     publish(
         'unseen_faults',

@@ -178,7 +178,9 @@ class Comparison:
         if self.reason:
             return f'plan 1 of {count}: not told, {self.reason}'
         best, done = self.best, self.num_successes
-        text = f'plan {best + 1} of {count}: succeeds in {done[best]} of {self.num_futures} futures'
+        text = (
+            f'plan {best + 1} of {count}: succeeds in {done[best]} of {self.num_futures} futures'
+        )
         pair = self.pair(0, best) if best else None
         if pair is None:
             return f'{text}, no other plan is better'

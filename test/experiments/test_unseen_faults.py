@@ -22,7 +22,7 @@ def script():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / 'experiments'))
         yield importlib.import_module('unseen_faults')
-    for name in ('unseen_faults', 'shifted_worlds', 'page'):
+    for name in ('unseen_faults', 'shifted_worlds', 'plan_pairs', 'page'):
         sys.modules.pop(name, None)
 
 
@@ -110,7 +110,11 @@ def test_the_block_of_the_readme_has_a_row_for_each_judge(script, monkeypatch):
     assert [row[0].strip('| *') for row in body] == [
         script.BOTH, script.FORESEEN, script.AS_FITTED, script.RULE,
     ]  # fmt: skip
-    assert body[1][4:7] == ['1.00 (1.00, `bold`)', '0.00 (0.00, `bold`)', '8 of 8']
+    assert body[1][4] == '1.00' and body[1][1] == '16 of 16'
+    assert [cell.partition(' [')[0] for cell in body[1][2:4]] == ['8 of 8', '8 of 8']
+    assert body[1][5:10] == [
+        '16 of 16', '8 of 8', '8 of 8', '1.00 (1.00, `bold`)', '1.00 (1.00, `bold`)',
+    ]  # fmt: skip
     assert '2 seeds (1,2)' in text and '`bold`' in text
     short = script.readme_block(made, 4, 16).splitlines()
     cells = [line.strip('| ').split(' | ') for line in short if line.startswith('| ')][2:]
