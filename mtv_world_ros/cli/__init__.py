@@ -42,6 +42,7 @@ from mtv_world_ros.core.files import check_output  # noqa: E402
 from mtv_world_ros.core.processes import (  # noqa: E402
     ended_by_signals,
     escape_unprintable_output,
+    is_helper_rank,
     stopped_by_sigterm,
 )
 from mtv_world_ros.core.writer_lock import only_writer  # noqa: E402
@@ -287,11 +288,6 @@ def _outputs(arguments: argparse.Namespace) -> list[tuple[Path, str]]:
     return [*found, *([(watched, '--watch')] if isinstance(watched, Path) else [])]
 
 
-def _is_helper_rank() -> bool:
-    """Return whether `torchrun` started this process beside the one that writes."""
-    return os.environ.get('RANK', '0') != '0' and 'WORLD_SIZE' in os.environ
-
-
 def main(argv: list[str] | None = None) -> int:
     """Run a command; return the exit status.
 
@@ -305,7 +301,7 @@ def main(argv: list[str] | None = None) -> int:
         return _said(str(error), 1)
     try:
         with stopped_by_sigterm(), ExitStack() as locks:
-            for path, option in [] if _is_helper_rank() else _outputs(arguments):
+            for path, option in [] if is_helper_rank() else _outputs(arguments):
                 locks.enter_context(only_writer(path, option))
             return arguments.handler(arguments)
     except TrainingInterrupted as stopped:

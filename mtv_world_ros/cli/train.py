@@ -14,6 +14,7 @@ from typing import Any, TYPE_CHECKING
 from mtv_world_ros.cli.bundled_help import presets
 from mtv_world_ros.cli.shared_options import add_options, number_or_0
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+from mtv_world_ros.core.processes import is_helper_rank
 
 if TYPE_CHECKING:
     import torch
@@ -150,6 +151,8 @@ def _train(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.training.training_config import load_training_config, TrainingRun
 
     config = load_training_config(arguments.preset, _overrides(arguments))
+    if arguments.dry_run and is_helper_rank():
+        return 0
     if arguments.dry_run:
         return _dry_run(config, arguments)
     if arguments.dataset is None or arguments.out is None:
@@ -199,6 +202,17 @@ def _train(arguments: argparse.Namespace) -> int:
         describer=asked_describer(arguments.describer),
         held_out=_held_out(arguments, paths, dtype, source),
     )
+    if not is_helper_rank():  # the main process may still be writing the result
+        _print_result(arguments, config, folder, paths)
+    return 0
+
+
+def _print_result(
+    arguments: argparse.Namespace, config: TrainingConfig, folder: Path, paths: Sequence[Path]
+) -> None:
+    """Print the folder of the result and the commands that come next."""
+    from mtv_world_ros.model.checkpoint import Checkpoint
+
     print(f'{f"adapter for {arguments.init}" if config.lora.rank else "checkpoint"}: {folder}')
     if not config.lora.rank and _lacks_contact(folder):
         views = ','.join(config.video.views)
@@ -211,7 +225,6 @@ def _train(arguments: argparse.Namespace) -> int:
     model = [str(arguments.init), '--adapter', str(folder)] if config.lora.rank else [str(folder)]
     out = arguments.out / f'evaluation_{Checkpoint.open(folder).card.trained_on["steps"]}'
     print('\n'.join(_evaluation_advice(arguments, model, paths, out)))
-    return 0
 
 
 #: stands for a folder that the user has to name

@@ -245,3 +245,8 @@ def stop_process(process: subprocess.Popen[bytes] | None) -> None:
 def threads_each(workers: int) -> int:
     """Return the usable cores' share of each of some processes, at least 1."""
     return max(len(os.sched_getaffinity(0)) // max(workers, 1), 1)
+
+
+def is_helper_rank() -> bool:
+    """Return whether `torchrun` started this process beside the one that writes."""
+    return os.environ.get('RANK', '0') != '0' and 'WORLD_SIZE' in os.environ

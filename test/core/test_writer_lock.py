@@ -132,10 +132,10 @@ def test_the_recorder_is_told_as_well(tmp_path, holder):
 
 
 def test_the_other_processes_of_one_training_take_no_lock(monkeypatch):
-    from mtv_world_ros.cli import _is_helper_rank
+    from mtv_world_ros.core.processes import is_helper_rank
 
-    assert not _is_helper_rank()
+    assert not is_helper_rank()
     monkeypatch.setenv('WORLD_SIZE', '2')
     for rank, is_helper in (('0', False), ('1', True)):
         monkeypatch.setenv('RANK', rank)
-        assert _is_helper_rank() == is_helper
+        assert is_helper_rank() == is_helper
