@@ -344,6 +344,24 @@ class ObjectMasks:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FutureEvidence:
+    """Outcomes of a task in simulated futures, and the estimate that rests on them alone.
+
+    Attributes:
+        outcomes: outcome in each of K futures; None = the future was lost.
+        probability: probability of success without imagined frames, in [0, 1].
+        interval: 95 % interval (low, high) of the probability.
+        is_fitted: contact parameters were fitted in this robot cell; False = futures are drawn
+            from the prior.
+    """
+
+    outcomes: tuple[bool | None, ...]
+    probability: float
+    interval: tuple[float, float]
+    is_fitted: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SuccessEstimate:
     """Probability that the task succeeds, given the world model.
 
@@ -356,6 +374,7 @@ class SuccessEstimate:
         is_calibrated: whether the probability is a fitted one.
         num_seeds: rollouts that it is the mean of.
         spread: standard deviation of their probabilities; NaN for one.
+        futures: evidence of simulated futures; None = no motion was simulated.
     """
 
     probability: float
@@ -366,6 +385,7 @@ class SuccessEstimate:
     is_calibrated: bool = False
     num_seeds: int = 1
     spread: float = np.nan
+    futures: FutureEvidence | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'reasons', tuple(self.reasons))

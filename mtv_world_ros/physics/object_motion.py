@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from typing import Any, Protocol
 
 import cv2
@@ -286,6 +287,20 @@ class FoundObjects:
         for positions in parts:
             found.append((found[-1] if found else self).after(positions))
         return tuple(found)
+
+    @property
+    def futures_key(self) -> str:
+        """Digest of the scene in each future where the motions begin; empty = nothing moved yet.
+
+        Plans with equal keys meet common futures: the same objects, places, sizes and contact.
+        """
+        if not self.motions:
+            return ''
+        starts = np.stack([motion.points[0] for motion in self.motions])
+        scene = np.concatenate([starts.ravel(), np.ravel(self.tracked.sizes)])
+        rounded = np.nan_to_num(np.rint(scene * 1e6), nan=-1.0).astype(np.int64)
+        words = '\0'.join((*self.names, str(self.tracked.is_fitted)))
+        return sha256(words.encode() + rounded.tobytes()).hexdigest()[:16]
 
     def medoid(self, among: BoolArray | None = None) -> int:
         """Return the index of the medoid motion: its end is closest to those of all.

@@ -27,6 +27,7 @@ from mtv_world_ros.ranking.judges import (
     scores,
     true_rate,
 )
+from mtv_world_ros.ranking.policy_order import PolicyOrder
 from mtv_world_ros.ranking.rollout_jobs import Job, Result
 from mtv_world_ros.simulation.faults.catalogue import EXPERT, in_order
 
@@ -118,6 +119,11 @@ class Summary:
     def tasks(self) -> tuple[str, ...]:
         """In the order of the jobs."""
         return tuple(dict.fromkeys(result.task for result in self.results))
+
+    @cached_property
+    def order(self) -> PolicyOrder:
+        """The order of the policies by rollouts of one scene under common futures."""
+        return PolicyOrder.of(self.results)
 
     def chosen(self, policy: str, task: str | None) -> list[Result]:
         """Return a policy's results on a task; None = all."""
@@ -222,6 +228,7 @@ class Summary:
         """Return everything as plain values, NaN where not known."""
         groups = {ALL_TASKS: None, **{task: task for task in self.tasks}}
         return {
+            'order': self.order.as_json(),
             'policies': {name: self._policy_json(name, groups) for name in self.policies},
             'agreement': {
                 judge: {

@@ -115,11 +115,17 @@ class StoredEstimate:
 
     @classmethod
     def of_motions(cls, estimate: SuccessEstimate | None) -> StoredEstimate:
-        """Return the share of an estimate's foreseen motions that succeed."""
-        feature = nan if estimate is None else estimate.features.get('foreseen', nan)
-        if not isfinite(feature):
+        """Return the estimate of foreseen motions alone, without the imagined frames."""
+        if estimate is None or estimate.futures is None:
             return cls.stated(nan, 'abstains: no motion was foreseen')
-        return cls.stated((1 + feature) / 2, 'the share of foreseen motions that succeed')
+        if not isfinite(estimate.probability):
+            return cls.stated(nan, estimate.reasons[0])
+        return cls(
+            probability=estimate.futures.probability,
+            interval=estimate.futures.interval,
+            jaccard=(),
+            reasons=('the estimate of foreseen motions alone',),
+        )
 
     @classmethod
     def stated(cls, probability: float, reason: str) -> StoredEstimate:
@@ -134,6 +140,38 @@ class StoredEstimate:
 
 
 _NOT_MEASURED = StoredEstimate.stated(nan, 'abstains: not measured')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredFutures:
+    """Outcomes of an imagined rollout in simulated futures, in a result file.
+
+    Attributes:
+        key: digest of the futures; rollouts with equal keys met common futures.
+        outcomes: outcome in each future; null = the future was lost.
+        is_fitted: contact parameters were fitted in this robot cell.
+    """
+
+    __pydantic_config__ = ConfigDict(extra='forbid')
+
+    key: str
+    outcomes: tuple[bool | None, ...]
+    is_fitted: bool
+
+    @classmethod
+    def of(cls, estimate: SuccessEstimate | None, key: str) -> StoredFutures | None:
+        """Return the outcomes of an estimate; None = nothing was foreseen, or it abstains.
+
+        Args:
+            estimate: the estimate at the end of the rollout.
+            key: digest of its futures.
+        """
+        if estimate is None or estimate.futures is None or not key:
+            return None
+        if not isfinite(estimate.probability):  # e.g. cameras that are elsewhere than told
+            return None
+        futures = estimate.futures
+        return cls(key=key, outcomes=futures.outcomes, is_fitted=futures.is_fitted)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,7 +227,7 @@ class Result:
         ever: whether the task was done at some time, in the simulator.
         final: whether the task was done at the end, in the simulator; this counts as success.
         imagined: the estimate at the end of the imagined episode.
-        foreseen: the share of its foreseen motions that succeed.
+        foreseen: the estimate of its foreseen motions alone.
         pictures: the estimate from the imagined frames alone, with no motion foreseen.
         seen: estimate on the simulator's own frames: its errors are not the world model's.
         no_picture: the rule that sees the commands and the first frame alone.
@@ -199,6 +237,8 @@ class Result:
         seconds: time by stage [s].
         end: reason why the simulated episode ended; empty = not known.
         imagined_end: reason why the imagined episode ended.
+        futures: outcomes in simulated futures; None = nothing was foreseen, or an earlier version
+            wrote the result.
         course: commands, overlaps and estimates over time in both worlds; None = not known.
         files: files of the rollout in base64 by suffix; empty once they are written to disk.
     """
@@ -222,6 +262,7 @@ class Result:
     seconds: Mapping[str, float]
     end: str = ''
     imagined_end: str = ''
+    futures: StoredFutures | None = None
     course: WorldComparison | None = None
     files: Mapping[str, str] = field(default_factory=dict)
 

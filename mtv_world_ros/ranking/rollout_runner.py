@@ -18,7 +18,7 @@ from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.ranking.both_worlds import BothWorlds
 from mtv_world_ros.ranking.flips import last_frames_png, OBJECTS, objects_png
 from mtv_world_ros.ranking.no_picture_rule import judge_without_pictures
-from mtv_world_ros.ranking.rollout_jobs import Job, Result, StoredEstimate
+from mtv_world_ros.ranking.rollout_jobs import Job, Result, StoredEstimate, StoredFutures
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.rollout import Rollout
@@ -153,6 +153,7 @@ class RolloutRunner:
                 'imagining': imagining_s,
                 'imagining without foresight': pictures_s,
             },
+            futures=StoredFutures.of(imagined.success, imagined.futures_key),
             course=both.course(),
             files={
                 '.png': base64.b64encode(last).decode(),

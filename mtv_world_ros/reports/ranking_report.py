@@ -21,10 +21,12 @@ from mtv_world_ros.ranking.judges import (
     Score,
     true_rate,
 )
+from mtv_world_ros.ranking.policy_order import MIN_CONFIDENCE, PolicyOrder
 from mtv_world_ros.ranking.ranking_summary import ALL_TASKS, Optimism, Summary
 from mtv_world_ros.reports.charts import Point, scatter_chart
 from mtv_world_ros.reports.rollout_cards import rollout_cards
 from mtv_world_ros.simulation.faults.catalogue import FAULTS
+from mtv_world_ros.success.comparison import RULE as COMPARISON_RULE
 from mtv_world_ros.success.estimator import FAILURE_BELOW, SUCCESS_FROM
 
 TITLE = 'Policy ranking'
@@ -38,6 +40,7 @@ def tables(summary: Summary) -> list[Table]:
     """Return the ranking's tables."""
     return [
         _worth(summary),
+        *_pairs(summary),
         *optimism_tables(summary.optimism),
         _agreement(summary),
         *(_rates(summary, task) for task in (None, *summary.tasks)),
@@ -46,6 +49,88 @@ def tables(summary: Summary) -> list[Table]:
         _speed(summary),
         *_ends(summary),
         *_failures(summary),
+    ]
+
+
+def order_table(order: PolicyOrder) -> Table:
+    """Return the table of the partial order: for each policy those that it is better than."""
+    number = {name: str(k) for k, name in enumerate(order.policies, 1)}
+    rows = []
+    for name, strength, interval in zip(
+        order.policies, order.strengths, order.intervals, strict=True
+    ):
+        mine = [pair for pair in order.pairs if name in (pair.first, pair.second)]
+        below = [pair.other(name) for pair in mine if pair.better == name]
+        open_pairs = [pair.other(name) for pair in mine if not pair.better]
+        rows.append(
+            [
+                number[name],
+                name,
+                f'{strength:.2f} {_interval(interval)}' if isfinite(strength) else DASH,
+                ', '.join(number[other] for other in below) or DASH,
+                ', '.join(number[other] for other in open_pairs) or DASH,
+            ]
+        )
+    return Table(
+        caption=f'Order of the policies: {order.num_ordered} of {len(order.pairs)} pairs are '
+        f'ordered, {order.num_scenes} scenes under common futures',
+        head=['', 'policy', 'strength', 'better than', 'not told from'],
+        rows=rows,
+        num_labels=2,
+    )
+
+
+def order_remark(order: PolicyOrder) -> str:
+    """Return what the order of the policies rests on, and what it does not say."""
+    if not order.num_scenes:
+        return (
+            'The policies are not ordered: no two rollouts of one scene have common futures. That '
+            'takes a checkpoint that foresees object motion, and results of this version (give '
+            '--overwrite to run those of an earlier one again).'
+        )
+    text = (
+        'Each scene is judged under futures that are the same for all policies. '
+        f'{COMPARISON_RULE.text}. A pair of policies is ordered where one is better in most '
+        f'scenes that tell, with probability {MIN_CONFIDENCE:.2f} or more. Strength '
+        '(Bradley-Terry): probability to be better than a policy of mean strength.'
+    )
+    found = [text]
+    if not order.is_fitted:
+        found.append(
+            'Contact parameters were not fitted in this robot cell, so that futures are drawn '
+            'from a wide prior and most estimates of single rollouts are open: the order is the '
+            'answer here. It says which policy is better under some contact, not how often one '
+            'succeeds in this cell. Run `mtv-world fit contact` on recordings of this cell for '
+            'that.'
+        )
+    if order.num_without:
+        found.append(f'{order.num_without} rollouts without foreseen motion are not compared.')
+    return ' '.join(found)
+
+
+def _pairs(summary: Summary) -> list[Table]:
+    """Return the table of all pairs of policies; empty = there is none."""
+    if not summary.order.pairs:
+        return []
+    rows = [
+        [
+            pair.first,
+            pair.second,
+            str(pair.num_scenes),
+            str(pair.num_first),
+            str(pair.num_second),
+            pair.better or 'not told',
+            f'{pair.confidence:.2f}' if pair.leader else DASH,
+        ]
+        for pair in summary.order.pairs
+    ]
+    return [
+        Table(
+            caption='Pairs of policies under common futures: scenes in which one is better',
+            head=['one', 'other', 'scenes', 'one better', 'other better', 'better', 'how sure'],
+            rows=rows,
+            num_labels=2,
+        )
     ]
 
 
@@ -393,9 +478,12 @@ def _failures(summary: Summary) -> list[Table]:
 
 
 def console(summary: Summary) -> str:
-    """Return the text for the console: what decides, success rates, failures, remarks."""
+    """Return the text for the console: order of policies, what decides, rates, remarks."""
     tables = [_worth(summary), _rates(summary, None), *_failures(summary)]
+    if summary.order.num_scenes:
+        tables.insert(0, order_table(summary.order))
     parts = [f'{found.caption}\n\n{found.text()}' for found in tables]
+    parts.insert(bool(summary.order.num_scenes), order_remark(summary.order))
     return '\n\n'.join([*parts, *_notes(summary)])
 
 
@@ -469,6 +557,8 @@ def _content(summary: Summary) -> dict[str, Any]:
     """Return the values that the Markdown and the HTML page share."""
     return {
         'title': TITLE,
+        'order': order_table(summary.order) if summary.order.num_scenes else None,
+        'order_remark': order_remark(summary.order),
         'remarks': remarks(summary),
         'tables': tables(summary),
         'made': summary.provenance,

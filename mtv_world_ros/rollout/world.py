@@ -188,6 +188,12 @@ class ImaginedWorld:
         """The estimate at the end of the newest chunk; None before the first one."""
         return self.chunks[-1].success if self.chunks else None
 
+    @property
+    def futures_key(self) -> str:
+        """Digest of the simulated futures of the episode; empty = nothing is foreseen."""
+        objects = None if self._rollout is None else self._rollout.objects
+        return '' if objects is None else objects.futures_key
+
     def reset(self, *, seed: int) -> Observation:
         """Begin an episode at the real observation; return that."""
         self._rollout = self._pipeline.begin(self._start, replace(self._options, seed=seed))

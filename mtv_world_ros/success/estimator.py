@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
+from dataclasses import replace
 from math import exp, isfinite, isnan, nan
 from typing import NamedTuple
 
 import numpy as np
 
-from mtv_world_ros.core.data_types import FloatArray, SuccessEstimate
+from mtv_world_ros.core.data_types import FloatArray, FutureEvidence, SuccessEstimate
 from mtv_world_ros.core.errors import CannotTell, ConfigError, nearest
 from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
 from mtv_world_ros.success.calibration import Calibration, DOUBTS, weighed
@@ -297,6 +298,15 @@ class SuccessEstimator:
             fit = ShareFit(max_picture_gap_m=fit.max_picture_gap_m)
             basis, elsewhere = f'uncalibrated: {NOT_FITTED_HERE}', ''
         probability, low, high = estimate_of_futures(fit, features, is_fitted=ends.is_fitted)
+        alone = estimate_of_futures(
+            fit, {**features, 'picture_gap': nan}, is_fitted=ends.is_fitted
+        )
+        futures = FutureEvidence(
+            outcomes=ends.outcomes,
+            probability=alone.probability,
+            interval=(alone.low, alone.high),
+            is_fitted=ends.is_fitted,
+        )
         counts = f'{ends.done.sum()} of {len(ends.done)} foreseen motions succeed'
         reasons = [f'{counts}, {ends.share:.0%} by weight']
         if gap is not None and gap.distance_m > fit.max_picture_gap_m:
@@ -306,7 +316,8 @@ class SuccessEstimator:
         reasons.append(basis or self._origin(elsewhere, is_real=False))
         is_calibrated = not (basis or elsewhere)
         numbers = (low, probability, high)
-        return _estimate(numbers, evidence, views, reasons, features, is_calibrated)
+        judged = _estimate(numbers, evidence, views, reasons, features, is_calibrated)
+        return replace(judged, futures=futures)
 
     def _judge(
         self,

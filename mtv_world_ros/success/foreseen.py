@@ -37,6 +37,12 @@ class ForeseenEnds:
     is_fitted: bool = True
 
     @property
+    def outcomes(self) -> tuple[bool | None, ...]:
+        """Outcome of each motion; None = the simulation of the motion was lost."""
+        pairs = zip(self.done, self.weights, strict=True)
+        return tuple(bool(done) if weight > 0 else None for done, weight in pairs)
+
+    @property
     def share(self) -> float:
         """Weighted share of the motions that succeed."""
         return float(np.average(self.done, weights=self.weights))
