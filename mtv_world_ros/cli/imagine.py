@@ -142,6 +142,14 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
         '--max-seconds', type=float, default=3600.0, help='wall-clock limit of an episode [s]'
     )
     parser.add_argument(
+        '--candidates',
+        type=int,
+        default=1,
+        metavar='N',
+        help='ask the policy for N plans (seeds) when an episode begins, and imagine the one that '
+        'is best in simulated futures; default: 1',
+    )
+    parser.add_argument(
         '--instruction', default='', help="text for the robot; default: the recorded episode's"
     )
     parser.add_argument(
@@ -228,6 +236,7 @@ def _in_world_model(
         instruction=arguments.instruction,
         seed=arguments.seed,
         num_inference_steps=arguments.steps,
+        num_candidates=arguments.candidates,
     )
     starts = _starts(arguments, episodes, pipeline)
     if arguments.place is not None:
@@ -286,6 +295,8 @@ def episode_table(results: Sequence[Mapping[str, object]]) -> list[str]:
             f'{result["episode"]:>7}  {result["how"]:<13}  {result["num_chunks"]:>6}  '
             f'{estimate:<15}  {result["verdict"]:<8}  {result["episode_s"]:>7}  {result["bag"]}'
         )
+        if 'choice' in result:
+            lines.append(f'         {result["choice"]}')
         lines += [f'         {reason}' for reason in str(result['reasons']).split('; ') if reason]
     return [*lines, _success_rate([str(result['verdict']) for result in results])]
 

@@ -31,6 +31,11 @@ from mtv_world_ros.policies.policy import EpisodeOrigin, Policy
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import PlanLimits
 from mtv_world_ros.rollout.assembly import assemble_policy, policy_settings, PolicyMaker
+from mtv_world_ros.rollout.candidates import (
+    candidate_policy,
+    CandidatePolicy,
+    check_candidates,
+)
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.prediction import Prediction
@@ -62,6 +67,8 @@ class EpisodeOptions:
         instruction: text for the robot; empty = the start's.
         seed: episode k uses seed + 1000 k.
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
+        num_candidates: number of plans that the policy is asked for when an episode begins; the
+            best one in simulated futures is imagined.
     """
 
     policy: str
@@ -71,6 +78,11 @@ class EpisodeOptions:
     instruction: str = ''
     seed: int = 0
     num_inference_steps: int = 0
+    num_candidates: int = 1
+
+    def __post_init__(self) -> None:
+        if self.num_candidates < 1:
+            raise ConfigError(f'--candidates is {self.num_candidates}; it must be at least 1')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -208,7 +220,10 @@ def imagine_episodes(
         EpisodeError: a recorded episode cannot be used, or the disk is full.
         ObservationError: the cameras or the robot gave no observation.
     """
-    make_policy = assemble_policy(options.policy, pipeline.robot)
+    check_candidates(options.policy, pipeline.robot, options.num_candidates)
+    makers = [
+        assemble_policy(options.policy, pipeline.robot) for _ in range(options.num_candidates)
+    ]
     results = list[dict[str, Any]]()
     first = next(starts)
     clear_episodes(out, overwrite=overwrite)
@@ -217,7 +232,7 @@ def imagine_episodes(
         on_start(start)
         run = _EpisodeRun(pipeline, options, number, start, out / f'episode_{number:05d}')
         try:
-            run.imagine(make_policy, on_chunk)
+            run.imagine(makers, on_chunk)
         finally:
             results.append({**run.result(), 'start': start.source})
             write_whole(out / 'episodes.json', json.dumps(results, indent=2) + '\n')
@@ -249,9 +264,12 @@ class _EpisodeRun:
         self._begun_s = time.monotonic()
         self._num_chunks, self._policy = 0, options.policy
         self._last: Prediction | None = None
+        self._choice = ''
         self._how, self._text = 'interrupted', 'it was stopped before its end'
 
-    def imagine(self, make: PolicyMaker, on_chunk: Callable[[Prediction], object]) -> None:
+    def imagine(
+        self, makers: Sequence[PolicyMaker], on_chunk: Callable[[Prediction], object]
+    ) -> None:
         """Run the policy until the episode ends; an error of the episode is its end."""
         robot, seen = self._pipeline.robot, self._start.observation
         instruction = self._options.instruction or self._start.instruction
@@ -276,7 +294,7 @@ class _EpisodeRun:
                 should_stop=self._is_late,
             )
             world = _RecordedWorld(self._pipeline, seen, options, keep, writer)
-            self._end(make, world)
+            self._end(makers, world, options)
             if self._how not in ('done', 'max_chunks', 'max_seconds'):
                 values = {'how': self._how, 'text': self._text}
                 writer.write_report(world.observation.stamp_ns, ERROR, self._how, values)
@@ -296,6 +314,7 @@ class _EpisodeRun:
             'how': self._how,
             'text': self._text,
             'policy': self._policy,
+            **({'choice': self._choice} if self._choice else {}),
             'task': self._start.origin.task,
             'scene_seed': self._start.origin.scene_seed,
             'seed': self._seed,
@@ -305,10 +324,14 @@ class _EpisodeRun:
             'reasons': '' if success is None else '; '.join(success.reasons),
         }
 
-    def _end(self, make: PolicyMaker, world: _RecordedWorld) -> None:
+    def _end(
+        self, makers: Sequence[PolicyMaker], world: _RecordedWorld, options: RolloutOptions
+    ) -> None:
         """Run the episode; set how it ended."""
+        policy: Policy | None = None
         try:
-            policy = make(self._start.origin)
+            policies = [make(self._start.origin) for make in makers]
+            policy = candidate_policy(policies, self._pipeline, options)
             self._policy = policy.name
             with _PolicyThread(policy, self._left_s) as asked:
                 run = run_policy(
@@ -332,6 +355,8 @@ class _EpisodeRun:
             self._how, self._text = 'rejected', str(error)
         finally:
             self._num_chunks = world.num_answers
+            if isinstance(policy, CandidatePolicy):
+                self._choice = policy.choice
 
     def _left_s(self) -> float:
         """Time that is left of the episode's longest time on the wall [s]."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -17,12 +17,13 @@ from mtv_world_ros.core.data_types import (
     ByteArray,
     FloatArray,
     History,
+    JointTrajectory,
     MultiViewVideo,
     ObjectMasks,
     Observation,
     WorldModelSpec,
 )
-from mtv_world_ros.core.errors import CheckpointError
+from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.core.processes import threads_each
 from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.checkpoint import BUNDLED, Checkpoint, control_options
@@ -30,15 +31,17 @@ from mtv_world_ros.physics.episode_objects import Majority, ObjectForesight
 from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
 from mtv_world_ros.physics.object_motion import ObjectMotionModel
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.robot.plan import ChunkPlan
+from mtv_world_ros.robot.plan import ChunkPlan, Plan
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.assembly import asked_describer
 from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions, with_keywords
+from mtv_world_ros.rollout.plan_comparison import foreseen_outcomes, plans_to_compare
 from mtv_world_ros.rollout.prediction import Prediction, StageClock
 from mtv_world_ros.rollout.rollout import ObservedChunk, Rollout
 from mtv_world_ros.rollout.scene_memory import SceneKeeper, SceneMemory
 from mtv_world_ros.rollout.state import RolloutState
 from mtv_world_ros.success.calibration import Calibration, Fits, HorizonCurve, load_fits
+from mtv_world_ros.success.comparison import Comparison
 from mtv_world_ros.success.doubts import doubted, Grounds, widened
 from mtv_world_ros.success.estimator import JudgedChunk, SuccessEstimator, verdict_word
 from mtv_world_ros.success.fitted_to import Setting
@@ -336,12 +339,64 @@ class Pipeline:
             TypeError: a keyword is no option.
         """
         options = with_keywords(options, keywords)
+        return Rollout(pipeline=self, options=options, _states=(self._state_at(observation),))
+
+    def compare(
+        self,
+        observation: Observation,
+        plans: Sequence[JointTrajectory | Plan],
+        options: RolloutOptions = DEFAULT_OPTIONS,
+    ) -> Comparison:
+        """Return which of several plans of one scene is better, without imagining frames.
+
+        All plans meet the same simulated futures, so that they can often be told apart where no
+        single verdict can be given, e.g. where contact was not fitted.
+
+        Args:
+            observation: observation that all plans start from.
+            plans: two plans or more of one length; times of trajectories count from the
+                observation.
+            options: instruction, objects and limits.
+
+        Raises:
+            ConfigError: this pipeline foresees no object motion, there are fewer than two plans,
+                or plans have another length, start or robot.
+            PlanError: a trajectory does not fit the robot.
+            ObservationError: the views are not the model's.
+            DescriptionError: the describer failed.
+            RolloutPreempted: `should_stop` of the options said so.
+        """
+        state = self._state_at(observation)
+        if state.objects.model is None:
+            raise ConfigError(
+                'plans are compared in simulated object motion, and this pipeline foresees none: '
+                'use a checkpoint with object_motion (mtv-world fit contact) and foresight=True'
+            )
+        start = state.observation
+        checked = plans_to_compare(plans, self.robot, start, options.limits, self.spec.fps)
+        first_frame = state.objects.first.frames[0]
+        options = replace(options, objects=self.name_objects(options, lambda: first_frame))
+        masks, estimator = self.find(state, options), self.estimator.for_task(options.task)
+        objects = state.objects.as_fitted() if options.contact.is_confirmed else state.objects
+        found = [
+            foreseen_outcomes(objects, plan, start, masks, self.spec, estimator, options)
+            for plan in checked
+        ]
+        reason = state.camera_check.refusal
+        if len({key for _, key, _ in found}) > 1:
+            reason = reason or 'the futures of the plans are not common'
+        return Comparison.of(
+            [outcomes for outcomes, _, _ in found],
+            reason=reason,
+            is_fitted=all(is_fitted for _, _, is_fitted in found),
+        )
+
+    def _state_at(self, observation: Observation) -> RolloutState:
+        """Return the state of an episode that begins at an observation, with checked cameras."""
         checker = self.camera_checker
         check = CameraCheck() if checker is None else checker.check(observation)
         observation = check.corrected_observation(observation)
-        objects = self._objects_in(observation)
-        state = RolloutState.at(observation, self.spec, objects, check)
-        return Rollout(pipeline=self, options=options, _states=(state,))
+        return RolloutState.at(observation, self.spec, self._objects_in(observation), check)
 
     def name_objects(
         self, options: RolloutOptions, first_frame: Callable[[], ByteArray]

@@ -175,25 +175,35 @@ class Comparison:
     def text(self) -> str:
         """The choice, in words."""
         count = len(self.outcomes)
+        return self.told_as(range(1, count + 1), count)
+
+    def told_as(self, numbers: Sequence[int], count: int) -> str:
+        """Return the choice in words, for plans that have other numbers.
+
+        Args:
+            numbers: number of each plan.
+            count: number of all plans, including those that were not compared.
+        """
+        best = self.best
+        title = f'plan {numbers[best]} of {count}'
         if self.reason:
-            return f'plan 1 of {count}: not told, {self.reason}'
-        best, done = self.best, self.num_successes
-        text = (
-            f'plan {best + 1} of {count}: succeeds in {done[best]} of {self.num_futures} futures'
-        )
+            return f'{title}: not told, {self.reason}'
+        done = self.num_successes
+        text = f'{title}: succeeds in {done[best]} of {self.num_futures} futures'
         pair = self.pair(0, best) if best else None
         if pair is None:
             return f'{text}, no other plan is better'
-        certain = f'{pair.confidence:.2f}'
-        told = 'better' if pair.better == best else 'not told from plan 1, which another one beats'
-        return f'{text}, plan 1 in {done[0]} ({told}, {certain})'
+        first = f'{text}, plan {numbers[0]} in {done[0]}'
+        if pair.better == best:
+            return f'{first} (better, {pair.confidence:.2f})'
+        return f'{first} (not told from it, but a third plan is better)'
 
 
 def _objection(outcomes: Sequence[Outcomes]) -> str:
     """Return the reason why outcomes cannot be compared; empty = they can be."""
-    unknown = [number for number, plan in enumerate(outcomes, 1) if not plan]
+    unknown = sum(not plan for plan in outcomes)
     if unknown:
-        return f'the outcome of plan {unknown[0]} is not foreseen'
+        return f'the outcome of {unknown} of {len(outcomes)} plans is not foreseen'
     if len({len(plan) for plan in outcomes}) > 1:
         return 'the plans have different numbers of futures'
     if len(_common(outcomes)) < RULE.min_known_fraction * len(outcomes[0]):

@@ -57,6 +57,15 @@ def test_the_choice_is_a_later_plan_only_where_it_is_better():
     )
 
 
+def test_the_text_uses_the_numbers_that_plans_have():
+    found = compared('----', '++++')
+    assert found.told_as([2, 5], 6).startswith('plan 5 of 6: succeeds in 4 of 4 futures, plan 2')
+    # the third beats the first; the second is not told from either, and comes before the third
+    between = compared('++------', '--++++--', '++----++')
+    assert between.beaten == {0} and between.best == 1
+    assert 'plan 1 in 2 (not told from it, but a third plan is better)' in between.text
+
+
 def test_a_future_that_is_lost_under_one_plan_counts_for_none():
     found = compared('++++??', '----++')
     assert (found.num_futures, found.num_successes) == (4, (4, 0))
@@ -65,7 +74,7 @@ def test_a_future_that_is_lost_under_one_plan_counts_for_none():
 
 @pytest.mark.parametrize(
     ('plans', 'words'),
-    [(('++', ''), 'outcome of plan 2 is not foreseen'), (('++', '++-'), 'different numbers'),
+    [(('++', ''), 'outcome of 1 of 2 plans is not foreseen'), (('++', '++-'), 'different numbers'),
      (('+???', '+--+'), 'most futures were lost')],
 )  # fmt: skip
 def test_outcomes_that_cannot_be_compared_tell_nothing(plans, words):

@@ -13,6 +13,7 @@ from sensor_msgs.msg import Image, JointState
 from mtv_world_ros.cameras.camera import scaled
 from mtv_world_ros.core.data_types import FloatArray, JointTrajectory, Observation, WorldModelSpec
 from mtv_world_ros.policies.policy import first_part, Policy
+from mtv_world_ros.rollout.candidates import CandidatePolicy
 from mtv_world_ros.ros.bags.player import ENDS
 from mtv_world_ros.ros.messages.conversions import NANO, to_ns, to_positions
 from mtv_world_ros.ros.messages.image_messages import to_rgb
@@ -40,6 +41,12 @@ class PolicySettings(NodeSettings):
         0, 'Stamp in it at which the episode begins, for the same [ns].', (0, 2**62)
     )
     seed: int = parameter(0, "Seed of the policy's own randomness.", (0, 2**31 - 1))
+    candidates: int = at_start(
+        1,
+        'Number of plans (seeds) that the policy is asked for when an episode begins. They are '
+        'compared in simulated futures, and the best one acts; the first where none is better.',
+        (1, 64),
+    )
     max_chunks: int = parameter(
         0, 'An episode ends after this number of chunks; 0 = no limit.', (0, 10**6)
     )
@@ -377,6 +384,11 @@ class PolicyLoop:
         }
         self._out.report('chunk', values)
 
+    def _choice(self) -> dict[str, object]:
+        """The plan that was chosen, where the policy has several candidates."""
+        policy = self._policy
+        return {'choice': policy.choice} if isinstance(policy, CandidatePolicy) else {}
+
     def _values(self) -> dict[str, object]:
         settings = self._settings
         return {
@@ -388,4 +400,5 @@ class PolicyLoop:
             'scene_seed': settings.scene_seed,
             'instruction': settings.instruction,
             'mode': settings.mode,
+            **self._choice(),
         }

@@ -25,6 +25,11 @@ from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.rollout.assembly import assemble_policy, PolicyMaker
+from mtv_world_ros.rollout.candidates import (
+    candidate_policy,
+    check_candidates,
+    comparing_pipeline,
+)
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.messages.conversions import make_header, to_trajectory_message, values_of
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
@@ -49,7 +54,23 @@ _MAX_ASKED = 3
 
 def load_named_policy(settings: PolicySettings, robot: RobotModel) -> PolicyMaker:
     """Return the maker of the policy that is set, for a robot."""
+    check_candidates(settings.policy, robot, settings.candidates)
     return assemble_policy(settings.policy, robot)
+
+
+def with_candidates(
+    load: Load, settings: PolicySettings, checkpoint: Checkpoint, robot: RobotModel
+) -> PolicyMaker:
+    """Return the maker of the policy, or of the best of its candidates.
+
+    Raises:
+        ConfigError: there are several candidates, and nothing that plans can be compared with.
+    """
+    if settings.candidates == 1:
+        return load(settings, robot)
+    pipeline = comparing_pipeline(checkpoint, robot)
+    makers = [load(settings, robot) for _ in range(settings.candidates)]
+    return lambda origin: candidate_policy([make(origin) for make in makers], pipeline)
 
 
 class PolicyNode(Node):
@@ -69,7 +90,7 @@ class PolicyNode(Node):
         settings = self._settings()
         self._checkpoint = checkpoint = Checkpoint.open(settings.checkpoint)
         robot = checkpoint.load_robot(settings.robot_file or None)
-        self._make_policy = load(settings, robot)
+        self._make_policy = with_candidates(load, settings, checkpoint, robot)
         self._spec, joint_names = checkpoint.spec, robot.joint_names
         self._status = StatusPublisher(self)
         self._buffer = ObservationBuffer(
