@@ -94,6 +94,8 @@ class Limits:
         jpeg_scans: number of scans of a progressive JPEG; each costs a pass over all pixels.
         video_bytes: size of a video once it is decoded.
         chunk_bytes: size of a bag's chunk once it is inflated, and of a message.
+        plan_bytes: size of a trajectory in a message.
+        message_bytes: size of a message that is no image and no trajectory.
         joint_names: number of joint names in a message.
         trajectory_points: number of points of a trajectory in a message.
         instruction_characters: length of an instruction.
@@ -117,6 +119,8 @@ class Limits:
     jpeg_scans: int = 64
     video_bytes: int = 2**32
     chunk_bytes: int = 2**28
+    plan_bytes: int = 32 * 2**20
+    message_bytes: int = 2**18
     joint_names: int = 1_000
     trajectory_points: int = 20_000
     instruction_characters: int = 4_000

@@ -11,6 +11,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
+from mtv_world_ros.data.bag.message_sizes import check_size
 from mtv_world_ros.data.bag.reader import BagMessage
 from mtv_world_ros.ros.messages.conversions import has_header, message_class, read_stamp
 from mtv_world_ros.ros.qos_profiles import best_offer, QosWatch
@@ -74,6 +75,7 @@ class LiveViewer(Node):
         return show
 
     def _show(self, topic: str, msgtype: str, data: bytes) -> None:
+        check_size(msgtype, data)
         # what has no stamp is about the last frame
         stamp_ns = read_stamp(data) if has_header(msgtype) else self._last_ns
         stamp_ns = stamp_ns or self._last_ns or self.get_clock().now().nanoseconds

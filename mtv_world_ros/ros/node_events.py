@@ -55,6 +55,10 @@ class NodeEvents(SensingEvents, Protocol):
         """Take a plan of the topic or of the action, and how long it was under way [s]."""
         ...
 
+    def on_refused_plan(self, error: Exception, stamp_ns: int) -> None:
+        """Answer a plan of the topic that was refused before it was decoded."""
+        ...
+
     def on_results(self) -> None:
         """Note that the worker has results; called from any thread."""
         ...

@@ -23,6 +23,7 @@ import yaml
 from mtv_world_ros.core.config import ListOf, Model, Schema
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
 from mtv_world_ros.robot.plan import PlanLimits
+from mtv_world_ros.ros.messages.request_limits import RefusingCallback
 from mtv_world_ros.vision.segmenters.registry import SEGMENTERS
 
 Span = tuple[float, float]
@@ -267,7 +268,9 @@ def guard_parameter_services(node: Node) -> None:
     """
     for service in node.services:
         name = service.srv_name.rpartition('/')[2]
-        if name in _SET_SERVICES and not isinstance(service.callback, _Answered):
+        if name in _SET_SERVICES and not isinstance(
+            service.callback, _Answered | RefusingCallback
+        ):
             service.callback = _Answered(service.callback)
 
 

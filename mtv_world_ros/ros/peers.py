@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
+from mtv_world_ros.ros.messages.bounded import subscribe_bounded
 from mtv_world_ros.ros.messages.conversions import values_of
 
 
@@ -22,7 +23,7 @@ class Peers:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._newest: dict[str, dict[str, str]] = {}
-        node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 100)
+        subscribe_bounded(node, DiagnosticArray, '/diagnostics', self._on_diagnostics, 100)
 
     def state(self, name: str) -> Mapping[str, str]:
         """Return the values of a node's newest diagnostics."""

@@ -25,6 +25,7 @@ from mtv_world_ros.core.processes import (
     PARENT_VARIABLE,
 )
 from mtv_world_ros.ros.guarded_clock import guard_clock
+from mtv_world_ros.ros.messages.request_limits import guard_services
 from mtv_world_ros.ros.parameters import guard_parameter_services
 from mtv_world_ros.ros.receive_paths import receive_paths, resolved_topics
 
@@ -48,6 +49,7 @@ def end_with_parent() -> None:
 def guard_node(node: Node) -> None:
     """Let a node outlive messages and requests of peers that rclpy itself fails on."""
     guard_parameter_services(node)
+    guard_services(node)
     guard_clock(node)
 
 

@@ -16,9 +16,12 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.ros.messages.conversions import make_header, to_status
+from mtv_world_ros.ros.namesakes import Namesakes, PROCESS
 
 #: a fault shows as a warning for this long [s]
 _WARN_S = 5.0
+#: message of a node without problems
+READY = 'ready'
 
 
 class StatusPublisher:
@@ -40,6 +43,7 @@ class StatusPublisher:
         self._last: tuple[float, str] | None = None
         self._report = create_publisher(node, DiagnosticArray, '~/report', reports_kept)
         self._diagnostics = create_publisher(node, DiagnosticArray, '/diagnostics', 10)
+        self._namesakes = Namesakes(node)
 
     def fault(self, kind: str, text: str) -> None:
         """Count a fault; `/diagnostics` warns of it for a while."""
@@ -68,10 +72,15 @@ class StatusPublisher:
             recent = self._last[1] if age < _WARN_S else ''
             warning = '; '.join(filter(None, (recent, warning)))
         level = DiagnosticStatus.WARN if warning else DiagnosticStatus.OK
-        self.diagnose(level, warning or 'ready', values)
+        self.diagnose(level, warning or READY, values)
 
     def diagnose(self, level: bytes, message: str, values: Mapping[str, object]) -> None:
-        """Publish `/diagnostics` as they are given."""
+        """Publish `/diagnostics` as they are given, with the process and others of its name."""
+        others = self._namesakes.warning()
+        if others:
+            level = max(level, DiagnosticStatus.WARN)
+            message = others if message == READY else f'{message} | {others}'
+        values = {**values, PROCESS: self._namesakes.process}
         self._publish(self._diagnostics, '', level, message, values)
 
     def _publish(

@@ -24,7 +24,9 @@ from rosgraph_msgs.msg import Clock
 from mtv_world_ros.ros.messages.conversions import NANO, to_stamp
 from test.robustness.default_client import SETTINGS
 from test.robustness.node_messages import commit, DAMAGE, damaged
+from test.robustness.usage import usage
 from test.support import ros_nodes as ros
+from test.support.large_messages import empty_points
 
 #: no plan takes longer, on a busy machine either [s]
 PATIENCE_S = 20.0
@@ -41,6 +43,8 @@ STOP_S, LATE_S = 0.3, 2.0
 #: Fast DDS ask for that message again [s]
 SETTLED_S = 0.05
 NUM_PLANS = 5
+#: processor time of a node from a plan that is too large to its answer, transport included [s]
+MOST_CPU_S = 0.2
 TOPICS = {
     'joints': '/joint_states',
     'plan': '/joint_trajectory',
@@ -244,6 +248,27 @@ def clock_that_is_no_time(inputs: NodeInputs, rng: np.random.Generator) -> None:
     client.node.destroy_publisher(clock)
 
 
+def plans_of_many_points(inputs: NodeInputs, rng: np.random.Generator) -> None:
+    """Plans of 4.8 and 24 MB that hold points and no values: each is answered, at no cost."""
+    client, pid = inputs.client, inputs.node.process.pid
+    for count in (200_000, 1_000_000):
+        stamp_ns, begin_s = int(client.now_ns()), _cpu_s(pid)
+        memory_mb = usage(pid)['memory_mb']
+        client.publish(TOPICS['plan'], empty_points(count, stamp_ns))
+        client.wait(lambda stamp=stamp_ns: inputs.ends(stamp), 'the answer', PATIENCE_S)
+        (end,) = inputs.ends(stamp_ns)
+        spent_s, grown_mb = _cpu_s(pid) - begin_s, usage(pid)['memory_mb'] - memory_mb
+        sys.stderr.write(f'{count} points: {spent_s:.2f} s of CPU, {grown_mb:+.0f} MB\n')
+        assert end['reason'] == 'trajectory_malformed' and str(count) in end['text'], end
+        assert spent_s < MOST_CPU_S, f'{spent_s:.2f} s of CPU for {count} points'
+
+
+def _cpu_s(pid: int) -> float:
+    """Return the processor time of a process so far [s]."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
 ATTACKS: dict[str, Callable[[NodeInputs, np.random.Generator], None]] = {
     attack.__name__: attack
     for attack in (
@@ -255,6 +280,7 @@ ATTACKS: dict[str, Callable[[NodeInputs, np.random.Generator], None]] = {
         one_bad_joint,
         best_effort_policy,
         clock_that_is_no_time,
+        plans_of_many_points,
     )
 }
 

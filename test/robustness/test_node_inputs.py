@@ -24,4 +24,4 @@ def test_no_input_of_a_peer_ends_blinds_or_silences_the_node():
     )
     assert done.returncode == 0, done.stdout + done.stderr
     rows = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [row['attack'] for row in rows][-2:] == ['fuzz', 'end'] and len(rows) == 10
+    assert [row['attack'] for row in rows][-2:] == ['fuzz', 'end'] and len(rows) == 11

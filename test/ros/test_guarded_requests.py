@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 import signal
+import time
 
 import pytest
 
@@ -12,6 +13,7 @@ rclpy = pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue  # noqa: E402
 from rcl_interfaces import srv  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 
 from mtv_world_ros.core.files import share_path  # noqa: E402
@@ -113,3 +115,37 @@ def test_a_message_that_cannot_be_shown_does_not_end_the_viewer(context, monkeyp
         monkeypatch.setattr(node, '_show', lambda *_: 1 / 0)
         node._handler('/topic', 'std_msgs/msg/String')(b'')
         assert node._num_refused == 1
+
+
+@pytest.mark.parametrize('name', ['SetParameters', 'SetParametersAtomically', 'GetParameters'])
+def test_a_request_of_many_items_is_refused_before_it_is_decoded(name, context):
+    kind = getattr(srv, name)
+    field, item = ('names', 'x') if name == 'GetParameters' else ('parameters', Parameter())
+    with ended(Node('many')) as node, ended(Node('client')) as client:
+        run_node.guard_node(node)
+        run_node.guard_node(node)
+        (served,) = (s for s in node.services if isinstance(s.srv_type.Request(), kind.Request))
+        caller = client.create_client(kind, served.srv_name)
+        assert caller.wait_for_service(60.0)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        for count in (100_000, 1):
+            answer, spent_s = caller.call_async(kind.Request(**{field: [item] * count})), 0.0
+            while not answer.done():
+                begin_s = time.thread_time()
+                executor.spin_once(timeout_sec=0.1)
+                spent_s += time.thread_time() - begin_s
+                rclpy.spin_once(client, timeout_sec=0.1)
+            assert spent_s < 0.1
+            values = list(results_of(answer.result()))
+            said = [value.reason for value in values if hasattr(value, 'reason')]
+            is_refused = any('100000 items; at most 2000 are read' in text for text in said)
+            assert is_refused == (count > 1 and name != 'GetParameters')
+            assert len(values) == 1 or name == 'GetParameters' and not values
+
+
+def results_of(response) -> list:
+    """Return the results of a response, whether it has one or several."""
+    one = getattr(response, 'result', None)
+    several = getattr(response, 'results', getattr(response, 'values', []))
+    return [one] if one is not None else list(several)

@@ -22,6 +22,7 @@ from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 
+from mtv_world_ros.core.clock_offset import Offset, read_offset
 from mtv_world_ros.core.errors import (
     CalibrationError,
     ConfigError,
@@ -31,6 +32,7 @@ from mtv_world_ros.core.errors import (
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data.episode import CALIBRATION_FILE, EpisodeInfo, METADATA_NAME, parse_info
 from mtv_world_ros.data.episode_cameras import views_without_info
+from mtv_world_ros.ros.messages.bounded import subscribe_bounded
 from mtv_world_ros.ros.messages.conversions import (
     has_header,
     message_class,
@@ -77,19 +79,19 @@ class Timeline:
         bag_ns: bag time at which playing started [ns].
         steady_ns: monotonic time at that moment, moved on by every pause [ns].
         rate: seconds of the bag a second.
-        offset_ns: system time minus monotonic time [ns].
+        offset: offset of the system clock.
     """
 
     bag_ns: int
     steady_ns: int
     rate: float
-    offset_ns: int
+    offset: Offset
 
     @classmethod
     def now(cls, bag_ns: int, rate: float) -> Timeline:
         """Return the timeline that has a bag time now."""
         steady_ns = time.monotonic_ns()
-        return cls(bag_ns, steady_ns, rate, time.time_ns() - steady_ns)
+        return cls(bag_ns, steady_ns, rate, read_offset())
 
     def due(self, bag_ns: int) -> int:
         """Return the monotonic time at which a bag time is due [ns]."""
@@ -101,10 +103,10 @@ class Timeline:
 
     def stamp(self, bag_ns: int) -> int:
         """Stamp of the system clock at which a bag time is due [ns]."""
-        offset_ns = time.time_ns() - time.monotonic_ns()
-        if abs(offset_ns - self.offset_ns) > _CLOCK_STEP_NS:
-            self.offset_ns = offset_ns
-        return self.due(bag_ns) + self.offset_ns
+        offset = read_offset()
+        if offset.step_ns(self.offset, _CLOCK_STEP_NS):
+            self.offset = offset
+        return self.due(bag_ns) + self.offset.value_ns
 
     def pause(self, duration_ns: int) -> None:
         """Delay everything after this moment."""
@@ -191,7 +193,7 @@ class Player(Node):
         self._ends: list[dict[str, str]] = []
         self._was_reported = False
         self._unpublished: set[tuple[str, str]] = set()
-        self.create_subscription(DiagnosticArray, options.report_topic, self._on_report, 100)
+        subscribe_bounded(self, DiagnosticArray, options.report_topic, self._on_report, 100)
         self._objects = self._offer_objects(types)
         self._hint = self._describe_cameras(types)
         self._say_parameters(types)

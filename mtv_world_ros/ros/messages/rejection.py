@@ -39,6 +39,8 @@ class Reason(StrEnum):
     JOINT_SPEEDS = 'joint_speeds'
     INSTRUCTION_TOO_LONG = 'instruction_too_long'
     OBJECTS_TOO_LONG = 'objects_too_long'
+    MESSAGE_TOO_LARGE = 'message_too_large'
+    MESSAGE_MALFORMED = 'message_malformed'
     NO_CLOCK = 'no_clock'
     NOT_ACTIVE = 'not_active'
     WORLD_MODEL_MISSING = 'world_model_missing'

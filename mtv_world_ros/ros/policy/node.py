@@ -31,6 +31,7 @@ from mtv_world_ros.rollout.candidates import (
     comparing_pipeline,
 )
 from mtv_world_ros.ros import parameters
+from mtv_world_ros.ros.messages.bounded import bounded
 from mtv_world_ros.ros.messages.conversions import make_header, to_trajectory_message, values_of
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.policy.loop import PolicyLoop, PolicySettings, PredictedFrames
@@ -187,7 +188,11 @@ class PolicyNode(Node):
         ]
         self._predictions = [
             self.create_subscription(
-                kind, f'{world_model}/{topic}', self._guarded(handle), profile
+                kind,
+                f'{world_model}/{topic}',
+                self._guarded(bounded(kind, handle)),
+                profile,
+                raw=True,
             )
             for kind, topic, handle in topics
         ]

@@ -22,6 +22,7 @@ from mtv_world_ros.core.transforms import inverse, quaternion
 from mtv_world_ros.data.transform_tree import Mount, STILL, TransformTree
 from mtv_world_ros.robot.file import described_robot
 from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.ros.messages.bounded import bounded
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 from mtv_world_ros.ros.node_events import SensingEvents
@@ -56,7 +57,8 @@ class RobotDescription:
         self.problem = ''
         self._offset_m: float | None = None
         self._topic = node.resolve_topic_name(TOPIC)
-        node.create_subscription(String, TOPIC, events.guarded(self._take), LATCHED)
+        take = events.guarded(bounded(String, self._take, 'urdf_bytes'))
+        node.create_subscription(String, TOPIC, take, LATCHED, raw=True)
 
     def check(self) -> None:
         """Refuse to go on while another robot is described.
@@ -146,8 +148,8 @@ class Extrinsics:
             ('/tf', QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT), False),
             ('/tf_static', QoSProfile(depth=100, durability=LATCHED.durability), True),
         ):
-            take = events.guarded(partial(self._take, latched=latched))
-            node.create_subscription(self._message, topic, take, qos)
+            take = bounded(self._message, partial(self._take, latched=latched))
+            node.create_subscription(self._message, topic, events.guarded(take), qos, raw=True)
 
     def pose(self, view: str, frame: str, stamp_ns: int) -> Mount | None:
         """Return the link and pose of a view's camera by TF; None = use the calibration file.

@@ -20,6 +20,7 @@ from mtv_world_ros.policies.policy import EpisodeOrigin
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.rollout.imagined_episodes import EpisodeStart
 from mtv_world_ros.ros import parameters
+from mtv_world_ros.ros.messages.bounded import bounded
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 from mtv_world_ros.ros.parameters import at_start, LiveSettings
 from mtv_world_ros.ros.qos_profiles import QosWatch
@@ -152,7 +153,7 @@ class LiveObserver(Node):
             buffer=self._buffer,
             guarded=self.guarded,
         )
-        take = self.guarded(self._take_instruction)
+        take = self.guarded(bounded(String, self._take_instruction))
         self._words = MatchedSubscription(self, String, 'instruction', take, depth=1)
         self._watch = QosWatch(self)
         parameters.refuse_unknown(self)

@@ -12,6 +12,7 @@ from typing import Generic, TypeVar
 from rclpy.clock import ROSClock
 from rclpy.node import Node
 
+from mtv_world_ros.core.clock_offset import Offset, read_offset
 from mtv_world_ros.ros.messages.conversions import NANO
 
 Value = TypeVar('Value')
@@ -19,6 +20,7 @@ Value = TypeVar('Value')
 RESTART_S = 1.0
 #: a change of the system clock against the monotonic clock that is a step, not a drift [s]
 STEP_S = 0.1
+_STEP_NS = round(STEP_S * NANO)
 
 
 class NodeTime:
@@ -38,7 +40,7 @@ class NodeTime:
     ) -> None:
         self.now_ns, self.is_simulated = now_ns, is_simulated
         self._monotonic_ns = monotonic_ns
-        self._offset_ns: int | None = None
+        self._offset: Offset | None = None
 
     @classmethod
     def of(cls, node: Node) -> NodeTime:
@@ -51,14 +53,25 @@ class NodeTime:
         return cls(lambda: clock.now().nanoseconds, is_simulated)
 
     def step_s(self) -> float:
-        """Return the step of the system clock since the last call [s]; 0 = none."""
+        """Return the step of the system clock since the last call [s]; 0 = none.
+
+        A step counts once two readings agree on it.
+        """
         if self.is_simulated():
-            self._offset_ns = None
+            self._offset = None
             return 0.0
-        offset_ns = self.now_ns() - self._monotonic_ns()
-        before, self._offset_ns = self._offset_ns, offset_ns
-        step_s = 0.0 if before is None else (offset_ns - before) / NANO
-        return step_s if abs(step_s) > STEP_S else 0.0
+        offset, before = self._read(), self._offset
+        if before is None or not offset.step_ns(before, _STEP_NS):
+            self._offset = offset
+            return 0.0
+        again = self._read()
+        if again.step_ns(offset, _STEP_NS) or not again.step_ns(before, _STEP_NS):
+            return 0.0
+        self._offset = again
+        return again.step_ns(before, _STEP_NS) / NANO
+
+    def _read(self) -> Offset:
+        return read_offset(self.now_ns, self._monotonic_ns)
 
 
 class Samples(Generic[Value]):

@@ -18,7 +18,9 @@ from trajectory_msgs.msg import JointTrajectory
 from mtv_world_ros.cameras.camera_info import RECTIFIED
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.ros import parameters
-from mtv_world_ros.ros.messages.conversions import NANO
+from mtv_world_ros.ros.messages.bounded import bounded, decode
+from mtv_world_ros.ros.messages.conversions import MIN_STAMPED_BYTES, NANO, read_stamp
+from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.node_events import NodeEvents
 from mtv_world_ros.ros.qos_profiles import QosWatch
 from mtv_world_ros.ros.receive_paths import PATHS, SERVICES
@@ -66,13 +68,19 @@ class Inputs:
             guarded=events.guarded,
         )
         self._all = [*self._observations]
-        instruction = events.guarded(events.on_instruction)
+        instruction = events.guarded(bounded(String, events.on_instruction))
         self._all.append(MatchedSubscription(node, String, 'instruction', instruction, depth=1))
-        objects = events.guarded(events.on_objects)
+        objects = events.guarded(bounded(String, events.on_objects))
         self._all.append(MatchedSubscription(node, String, 'objects', objects, depth=1))
-        take = events.guarded(events.on_plan)
+        take, refuse = events.guarded(events.on_plan), events.guarded(events.on_refused_plan)
 
-        def handle(message: JointTrajectory, info: Mapping[str, int]) -> None:
+        def handle(data: bytes, info: Mapping[str, int]) -> None:
+            try:
+                message = decode(JointTrajectory, data)
+            except Rejection as error:
+                stamp_ns = read_stamp(data) if len(data) >= MIN_STAMPED_BYTES else 0
+                refuse(error, stamp_ns)
+                return
             take(message, (info['received_timestamp'] - info['source_timestamp']) / NANO)
 
         self._plans = MatchedSubscription(
@@ -146,7 +154,7 @@ def subscribe_observations(
         ]
     newest.append((JointState, 'joint_states', buffer.add_joint_state, 10))
     return [
-        MatchedSubscription(node, kind, topic, guarded(handle), depth=depth)
+        MatchedSubscription(node, kind, topic, guarded(bounded(kind, handle)), depth=depth)
         for kind, topic, handle, depth in newest
     ]
 
@@ -167,7 +175,8 @@ class MatchedSubscription:
         node: node that subscribes.
         kind: class of the message.
         topic: relative or absolute name of the topic.
-        callback: receiver of the messages; with two arguments also of rclpy's information.
+        callback: receiver of the serialised messages (see `bounded`); with two arguments also of
+            rclpy's information.
         depth: number of messages in the queue.
         default: `match`, or `reliable`, `best_effort` for a plain subscription.
     """
@@ -250,10 +259,12 @@ class MatchedSubscription:
                 incompatible_qos=lambda _: self.refresh(),
             )
             return self._node.create_subscription(
-                self._kind, self.topic, self._callback, profile, event_callbacks=events
+                self._kind, self.topic, self._callback, profile, event_callbacks=events, raw=True
             )
         except UnsupportedEventTypeError:
-            return self._node.create_subscription(self._kind, self.topic, self._callback, profile)
+            return self._node.create_subscription(
+                self._kind, self.topic, self._callback, profile, raw=True
+            )
 
     def _on_matched(self, event: Any, qos: tuple[Any, ...]) -> None:
         if self._next is None:

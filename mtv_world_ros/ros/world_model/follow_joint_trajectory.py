@@ -13,13 +13,16 @@ import numpy as np
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.exceptions import InvalidHandle
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from trajectory_msgs.msg import JointTrajectoryPoint
 
+from mtv_world_ros.core.bounded_input import limits
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
+from mtv_world_ros.ros.messages.request_limits import bounded_action, RefusedRequest
 from mtv_world_ros.ros.node_events import NodeEvents
 from mtv_world_ros.ros.world_model.goal import Goal
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request, Result
@@ -59,6 +62,7 @@ class FollowJointTrajectory:
             handle_accepted_callback=self._on_accepted,
             cancel_callback=self._on_cancel,
         )
+        self._server.refuse = events.guarded(_refuse)
 
     def close(self) -> None:
         """End the server."""
@@ -161,7 +165,26 @@ class _Server(ActionServer):
     """An action server whose goals end by `conclude`.
 
     rclpy's own way, a coroutine that waits, keeps the executor busy.
+
+    Attributes:
+        refuse: called with a goal that has too many points or tolerances to be read.
     """
+
+    refuse: Callable[[RefusedRequest], None]
+
+    def __init__(self, node: Node, action: Any, name: str, **callbacks: Any) -> None:
+        super().__init__(node, action, name, **callbacks)
+        self._action_type = bounded_action(action, limits().trajectory_points)
+
+    async def _execute_goal_request(self, taken: Any) -> None:
+        header, request = taken
+        if not isinstance(request, RefusedRequest):
+            await super()._execute_goal_request(taken)
+            return
+        self.refuse(request)
+        response = self._action_type.Impl.SendGoalService.Response(accepted=False)
+        with suppress(rclpy_implementation.RCLError):  # the client may have gone away
+            self._handle.send_goal_response(header, response)
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
         """Do nothing yet."""
@@ -233,6 +256,10 @@ def _point(positions: FloatArray, seconds: float) -> JointTrajectoryPoint:
         positions=[float(x) for x in positions],
         time_from_start=Duration(sec=sec, nanosec=nanosec),
     )
+
+
+def _refuse(request: RefusedRequest) -> None:
+    raise Rejection(Reason.MESSAGE_TOO_LARGE, f'{NAME}: {request}')
 
 
 def _never(_: ServerGoalHandle) -> None:

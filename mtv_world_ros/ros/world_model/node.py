@@ -45,6 +45,7 @@ class WorldModelNode(LifecycleNode):
         self._service_change_state.callback = self._on_change_state  # type: ignore[assignment]
         self._rollouts: Rollouts | None = None
         self._error: Exception | None = None
+        self._is_starting = False
         self._reporter = Reporter(self, self.settings, self._state, self._missing)
         self.create_timer(
             self._settings.diagnostics_period_s,
@@ -65,7 +66,10 @@ class WorldModelNode(LifecycleNode):
         if not self._settings.autostart:
             self.get_logger().info('unconfigured: waits for a lifecycle manager')
             return
-        if self.trigger_configure() != TransitionCallbackReturn.SUCCESS and self._error:
+        self._is_starting = True
+        configured = self.trigger_configure()
+        self._is_starting = False
+        if configured != TransitionCallbackReturn.SUCCESS and self._error:
             raise self._error
         self.trigger_activate()
 
@@ -85,8 +89,9 @@ class WorldModelNode(LifecycleNode):
         except Exception as error:
             self._release()
             self._error = error
-            if not self._settings.autostart:
+            if not self._is_starting:  # then the process ends with the error
                 self._say(error)
+                self._reporter.publish_diagnostics()
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from mtv_world_ros.core.data_types import SuccessEstimate
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.parameters import Settings
-from mtv_world_ros.ros.status_publisher import StatusPublisher
+from mtv_world_ros.ros.status_publisher import READY, StatusPublisher
 from mtv_world_ros.ros.world_model.chunk_outcomes import ScoredChunk, Sent
 from mtv_world_ros.ros.world_model.prediction_publisher import stamp_of
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request
@@ -247,7 +247,7 @@ class Tally:
                 'trajectories arrive faster than the model predicts'
             )
         texts += [', '.join(missing)] if missing else []
-        return (level, ' | '.join(texts)) if texts else (DiagnosticStatus.OK, 'ready')
+        return (level, ' | '.join(texts)) if texts else (DiagnosticStatus.OK, READY)
 
     def values(self, now_s: float) -> dict[str, object]:
         """Return keys and values: counts, `rejected.<reason>`, the last rejection, latencies."""

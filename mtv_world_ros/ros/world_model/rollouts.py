@@ -404,6 +404,11 @@ class Rollouts:
         self._arrived.append(_Arrived(time.monotonic(), plan, transport_s))
         self._arrivals.trigger()
 
+    def on_refused_plan(self, error: Exception, stamp_ns: int) -> None:
+        """Answer a plan of the topic that was refused before it was decoded."""
+        self._reporter.count('trajectories_received')
+        self._reporter.reject_trajectory(error, stamp_ns)
+
     def start_waiting(self) -> None:
         """Start the plans that wait, up to one that is early."""
         while self._arrived and not (self._is_active and self._is_early(self._arrived[0])):

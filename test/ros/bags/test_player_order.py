@@ -1,5 +1,6 @@
 """The order of what is played, and when; how plans ended."""
 
+from mtv_world_ros.core.clock_offset import Offset
 from mtv_world_ros.data.bag.reader import BagMessage
 from mtv_world_ros.ros.bags import player
 from mtv_world_ros.ros.bags.player import (
@@ -33,7 +34,7 @@ def test_messages_play_by_time_with_the_plan_after_what_it_is_made_from():
 
 
 def test_timeline_follows_rate_and_pauses():
-    timeline = Timeline(bag_ns=100 * NANO, steady_ns=1000 * NANO, rate=4.0, offset_ns=0)
+    timeline = Timeline(bag_ns=100 * NANO, steady_ns=1000 * NANO, rate=4.0, offset=Offset(0, 0))
     assert timeline.due(108 * NANO) == 1002 * NANO
     assert timeline.bag_time(1001 * NANO) == 104 * NANO
     timeline.pause(3 * NANO)
@@ -53,6 +54,24 @@ def test_a_system_clock_that_is_set_changes_stamps_and_not_the_pace(monkeypatch)
     system[0] -= 90 * NANO
     assert timeline.due(102 * NANO) == 1002 * NANO
     assert timeline.stamp(102 * NANO) == 4912 * NANO + 3_000_000
+
+
+def test_a_pause_between_two_readings_of_clocks_changes_no_stamp(monkeypatch):
+    """The process does not run for .15 s whenever one clock was read."""
+    now, pause = [1000 * NANO], [0]
+
+    def read(offset_ns):
+        value = now[0] + offset_ns
+        now[0] += pause[0]
+        return value
+
+    monkeypatch.setattr(player.time, 'monotonic_ns', lambda: read(0))
+    monkeypatch.setattr(player.time, 'time_ns', lambda: read(4000 * NANO))
+    timeline = Timeline.now(bag_ns=100 * NANO, rate=1.0)
+    pause[0] = 150_000_000
+    assert timeline.stamp(102 * NANO) == 5002 * NANO
+    pause[0] = 0
+    assert timeline.stamp(102 * NANO) == 5002 * NANO
 
 
 def test_plans_that_were_not_imagined_are_listed_by_reason_and_others_are_no_failure():

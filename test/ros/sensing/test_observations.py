@@ -406,3 +406,40 @@ def test_steps_of_the_system_clock_are_told_from_its_drift():
     simulated[0] = True  # rclpy tells of jumps of /clock
     now[0] = 0
     assert time.step_s() == 0.0
+
+
+@pytest.mark.parametrize('paused', [('now',), ('steady',), ('now', 'steady')])
+@pytest.mark.parametrize(
+    'interrupted', [1, 2, 3, 10**6], ids=['once', 'twice', 'thrice', 'always']
+)
+def test_a_pause_between_two_readings_of_clocks_is_no_step(paused, interrupted):
+    """The process does not run for .15 or .3 s between them: at times, or always."""
+    true, left = [NOW], [0]
+
+    def read(name, offset_ns):
+        value = true[0] + offset_ns
+        if name in paused and left[0] > 0:
+            left[0] -= 1
+            true[0] += 150 * MS
+        return value
+
+    time = NodeTime(lambda: read('now', 0), lambda: False, lambda: read('steady', -NOW))
+    assert time.step_s() == 0.0
+    for _ in range(4):
+        left[0] = interrupted
+        assert time.step_s() == 0.0
+    left[0] = 0
+    assert time.step_s() == 0.0
+
+
+def test_a_step_is_believed_once_two_readings_agree_on_it():
+    """A clock of one wrong reading did not step; one that stays away did."""
+    readings, now = [0, 0, 3600], 0
+
+    def offset_s():
+        return readings.pop(0) if readings else now
+
+    time = NodeTime(lambda: NOW + offset_s() * NANO, lambda: False, lambda: 0)
+    assert [time.step_s() for _ in range(3)] == [0.0, 0.0, 0.0]
+    now = -90
+    assert time.step_s() == pytest.approx(-90.0)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rclpy.action import ActionClient
 from rclpy.duration import Duration
+from trajectory_msgs.msg import JointTrajectoryPoint
 
 NAME = '/world_model/follow_joint_trajectory'
 BLOCKS, SLOW = 1200, 1400  # seeds: a rollout that lasts until it is stopped, and 0.3 s a chunk
@@ -337,3 +338,21 @@ def test_shutting_down_in_mid_rollout_ends_the_goal(client, new_controller, ros)
     status, _, text = controller.result(running)
     assert status == GoalStatus.STATUS_ABORTED and 'the node was deactivated' in text
     client.wait(lambda: client.diagnostic_values().get('lifecycle') == 'finalized', 'health')
+
+
+@needs_control_msgs
+def test_a_goal_of_many_points_is_refused_before_it_is_decoded(node, client, new_controller):
+    controller = new_controller()
+    goal = controller.messages.Goal()
+    goal.trajectory.points = [JointTrajectoryPoint()] * 20_001
+    before = int(client.diagnostic_values().get('rejected.message_too_large', 0))
+    answer = controller.actions.send_goal_async(goal)
+    client.wait(answer.done, 'the answer')
+    assert not answer.result().accepted
+    client.wait(
+        lambda: int(client.diagnostic_values().get('rejected.message_too_large', 0)) == before + 1,
+        'the count in /diagnostics',
+    )
+    said = client.diagnostic_values()['last_rejection']
+    assert 'the request has 20001 items; at most 20000 are read' in said
+    assert client.imagine_one()['state'] == 'done'

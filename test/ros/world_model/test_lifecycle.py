@@ -146,3 +146,21 @@ def test_what_cannot_be_loaded_leaves_it_unconfigured_and_says_why(tmp_path, sta
     assert manager.change(ACTIVATE)
     client.connect_inputs(ros.INPUTS)
     assert client.imagine_one()['state'] == 'done'
+
+
+def test_a_later_configure_that_fails_is_said_with_autostart_as_well(tmp_path, start, client, ros):
+    process = start()
+    manager = Manager(client)
+    client.subscribe(DiagnosticArray, '/diagnostics', 10)
+    assert manager.change(DEACTIVATE) and manager.change(CLEANUP)
+    (tmp_path / 'calibration.yaml').rename(tmp_path / 'moved.yaml')
+    assert not manager.change(CONFIGURE)
+    assert manager.state() == 'unconfigured'
+
+    def says_why():
+        messages = [status.message for status in client.statuses('/diagnostics')]
+        return any('not configured' in text and 'calibration.yaml' in text for text in messages)
+
+    client.wait(says_why, 'the reason in /diagnostics')
+    said = [line for line in process.output().splitlines() if 'not configured' in line]
+    assert len(said) == 1 and 'calibration.yaml' in said[0]

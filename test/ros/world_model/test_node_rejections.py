@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.data.measured_joints import REACH
+from test.support.large_messages import empty_points
 
 OUT_OF_MEMORY, CRASHES, STUCK = 1100, 1300, 1500
 
@@ -392,4 +393,38 @@ def test_a_camera_that_cannot_be_is_refused(node, client, ros, changes):
     else:
         assert ended['reason'] in ('camera_info_changed', 'camera_info_invalid')
     client.send_scene()
+    expect_goes_on(client)
+
+
+@pytest.mark.parametrize('count', [200_000, 1_000_000])
+def test_a_plan_of_many_points_is_answered_once_before_it_is_decoded(node, client, ros, count):
+    expect_goes_on(client)
+    stamp_ns, known = client.now_ns(), len(client.reports_of('rejected'))
+    before = rejections(client, 'trajectory_malformed')
+    client.publish('/joint_trajectory', empty_points(count, stamp_ns))
+    client.wait(lambda: len(client.reports_of('rejected')) > known, 'the answer')
+    expect_counted(client, 'trajectory_malformed', before)
+    assert len(client.reports_of('rejected')) == known + 1
+    answer = client.report_values('rejected')[-1]
+    assert answer['trajectory_stamp_ns'] == str(stamp_ns)
+    assert answer['reason'] == 'trajectory_malformed'
+    assert f'has {count} points; at most 20000 are read' in answer['text']
+    expect_goes_on(client)
+
+
+def test_bytes_that_are_no_plan_are_answered(node, client, ros):
+    known, stamp_ns = len(client.reports_of('rejected')), client.now_ns()
+    client.publish('/joint_trajectory', empty_points(3, stamp_ns)[:-40])
+    client.wait(lambda: len(client.reports_of('rejected')) > known, 'the answer')
+    answer = client.report_values('rejected')[-1]
+    assert answer['trajectory_stamp_ns'] == str(stamp_ns)
+    assert 'bytes hold no whole JointTrajectory' in answer['text']
+    expect_goes_on(client)
+
+
+@pytest.mark.parametrize('topic', ['/instruction', '/joint_states', '/low/camera_info'])
+def test_large_messages_of_other_topics_are_counted(node, client, topic):
+    before = rejections(client, 'message_too_large')
+    client.publish(topic, b'\0\1\0\0' + bytes(2**18))
+    expect_counted(client, 'message_too_large', before)
     expect_goes_on(client)
