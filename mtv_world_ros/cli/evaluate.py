@@ -213,6 +213,7 @@ _J = (
 def in_short(summary: EvaluationSummary) -> str:
     """Return the one line of an evaluation that is printed; all else is in its report."""
     from mtv_world_ros.core.documents import number
+    from mtv_world_ros.evaluation.evaluation_summary import TRAINING
     from mtv_world_ros.evaluation.metrics.statistics import MIN_EPISODES
     from mtv_world_ros.evaluation.tables import cell
 
@@ -230,7 +231,9 @@ def in_short(summary: EvaluationSummary) -> str:
     few = f'; no intervals below {MIN_EPISODES} episodes' if count < MIN_EPISODES else ''
     failed = len(summary.failed)
     lost = f'; {failed} episodes failed, see the report' if failed else ''
-    return f'{", ".join(said)}, {count} episode{"s" * (count > 1)}{few}{lost}'
+    training = summary.provenance.get(TRAINING, '')
+    seen = f', {training}' if training else ''
+    return f'{", ".join(said)}, {count} episode{"s" * (count > 1)}{seen}{few}{lost}'
 
 
 def _slug(label: str) -> str:
@@ -290,6 +293,7 @@ def _score(
             'dataset': f'{arguments.dataset}: {selection}',
             'physics': truth,
         },
+        trained_on=checkpoint.with_adapter(arguments.adapter).trained_episodes,
         parallel=parallel,
         describer=asked_describer(arguments.describer),
         overwrite=arguments.overwrite,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,8 @@ class Recording:
             views, then NaN until seen; None where neither is there.
         warnings: problems found and how the reader handled them.
         place: name of the robot cell; empty = not stated.
+        digest: digest of the measured joint motion, by which an episode is known again: it stays
+            the same in copies, in imports and with other cameras; empty = not known.
         recorded: frames and camera of each of the V views at the recorded size; empty = read from
             a cache.
     """
@@ -82,6 +85,7 @@ class Recording:
     described: tuple[str, ...] = ()
     masks_by: str = ''
     place: str = ''
+    digest: str = ''
     camera_tracks: Mapping[str, FloatArray] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     recorded: tuple[tuple[Track, CameraModel], ...] = ()
@@ -209,6 +213,7 @@ def load_recording(
         object_poses=_object_poses(episode, robot, spec.views, stamps, positions),
         masks_by=episode.info.metadata.get(MASKS_BY, ''),
         place=episode.info.place,
+        digest=motion_digest(episode),
         camera_tracks={
             view: track[nearest_rows(np.asarray(episode.images[view].stamps_ns), stamps)]
             for view, track in episode.camera_tracks.items()
@@ -294,6 +299,24 @@ def measured_positions(episode: Episode, robot: RobotModel, stamps: np.ndarray) 
     if states is None or len(states.stamps_ns) == 0:
         raise EpisodeError(f"episode '{episode.info.path}' has no joint_states")
     return states.at(stamps, robot)
+
+
+#: decimals of joint positions in a digest: rosbags and tables store more
+_DIGEST_DECIMALS = 4
+
+
+def motion_digest(episode: Episode) -> str:
+    """Return a digest of the measured joint positions; empty without joint states.
+
+    Stamps are left out, since imports of tables set them; so is the order of the joints.
+    """
+    states = episode.joint_states
+    if states is None or len(states.stamps_ns) == 0:
+        return ''
+    order = np.argsort(states.joint_names)
+    positions = np.round(states.positions[:, order], _DIGEST_DECIMALS) + 0.0  # no -0.0
+    names = ','.join(sorted(states.joint_names))
+    return hashlib.sha256(names.encode() + positions.astype('<f8').tobytes()).hexdigest()[:16]
 
 
 def frame_indices(

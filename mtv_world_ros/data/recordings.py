@@ -42,7 +42,7 @@ from mtv_world_ros.vision.describers.describer import Describer, name_objects
 #: reads the arrays of an .npz file by name, within a field of `Limits`
 ArrayReader = Callable[[Path, str], dict[str, np.ndarray]]
 #: to be increased when the stored data or their computation change
-_VERSION = 3
+_VERSION = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -250,7 +250,7 @@ def _key(path: Path, spec: WorldModelSpec, robot: RobotModel, source: EpisodeSou
 
 
 #: fields of a recording, of its commands and of a camera, as they are stored
-_TEXT = ('task', 'outcome', 'instruction', 'objects', 'masks_by', 'place', 'stamp_ns')
+_TEXT = ('task', 'outcome', 'instruction', 'objects', 'masks_by', 'place', 'stamp_ns', 'digest')
 _ARRAYS = ('times', 'frames', 'positions', 'object_ids', 'object_poses')
 _OF_COMMANDS = ('times', 'positions', 'velocities')
 _OF_CAMERA = ('view', 'width', 'height', 'distortion_model', 'mount_link', 'error_px')

@@ -189,6 +189,15 @@ def task_definitions(dataset: Path) -> dict[str, dict[str, Any]]:
     return _card(dataset).task_definitions
 
 
+def splits_of(dataset: Path) -> dict[str, list[str]]:
+    """Return the names of a data set's episodes by split; empty if it has none.
+
+    Raises:
+        ConfigError: the card cannot be read.
+    """
+    return _card(dataset).splits
+
+
 class _Entry(BaseModel):
     """An episode in `dataset.json`: its name, what is zero-shot in it, scene and seed if any."""
 

@@ -196,6 +196,7 @@ class EpisodeScorer:
             seconds_per_chunk=float(np.mean(found.chunk_seconds)),
             seconds=found.seconds,
             has_ids=recording.object_ids is not None and not recording.masks_by,
+            digest=recording.digest,
         )
 
     def _read(self, path: Path) -> Recording:

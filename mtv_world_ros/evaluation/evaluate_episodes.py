@@ -20,7 +20,7 @@ from mtv_world_ros.core.processes import threads_each
 from mtv_world_ros.core.worker_pool import score_all
 from mtv_world_ros.data.recordings import described_objects
 from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, EvaluationJob, Instruments
-from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, Group
+from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, Group, TRAINING
 from mtv_world_ros.evaluation.metrics.feature_store import (
     feature_path,
     FeatureTaker,
@@ -35,6 +35,7 @@ from mtv_world_ros.evaluation.result_settings import check_same_settings
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from mtv_world_ros.evaluation.tables import write_summary
+from mtv_world_ros.model.trained_episodes import TrainedEpisodes
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.success.own_tasks import own_tasks
 from mtv_world_ros.success.task import dump_task, TaskSpec
@@ -73,6 +74,7 @@ def evaluate(
     label: str = '',
     zero_shot: Mapping[Path, str] = MappingProxyType({}),
     provenance: Mapping[str, str] = MappingProxyType({}),
+    trained_on: TrainedEpisodes | None = None,
     parallel: Parallel | None = None,
     describer: Describer | None = None,
     overwrite: bool = False,
@@ -94,6 +96,8 @@ def evaluate(
         zero_shot: property that the model was not trained for (`view`, `task` or `object`), by
             path of the episode.
         provenance: command, date and versions, by heading; goes into metrics.json.
+        trained_on: episodes that the checkpoint was trained on; how many of them are scored goes
+            into the provenance. None = nothing is said.
         parallel: processes to score with; None = this one.
         describer: names the objects from each episode's first frame; None = see `EvaluationJob`.
         overwrite: replace results of other settings; only asked where there is a name.
@@ -124,6 +128,9 @@ def evaluate(
         reason = next(iter(failed.items()), ('', 'none was given'))
         raise EpisodeError(f'no episode could be scored; {reason[0]}: {reason[1]}')
     results.sort(key=lambda result: result.episode)
+    if trained_on is not None:
+        sentence = trained_on.sentence([result.digest for result in results])
+        provenance = {**provenance, TRAINING: sentence}
     summary = EvaluationSummary(
         folder=out,
         name=name,

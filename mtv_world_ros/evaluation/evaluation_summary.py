@@ -29,6 +29,8 @@ from mtv_world_ros.viewing.stored_rollout import load_rollout
 
 #: name of the group of episodes that are not zero-shot: the model was trained for them
 SEEN = 'seen'
+#: heading in the provenance of how many of the episodes the checkpoint was trained on
+TRAINING = 'training episodes'
 NOT_MEASURED = Estimate(value=nan, interval=(nan, nan), num_episodes=0)
 
 

@@ -44,6 +44,7 @@ class EpisodeResult:
         resumed: features of the success estimate if only the last chunk is imagined.
         has_ids: recorded object identities show which objects move.
         grasps: outcomes of all attempts to grasp; empty in results of earlier versions.
+        digest: digest of the episode's motion, see `Recording`; empty = not known.
     """
 
     episode: str
@@ -58,6 +59,7 @@ class EpisodeResult:
     seconds_per_chunk: float
     seconds: Mapping[str, float]
     has_ids: bool
+    digest: str = ''
     interval: tuple[float, float] = (np.nan, np.nan)
     pictures: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     num_chunks: int = 0

@@ -8,7 +8,13 @@ import io
 
 from mtv_world_ros.core.documents import DASH, Table, with_interval
 from mtv_world_ros.core.files import write_json, write_whole
-from mtv_world_ros.evaluation.evaluation_summary import ALL, EvaluationSummary, Group, NOT_MEASURED
+from mtv_world_ros.evaluation.evaluation_summary import (
+    ALL,
+    EvaluationSummary,
+    Group,
+    NOT_MEASURED,
+    TRAINING,
+)
 from mtv_world_ros.evaluation.metrics.grasp_outcomes import GRASP_RULE
 from mtv_world_ros.evaluation.metrics.jaccard_scores import FRAME_FIELDS
 from mtv_world_ros.evaluation.metrics.picture_scores import KINDS, MARGIN_KINDS, MEASURES
@@ -95,6 +101,7 @@ def markdown(summary: EvaluationSummary) -> str:
     counts = ', '.join(
         f'{len(summary.chosen(Group(task=t)))} of {t or "no task"}' for t in summary.tasks
     )
+    training = summary.provenance.get(TRAINING, '')
     of_objects = [
         _truth(summary),
         BRACKETS,
@@ -107,7 +114,8 @@ def markdown(summary: EvaluationSummary) -> str:
     ]
     parts = [
         summary.following.line,
-        f'# {summary.name or "Evaluation"}\n\n{len(summary.results)} episodes: {counts}.',
+        f'# {summary.name or "Evaluation"}\n\n{len(summary.results)} episodes: {counts}.'
+        + (f' The checkpoint: {training}.' if training else ''),
         *(of_objects if summary.has_objects else [_NO_OBJECTS, BRACKETS]),
         quality_table(summary),
         pictures_table(summary),

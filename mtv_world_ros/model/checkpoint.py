@@ -21,6 +21,7 @@ from mtv_world_ros.model.card import (
     read_card,
     ROBOT_FOLDER,
 )
+from mtv_world_ros.model.trained_episodes import TrainedEpisodes
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.model import RobotModel
 
@@ -94,6 +95,16 @@ class Checkpoint:
     def spec(self) -> WorldModelSpec:
         """Views, frame size and rate of the model."""
         return self.card.spec
+
+    @property
+    def trained_episodes(self) -> TrainedEpisodes:
+        """Episodes that its weights, and those of its adapter, were trained on."""
+        found = TrainedEpisodes.of_card(self.card.trained_on)
+        if self.adapter is None:
+            return found
+        if not (self.adapter / CARD).is_file():
+            return found | TrainedEpisodes()
+        return found | TrainedEpisodes.of_card(read_card(self.adapter).trained_on)
 
     @property
     def object_motion(self) -> Path | None:

@@ -14,7 +14,7 @@ from mtv_world_ros.core.documents import DASH, number, render, Table
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import write_whole
 from mtv_world_ros.evaluation import tables
-from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary
+from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, TRAINING
 from mtv_world_ros.evaluation.metrics.statistics import METHOD
 from mtv_world_ros.evaluation.metrics.success_agreement import reliability_bins
 from mtv_world_ros.reports.charts import reliability_chart
@@ -88,7 +88,8 @@ def _statuses(found: EvaluationSummary) -> Table:
 
 
 def _header(found: EvaluationSummary) -> dict[str, Any]:
-    about = [part for key in ('dataset', 'date') if (part := found.provenance.get(key, ''))]
+    keys = ('dataset', TRAINING, 'date')
+    about = [part for key in keys if (part := found.provenance.get(key, ''))]
     return {'name': found.title, 'about': ' · '.join(about), 'tiles': _tiles(found)}
 
 

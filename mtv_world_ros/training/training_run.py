@@ -37,6 +37,7 @@ from mtv_world_ros.data.recordings import cached_recording, clip_starts, describ
 from mtv_world_ros.model.card import CAMERAS, CARD, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.runtime import check_device, choose_dtype
+from mtv_world_ros.model.trained_episodes import TrainedEpisodes
 from mtv_world_ros.robot.file import save_robot
 from mtv_world_ros.robot.model import check_positions, RobotModel
 from mtv_world_ros.robot.shape import moving_links
@@ -289,6 +290,9 @@ def train(
     )
     with processes.main_first():
         resumed = trainer.load_state()
+    trainer.trained_on |= _trained_episodes(
+        recordings, run.initial, trainer.result if resumed else None
+    ).as_card()
     if run.initial is not None and base is None and not resumed:
         trainer.start_from(run.initial)
     if resumed and processes.is_main and _steps_of(trainer.result) != trainer.step:
@@ -315,6 +319,19 @@ def train(
     finally:
         source.close()
     return trainer.result
+
+
+def _trained_episodes(
+    recordings: Sequence[Recording], initial: Checkpoint | None, earlier: Path | None
+) -> TrainedEpisodes:
+    """Return the episodes of this training, of its initial weights and of the resumed part."""
+    digests = frozenset(recording.digest for recording in recordings)
+    found = TrainedEpisodes(digests - {''}, '' not in digests)
+    if initial is not None:
+        found |= initial.trained_episodes
+    if earlier is not None and (earlier / CARD).is_file():
+        found |= TrainedEpisodes.of_card(read_card(earlier).trained_on)
+    return found
 
 
 def _save_robot(

@@ -1,6 +1,7 @@
 """`mtv-world import bag`: a robot's own bags, with TF, its description and no commands."""
 
 from dataclasses import replace
+import json
 import re
 import shlex
 
@@ -12,6 +13,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag_mapping import load_bag_mapping
 from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.recording import motion_digest
 from mtv_world_ros.importing.bags import guess_views
 from mtv_world_ros.robot.file import load_robot
 from test.support.bags import bag_cameras, MAPPING, record
@@ -244,3 +246,24 @@ def test_views_are_named_after_what_tells_them_apart():
         'front': '/cell/front/color/image_raw',
         'wrist_camera': '/wrist_camera/image_rect',
     }
+
+
+def test_an_import_keeps_what_a_recording_is_known_by(robot, make_bag, tmp_path, capsys):
+    bag = make_bag()
+    assert run(tmp_path, bag) == 0, capsys.readouterr().err
+    mapping = load_bag_mapping(tmp_path / 'out' / 'mapping.yaml')
+    raw = read_episode(bag, mapping=mapping, views=list(mapping.views), robot=robot)
+    episode = read_episode(tmp_path / 'out' / 'wave')
+    assert motion_digest(raw) == motion_digest(episode) != ''
+    other = replace(raw.joint_states, positions=raw.joint_states.positions + 0.01)
+    assert motion_digest(replace(raw, joint_states=other)) != motion_digest(raw)
+
+
+def test_four_bags_are_split_and_the_command_says_so(make_bag, tmp_path, capsys):
+    bags = [make_bag(f'wave_{k}') for k in range(4)]
+    assert run(tmp_path, *bags) == 0, capsys.readouterr().err
+    assert 'split: 3 to train on, 1 to test on (wave_' in capsys.readouterr().out
+    card = json.loads((tmp_path / 'out' / 'dataset.json').read_text())
+    assert {name: len(names) for name, names in card['splits'].items()} == {'train': 3, 'test': 1}
+    assert run(tmp_path, *bags, more=['--split', 'half']) == 1
+    assert '75:25' in capsys.readouterr().err

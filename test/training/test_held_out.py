@@ -14,7 +14,10 @@ import pytest
 from mtv_world_ros.cli import main
 from mtv_world_ros.cli.train import _evaluation_advice
 from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.recording import motion_digest
 from mtv_world_ros.model.card import read_card
+from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.training.training_config import TrainingRun
 from mtv_world_ros.training.training_run import HeldOut, HeldOutScores, train
 from mtv_world_ros.viewing.video import decode_video
@@ -44,6 +47,26 @@ def test_the_best_checkpoint_by_the_judge_is_kept(episode, tiny, robot, tmp_path
     assert [row['j_moving'] for row in rows if 'j_moving' in row][1:] == [0.3, 0.5, 0.4]
 
 
+def test_the_card_names_the_episodes_of_a_training_and_of_what_it_began_with(
+    episode, tiny, robot, tmp_path
+):
+    def trained(name: str, **more):
+        run = TrainingRun(config=tiny, dataset=(episode,), out=tmp_path / name, **more)
+        folder = train(run, robot=robot, segmenter=ColourSegmenter())
+        return Checkpoint.open(folder)
+
+    digest = motion_digest(read_episode(episode))
+    first = trained('first')
+    assert first.trained_episodes.sentence([digest, 'another']) == 'trained on 1 of these 2'
+    told = first.card.trained_on | {'digests': ['earlier'], 'digests_complete': True}
+    first.card.replace(trained_on=told).write(first.folder)
+    second = trained('second', initial=Checkpoint.open(first.folder)).trained_episodes
+    assert second.digests == {digest, 'earlier'} and second.is_complete
+    first.card.replace(trained_on={'episodes': 1, 'steps': 1}).write(first.folder)
+    third = trained('third', initial=Checkpoint.open(first.folder)).trained_episodes
+    assert third.digests == {digest} and not third.is_complete
+
+
 @pytest.mark.slow
 def test_the_command_scores_held_out_episodes_as_evaluate_does(episode, tmp_path, capsys):
     data = tmp_path / 'data'
@@ -68,6 +91,8 @@ def test_the_command_scores_held_out_episodes_as_evaluate_does(episode, tmp_path
     assert main([*command, '--actions', 'true']) == 0
     expected = json.loads((scores / 'metrics.json').read_text())
     assert row['j_moving'] == pytest.approx(expected['overall']['j_moving'], abs=1e-4)
+    # a copy of an episode is the same episode, whatever the split says
+    assert expected['provenance']['training episodes'] == 'trained on 1 of these 1'
     assert row['j_moving_low'] == pytest.approx(expected['views']['low']['j_moving'], abs=1e-4)
 
 

@@ -91,6 +91,7 @@ def _fit_and_store(
     selection: Selection,
     made: dict[str, str],
 ) -> int:
+    from mtv_world_ros.evaluation.evaluation_summary import TRAINING
     from mtv_world_ros.evaluation.fit import calibrate, samples_of
     from mtv_world_ros.reports.calibration_report import write_calibration_report
     from mtv_world_ros.success.calibration import save_fit
@@ -98,6 +99,8 @@ def _fit_and_store(
     runs = _imagine(arguments, checkpoint, selection)
     failed = say_failed([run.failed for run in runs])  # before what is too few is refused
     segmenter = str(runs[0].settings['segmenter'])
+    made[TRAINING] = runs[0].provenance[TRAINING]
+    print(f'checkpoint: {made[TRAINING]}')
     samples = samples_of(
         [run.results for run in runs],
         result_kinds(selection.paths),
@@ -212,6 +215,7 @@ def _imagine(
             ),
             zero_shot=selection.zero_shot,
             provenance=provenance(arguments),
+            trained_on=checkpoint.with_adapter(arguments.adapter).trained_episodes,
             parallel=parallel,
             overwrite=arguments.overwrite,
         )

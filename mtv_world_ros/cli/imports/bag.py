@@ -99,6 +99,7 @@ def _import_bag(arguments: argparse.Namespace) -> int:
         objects=mapping.objects,
         convert=convert,
         episode=lambda part: part.name,
+        recording=lambda part: episode_name(part.bag),
         unit='bag',
     )
     return run_import(arguments, job)

@@ -45,6 +45,7 @@ class ImportJob:
         unit: a recording in the progress bar.
         episode: returns the folder of a converted recording, in OUT.
         label: returns the name of a recording in messages.
+        recording: returns the recording that an episode is a part of; None = it is a whole one.
     """
 
     found: Mapping[str, Any]
@@ -53,6 +54,7 @@ class ImportJob:
     convert: Callable[[MakeStage, Progress], ImportSummary[Any]]
     episode: Callable[[Any], str]
     label: Callable[[Any], str] = str
+    recording: Callable[[Any], str] | None = None
     unit: str = 'ep'
 
 
@@ -91,6 +93,12 @@ def add_common_options(
     """
     parser.add_argument('--calibration', type=Path, help=calibration)
     parser.add_argument('--out', type=Path, required=True, help='folder of the episodes')
+    parser.add_argument(
+        '--split',
+        metavar='TRAIN:TEST',
+        help="shares of the recordings to train and to test on, or 'off'; OUT/dataset.json gets "
+        'the names. Default: 75:25 where there are four recordings or more',
+    )
     _add_masks(parser)
     _add_boxes(parser)
     parser.set_defaults(handler=run)
@@ -102,7 +110,9 @@ def run_import(arguments: argparse.Namespace, job: ImportJob) -> int:
 
     from mtv_world_ros.core.files import ROBOT_YAML
     from mtv_world_ros.importing.bags import summary_line
+    from mtv_world_ros.importing.split import parse_split, write_split
 
+    percent = None if arguments.split is None else parse_split(arguments.split)
     if arguments.click:
         return _write_boxes_page(arguments, job)
     summary = job.convert(
@@ -113,6 +123,13 @@ def run_import(arguments: argparse.Namespace, job: ImportJob) -> int:
     for one in summary.made:
         print(summary_line(arguments.out / job.episode(one), objects=has_objects))
     status = _import_status(summary, job.label)
+    recording = job.recording or job.episode
+    there = [*summary.made, *summary.kept]
+    split = write_split(
+        arguments.out, {job.episode(one): recording(one) for one in there}, percent
+    )
+    if split:
+        print(split)
     robot = arguments.out / ROBOT_FOLDER / ROBOT_YAML
     if robot.is_file():
         print(f'robot: {robot}')
