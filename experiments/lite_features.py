@@ -34,7 +34,7 @@ SIZE = 224
 BATCH = 16
 #: every n-th frame of an episode counts; neighbours look alike and cost as much
 FRAME_STRIDE = 8
-_SIDES = ('predicted', 'real')
+_SIDES = ('predicted', 'real', 'held')
 
 
 def lite_features() -> FrameFeatures:
@@ -69,13 +69,17 @@ def lite_features() -> FrameFeatures:
 
 
 def write_features(evaluated: EvaluationSummary, features: FrameFeatures, file: Path) -> None:
-    """Write the features of an evaluation's frames: predicted and real, by episode and view."""
+    """Write the features of an evaluation's frames by episode and view.
+
+    Frames are the predicted ones, the real ones, and the first of these held.
+    """
     held: dict[str, Any] = {}
     for result in evaluated.results:
         rollout = evaluated.rollout(result.episode)
         if rollout is None:
             continue
-        for side, videos in zip(_SIDES, (rollout.imagined, rollout.real), strict=True):
+        still = np.repeat(rollout.real[:, :1], rollout.real.shape[1], axis=1)
+        for side, videos in zip(_SIDES, (rollout.imagined, rollout.real, still), strict=True):
             for view, video in zip(rollout.views, videos, strict=True):
                 found = features(video[FRAME_STRIDE // 2 :: FRAME_STRIDE])
                 held[f'{side}/{view}/{result.episode}'] = found.astype(np.float16)
@@ -84,24 +88,25 @@ def write_features(evaluated: EvaluationSummary, features: FrameFeatures, file: 
     write_whole(file, archive.getvalue())
 
 
-def distance(file: Path, view: str) -> Estimate | None:
+def distance(file: Path, view: str, side: str = 'predicted') -> Estimate | None:
     """Return the distance of a view's frames; None = it was not measured.
 
     Args:
         file: that `write_features` wrote.
         view: name of the view.
+        side: frames to compare with the real ones: `predicted`, or `held`, the first one.
     """
     if not file.is_file():
         return None
     held = read_arrays(file)
-    sides = {
-        side: [held[key] for key in sorted(held) if key.startswith(f'{side}/{view}/')]
-        for side in _SIDES
-    }
-    if sum(map(len, sides['real'])) < 2:
+    real, others = (
+        [held[key] for key in sorted(held) if key.startswith(f'{name}/{view}/')]
+        for name in ('real', side)
+    )
+    if sum(map(len, real)) < 2 or len(others) != len(real):
         return None
     return Estimate(
-        value=frechet_distance(*(np.concatenate(sides[s]) for s in ('real', 'predicted'))),
-        interval=frechet_interval(sides['real'], sides['predicted']),
-        num_episodes=len(sides['real']),
+        value=frechet_distance(np.concatenate(real), np.concatenate(others)),
+        interval=frechet_interval(real, others),
+        num_episodes=len(real),
     )

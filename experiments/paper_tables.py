@@ -9,6 +9,11 @@ the stages: all rows are trained and evaluated with one number before any goes o
 The same command goes on where it was stopped. Stages, rows, seeds and weights for FID and FVD may
 be added later. Several processes may share a folder: each takes the rows that no other works on.
 
+Rows are tested on whole episodes from their first frame, as in the paper, and also chunk by chunk
+from recorded frames, which is named so. `--rates` trains each row with several learning rates for
+`--rate-clips` clips first and goes on with the best: the one with the lowest loss at the end, in
+less than one pass of the clips, so that the loss is of clips that were not seen before.
+
 Tables 1 to 3 are those of the last stage that all rows have; a learning curve shows all stages.
 The learning rate is constant after a short warm-up, so that a stage does not depend on those after
 it; the checkpoints hold moving averages of the weights.
@@ -27,6 +32,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 import fcntl
 from itertools import pairwise
+import json
 from math import ceil, isfinite, nan
 from pathlib import Path
 import shlex
@@ -55,7 +61,8 @@ from mtv_world_ros.evaluation.evaluation_summary import (
     NOT_MEASURED,
 )
 from mtv_world_ros.evaluation.metrics.frechet_features import clip_features, frame_features
-from mtv_world_ros.evaluation.metrics.statistics import Estimate, mean_interval
+from mtv_world_ros.evaluation.metrics.grasp_outcomes import Dreams
+from mtv_world_ros.evaluation.metrics.statistics import Estimate, mean_interval, t_quantile
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.model.runtime import check_device
 from mtv_world_ros.reports.read_back import read_evaluations
@@ -84,6 +91,27 @@ REAL_SETTINGS = (
     'video.num_frames=8', 'video.width=160', 'video.height=96', 'augment.colour_permutation=0',
 )  # fmt: skip
 ONE_VIEW = 'transformer.num_views=1'
+#: tests of a row: whole episodes as in the paper, and the same chunk by chunk
+WHOLE, CHUNKS = 'test', 'test_chunks'
+#: how each test imagines (`evaluate --mode`)
+MODES = {WHOLE: 'imagine', CHUNKS: 'observe', 'zero_shot': 'imagine'}
+#: what a row is made and tested by; rows of another version are not mixed with it
+METHODS = {
+    'policy2vec': 'version 2: three layers of 1,280; scale .1 at first; tested on whole episodes',
+    'ee_mlp': 'version 2: 1,024 wide, Kaiming, rotation columns, six history frames, guidance on '
+    'the control; tested on whole episodes',
+    'fast_tokens': 'version 2: tested on whole episodes',
+    TRAJECTORY_VIDEO: 'version 2: tested on whole episodes',
+}
+METHOD = 'method.json'
+#: settings of a method beyond the preset, as its authors have it (Ctrl-World: history, guidance)
+METHOD_SETTINGS = {
+    'ee_mlp': (
+        'history.num_frames=6', 'history.reference=first_frame', 'sampling.guidance_scale=2.0',
+    ),
+}  # fmt: skip
+#: lines of the training log whose mean loss a learning rate is judged by
+RATE_LINES = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,7 +186,9 @@ TABLE_2 = (*REAL_ORDER, 'real_mtv_world_after_simulation')
 #: rows of Table 1 (without the ablations), and of Table 3 in the paper's order
 TABLE_1 = ('policy2vec', 'ee_mlp', 'fast_tokens', 'mtv_world')
 _ABOUT = (
-    'J: of the union of all objects, mean over frames and episodes. J moving: of the objects that '
+    'J: of the union of all objects, mean over frames and episodes, in whole episodes from their '
+    'first frame. Chunk by chunk: each 3.2 s from recorded frames. Task Averaged: mean over '
+    'tasks. J moving: of the objects that '
     "really move. Other commands: J moving where the commands are another episode's; a method "
     'reacts to its actions where the interval of the difference is above 0. Brackets: 95 % t '
     'intervals over episodes of one seed, of Frechet distances jackknife; with several seeds the '
@@ -283,6 +313,8 @@ class PaperTables:
             'zero_shot_episodes': options.zero_shot_episodes,
             'preset': str(options.preset),
             'set': sorted(options.set),
+            'rates': options.rates,
+            'rate_clips': options.rate_clips if options.rates else None,
         }
 
     def _tested(self, stage: int) -> dict[str, int | None]:
@@ -351,12 +383,14 @@ class PaperTables:
         folder, training = self.folder(row, seed), self.folder(row, seed) / 'training'
         held = self.stage_folder(row, seed, stage)
         checkpoint, steps = held / 'checkpoint', self.steps(stage)
+        check_method(folder, row)
+        rate = self._find_rate(row, seed, label)
         if trained_steps(checkpoint) != steps:
             if (trained_steps(training / 'checkpoint') or 0) > steps:
                 print(f'{label}: left out, the row was trained further before', flush=True)
                 return
             self._command(
-                f'{label}: training', self._training(row, seed, stage),
+                f'{label}: training', self._training(row, seed, stage, rate),
                 done=trained_steps(training / 'checkpoint') == steps, times=folder,
             )  # fmt: skip
             with whole_folder(checkpoint) as new:
@@ -364,11 +398,11 @@ class PaperTables:
         for name, dataset in self._tests(row, stage):
             out = held / name
             self._command(
-                f'{label}: {name}', self._evaluation(row, seed, checkpoint, dataset, out),
+                f'{label}: {name}', self._evaluation(row, seed, checkpoint, dataset, out, name),
                 done=self._is_evaluated(out), times=folder,
             )  # fmt: skip
             file = held / f'{name}_features.npz'
-            if self.options.lite_features and not file.is_file():
+            if self.options.lite_features and name != CHUNKS and not file.is_file():
                 print(f'{label}: {name}: features of {LITE}', flush=True)
                 write_features(read_evaluations(out)[0], lite_features(), file)
 
@@ -376,9 +410,12 @@ class PaperTables:
         """Yield name and episodes of the tests of a row; the zero-shot episodes are made last."""
         counts = self._tested(stage)
         if row.is_real:
-            yield 'test', self.out / 'real_test'
+            yield WHOLE, self.out / 'real_test'
+            yield CHUNKS, self.out / 'real_test'
             return
-        yield 'test', self._linked(self.data, 'test', 'test', counts['test_episodes'])
+        tested = self._linked(self.data, 'test', 'test', counts['test_episodes'])
+        yield WHOLE, tested
+        yield CHUNKS, tested
         if row.name == FULL and self._wants_zero_shot:
             self._make_zero_shot()
             count = counts['zero_shot_tested']
@@ -405,6 +442,7 @@ class PaperTables:
             found += [f'video.views=[{",".join(row.views)}]', ONE_VIEW]
         if row.control != TRAJECTORY_VIDEO:
             found.append(f'video.control={row.control}')
+        found += METHOD_SETTINGS.get(row.control, ())
         return [*found, f'video.object_mask={str(row.object_mask).lower()}', *options.set]
 
     @property
@@ -418,11 +456,37 @@ class PaperTables:
         """Return the training steps of a number of clips."""
         return ceil(stage / self.batch_size)
 
-    def _training(self, row: Row, seed: int, stage: int) -> list[str]:
+    def _find_rate(self, row: Row, seed: int, label: str) -> float | None:
+        """Return the learning rate of a row; None = the preset's. Trains with each where asked."""
+        rates, clips = self.options.rates, self.options.rate_clips
+        if not rates or row.starts_from:
+            return None
+        losses = {}
+        for rate in rates:
+            folder = self.folder(row, seed) / f'rate_{rate:g}'
+            self._command(
+                f'{label}: training', self._training(row, seed, clips, rate, folder),
+                done=trained_steps(folder / 'checkpoint') == self.steps(clips),
+                times=self.folder(row, seed),
+            )  # fmt: skip
+            losses[rate] = last_loss(folder)
+        best = min(losses, key=lambda rate: losses[rate])
+        write_json(self.folder(row, seed) / 'rates.json', {'losses': losses, 'rate': best})
+        return best
+
+    def _training(
+        self,
+        row: Row,
+        seed: int,
+        stage: int,
+        rate: float | None = None,
+        out: Path | None = None,
+    ) -> list[str]:
         dataset = self.out / 'real_train' if row.is_real else self.data
         words = [
-            'train', str(dataset), '--out', str(self.folder(row, seed) / 'training'), '--preset',
-            str(self.options.preset), '--seed', str(seed), '--cache', str(self.out / 'cache'),
+            'train', str(dataset), '--out', str(out or self.folder(row, seed) / 'training'),
+            '--preset', str(self.options.preset), '--seed', str(seed),
+            '--cache', str(self.out / 'cache'),
             '--device', self.options.device, '--threads', str(self.options.threads),
             '--split', EVERY if row.is_real else 'train',
         ]  # fmt: skip
@@ -432,6 +496,7 @@ class PaperTables:
             words += ['--init', str(self._start(row, seed))]
         # the learning rate of a step must not depend on how many more there are
         schedule = [f'optimizer.warmup_steps={WARMUP_STEPS}', 'optimizer.decay_share=0.0']
+        schedule += [] if rate is None else [f'optimizer.learning_rate={rate:g}']
         sets = [*schedule, *self._overrides(row), f'optimizer.steps={self.steps(stage)}']
         return [*words, *(f'--set={text}' for text in sets)]
 
@@ -452,12 +517,13 @@ class PaperTables:
         return checkpoint
 
     def _evaluation(
-        self, row: Row, seed: int, checkpoint: Path, dataset: Path, out: Path
+        self, row: Row, seed: int, checkpoint: Path, dataset: Path, out: Path, test: str
     ) -> list[str]:
         options = self.options
         words = [
             'evaluate', f'{row.name}={checkpoint}', str(dataset), '--split', EVERY, '--actions',
             'true,shuffled', '--no-ceiling', '--no-report', '--seed', str(seed),
+            '--mode', MODES[test],
             '--device', options.device, '--threads', str(options.threads),
             '--workers', str(options.workers), '--out', str(out),
         ]  # fmt: skip
@@ -535,6 +601,8 @@ class Sections:
         )
         found, which = self._last(ROWS_SIMULATED)
         yield f'## Table 1: methods by view, {which}\n\n{found.methods(TABLE_1, VIEWS).markdown()}'
+        chunks = found.chunk_by_chunk(ROWS_SIMULATED, VIEWS).markdown()
+        yield f'## Chunk by chunk from recorded frames, {which}\n\n{chunks}'
         reactions = found.reactions(ROWS_SIMULATED).markdown()
         yield f'## Do they react to their actions? {which}\n\n{reactions}'
         yield f"## The paper's order, {which}\n\n{_ORDER}\n\n{found.order().markdown()}"
@@ -548,7 +616,8 @@ class Sections:
                 f'## Table 2: real recordings, one view, {which}\n\n'
                 f'{found.methods(TABLE_2, found.real_views).markdown()}\n\n'
                 f'{found.reactions(TABLE_2).markdown()}\n\n'
-                f'{found.real_order().markdown()}'
+                f'{found.real_order().markdown()}\n\n'
+                f'{found.real_by_task().markdown()}'
             )
         yield f'## Learning curve\n\n{self._curve().markdown()}'
         yield f'## Clips and time\n\n{self._times().text()}'
@@ -617,14 +686,17 @@ class Sections:
                 spent = read_json(folder / TIMES) if (folder / TIMES).is_file() else {}
                 hours = [
                     f'{sum(spent.get(n, {}).get("cpu_s", 0) for n in names) / 3600:.2f}'
-                    for names in (('training',), ('test', 'zero_shot'))
+                    for names in (('training',), tuple(MODES))
                 ]
                 rows.append([row.name, str(seed), str(steps * self._run.batch_size), *hours])
         return Table(head=head, rows=rows)
 
 
 #: columns of what tells whether a method reacts to its actions
-REACTION_HEAD = ['n', 'J moving', 'other commands', 'difference', 'reacts']
+REACTION_HEAD = [
+    'n', 'J moving', 'other commands', 'difference', 'reacts', 'pictures less other commands [dB]',
+    'missed grasps dreamt', 'grasps missed',
+]  # fmt: skip
 REACTION_KEYS = ('j_moving', 'j_shuffled_moving', 'margin_over_shuffled')
 HELD_KEY = 'j_copy_moving'
 #: columns of the difference of two rows
@@ -651,7 +723,7 @@ class Results:
             (row.name, seed, name): read_evaluations(folder)[0]
             for row in ROWS
             for seed in self._seeds
-            for name in ('test', 'zero_shot')
+            for name in MODES
             if ((folder := run.stage_folder(row, seed, stage) / name) / 'metrics.json').is_file()
         }
 
@@ -701,7 +773,7 @@ class Results:
         held = [HELD, self.count(first)]
         for view in views:
             copies = [self.cell(first, view, k) for k in ('j_copy_union', 'j_copy_moving')]
-            held += [DASH] * 3 + copies
+            held += [DASH, DASH, self._lite(first, view, 'held'), *copies]
         return Table(head=head, rows=[*rows, held])
 
     def _distance(self, name: str, view: str, key: str) -> str:
@@ -712,10 +784,10 @@ class Results:
     def _has_view(self, name: str, view: str) -> bool:
         return any(view in evaluated.spec.views for evaluated in self.evaluations(name))
 
-    def _lite(self, name: str, view: str) -> str:
+    def _lite(self, name: str, view: str, side: str = 'predicted') -> str:
         row = self._rows[name]
         folders = (self._run.stage_folder(row, seed, self._stage) for seed in self._seeds)
-        found = [distance(folder / 'test_features.npz', view) for folder in folders]
+        found = [distance(folder / f'{WHOLE}_features.npz', view, side) for folder in folders]
         return joined([one for one in found if one is not None], 1)
 
     def reactions(self, names: Sequence[str]) -> Table:
@@ -730,7 +802,34 @@ class Results:
     def reaction(self, name: str) -> list[str]:
         """Return the cells of a row under `REACTION_HEAD`."""
         cells = [self.cell(name, None, key) for key in REACTION_KEYS]
-        return [self.count(name), *cells, self.reacts(name)]
+        return [self.count(name), *cells, self.reacts(name), *self._pictures(name)]
+
+    def _pictures(self, name: str) -> list[str]:
+        """Return the margin in dB where the picture changes, and the shares of grasps."""
+        found = self.evaluations(name)
+        margins = [e.pictures[None].get('margin_over_shuffled', NOT_MEASURED) for e in found]
+        dreams = Dreams.of([g for e in found for r in e.results for g in r.grasps], [])
+        return [joined(margins, 2), dreams.dreamt.text, dreams.missed.text]
+
+    def chunk_by_chunk(self, names: Sequence[str], views: Sequence[str]) -> Table:
+        """Return J of all objects and of what moves, each chunk from recorded frames."""
+        head = ['Method', 'n', *(f'{view} {what}' for view in views for what in ('J', 'J moving'))]
+        keys = ('j_union', 'j_moving')
+        rows = [
+            [
+                f'{self._rows[name].title} ({name})',
+                self.count(name, CHUNKS),
+                *(self.cell(name, view, key, test=CHUNKS) for view in views for key in keys),
+            ]
+            for name in names
+        ]
+        held = next((n for n in reversed(names) if self.evaluations(n, CHUNKS)), names[-1])
+        copies = [
+            self.cell(held, view, key, test=CHUNKS)
+            for view in views
+            for key in ('j_copy_union', 'j_copy_moving')
+        ]
+        return Table(head=head, rows=[*rows, [HELD, self.count(held, CHUNKS), *copies]])
 
     def reacts(self, name: str) -> str:
         """Return whether true commands beat other ones by all seeds of a row."""
@@ -804,6 +903,35 @@ class Results:
         """Return how many episodes a row is tested on, of all seeds."""
         return str(sum(len(e.results) for e in self.evaluations(name, test)) or DASH)
 
+    def real_by_task(self) -> Table:
+        """Return J and J of what moves of the real recordings by task, times 100."""
+        (view,) = self.real_views
+        found = [e for name in TABLE_2 for e in self.evaluations(name)]
+        tasks = sorted({task for evaluated in found for task in evaluated.tasks})
+        rows = [
+            [
+                task or 'no task',
+                words,
+                *(self.cell(n, view, key, task, digits=1, factor=100.0) for n in TABLE_2),
+            ]
+            for task in tasks
+            for words, key in (('J', 'j_union'), ('J moving', 'j_moving'))
+        ]
+        head = ['Task', 'x 100', *(self._rows[name].title for name in TABLE_2)]
+        return Table(head=head, rows=rows, num_labels=2)
+
+    def task_mean(self, name: str, view: str, key: str, test: str) -> str:
+        """Return the mean over tasks of a row, times 100, with its 95 % interval."""
+        means = []
+        for evaluated in self.evaluations(name, test):
+            if view in evaluated.spec.views:
+                by_task = [
+                    [r.means(view)[key] for r in evaluated.chosen(Group(task=task))]
+                    for task in evaluated.tasks
+                ]
+                means.append(mean_over_groups(by_task))
+        return joined(means, 1, 100.0)
+
     def by_task(self, key: str) -> Table:
         """Return Table 3 turned: a line a task and view, a column a method, J times 100."""
         tasks = sorted(self._run.options.tasks)
@@ -838,12 +966,58 @@ class Results:
                 view,
                 *(
                     self.cell(names[view], view, k, task, test=test, digits=1, factor=100.0)
+                    if task
+                    else self.task_mean(names[view], view, k, test)
                     for _, names, test, k in columns
                 ),
             ]
             for task, view in lines
         ]
         return Table(head=head, rows=[*rows, ['n', '', *counts]])
+
+
+def mean_over_groups(groups: Sequence[Sequence[float]]) -> Estimate:
+    """Return the mean of the groups' means, each group of the same weight, and its interval.
+
+    The groups are the tasks of the paper, no sample of tasks: the interval is that of the episodes
+    within them. It is not known where a group has one value.
+    """
+    known = [np.array([v for v in group if isfinite(v)]) for group in groups]
+    known = [group for group in known if len(group)]
+    if not known:
+        return NOT_MEASURED
+    value, count = float(np.mean([group.mean() for group in known])), sum(map(len, known))
+    if min(map(len, known)) < 2:
+        return Estimate(value=value, interval=(nan, nan), num_episodes=count)
+    variances = [group.var(ddof=1) / len(group) for group in known]
+    half = float(t_quantile(count - len(known)) * np.sqrt(sum(variances)) / len(known))
+    low, high = max(value - half, 0.0), min(value + half, 1.0)
+    return Estimate(value=value, interval=(low, high), num_episodes=count)
+
+
+def check_method(folder: Path, row: Row) -> None:
+    """Write how a row is made; refuse a folder whose row was made otherwise.
+
+    Raises:
+        ConfigError: names the row, both methods and what to do.
+    """
+    file, method = folder / METHOD, METHODS[row.control]
+    if file.is_file():
+        there = str(read_json(file)['method'])
+    else:
+        there = 'version 1' if (folder / 'training').is_dir() else method
+    if there != method:
+        raise ConfigError(
+            f"row '{row.name}' in '{folder}' was made by {there}; today's method is {method}. "
+            'Move that folder away, or give another --out'
+        )
+    write_json(file, {'method': method})
+
+
+def last_loss(training: Path) -> float:
+    """Return the mean loss of the last lines of a training's log."""
+    lines = (training / 'log.jsonl').read_text(encoding='utf-8').splitlines()[-RATE_LINES:]
+    return float(np.mean([json.loads(line)['loss'] for line in lines]))
 
 
 def joined(found: Sequence[Estimate], digits: int, factor: float = 1.0) -> str:
@@ -1064,6 +1238,14 @@ def parser() -> argparse.ArgumentParser:
         metavar='CLIPS',
         help='stage of the simulated row whose weights the last row of Table 2 starts from',
     )
+    add(
+        '--rates',
+        type=_rates,
+        default=[],
+        metavar='R,R,...',
+        help="learning rates that each row is first tried with; default: the preset's alone",
+    )
+    add('--rate-clips', type=int, default=500, help='training clips of each of --rates')
     add('--preset', default='paper', help='name or YAML file')
     add('--set', action='append', default=[], metavar='SECTION.KEY=VALUE', help='of all rows')
     add('--device', default='cpu', help='of trainings and tests, e.g. cuda')
@@ -1082,6 +1264,10 @@ def parser() -> argparse.ArgumentParser:
 
 def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(',') if name.strip()]
+
+
+def _rates(text: str) -> list[float]:
+    return [float(name) for name in _names(text)]
 
 
 def _numbers(text: str) -> list[int]:

@@ -45,6 +45,7 @@ def test_equal_frames_have_no_distance_and_others_have_one(lite: ModuleType, tmp
     # of colours of a mean of 127.5 each, three channels are half as bright
     assert found.value == pytest.approx(3 * 64**2, rel=0.1)
     assert found.num_episodes == 3
+    assert lite.distance(file, 'low', 'held').value > 1  # the first of random pictures, held
     assert lite.distance(file, 'high') is None
     assert lite.distance(tmp_path / 'none.npz', 'low') is None
 

@@ -129,7 +129,9 @@ def test_a_row_is_added_later_without_touching_the_others(
 ):
     later = Recorder()
     assert tables.main(words_of(run_folder, data, f'{ROWS},without_mask'), later) == 0
-    assert [words[0] for words in later.commands] == ['train', 'evaluate']
+    assert [words[0] for words in later.commands] == ['train', 'evaluate', 'evaluate']
+    modes = [words[words.index('--mode') + 1] for words in later.commands[1:]]
+    assert modes == ['imagine', 'observe']
     assert all('without_mask' in ' '.join(words) for words in later.commands)
     curve = (run_folder / 'tables.md').read_text().partition('## Learning curve')[2]
     assert '| without_mask ' in curve
@@ -281,7 +283,7 @@ def test_a_row_goes_on_to_a_further_stage_and_keeps_the_earlier_numbers(
     assert tables.main(words, further) == 1 and further.commands == []
     words = words_of(run_folder, data, ROWS, '--clips', '1,4')
     assert tables.main([*words, '--rows', 'mtv_world'], further) == 0
-    assert [command[0] for command in further.commands] == ['train', 'evaluate']
+    assert [command[0] for command in further.commands] == ['train', 'evaluate', 'evaluate']
     row = run_folder / 'rows/mtv_world/seed_0'
     assert (row / 'clips_000001/test/metrics.json').read_bytes() == before
     steps = [tables.trained_steps(row / name / 'checkpoint') for name in
@@ -470,3 +472,48 @@ def test_real_recordings_are_split_three_to_one(
     tables.PaperTables(options)._split_real()
     counts = [len(list((tmp_path / 'out' / n).iterdir())) for n in ('real_train', 'real_test')]
     assert counts == [6, 2]
+
+
+def test_the_mean_over_tasks_weighs_tasks_alike_whatever_number_of_episodes_they_have(tables):
+    found = tables.mean_over_groups([[0.8, 0.8, 0.9, 0.7], [0.2, 0.4], [float('nan')]])
+    assert found.value == pytest.approx((0.8 + 0.3) / 2) and found.num_episodes == 6
+    # standard errors sqrt(.02 / 3 / 4) and .1, four degrees of freedom (t table: 2.776)
+    half = 2.776 * ((0.02 / 3 / 4 + 0.01) ** 0.5) / 2
+    assert found.interval == pytest.approx((0.55 - half, 0.55 + half), abs=1e-3)
+
+
+def test_one_episode_of_a_task_leaves_the_mean_over_tasks_without_an_interval(tables):
+    found = tables.mean_over_groups([[0.8], [0.2, 0.4]])
+    assert found.value == pytest.approx(0.55) and found.interval[0] != found.interval[0]
+
+
+def test_a_row_of_another_method_version_is_refused_by_name(tables, tmp_path: Path):
+    row = next(row for row in tables.ROWS if row.name == 'ee_mlp')
+    (tmp_path / 'training').mkdir()
+    with pytest.raises(ConfigError, match=r"row 'ee_mlp' .*version 1.*version 2.*--out"):
+        tables.check_method(tmp_path, row)
+    (tmp_path / 'training').rmdir()
+    tables.check_method(tmp_path, row)
+    (tmp_path / 'training').mkdir()
+    tables.check_method(tmp_path, row)  # its own method, again
+
+
+def test_the_learning_rate_with_the_lowest_loss_is_taken(tables, data: Path, tmp_path: Path):
+    losses = {0.0003: 0.5, 0.0006: 0.2, 0.0012: 0.4}
+
+    def train(words: list[str]) -> int:
+        folder = Path(words[words.index('--out') + 1])
+        folder.mkdir(parents=True)
+        rate = float(next(w for w in words if '.learning_rate=' in w).rpartition('=')[2])
+        lines = [json.dumps({'step': k, 'loss': losses[rate]}) for k in range(8)]
+        (folder / 'log.jsonl').write_text('\n'.join(lines) + '\n')
+        return 0
+
+    options = tables.parser().parse_args(
+        words_of(tmp_path, data, ROWS, '--rates', '3e-4,6e-4,1.2e-3', '--rate-clips', '2')
+    )
+    run = tables.PaperTables(options, train)
+    row = next(row for row in tables.ROWS if row.name == 'mtv_world')
+    assert run._find_rate(row, 0, 'mtv_world') == 0.0006
+    words = run._training(row, 0, 4, 0.0006)
+    assert '--set=optimizer.learning_rate=0.0006' in words
