@@ -84,8 +84,8 @@ from mtv_world_ros.simulation.physics import catalogue, physics_named
 from mtv_world_ros.simulation.scenes.tasks import task_named
 from mtv_world_ros.simulation.simulator import CONTROL_PERIOD_S, SimEpisode
 from mtv_world_ros.success.comparison import RULE as RULE_OF_PAIRS
+from mtv_world_ros.success.confirmation import ContactConfirmation, seen_end
 from mtv_world_ros.success.doubts import (
-    ContactConfirmation,
     Grounds,
     NEAR_M,
     PhysicsWatch,
@@ -838,7 +838,7 @@ def confirmed_cells(
                 away_m = nan if away is None else away
                 watch.take(away_m, count)
                 is_last = chunk == len(apart[number])
-                test.take(away_m, count, tasks[number], is_last=is_last)
+                test.take(seen_end(away_m), count, tasks[number], is_last=is_last)
         first.append(confirmed)
         true.append(real[order])
     return _over_orders(np.array(first), np.array(said), np.concatenate(true))

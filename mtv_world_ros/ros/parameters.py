@@ -88,7 +88,8 @@ class ObservationSettings(Schema):
         '',
         'Name of this robot cell, as in `mtv-world fit contact --place`. Where contact parameters '
         'were fitted in another one, futures are drawn from a wide prior, and most successes stay '
-        'open until ten executed plans ended as foreseen. Simulated episodes are of '
+        'open until ten executed plans of their task ended as foreseen; the evidence is kept in '
+        '`$ROS_HOME/mtv_world/cells`. Simulated episodes are of '
         "'simulator/PHYSICS'.",
     )
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import ceil, isfinite, log, nan
+from math import isfinite, log, nan
 
 import numpy as np
 
-from mtv_world_ros.core.data_types import FloatArray, SuccessEstimate
+from mtv_world_ros.core.data_types import BoolArray, FloatArray, SuccessEstimate
 
 #: an object nearer than this to one of its futures moved as foreseen [m]; masks of small pictures
 #: are no more exact
@@ -37,46 +37,26 @@ WATCH = WatchSettings()
 SAYS = 'the physics here is not the one that was fitted'
 
 
-@dataclass(frozen=True, slots=True)
-class ConfirmationSettings:
-    """Settings of the sequential test that confirms fitted parameters in another robot cell.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChunkEnd:
+    """End of an executed chunk, compared with its futures.
 
     Attributes:
-        unforeseen_fraction: fraction of rollouts with an unforeseen end if the parameters hold,
-            for which the test is fastest.
-        other_unforeseen_fraction: smallest such fraction if the parameters do not hold.
-        false_acceptance: largest probability that parameters which do not hold are ever confirmed.
+        away_m: distance of the real motion from the nearest future [m], the largest over the
+            objects that moved; NaN = none that moved was seen.
+        moved: (O,) objects that moved in a future or in the masks.
+        lost: (O,) objects that moved and whose motion the masks do not show.
+        hidden: (O,) objects that the masks do not show at the end.
     """
 
-    unforeseen_fraction: float = 0.05
-    other_unforeseen_fraction: float = 0.3
-    false_acceptance: float = 0.05
-
-    @property
-    def foreseen_log_ratio(self) -> float:
-        """Evidence of a rollout that ended as foreseen: logarithm of a likelihood ratio."""
-        return log((1 - self.unforeseen_fraction) / (1 - self.other_unforeseen_fraction))
-
-    @property
-    def unforeseen_log_ratio(self) -> float:
-        """Evidence of a rollout with an unforeseen end."""
-        return log(self.unforeseen_fraction / self.other_unforeseen_fraction)
-
-    @property
-    def log_evidence(self) -> float:
-        """Evidence that confirms: by Ville's inequality, rarely reached if parameters do not hold.
-
-        The product of likelihood ratios has a mean of at most 1 if they do not hold, however many
-        rollouts there are, and so exceeds 1 / `false_acceptance` with that probability at most.
-        """
-        return -log(self.false_acceptance)
+    away_m: float
+    moved: BoolArray
+    lost: BoolArray
+    hidden: BoolArray
 
 
-CONFIRMATION = ConfirmationSettings()
-
-
-def unforeseen(foreseen: FloatArray, real: FloatArray) -> float:
-    """Return the distance of the real motion from the nearest future [m]; NaN = nothing moved.
+def chunk_end(foreseen: FloatArray, real: FloatArray) -> ChunkEnd:
+    """Return how a chunk ended.
 
     Args:
         foreseen: (K, 1 + T, O, 3) centres of objects from a chunk's start on [m].
@@ -86,10 +66,23 @@ def unforeseen(foreseen: FloatArray, real: FloatArray) -> float:
     came = real[-1] - real[0]
     gaps = np.linalg.norm(ahead - came, axis=-1)
     known = np.isfinite(gaps).all(0)
-    moved = np.maximum(np.linalg.norm(ahead, axis=-1).max(0, initial=0.0),
-                       np.linalg.norm(came, axis=-1)) > _MIN_MOTION_M  # fmt: skip
+    longest = np.nan_to_num(np.linalg.norm(ahead, axis=-1)).max(0, initial=0.0)
+    moved = np.maximum(longest, np.nan_to_num(np.linalg.norm(came, axis=-1))) > _MIN_MOTION_M
     counts = known & moved
-    return float(gaps.min(0)[counts].max()) if counts.any() else nan
+    return ChunkEnd(
+        away_m=float(gaps.min(0)[counts].max()) if counts.any() else nan,
+        moved=moved,
+        lost=moved & ~known,
+        hidden=~np.isfinite(real[-1]).all(-1),
+    )
+
+
+def unforeseen(foreseen: FloatArray, real: FloatArray) -> float:
+    """Return the distance of the real motion from the nearest future [m]; NaN = nothing moved.
+
+    See `chunk_end`.
+    """
+    return chunk_end(foreseen, real).away_m
 
 
 class PhysicsWatch:
@@ -171,88 +164,6 @@ class ContactTrust:
 
     is_confirmed: bool = False
     text: str = ''
-
-
-class ContactConfirmation:
-    """Sequential test whether contact parameters that were fitted elsewhere hold in a robot cell.
-
-    The null hypothesis is that they do not hold: at least `other_unforeseen_fraction` of rollouts
-    end where none of their futures does. Each rollout in which an object moved multiplies the
-    evidence by a likelihood ratio (`CONFIRMATION`). The evidence of all tasks is pooled, and a
-    task counts as tried after one of its rollouts ended as foreseen. Evidence beyond what confirms
-    is not kept, so that unforeseen ends soon withdraw a confirmation.
-    """
-
-    def __init__(self) -> None:
-        self._log_evidence, self._num_compared, self._num_foreseen = 0.0, 0, 0
-        self._tried: set[str] = set()
-        self._rollout: tuple[int, str] | None = None
-        self._is_compared = self._is_counted = False
-
-    def take(self, away_m: float, rollout: int, task: str, *, is_last: bool = True) -> None:
-        """Add the end of a chunk; a rollout counts once, when it ends or with an unforeseen end.
-
-        Args:
-            away_m: distance from the nearest future of the parameters [m]; NaN = no evidence.
-            rollout: number of the rollout.
-            task: instruction of the rollout.
-            is_last: whether the chunk is the last of its rollout.
-        """
-        if self._rollout != (rollout, task):
-            self._count(is_foreseen=True)
-            self._rollout, self._is_compared, self._is_counted = (rollout, task), False, False
-        self._is_compared |= isfinite(away_m)
-        if away_m > NEAR_M:
-            self._count(is_foreseen=False)
-        elif is_last:
-            self._count(is_foreseen=True)
-
-    def _count(self, *, is_foreseen: bool) -> None:
-        """Count the present rollout, unless nothing moved in it or it was counted."""
-        if self._rollout is None or self._is_counted or not self._is_compared:
-            return
-        self._is_counted = True
-        self._num_compared += 1
-        self._num_foreseen += is_foreseen
-        if is_foreseen:
-            self._tried.add(self._rollout[1])
-        ratio = (
-            CONFIRMATION.foreseen_log_ratio if is_foreseen else CONFIRMATION.unforeseen_log_ratio
-        )
-        self._log_evidence = min(self._log_evidence + ratio, CONFIRMATION.log_evidence)
-
-    @property
-    def num_missing(self) -> int:
-        """Number of rollouts in a row that must yet end as foreseen."""
-        missing = CONFIRMATION.log_evidence - self._log_evidence
-        return ceil(missing / CONFIRMATION.foreseen_log_ratio - 1e-9)
-
-    @property
-    def text(self) -> str:
-        """Evidence about the robot cell, in words."""
-        missing = self.num_missing
-        if missing:
-            return (
-                f'contact of this cell is not confirmed: {self._num_foreseen} of '
-                f'{self._num_foreseen + missing} ends as foreseen'
-            )
-        return (
-            f'contact of this cell is confirmed: {self._num_foreseen} of {self._num_compared} '
-            f'ends as foreseen (falsely confirmed: {CONFIRMATION.false_acceptance:.0%} at most)'
-        )
-
-    def trust(self, task: str) -> ContactTrust:
-        """Return whether the parameters are taken as fitted here, for a task.
-
-        Args:
-            task: instruction of the rollout.
-        """
-        if not self.num_missing and task not in self._tried:
-            return ContactTrust(
-                text='contact of this cell is not confirmed for this task: no end of it was as '
-                'foreseen yet'
-            )
-        return ContactTrust(is_confirmed=not self.num_missing, text=self.text)
 
 
 def doubted(

@@ -117,7 +117,7 @@ def test_verdicts_come_back_after_ten_rollouts_that_ended_as_foreseen(benchmark)
     assert cells(benchmark, [None] * 40)[:3] == ['0 of 200', '–', '1.00']
 
 
-def test_each_task_is_open_until_an_end_of_its_own_was_as_foreseen(benchmark):
-    # ten of the first task, then one of each other task: 12 of 60
+def test_each_task_is_open_until_ten_ends_of_its_own_were_as_foreseen(benchmark):
+    # ten of each of three tasks: 30 of 60
     found = cells(benchmark, [0.0] * 20, ('a', 'b', 'c'), is_mixed=False)
-    assert found[:3] == ['200 of 200', '10 [10, 10]', '0.20']
+    assert found[:3] == ['200 of 200', '10 [10, 10]', '0.50']

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from threading import Condition, Thread
+from threading import Condition, Lock, Thread
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Float32MultiArray
 
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
-from mtv_world_ros.core.errors import RolloutPreempted
+from mtv_world_ros.core.errors import ConfigError, RolloutPreempted
 from mtv_world_ros.core.images import resize_frames
 from mtv_world_ros.physics.object_motion import ObjectMotionModel
 from mtv_world_ros.robot.model import RobotModel
@@ -29,13 +29,11 @@ from mtv_world_ros.ros.sensing.samples import Samples
 from mtv_world_ros.ros.status_publisher import create_publisher
 from mtv_world_ros.ros.world_model.chunk_outcomes import ScoredChunk
 from mtv_world_ros.ros.world_model.worker import Chunk, Request, Result
-from mtv_world_ros.success.doubts import (
-    ContactConfirmation,
-    ContactTrust,
-    PhysicsWatch,
-    unforeseen,
-)
+from mtv_world_ros.success.cell_file import CellFile
+from mtv_world_ros.success.confirmation import ContactConfirmation
+from mtv_world_ros.success.doubts import chunk_end, ContactTrust, PhysicsWatch
 from mtv_world_ros.success.estimator import NOT_FITTED_HERE
+from mtv_world_ros.success.task import match_task
 from mtv_world_ros.vision.jaccard import held_masks, mean_of_known, object_jaccard
 
 #: chunks that wait for their real frames; the oldest is given up for a newer one
@@ -46,6 +44,8 @@ MAX_WAITING = 32
 MAX_FRAMES = 256
 #: chunks whose scores are kept
 MAX_KEPT = 1000
+#: remark on evidence without a file
+NOT_KEPT = "the evidence ends with the node: set the parameter 'place' to keep it"
 #: a real frame stands for an imagined one if it is at most this share of a period away
 MAX_OFFSET = 0.3
 
@@ -72,6 +72,35 @@ class _SeenRollout(NamedTuple):
     episode: Rollout
 
 
+@dataclass(slots=True, eq=False)
+class _Cell:
+    """Evidence on contact parameters in a robot cell.
+
+    Attributes:
+        confirmation: test of each task.
+        file: file that keeps the evidence; None = it ends with the node.
+        refusal: reason why the file cannot be used, so that nothing is confirmed; empty = it can.
+    """
+
+    confirmation: ContactConfirmation
+    file: CellFile | None = None
+    refusal: str = ''
+
+    def trust(self, task: str) -> ContactTrust:
+        """Return whether contact parameters are taken as fitted here, for a task."""
+        if self.refusal:
+            return ContactTrust(text=f'contact of this cell is not confirmed: {self.refusal}')
+        trust = self.confirmation.trust(task)
+        return trust if self.file else replace(trust, text=f'{trust.text}; {NOT_KEPT}')
+
+    @property
+    def text(self) -> str:
+        """Evidence in words."""
+        if self.refusal:
+            return f'contact of this cell is not confirmed: {self.refusal}'
+        return self.confirmation.text if self.file else f'{self.confirmation.text}; {NOT_KEPT}'
+
+
 class LiveFidelity:
     """Compares in a thread of its own; publishes `~/fidelity` from the executor.
 
@@ -79,7 +108,6 @@ class LiveFidelity:
 
     Attributes:
         watch: tests whether executed plans ended as the fitted contact parameters foresee.
-        confirmation: tests whether parameters of another robot cell hold in this one.
 
     Args:
         node: owner of the publisher.
@@ -93,8 +121,12 @@ class LiveFidelity:
         pipeline: Pipeline,
         events: NodeEvents,
     ) -> None:
-        self.watch, self.confirmation = PhysicsWatch(), ContactConfirmation()
+        self.watch = PhysicsWatch()
         self._place = ''
+        self._cells: dict[str, _Cell] = {}
+        self._cells_lock = Lock()
+        #: chunks whose end will not be seen
+        self._given_up: list[Chunk] = []
         self._fitted: ObjectMotionModel | None = None
         # imagined frames begin chunks, too, and cameras were checked before
         self._pipeline, self._spec = replace(pipeline, camera_checker=None), pipeline.spec
@@ -129,7 +161,9 @@ class LiveFidelity:
         """Remember a chunk until its real frames are here."""
         if isinstance(result, Chunk) and not result.request.imagine:
             with self._changed:
-                self._num_missed += len(self._expected) == MAX_CHUNKS
+                if len(self._expected) == MAX_CHUNKS:
+                    self._num_missed += 1
+                    self._given_up.append(self._expected.popleft().chunk)
                 self._expected.append(Expected(result))
                 self._changed.notify_all()
             # not before: a node that fails at its start would wait for the thread
@@ -153,6 +187,7 @@ class LiveFidelity:
     def reset(self) -> None:
         """Forget chunks and frames: reset, or the clock went back."""
         with self._changed:
+            self._given_up += [expected.chunk for expected in self._expected]
             self._expected.clear()
             self._images.clear()
             for frames in self._frames.values():
@@ -165,6 +200,7 @@ class LiveFidelity:
             self._changed.notify_all()
         if self._thread.ident is not None:
             self._thread.join()
+            self._finish()
 
     def values(self) -> dict[str, object]:
         """Values for `/diagnostics`: chunks compared and not, mean J of those that are kept."""
@@ -188,12 +224,17 @@ class LiveFidelity:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closing or self._images or self._due())
+                self._changed.wait_for(
+                    lambda: self._closing or self._images or self._given_up or self._due()
+                )
                 if self._closing:
                     return
-                images = list(self._images)
+                images, given_up = list(self._images), self._given_up
                 self._images.clear()
+                self._given_up = []
             try:
+                for chunk in given_up:
+                    self._miss(chunk)
                 for view, message in images:
                     self._keep(view, message)
                 while (expected := self._next_due()) is not None:
@@ -236,6 +277,7 @@ class LiveFidelity:
         indices, frames = self._matched(expected.stamps)
         if not indices or not prediction.masks.names:
             self._num_missed += 1
+            self._miss(expected.chunk)
             return
         episode = self._real_episode(expected.chunk)
         start = episode.observation.positions[None]
@@ -253,6 +295,8 @@ class LiveFidelity:
         self._done.trigger()
         if len(indices) == len(prediction.video.times):
             self._test_physics(expected.chunk, episode.seen_points(len(indices)))
+        else:
+            self._miss(expected.chunk)
 
     def _test_physics(self, chunk: Chunk, seen: FloatArray) -> None:
         """Compare the end of an executed chunk with the futures of the fitted parameters.
@@ -276,10 +320,75 @@ class LiveFidelity:
         if foreseen is None:
             return
         self._use_place(prediction.start.place)
-        away_m = unforeseen(foreseen, seen)
-        self.watch.take(away_m, request.rollout)
-        is_last = prediction.chunk + 1 == prediction.num_chunks
-        self.confirmation.take(away_m, request.rollout, request.instruction, is_last=is_last)
+        end = chunk_end(foreseen, seen)
+        self.watch.take(end.away_m, request.rollout)
+        is_last, task = prediction.chunk + 1 == prediction.num_chunks, self._task(request)
+        self._change(lambda test: test.take(end, request.rollout, task, is_last=is_last))
+
+    def _miss(self, chunk: Chunk) -> None:
+        """Note a chunk whose end was not seen, e.g. of a plan that was given up."""
+        if chunk.prediction.foreseen is not None:
+            self._use_place(chunk.prediction.start.place)
+            number, task = chunk.request.rollout, self._task(chunk.request)
+            self._change(lambda test: test.miss(number, task))
+
+    def _finish(self) -> None:
+        """Count the present rollout, whose end is not seen any more."""
+        with self._changed:
+            left = [*self._given_up, *(expected.chunk for expected in self._expected)]
+        for chunk in left:
+            self._miss(chunk)
+        self._change(lambda test: test.finish())
+
+    def _change(self, change: Callable[[ContactConfirmation], object]) -> None:
+        """Change the evidence of the robot cell, and keep it in its file."""
+        if self.is_fitted_at(self._place):
+            return
+        cell = self._cell(self._place)
+        with self._cells_lock:
+            before = dict(cell.confirmation.tasks)
+            change(cell.confirmation)
+            if cell.file is None or cell.refusal or cell.confirmation.tasks == before:
+                return
+            try:
+                cell.file.store(cell.confirmation)
+            except OSError as error:
+                self._report(error)
+
+    def _cell(self, place: str) -> _Cell:
+        """Return the evidence of a robot cell, at first that of its file."""
+        with self._cells_lock:
+            if place not in self._cells:
+                self._cells[place] = self._load_cell(place)
+            return self._cells[place]
+
+    def _load_cell(self, place: str) -> _Cell:
+        checkpoint, robot = self._pipeline.checkpoint, self._pipeline.robot
+        fit = '' if checkpoint is None else checkpoint.object_motion_digest
+        file = CellFile.at_home(place=place, robot=robot.name, fit=fit)
+        if file is None:
+            return _Cell(ContactConfirmation())
+        try:
+            confirmation, remark = file.load()
+        except ConfigError as error:
+            self._report(error)
+            return _Cell(ContactConfirmation(), file, str(error))
+        if remark:
+            self._report(ConfigError(remark))
+        return _Cell(confirmation, file)
+
+    def _report(self, error: Exception) -> None:
+        """Report an error from any thread."""
+        self._results.append(error)
+        self._done.trigger()
+
+    def _task(self, request: Request) -> str:
+        """Return the name of a request's task; without a known one, its instruction."""
+        return self._task_named(request.instruction)
+
+    def _task_named(self, instruction: str) -> str:
+        matched = match_task(self._pipeline.estimator.tasks, instruction)
+        return instruction if matched is None else matched[0].name
 
     def _fitted_model(self) -> ObjectMotionModel:
         """Return foresight with the fitted parameters; its simulator is this thread's own."""
@@ -292,7 +401,7 @@ class LiveFidelity:
     def _use_place(self, place: str) -> None:
         """Begin the tests anew in another robot cell."""
         if place != self._place:
-            self._place, self.confirmation = place, ContactConfirmation()
+            self._place = place
             self.watch.forget()
 
     def trust(self, place: str, instruction: str) -> ContactTrust:
@@ -304,20 +413,20 @@ class LiveFidelity:
         """
         if self.is_fitted_at(place):
             return ContactTrust()
-        if place != self._place:
-            return ContactConfirmation().trust(instruction)
         # while the watch doubts, its reason is given
-        return ContactTrust() if self.watch.doubt else self.confirmation.trust(instruction)
+        if place == self._place and self.watch.doubt:
+            return ContactTrust()
+        return self._cell(place).trust(self._task_named(instruction))
 
     def physics_text(self, place: str) -> str:
         """Text about the contact parameters in a robot cell, for `/diagnostics`."""
-        is_here = place == self._place
         if self.is_fitted_at(place):
             return self.watch.text
-        if is_here and self.watch.doubt:
+        if place == self._place and self.watch.doubt:
             return self.watch.doubt
-        tested = self.confirmation if is_here else ContactConfirmation()
-        return f'{tested.text}; {NOT_FITTED_HERE}' if tested.num_missing else tested.text
+        cell = self._cell(place)
+        is_confirmed = cell.confirmation.is_complete and not cell.refusal
+        return cell.text if is_confirmed else f'{cell.text}; {NOT_FITTED_HERE}'
 
     def _real_episode(self, chunk: Chunk) -> Rollout:
         """Return the real frames of the chunk's rollout; a new episode if some are missing."""

@@ -20,11 +20,15 @@ from mtv_world_ros.ros.messages.conversions import (
 )
 from mtv_world_ros.ros.messages.image_messages import to_image
 from mtv_world_ros.ros.world_model.loading import load_named_pipeline
+from mtv_world_ros.success.cell_file import CellFile
+from mtv_world_ros.success.confirmation import ContactConfirmation, seen_end
 from mtv_world_ros.success.doubts import SAYS
 
 #: of the bundled model; two of its chunks, in which the first block is picked up and set down
 FPS, PLAN_S = 5.0, 6.4
 EPISODE = share_path('resource', 'demo_episode')
+#: task of its instruction
+TASK = 'stack_blocks_two'
 
 
 @pytest.fixture(scope='module')
@@ -140,6 +144,47 @@ def test_in_another_robot_cell_ends_as_foreseen_are_counted_for_a_confirmation(n
         assert ends_as_foreseen(said(node)) >= 1
         assert send_plan(node, recording, node.now_ns())['state'] == 'done'
         assert ends_as_foreseen(node.report_values('chunk')[-1]['success_reasons']) >= 1
+        # the evidence lies in a file, by task
+        evidence, remark = cell_file('cell 3').load()
+        assert remark == '' and evidence.tasks[TASK].num_foreseen >= 1
+    finally:
+        assert node.set(place='simulator/nominal') == ''
+        node.reset()
+
+
+def cell_file(place) -> CellFile:
+    """Return the file of a robot cell."""
+    checkpoint = Checkpoint.open('bundled')
+    robot, fit = checkpoint.load_robot().name, checkpoint.object_motion_digest
+    found = CellFile.at_home(place=place, robot=robot, fit=fit)
+    assert found is not None
+    return found
+
+
+@pytest.mark.slow
+def test_evidence_of_an_earlier_run_counts_and_a_damaged_or_foreign_file_is_named(node, recording):
+    confirmed = ContactConfirmation()
+    for rollout in range(10):
+        confirmed.take(seen_end(0.0), rollout, TASK)
+    for place in ('cell 5', 'cell 6', 'cell 7'):
+        cell_file(place).store(confirmed)
+    cell_file('cell 6').path.write_text('{"place": "cell 6", "ta')
+    cell_file('cell 5').path.rename(cell_file('cell 7').path)
+    cell_file('cell 5').store(confirmed)
+    node.publish('/instruction', String(data=recording.instruction))
+    try:
+        for place, words in (
+            ('cell 5', f'is confirmed for {TASK} (10 of 10 ends as foreseen)'),
+            ('cell 6', 'not confirmed for any task: no end was seen yet'),
+            ('cell 7', "has evidence on the place 'cell 5', and this is 'cell 7'"),
+        ):
+            assert node.set(place=place) == ''
+            node.wait(lambda words=words: words in said(node), place)
+            assert send_plan(node, recording, node.now_ns())['state'] == 'done'
+            reasons = node.report_values('chunk')[-1]['success_reasons']
+            assert ('is confirmed for this task' in reasons) == (place == 'cell 5'), reasons
+            node.reset()
+        assert cell_file('cell 6').path.with_suffix('.damaged1').is_file()
     finally:
         assert node.set(place='simulator/nominal') == ''
         node.reset()
@@ -147,7 +192,9 @@ def test_in_another_robot_cell_ends_as_foreseen_are_counted_for_a_confirmation(n
 
 def ends_as_foreseen(text) -> int:
     """Return the number of ends as foreseen that a text states, of ten; -1 = it states none."""
-    found = re.search(r'this cell is not confirmed: (\d+) of 10 ends as foreseen', text)
+    if 'not confirmed for any task: no end was seen yet' in text:
+        return 0
+    found = re.search(r'this cell is not confirmed for .*?(\d+) of 10 ends as foreseen', text)
     return int(found[1]) if found else -1
 
 
