@@ -16,8 +16,18 @@ from mtv_world_ros.cameras.image_window import ImageWindow, window_of
 from mtv_world_ros.core.data_types import CameraModel, FloatArray
 from mtv_world_ros.core.errors import CalibrationError
 
-#: part of the name of a topic of rectified images, as image_proc and drivers name it
-RECTIFIED = '/image_rect'
+#: words of topic names of rectified images, as image_proc and drivers have them
+_RECTIFIED = {'rect', 'rectified'}
+
+
+def is_rectified(topic: str) -> bool:
+    """Return True if the name of an image topic says that its images are rectified.
+
+    The word is that of the topic (`image_rect_color`), or of a part before it (`left/rect/image`,
+    `front_rect/image_raw`).
+    """
+    words = topic.lower().replace('_', '/').split('/')
+    return not _RECTIFIED.isdisjoint(words)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +115,9 @@ def read_camera_info(view: str, info: Any, *, is_rectified: bool = False) -> Int
     field, matrix = 'K', np.asarray(info.k, np.float64)
     model, distortion = info.distortion_model, np.asarray(info.d, np.float64)
     if is_rectified:
-        field, matrix = 'P', np.reshape(info.p, (3, 4))[:, :3].astype(np.float64).ravel()
+        projection = np.reshape(info.p, (3, 4))[:, :3].astype(np.float64).ravel()
+        if projection.any() or distortion.any():  # else K is that of undistorted images
+            field, matrix = 'P', projection
         model, distortion = 'none', np.zeros(0)
     for name, values in ((field, matrix), ('D', distortion)):
         if not np.isfinite(values).all():

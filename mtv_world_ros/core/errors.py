@@ -61,6 +61,10 @@ class EpisodeError(MtvWorldError):
     """A recorded episode cannot be read, or lacks something."""
 
 
+class DamagedFrameError(EpisodeError):
+    """A single recorded frame cannot be decoded; its neighbours may be."""
+
+
 class CheckpointError(MtvWorldError):
     """A checkpoint folder is incomplete or is for another model."""
 

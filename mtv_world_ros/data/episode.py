@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mtv_world_ros.core.bounded_input import parse_json
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
-from mtv_world_ros.core.errors import EpisodeError, MtvWorldError, nearest
+from mtv_world_ros.core.errors import DamagedFrameError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.resample import interpolated, match_joints
 
@@ -243,7 +243,8 @@ class LazyFrames:
         try:
             return self._decode(self._messages[index])
         except MtvWorldError as error:
-            raise EpisodeError(f"'{self._topic}', frame {index}: {error}") from error
+            text = f"'{self._topic}', frame {index}: {error}"
+            raise DamagedFrameError(text) from error
 
     def _stack(self, frames: list[ByteArray]) -> ByteArray:
         sizes = sorted({frame.shape[:2] for frame in frames})
@@ -323,11 +324,13 @@ class Episode:
         object_poses: None if not recorded.
         unknown: parameters that are not known of some views' cameras (`pose`, or `pose and
             intrinsics`), by view; `cameras` has a placeholder.
+        unknown_because: reason why a pose is not known, by view, where something is recorded of it.
         camera_tracks: (N, 4, 4) T_mount_camera [m] at the images of each view whose camera moves
             against the robot's links; `cameras` has the first one.
         truncated: the recording is cut off.
         warnings: problems found and how they were handled, one line each; if
             `truncated`, the first says where the record was cut.
+        unused: reason why a recorded topic is not part of the episode, by topic.
     """
 
     info: EpisodeInfo
@@ -340,9 +343,11 @@ class Episode:
     instructions: list[tuple[int, str]]
     object_poses: ObjectPoses | None = None
     unknown: Mapping[str, str] = field(default_factory=dict)
+    unknown_because: Mapping[str, str] = field(default_factory=dict)
     camera_tracks: Mapping[str, FloatArray] = field(default_factory=dict)
     truncated: bool = False
     warnings: tuple[str, ...] = ()
+    unused: Mapping[str, str] = field(default_factory=dict)
 
     def mask_areas(self) -> dict[str, FloatArray]:
         """Return (O, T) areas of the objects in the stored masks by view [share of the image]."""

@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.cameras.camera import unknown_camera
-from mtv_world_ros.cameras.camera_info import Intrinsics, read_camera_info, RECTIFIED
+from mtv_world_ros.cameras.camera_info import Intrinsics, is_rectified, read_camera_info
 from mtv_world_ros.cameras.image_window import ImageWindow, WHOLE, windowed_camera
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.core.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
 from mtv_world_ros.data.bag import messages
-from mtv_world_ros.data.bag.image_decoding import check_image, to_ids, to_rgb
+from mtv_world_ros.data.bag.image_decoding import check_decodable, check_image, to_ids, to_rgb
 from mtv_world_ros.data.bag.image_orientation import stored_note
 from mtv_world_ros.data.bag.messages import IMAGE_TYPES
-from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.bag.reader import BagReader, is_storage
+from mtv_world_ros.data.bag.unused_topics import unused_topics
 from mtv_world_ros.data.bag.video_packets import (
     check_packet,
     FFMPEG_PACKET,
@@ -109,6 +110,7 @@ def read_episode(
     robot: RobotModel | None = None,
     unknown_mount: str = '',
     window: Window = WHOLE_BAG,
+    decode_all: bool = True,
 ) -> Episode:
     """Read an episode; frames are decoded on access.
 
@@ -131,6 +133,8 @@ def read_episode(
             (without a CameraInfo, for the intrinsics too) and are named in `Episode.unknown`;
             empty = they are an error.
         window: the part of the recording that is wanted, by receive times.
+        decode_all: whether the JPEG frames of a recording of others are decoded once, and damaged
+            ones left out; False = damaged ones raise `DamagedFrameError` when they are read.
 
     Raises:
         ClockBreakError: all clocks change at once; its windows are the parts.
@@ -139,6 +143,7 @@ def read_episode(
         CalibrationError: a view's calibration is missing or does not fit its CameraInfo.
     """
     reader = _EpisodeReader(Path(path), views, topics or {}, with_masks, mapping, robot, window)
+    reader.decode_all = decode_all
     return reader.read(calibration, with_cameras, unknown_mount)
 
 
@@ -161,7 +166,8 @@ def read_info(path: Path | str) -> EpisodeInfo:
 def list_episodes(folder: Path | str) -> list[Path]:
     """Return the episode folders anywhere in a folder, by path, links followed.
 
-    Hidden ones are left out.
+    A folder with files of a bag is one without metadata.yaml, too: its recorder was killed. Hidden
+    folders are left out.
     """
     found, seen = [], set()
     for place, folders, names in os.walk(folder, followlinks=True):
@@ -170,7 +176,8 @@ def list_episodes(folder: Path | str) -> list[Path]:
             folders.clear()
             continue
         seen.add(real)
-        if 'metadata.yaml' in names and not Path(place).name.startswith('.'):
+        is_bag = 'metadata.yaml' in names or any(is_storage(Path(name)) for name in names)
+        if is_bag and not Path(place).name.startswith('.'):
             found.append(Path(place))
     return sorted(found)
 
@@ -202,11 +209,14 @@ class _EpisodeReader:
                 raise EpisodeError(f'{error}; {self.bag.truncated}') from error
             raise
         self.with_masks = with_masks
+        self.decode_all = True
         self.received: dict[str, Stamped] = {}
         self.arrived: dict[str, NDArray[np.int64]] = {}
         self.refused: dict[str, list[str]] = {}
         self.tracks: dict[str, FloatArray] = {}
         self.unknown: dict[str, str] = {}
+        self.unknown_because: dict[str, str] = {}
+        self.is_calibrated = False
         self.infos: dict[str, list[tuple[Any, Intrinsics]]] = {}
         self.seen_ns = 0  # all views have an image from here on
 
@@ -237,10 +247,26 @@ class _EpisodeReader:
             instructions=instructions,
             object_poses=self._object_poses(len(episode_info.objects)),
             unknown=self.unknown,
+            unknown_because=self.unknown_because,
             camera_tracks=self.tracks,
             truncated=bool(self.bag.truncated),
             warnings=self._all_warnings(),
+            unused=self._unused(),
         )
+
+    def _unused(self) -> dict[str, str]:
+        """Return why recorded topics are not part of the episode, by topic."""
+        topics, mapping = self.topics, self.mapping
+        used = topics.names(with_masks=True) | {self._camera_info(view) for view in topics.views}
+        used |= {mapping.topic(tool.topic) for tool in mapping.tools.values()}
+        if mapping.action == STATE:
+            used.discard(topics.joint_trajectory)
+        if mapping.instruction:
+            used.discard(topics.instruction)
+        if not self.is_calibrated:
+            used |= set(TF_TOPICS)
+        images = [view.image for view in topics.views.values()]
+        return unused_topics(self.types, used, images, mapping)
 
     def _receive(self) -> None:
         wanted = self.topics.names(with_masks=self.with_masks) | set(TF_TOPICS)
@@ -392,6 +418,8 @@ class _EpisodeReader:
                 self._refuse(topic, error)
         if self.types.get(topic) == FFMPEG_PACKET:
             return self._video(topic, good)
+        if decode is to_rgb:
+            good = self._whole(topic, good)
         if not good:
             return None
         ordered = in_order(topic, good, self.warnings)
@@ -399,6 +427,21 @@ class _EpisodeReader:
             self._warn_once(f"'{topic}': {note}")
         stamps = np.array([stamp for stamp, _ in ordered], np.int64)
         return Track(stamps, LazyFrames(topic, [message for _, message in ordered], decode))
+
+    def _whole(self, topic: str, images: Stamped) -> Stamped:
+        """Return the images that are not damaged; without `decode_all` from the first such on."""
+        if METADATA_NAME in self.bag.metadata:  # written by this package
+            return images
+        whole: Stamped = []
+        for number, (stamp, message) in enumerate(images):
+            if whole and not self.decode_all:
+                return [*whole, *images[number:]]
+            try:
+                check_decodable(message)
+                whole.append((stamp, message))
+            except MtvWorldError as error:
+                self._refuse(topic, error)
+        return whole
 
     def _video(self, topic: str, packets: Stamped) -> Track | None:
         whole = from_first_key(in_order(topic, packets, self.warnings))
@@ -601,6 +644,7 @@ class _EpisodeReader:
                     f'{CALIBRATION_FILE} into its folder or name one in `calibration` (the bag '
                     f'has no /tf_static either); {_estimate(self.path, next(iter(images)))}'
                 )
+        self.is_calibrated = bool(calibration)
         known = load_calibration(file) if tree is None else {}
         cameras = {}
         for view in self.topics.views:
@@ -669,9 +713,10 @@ class _EpisodeReader:
         row = self.mapping.views.get(view)
         frame = (row.frame if row else '') or of_info or of_images
         links = () if self.robot is None else self.robot.posed_links
-        if unknown_mount and tree.name(frame) not in tree.frames:
+        if unknown_mount and (why := tree.unknown_because(frame, links)) is not None:
             mount = Mount(unknown_mount, np.eye(4), None)
             self.unknown[view] = 'pose'
+            self.unknown_because |= {view: why} if why else {}
         elif tree.is_moving(frame, links):
             moving, static = self._tf()
             prefix = self.mapping.tf_prefix
@@ -712,14 +757,14 @@ class _EpisodeReader:
             CalibrationError: a number in one is NaN or infinite.
         """
         if view not in self.infos:
-            is_rectified = RECTIFIED in self.topics.views[view].image
+            rectified = is_rectified(self.topics.views[view].image)
             taken = self._take(self._camera_info(view), messages.CAMERA_INFO)
-            read = [(m, read_camera_info(view, m, is_rectified=is_rectified)) for _, m in taken]
+            read = [(m, read_camera_info(view, m, is_rectified=rectified)) for _, m in taken]
             self.infos[view] = [(m, found) for m, found in read if found is not None]
             if read and not self.infos[view]:
                 self._warn_once(
                     f"view '{view}': '{self._camera_info(view)}' is not calibrated "
-                    f'({"P" if is_rectified else "K"}[0] = 0), which is the same as no CameraInfo'
+                    f'({"P" if rectified else "K"}[0] = 0), which is the same as no CameraInfo'
                 )
         return self.infos[view]
 

@@ -270,11 +270,11 @@ class TransformTree:
                 return mount
             fixed[mount.link] = mount
         if links:
-            circle = next((c for c in self._circles() if fixed.keys() & set(c)), None)
-            if circle is not None:
+            self._refuse_circle(frame, fixed.keys())
+            if not self.is_connected(frame, links):
                 raise CalibrationError(
-                    f"no link of the robot is fixed to frame '{frame}': it hangs in a circle, "
-                    f'{_quoted(circle)}'
+                    f"no link of the robot is fixed to frame '{frame}': TF does not connect "
+                    f"'{self._top(frame)}' with the robot; mtv-world fit camera estimates the pose"
                 )
             raise CalibrationError(
                 f"no link of the robot is fixed to frame '{frame}': only {', '.join(fixed)} are. "
@@ -285,6 +285,19 @@ class TransformTree:
         while parents.get(top) in fixed:
             top = parents[top]
         return fixed[top]
+
+    def _refuse_circle(self, frame: str, fixed: Collection[str]) -> None:
+        """Raise if frames that are fixed to a frame go in a circle.
+
+        Raises:
+            CalibrationError: they do.
+        """
+        circle = next((c for c in self._circles() if not set(c).isdisjoint(fixed)), None)
+        if circle is not None:
+            raise CalibrationError(
+                f"no link of the robot is fixed to frame '{frame}': it hangs in a circle, "
+                f'{_quoted(circle)}'
+            )
 
     def moving_mount(
         self, frame: str, links: Collection[str], stamp_ns: int | None = None
@@ -336,6 +349,31 @@ class TransformTree:
         frame = self.name(frame)
         reached = self._reachable(frame, only_still=False)
         return frame in self.frames and any(mount.link in links for mount in reached)
+
+    def unknown_because(self, frame: str, links: Collection[str]) -> str | None:
+        """Return why TF does not have a frame's pose; '' = it lacks the frame; None = it has it.
+
+        Args:
+            frame: name of the frame, e.g. a camera's optical frame.
+            links: links of the robot; empty = any frame carries it.
+
+        Raises:
+            CalibrationError: the frame hangs in a circle.
+        """
+        name = self.name(frame)
+        if name not in self.frames:
+            return ''
+        if not links or self.is_connected(name, links):
+            return None
+        self._refuse_circle(name, {mount.link for mount in self._reachable(name, only_still=True)})
+        return f"TF does not connect '{self._top(name)}' with the robot"
+
+    def _top(self, frame: str) -> str:
+        """Return the frame that a frame hangs from and that has no parent."""
+        parents = self._parents()
+        while (above := parents.get(frame)) is not None:
+            frame = above
+        return frame
 
     def parent(self, frame: str) -> str | None:
         """Return a frame's parent; None = it has none."""

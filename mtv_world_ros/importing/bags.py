@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 import tempfile
 from typing import Any
@@ -16,6 +16,7 @@ from mtv_world_ros.cameras.camera import camera_poses
 from mtv_world_ros.core.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.core.errors import (
     ConfigError,
+    DamagedFrameError,
     EpisodeError,
     nearest,
     RobotError,
@@ -24,9 +25,10 @@ from mtv_world_ros.core.errors import (
 from mtv_world_ros.core.files import ROBOT_YAML
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.bag.unused_topics import unused_line
 from mtv_world_ros.data.bag_mapping import BagMapping, key_of
 from mtv_world_ros.data.episode import Episode, MASKS_BY, parse_outcome, UNKNOWN_CAMERAS
-from mtv_world_ros.data.episode_reader import list_episodes, read_episode
+from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.stream_clocks import ClockBreakError, WHOLE, Window
 from mtv_world_ros.importing.convert import (
@@ -39,16 +41,10 @@ from mtv_world_ros.importing.convert import (
 from mtv_world_ros.importing.mapping import digest_of
 from mtv_world_ros.importing.robot_guess import guess_robot
 from mtv_world_ros.importing.stored_objects import AS_RECORDED, MaskWriter, ObjectStage
+from mtv_world_ros.importing.view_names import guess_views
 from mtv_world_ros.robot.file import load_robot, save_robot
 from mtv_world_ros.robot.model import check_positions, RobotModel
 from mtv_world_ros.robot.resample import match_joints
-
-#: parts of an image topic's name that say nothing of the view
-_NOT_A_VIEW = {'image', 'image_raw', 'image_rect', 'image_color', 'image_rect_color', 'color',
-               'rgb', 'compressed', 'ffmpeg', 'camera', 'image_rect_raw'}  # fmt: skip
-#: words in the names of image topics that are not colour images of the scene
-_NO_COLOURS = ('depth', 'infra', 'mask', 'confidence', 'disparity')
-
 
 @dataclass(frozen=True, slots=True)
 class BagPart:
@@ -74,23 +70,6 @@ class BagPart:
         return f'{self.bag} (part {self.number})' if self.number else str(self.bag)
 
 
-def find_bags(paths: Sequence[Path]) -> list[Path]:
-    """Return bags: files as they are, folders that are bags, and the bags in other folders.
-
-    Raises:
-        EpisodeError: a path is not there, or there is no bag.
-    """
-    found: list[Path] = []
-    for path in paths:
-        if not path.exists():
-            raise EpisodeError(f"there is no bag '{path}'")
-        holds_files = path.is_dir() and any(path.glob('*.mcap*')) or any(path.glob('*.db3*'))
-        found += [path] if path.is_file() or holds_files else list_episodes(path)
-    if not found:
-        raise EpisodeError(f'there is no bag in {", ".join(map(str, paths))}')
-    return found
-
-
 def with_guessed_views(mapping: BagMapping, bag: Path) -> BagMapping:
     """Return the mapping with the bag's image topics as views, where it names none.
 
@@ -108,22 +87,6 @@ def with_guessed_views(mapping: BagMapping, bag: Path) -> BagMapping:
             f"'{bag}' has no images (topics of Image, CompressedImage or FFMPEGPacket)"
         )
     return mapping.replace(views={view: {'image': topic} for view, topic in views.items()})
-
-
-def guess_views(topics: Collection[str]) -> dict[str, str]:
-    """Return image topics by a view's name: the last part of the topic that says which it is.
-
-    Depth, infrared and masks are left out; of raw and compressed images of a view the raw ones
-    are taken.
-    """
-    found: dict[str, str] = {}
-    for topic in sorted(topics):
-        plain = topic.removesuffix('/compressed').removesuffix('/ffmpeg')
-        if any(word in plain for word in _NO_COLOURS):
-            continue
-        parts = [part for part in plain.split('/') if part and part not in _NOT_A_VIEW]
-        found.setdefault(parts[-1] if parts else 'camera', plain)
-    return found
 
 
 def described_robot(bag: Path, mapping: BagMapping, folder: Path) -> tuple[Path, tuple[str, ...]]:
@@ -302,6 +265,7 @@ def convert_bag(
         robot=robot,
         unknown_mount=robot.base_link,
         window=part.window,
+        decode_all=False,  # each frame is decoded once, when it is written
     )
     key_name = key_of(mapping.outcome)
     if key_name:
@@ -358,8 +322,13 @@ def write_imported(
     stamps, positions = _measured(episode, robot, mapping)
     commands = _commands(episode, robot, mapping)
     warnings = [*episode.warnings, *joints_too_fast([t for _, t in commands], robot)]
+    if line := unused_line(episode.unused):
+        warnings.append(line)
     unknown = episode.unknown.items()
-    warnings += [unknown_camera_note(out.parent, view, what) for view, what in unknown]
+    warnings += [
+        unknown_camera_note(out.parent, view, what, episode.unknown_because.get(view, ''))
+        for view, what in unknown
+    ]
     instruction = mapping.instruction or episode.info.instruction
     names = stage.names(
         out.name,
@@ -383,13 +352,58 @@ def write_imported(
         jpeg_quality=mapping.jpeg_quality,
     ) as writer:
         writer.outcome = mapping.outcome if mapping.outcome != 'unknown' else episode.info.outcome
-        masks = stage.masks(out.name, writer)
+        frames = _FrameWriter(writer, stage.masks(out.name, writer), episode)
         for write in _in_order(
-            episode, writer, masks, robot, stamps, positions, commands, mapping
+            episode, writer, frames, robot, stamps, positions, commands, mapping
         ):
             write()
-        masks.finish()
+        warnings += frames.finish()
     return tuple(warnings)
+
+
+@dataclass(slots=True)
+class _FrameWriter:
+    """Writer of frames that leaves damaged ones out.
+
+    Attributes:
+        writer: writer of the episode.
+        masks: writer of the masks of its frames.
+        episode: recording as it was read.
+        damaged: faults of the damaged frames, by view.
+    """
+
+    writer: EpisodeWriter
+    masks: MaskWriter
+    episode: Episode
+    damaged: dict[str, list[str]] = field(default_factory=dict)
+
+    def write(self, view: str, index: int) -> None:
+        """Write a frame and find its masks; note a damaged one."""
+        track = self.episode.images[view]
+        stamp = int(track.stamps_ns[index])
+        try:
+            frame = track.frames[index]
+        except DamagedFrameError as error:
+            self.damaged.setdefault(view, []).append(str(error))
+            return
+        self.writer.write_image(view, stamp, frame)
+        self.masks.add(view, stamp, frame)
+
+    def finish(self) -> list[str]:
+        """Write the masks of the frames that wait; return a line for each view's damaged frames.
+
+        Raises:
+            EpisodeError: a view has fewer than two frames that are not damaged.
+        """
+        self.masks.finish()
+        notes = []
+        for view, faults in self.damaged.items():
+            count = len(self.episode.images[view].stamps_ns)
+            text = f"view '{view}': {len(faults)} of {count} frames were left out, {faults[0]}"
+            if count - len(faults) < 2:
+                raise EpisodeError(text)
+            notes.append(text)
+        return notes
 
 
 def _check_views(episode: Episode) -> None:
@@ -460,7 +474,7 @@ def _check(robot: RobotModel, positions: FloatArray, mapping: BagMapping, what: 
 def _in_order(
     episode: Episode,
     writer: EpisodeWriter,
-    object_masks: MaskWriter,
+    image_writer: _FrameWriter,
     robot: RobotModel,
     stamps: np.ndarray,
     positions: FloatArray,
@@ -487,7 +501,7 @@ def _in_order(
             camera = episode.camera(view, index)
             mount, T = camera.mount_link, camera.T_mount_camera
             add(stamp, 3, writer.write_camera_pose, view, stamp, mount, T)
-        add(stamp, 4, _write_frame, writer, object_masks, episode, view, index)
+        add(stamp, 4, image_writer.write, view, index)
     masks = episode.masks or {}
     for view, stamp, index in ((v, s, i) for v in masks for i, s in enumerate(masks[v].stamps_ns)):
         add(int(stamp), 5, _write_mask, writer, view, int(stamp), masks[view].frames, index)
@@ -512,15 +526,6 @@ def _metadata(episode: Episode, source: str, key: str) -> dict[str, str]:
 def _write_camera_info(writer: EpisodeWriter, episode: Episode, view: str, stamp_ns: int) -> None:
     if episode.unknown.get(view, 'pose') == 'pose':  # the intrinsics are known
         writer.write_camera_info(view, stamp_ns, episode.cameras[view])
-
-
-def _write_frame(
-    writer: EpisodeWriter, masks: MaskWriter, episode: Episode, view: str, index: int
-) -> None:
-    track = episode.images[view]
-    stamp, frame = int(track.stamps_ns[index]), track.frames[index]
-    writer.write_image(view, stamp, frame)
-    masks.add(view, stamp, frame)
 
 
 def _write_mask(writer: EpisodeWriter, view: str, stamp: int, frames: Any, index: int) -> None:

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
+import shlex
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -413,10 +414,18 @@ def _commands(
     return found
 
 
-def unknown_camera_note(folder: Path, view: str, what: str) -> str:
-    """Return what is not known of a view's camera, and the command that estimates it."""
+def unknown_camera_note(folder: Path, view: str, what: str, why: str = '') -> str:
+    """Return what is not known of a view's camera, and the command that estimates it.
+
+    Args:
+        folder: folder of the episodes.
+        view: name of the view.
+        what: parameters that are not known.
+        why: the reason; empty = nothing is recorded of them.
+    """
+    because = f' ({why})' if why else ''
     return (
-        f"view '{view}': {what} not known: mtv-world fit camera {folder} --view {view} "
+        f"view '{view}': {what} not known{because}: mtv-world fit camera {shlex.quote(str(folder))} --view {view} "
         '--click points.html'
     )
 

@@ -14,7 +14,7 @@ from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag_mapping import load_bag_mapping
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import motion_digest
-from mtv_world_ros.importing.bags import guess_views
+from mtv_world_ros.importing.view_names import guess_views
 from mtv_world_ros.robot.file import load_robot
 from test.support.bags import bag_cameras, MAPPING, record
 from test.support.crane import FPS, make_positions, render, START_NS, URDF

@@ -59,12 +59,8 @@ def _import_bag(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.core.files import write_whole
     from mtv_world_ros.data.bag_mapping import BagMapping, load_bag_mapping
     from mtv_world_ros.data.episode_reader import read_episode
-    from mtv_world_ros.importing.bags import (
-        episode_name,
-        find_bags,
-        import_bags,
-        with_guessed_views,
-    )
+    from mtv_world_ros.importing.bag_folders import find_bags
+    from mtv_world_ros.importing.bags import episode_name, import_bags, with_guessed_views
 
     mapping = BagMapping() if arguments.topics is None else load_bag_mapping(arguments.topics)
     if arguments.action:

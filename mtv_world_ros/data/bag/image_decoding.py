@@ -14,6 +14,7 @@ import simplejpeg
 from mtv_world_ros.core.bounded_input import check_limit, LimitError
 from mtv_world_ros.core.data_types import ByteArray
 from mtv_world_ros.core.errors import ObservationError
+from mtv_world_ros.data.bag.jpeg_padding import is_only_padded, SURPLUS
 
 #: encodings of sensor_msgs/Image: bytes a pixel in a row, conversion to RGB (None = is RGB).
 #: OpenCV names a Bayer pattern by its second row, and `yuv422` is ROS' older name of `uyvy`
@@ -52,8 +53,8 @@ _PNG = b'\x89PNG'
 _SIGNATURES = {b'\xff\xd8\xff': b'\xff\xd9', _PNG: b'IEND'}
 #: JPEG marker of a scan
 _SCAN = b'\xff\xda'
-#: warning of a decoder that lost nothing
-_HARMLESS = 'extraneous bytes before marker 0xd9'
+#: last digit of the marker that ends a JPEG file; many USB cameras write a byte too much before it
+_END_OF_IMAGE = '9'
 #: largest padding after the end: some cameras pad their files
 _MAX_PADDING = 4096
 
@@ -68,6 +69,16 @@ def check_image(message: Any) -> None:
         check_raw(message)
     else:
         check_compressed(message.format, _bytes(message))
+
+
+def check_decodable(message: Any) -> None:
+    """Decode a JPEG of a sensor_msgs/CompressedImage, at an eighth of its size.
+
+    Raises:
+        ObservationError: the file is damaged.
+    """
+    if not _is_raw(message) and (data := _bytes(message))[:4].tobytes() != _PNG:
+        _decode_jpeg(message.format, data, 'GRAY', min_height=1, min_width=1, min_factor=8)
 
 
 def to_rgb(message: Any) -> ByteArray:
@@ -195,7 +206,7 @@ def compressed_to_rgb(layout: str, data: NDArray[np.uint8]) -> ByteArray:
             return np.asarray(cv2.cvtColor(image, ENCODINGS[mosaic][1] or 0), np.uint8)
     if data[:4].tobytes() != _PNG:
         check_compressed(layout, data)
-        return _check_jpeg(layout, data)
+        return _decode_jpeg(layout, data, 'RGB')
     bgr = _decode(layout, data, cv2.IMREAD_COLOR)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
@@ -217,21 +228,22 @@ def compressed_to_ids(layout: str, data: NDArray[np.uint8]) -> ByteArray:
 def _decode(layout: str, data: NDArray[np.uint8], mode: int) -> NDArray[Any]:
     check_compressed(layout, data)
     if data[:4].tobytes() != _PNG:
-        _check_jpeg(layout, data)
+        _decode_jpeg(layout, data, 'RGB')
     image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise _damaged(layout, data)
     return image
 
 
-def _check_jpeg(layout: str, data: NDArray[np.uint8]) -> ByteArray:
-    """Return (H, W, 3) RGB; a decoder's warning that data are missing counts as damage."""
+def _decode_jpeg(layout: str, data: NDArray[np.uint8], colours: str, **size: int) -> ByteArray:
+    """Return (H, W, C) pixels; a decoder's warning that data are missing counts as damage."""
     content = data.tobytes()
     try:
-        return simplejpeg.decode_jpeg(content, 'RGB')
+        return simplejpeg.decode_jpeg(content, colours, **size)
     except ValueError as error:
-        if _HARMLESS in str(error):  # many USB cameras write a byte too much
-            return simplejpeg.decode_jpeg(content, 'RGB', strict=False)
+        surplus = SURPLUS.search(str(error))
+        if surplus and (surplus[2] == _END_OF_IMAGE or is_only_padded(content)):
+            return simplejpeg.decode_jpeg(content, colours, strict=False, **size)
         raise _damaged(layout, data, f': {error}') from error
 
 

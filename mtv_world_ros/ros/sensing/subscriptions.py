@@ -15,7 +15,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from mtv_world_ros.cameras.camera_info import RECTIFIED
+from mtv_world_ros.cameras.camera_info import is_rectified
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.messages.bounded import bounded, decode
@@ -146,8 +146,8 @@ def subscribe_observations(
     for view, topic in topics.items():
         is_compressed = view in compressed
         kind, suffix = (CompressedImage, '/compressed') if is_compressed else (Image, '')
-        is_rectified = RECTIFIED in node.resolve_topic_name(f'{topic}/image_raw{suffix}')
-        add_info = partial(buffer.add_camera_info, view, is_rectified=is_rectified)
+        rectified = is_rectified(node.resolve_topic_name(f'{topic}/image_raw{suffix}'))
+        add_info = partial(buffer.add_camera_info, view, is_rectified=rectified)
         newest += [
             (CameraInfo, f'{topic}/camera_info', add_info, 1),
             (kind, f'{topic}/image_raw{suffix}', partial(buffer.add_image, view), 1),

@@ -1,0 +1,43 @@
+"""Finds the bags of an import in files and folders."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+import re
+
+from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.data.bag.reader import is_storage
+from mtv_world_ros.data.episode_reader import list_episodes
+
+#: number that rosbag2 adds to the files of a bag that it splits
+_PART = re.compile(r'_\d+$')
+
+
+def find_bags(paths: Sequence[Path]) -> list[Path]:
+    """Return bags: files as they are, folders that are bags, and the bags in other folders.
+
+    A folder without metadata.yaml is a bag where its files are named like the parts of one; else
+    each of them is.
+
+    Raises:
+        EpisodeError: a path is not there, or there is no bag.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.exists():
+            raise EpisodeError(f"there is no bag '{path}'")
+        inside = [path] if path.is_file() else list_episodes(path)
+        found += [bag for folder in inside for bag in _apart(folder)]
+    if not found:
+        raise EpisodeError(f'there is no bag in {", ".join(map(str, paths))}')
+    return found
+
+
+def _apart(folder: Path) -> list[Path]:
+    """Return a folder that is one bag, or else the bags that its files are."""
+    if folder.is_file() or (folder / 'metadata.yaml').is_file():
+        return [folder]
+    files = [file for file in sorted(folder.iterdir()) if is_storage(file) and file.is_file()]
+    stems = {_PART.sub('', file.name.split('.')[0]) for file in files}
+    return [folder] if len(stems) == 1 else files
