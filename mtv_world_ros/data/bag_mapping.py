@@ -13,6 +13,8 @@ from mtv_world_ros.data.episode import check_outcome
 from mtv_world_ros.data.tool_targets import ToolTargets
 
 STATE = 'state'
+#: key of `joints` whose value is taken off the recorded names
+PREFIX = 'prefix'
 
 
 class ViewSource(Schema):
@@ -89,11 +91,15 @@ class BagMapping(Written):
     views: dict[str, Annotated[ViewSource, BeforeValidator(_view)]] = Field(
         default={}, description='topic of the images by view; empty = `<view>/image_raw`'
     )
-    joint_states: str = Field(
-        default='joint_states', description='topic of the measured positions (JointState)'
+    joint_states: str | Annotated[ListOf[str], Field(min_length=1)] = Field(
+        default='joint_states',
+        description='topic of the measured positions (JointState), or a list of topics: of an arm '
+        'and its gripper',
     )
     joints: dict[str, str] = Field(
-        default={}, description="the robot's name of a joint, by the recorded one"
+        default={},
+        description="the robot's name of a joint, by the recorded one; `prefix: NAME` takes NAME "
+        'off all recorded names that begin with it',
     )
     constants: dict[str, Number] = Field(
         default={}, description='positions of joints that are not measured, by name [rad or m]'
@@ -128,11 +134,23 @@ class BagMapping(Written):
             return name
         return '/'.join(['', *filter(None, self.namespace.strip('/').split('/')), name])
 
+    @property
+    def state_topics(self) -> tuple[str, ...]:
+        """Absolute names of the topics of the measured positions."""
+        names = self.joint_states
+        return tuple(map(self.topic, (names,) if isinstance(names, str) else names))
+
+    def joint_name(self, recorded: str) -> str:
+        """Return the robot's name of a recorded joint."""
+        if recorded in self.joints and recorded != PREFIX:
+            return self.joints[recorded]
+        return recorded.removeprefix(self.joints.get(PREFIX, ''))
+
     def streams(self) -> dict[str, str]:
         """Return the topics by view and by stream, as `read_episode` takes them."""
         return {
             **{view: self.topic(row.image) for view, row in self.views.items()},
-            'joint_states': self.topic(self.joint_states),
+            'joint_states': self.state_topics[0],
             'joint_trajectory': self.topic(
                 'joint_trajectory' if self.action == STATE else self.action
             ),

@@ -324,7 +324,7 @@ class Episode:
         object_poses: None if not recorded.
         unknown: parameters that are not known of some views' cameras (`pose`, or `pose and
             intrinsics`), by view; `cameras` has a placeholder.
-        unknown_because: reason why a pose is not known, by view, where something is recorded of it.
+        unknown_because: reason why a pose is not known although TF has the camera, by view.
         camera_tracks: (N, 4, 4) T_mount_camera [m] at the images of each view whose camera moves
             against the robot's links; `cameras` has the first one.
         truncated: the recording is cut off.

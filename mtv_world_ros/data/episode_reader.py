@@ -17,7 +17,13 @@ from mtv_world_ros.cameras.camera import unknown_camera
 from mtv_world_ros.cameras.camera_info import Intrinsics, is_rectified, read_camera_info
 from mtv_world_ros.cameras.image_window import ImageWindow, WHOLE, windowed_camera
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
-from mtv_world_ros.core.errors import CalibrationError, EpisodeError, MtvWorldError, nearest
+from mtv_world_ros.core.errors import (
+    CalibrationError,
+    EpisodeError,
+    MtvWorldError,
+    nearest,
+    TrajectoryError,
+)
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.image_decoding import check_decodable, check_image, to_ids, to_rgb
 from mtv_world_ros.data.bag.image_orientation import stored_note
@@ -50,6 +56,7 @@ from mtv_world_ros.data.episode import (
     TF_STATIC,
     Track,
 )
+from mtv_world_ros.data.gripper_sources import resting_grippers
 from mtv_world_ros.data.joint_plans import (
     complete_plans,
     hold_at_stops,
@@ -58,6 +65,7 @@ from mtv_world_ros.data.joint_plans import (
     trajectories_to,
 )
 from mtv_world_ros.data.measured_joints import merge_joint_states
+from mtv_world_ros.data.missing_joints import missing_joints_text
 from mtv_world_ros.data.stream_clocks import (
     arrival_times,
     ClockBreakError,
@@ -72,7 +80,7 @@ from mtv_world_ros.data.stream_clocks import (
 from mtv_world_ros.data.tool_targets import joints_of_tools, ToolTrack
 from mtv_world_ros.data.transform_tree import Mount, pose_track, read_tree, TransformTree
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.robot.resample import nearest_rows
+from mtv_world_ros.robot.resample import match_joints, nearest_rows
 
 Stamped = list[tuple[int, Any]]
 #: joints that a warning names at most
@@ -208,6 +216,8 @@ class _EpisodeReader:
             if self.bag.truncated:
                 raise EpisodeError(f'{error}; {self.bag.truncated}') from error
             raise
+        further = self.mapping.state_topics[1:]
+        self.state_topics = (self.topics.joint_states, *further)
         self.with_masks = with_masks
         self.decode_all = True
         self.received: dict[str, Stamped] = {}
@@ -236,13 +246,15 @@ class _EpisodeReader:
         self._check_shared(images, states)
         cameras = self._cameras(calibration, images, unknown_mount) if with_cameras else {}
         episode_info = _info(self.bag, instructions)
+        trajectories = self._trajectories(states)
+        self._warn_of_resting_grippers(states, trajectories)
         return Episode(
             info=episode_info,
             views=tuple(topics.views),
             cameras=cameras,
             images=images,
             joint_states=states,
-            trajectories=self._trajectories(states),
+            trajectories=trajectories,
             masks={view: track for view, track in masks.items() if track} or None,
             instructions=instructions,
             object_poses=self._object_poses(len(episode_info.objects)),
@@ -259,6 +271,7 @@ class _EpisodeReader:
         topics, mapping = self.topics, self.mapping
         used = topics.names(with_masks=True) | {self._camera_info(view) for view in topics.views}
         used |= {mapping.topic(tool.topic) for tool in mapping.tools.values()}
+        used |= set(self.state_topics)
         if mapping.action == STATE:
             used.discard(topics.joint_trajectory)
         if mapping.instruction:
@@ -266,12 +279,27 @@ class _EpisodeReader:
         if not self.is_calibrated:
             used |= set(TF_TOPICS)
         images = [view.image for view in topics.views.values()]
-        return unused_topics(self.types, used, images, mapping)
+        unused = unused_topics(self.types, used, images, mapping)
+        if self.robot is not None:
+            for topic in self.state_topics:
+                if names := self._joints_of_others(topic, self.robot):
+                    unused[f'{", ".join(names)} of {topic}'] = 'no joint of the robot'
+        return unused
+
+    def _joints_of_others(self, topic: str, robot: RobotModel) -> dict[str, None]:
+        """Return the joints that are recorded beside those of the robot, in order."""
+        items = self.received.get(topic, [])
+        kinds = {tuple(m.name) for _, (kind, m) in items if kind == messages.JOINT_STATE}
+        wanted = set(robot.joint_names)
+        own = [names for names in sorted(kinds) if not wanted.isdisjoint(self._renamed(names))]
+        names = [name for names in own for name in names]
+        return dict.fromkeys(n for n in names if self.mapping.joint_name(n) not in wanted)
 
     def _receive(self) -> None:
         wanted = self.topics.names(with_masks=self.with_masks) | set(TF_TOPICS)
         wanted |= {self._camera_info(view) for view in self.topics.views}
         wanted |= {self.mapping.topic(tool.topic) for tool in self.mapping.tools.values()}
+        wanted |= set(self.state_topics)
         logged: dict[str, list[tuple[int, int]]] = {}
         for index, message in enumerate(self.bag.messages(wanted)):
             try:
@@ -339,7 +367,7 @@ class _EpisodeReader:
     def _senders(self) -> list[tuple[StampedStream, str, NDArray[np.intp]]]:
         """Streams whose clocks are compared, their topics, and which of its messages they are."""
         keys = {names.image: view for view, names in self.topics.views.items()}
-        keys |= {self.topics.joint_states: 'joint_states'}
+        keys |= dict.fromkeys(self.state_topics, 'joint_states')
         if self.mapping.action != STATE:
             keys |= {self.topics.joint_trajectory: 'action'}
         keys |= {self.mapping.topic(tool.topic): arm for arm, tool in self.mapping.tools.items()}
@@ -476,19 +504,75 @@ class _EpisodeReader:
         return in_order(topic, good, self.warnings)
 
     def _states(self) -> JointStates | None:
-        topic = self.topics.joint_states
-        taken = self._own_states(topic, self._take(topic, messages.JOINT_STATE))
+        topics = self.state_topics
+        taken = [
+            item
+            for topic in topics
+            for item in self._own_states(topic, self._take(topic, messages.JOINT_STATE))
+        ]
         states = merge_joint_states(
-            topic, taken, self.warnings, self.robot, self._renamed, self.mapping.constants
+            ', '.join(topics),
+            taken,
+            self.warnings,
+            self.robot,
+            self._renamed,
+            self.mapping.constants,
         )
         if states is None:
             others = self._topics_of(messages.JOINT_STATE)
-            if others and topic not in others:
+            if others and set(topics).isdisjoint(others):
                 self._warn_once(
-                    f"no joint states at '{topic}'; there are some at {_listed(others)}: name "
-                    'the topic in `joint_states`'
+                    f"no joint states at '{', '.join(topics)}'; there are some at "
+                    f'{_listed(others)}: name the topic in `joint_states`'
                 )
+        elif self.robot is not None:
+            missing = [n for n in self.robot.joint_names if n not in states.joint_names]
+            if missing:
+                raise TrajectoryError(self._missing_joints(self.robot, states, missing))
         return states
+
+    def _missing_joints(
+        self, robot: RobotModel, states: JointStates, missing: Sequence[str]
+    ) -> str:
+        """Return which joints are not measured, and how the mapping gives them."""
+        recorded = self._other_joints()
+        return missing_joints_text(robot, self.mapping, states.joint_names, missing, recorded)
+
+    def _warn_of_resting_grippers(self, states: JointStates | None, trajectories: Stamped) -> None:
+        """Name grippers that are measured at one position all the time while they are commanded.
+
+        A topic that measures them is named, too.
+        """
+        robot = self.robot
+        if (
+            robot is None
+            or states is None
+            or not set(robot.joint_names) <= set(states.joint_names)
+        ):
+            return
+        columns = [states.joint_names.index(name) for name in robot.joint_names]
+        plans = [match_joints(plan, robot).positions for _, plan in trajectories]
+        resting = resting_grippers(states.positions[:, columns], plans, robot)
+        others = self._other_joints() if resting else {}
+        for joint, text in resting.items():
+            topics = [topic for topic, names in others.items() if joint in names]
+            listed = ', '.join([*self.state_topics, *topics])
+            self._warn_once(
+                f"{text}; {', '.join(topics)} has it, too: 'joint_states: [{listed}]' in the "
+                'mapping (--topics)'
+                if topics
+                else f'{text}: is it measured on a topic that was not recorded?'
+            )
+
+    def _other_joints(self) -> dict[str, tuple[str, ...]]:
+        """Return the names of the joints in topics of joint states that are not read, by topic."""
+        others = [t for t in self._topics_of(messages.JOINT_STATE) if t not in self.state_topics]
+        others = [topic for topic in others if topic != self.topics.joint_trajectory]
+        found: dict[str, dict[str, None]] = {topic: {} for topic in others}
+        for message in self.bag.messages(others) if others else ():
+            state = messages.deserialize(message.msgtype, message.data)
+            found[message.topic].update(dict.fromkeys(self._renamed(state.name)))
+        return {topic: tuple(names) for topic, names in found.items()}
 
     def _own_states(self, topic: str, taken: Stamped) -> Stamped:
         """Return the messages that name a joint of the robot.
@@ -514,7 +598,7 @@ class _EpisodeReader:
         return own
 
     def _renamed(self, names: Sequence[str]) -> tuple[str, ...]:
-        return tuple(self.mapping.joints.get(name, name) for name in names)
+        return tuple(map(self.mapping.joint_name, names))
 
     def _trajectories(self, states: JointStates | None) -> Stamped:
         others = self._joint_commands(states)

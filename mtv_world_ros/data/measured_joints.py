@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.episode import JointStates
+from mtv_world_ros.data.gripper_sources import settle_grippers
 from mtv_world_ros.robot.model import RobotModel
 
 Stamps = NDArray[np.int64]
@@ -553,6 +554,8 @@ def mend_rows(
     found = find_unreachable(what, stamps, mended, JointReach(robot), 'rows')
     notes += found.texts
     mended[found.rows] = np.nan
+    alike = [robot.joint_names] * len(times)
+    notes += settle_grippers(what, stamps, robot.joint_names, mended, alike, robot)
     for joint in np.flatnonzero(np.isnan(mended).any(axis=0)):
         known = np.flatnonzero(np.isfinite(mended[:, joint]))
         mended[:, joint] = np.interp(times, times[known], mended[known, joint])
@@ -613,11 +616,15 @@ def merge_joint_states(
     names, table = _table(topic, given, renamed, warnings, robot, constants)
     names, table = _own_columns(names, table, robot, constants)
     stamps = np.array([stamp for stamp, _ in whole], np.int64)
+    senders = [tuple(message.name) for message in given]
     if robot is not None and set(names) >= set(robot.joint_names):
         columns = [names.index(name) for name in robot.joint_names]
         found = find_unreachable(topic, stamps, table[:, columns], JointReach(robot))
         warnings += found.texts
         stamps, table = stamps[~found.rows], table[~found.rows]
+        senders = [each for each, is_out in zip(senders, found.rows, strict=True) if not is_out]
+    if robot is not None:
+        warnings += settle_grippers(topic, stamps, names, table, senders, robot)
     tools = () if robot is None else robot.tools
     grippers = tuple(tool.gripper_joint for tool in tools if tool.gripper_joint)
     _warn_of_repeats(topic, stamps, np.isfinite(table), warnings)

@@ -46,6 +46,7 @@ from mtv_world_ros.robot.file import load_robot, save_robot
 from mtv_world_ros.robot.model import check_positions, RobotModel
 from mtv_world_ros.robot.resample import match_joints
 
+
 @dataclass(frozen=True, slots=True)
 class BagPart:
     """A bag, or a part of one whose clocks jump.
@@ -139,18 +140,18 @@ def robot_description(bag: Path, mapping: BagMapping) -> tuple[str, str, tuple[s
         )
     if len(texts) == 1:
         return *next(iter(texts.items())), ()
-    topic = mapping.topic(mapping.joint_states)
+    topics = mapping.state_topics
     named = [
-        {f'name="{mapping.joints.get(name, name)}"' for name in state.name}
-        for message in BagReader(bag).messages({topic})
+        {f'name="{mapping.joint_name(name)}"' for name in state.name}
+        for message in BagReader(bag).messages(topics)
         if message.msgtype == messages.JOINT_STATE
         for state in [messages.deserialize(messages.JOINT_STATE, message.data)]
     ]
     counts = {text: sum(any(name in text for name in names) for names in named) for text in texts}
     best = max(counts, key=lambda text: counts[text])
     note = (
-        f"the bag describes {len(texts)} robots: taken is the one whose joints '{topic}' names "
-        f'most ({counts[best]} of {len(named)} messages); --robot takes another'
+        f"the bag describes {len(texts)} robots: taken is the one whose joints '{topics[0]}' "
+        f'names most ({counts[best]} of {len(named)} messages); --robot takes another'
     )
     return best, texts[best], (note,)
 
@@ -432,13 +433,6 @@ def _measured(
         times=np.asarray(seconds, np.float64),
         positions=states.positions,
     )
-    missing = [name for name in robot.joint_names if name not in states.joint_names]
-    if missing:
-        raise TrajectoryError(
-            f"joints {missing} of robot '{robot.name}' are not in the joint states, which have "
-            f"{list(states.joint_names)}; rename recorded ones by 'joints' in the mapping, or "
-            f"give what is not measured: 'constants: {{{missing[0]}: 0.0}}'"
-        )
     positions = match_joints(table, robot).positions
     _check(robot, positions, mapping, 'joint states')
     return states.stamps_ns, positions

@@ -19,6 +19,7 @@ from mtv_world_ros.core.errors import ConfigError, EpisodeError, MtvWorldError, 
 from mtv_world_ros.data.episode import Episode, EpisodeInfo, Track, UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.data.episode_writer import EpisodeWriter
+from mtv_world_ros.data.gripper_sources import resting_grippers
 from mtv_world_ros.data.measured_joints import mend_rows
 from mtv_world_ros.data.stream_clocks import check_row_times
 from mtv_world_ros.importing.camera_parameters import camera_track
@@ -231,6 +232,8 @@ def convert_episode(
     }
     first = {view: _next_frame(frames, view, 0) for view, frames in videos.items()}
     cameras, tracks, notes = _cameras(dataset, entry, mapping, rows, first)
+    if mapping.action is not None:
+        odd = (*odd, *resting_grippers(measured, [commanded], mapping.robot).values())
     unknown = [view for view, source in mapping.views.items() if not source.is_known]
     texts = _instructions(dataset, rows, mapping)
     with ExitStack() as stack:
@@ -423,9 +426,9 @@ def unknown_camera_note(folder: Path, view: str, what: str, why: str = '') -> st
         what: parameters that are not known.
         why: the reason; empty = nothing is recorded of them.
     """
-    because = f' ({why})' if why else ''
+    because, quoted = f' ({why})' if why else '', shlex.quote(str(folder))
     return (
-        f"view '{view}': {what} not known{because}: mtv-world fit camera {shlex.quote(str(folder))} --view {view} "
+        f"view '{view}': {what} not known{because}: mtv-world fit camera {quoted} --view {view} "
         '--click points.html'
     )
 

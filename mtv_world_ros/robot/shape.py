@@ -17,6 +17,7 @@ import pinocchio as pin
 from mtv_world_ros.core.bounded_input import parse_yaml, read_text
 from mtv_world_ros.core.data_types import CameraModel, FloatArray
 from mtv_world_ros.core.errors import RobotError
+from mtv_world_ros.robot.gripper_doubts import gripper_doubts
 from mtv_world_ros.robot.mesh_pieces import (
     even_directions,
     find_mesh,
@@ -80,7 +81,7 @@ class RobotShape:
         is_known: False where rods stand for the links.
         missing: meshes that are not there or cannot be read, and why.
         replaced: meshes that are not where the URDF says, and the files that were taken.
-        doubts: links whose size does not fit the arm.
+        doubts: links whose size does not fit the arm, grippers whose range is no finger's.
     """
 
     parts: tuple[LinkShape, ...]
@@ -141,7 +142,7 @@ def load_shape(robot: RobotModel) -> RobotShape:
         source=f"the shapes of '{path.name}'",
         missing=missing,
         replaced=replaced_meshes(links.values(), path),
-        doubts=size_doubts(robot, parts),
+        doubts=(*size_doubts(robot, parts), *gripper_doubts(robot)),
     )
 
 
@@ -244,6 +245,7 @@ def rods(robot: RobotModel, why: str, missing: Sequence[str] = ()) -> RobotShape
         source=f'rods from joint to joint ({why})',
         is_known=False,
         missing=tuple(missing),
+        doubts=gripper_doubts(robot),
     )
 
 

@@ -77,6 +77,10 @@ class ObservationSettings(Schema):
         "YAML with every view's pose; empty = the one in the checkpoint. Read again when an "
         'episode begins (`~/reset`, `~/start`).',
     )
+    joint_state_topics: Names = at_start(
+        ('joint_states',),
+        'Topics of the measured positions; several where an arm and its gripper have their own.',
+    )
     max_image_age_s: float = parameter(0.5, 'Older images are no observation [s].', _SECONDS)
     max_joint_state_age_s: float = parameter(
         0.5, 'Older joint states are no observation [s].', _SECONDS

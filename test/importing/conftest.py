@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from fractions import Fraction
 import json
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
 import numpy as np
 import pytest
+import yaml
+
+from mtv_world_ros.cli import main
+from mtv_world_ros.data.bag import messages
+from mtv_world_ros.data.bag.writer import BagWriter
+from test.support.robot_recordings import Edit, Event, events, NANO, ns, VIEWS
 
 pyarrow = pytest.importorskip('pyarrow', reason='pyarrow is not installed (pip install .[import])')
 
@@ -273,3 +281,51 @@ def make_mapping(tmp_path):
 @pytest.fixture(name='write_video')
 def write_video_fixture():
     return write_video
+
+
+@pytest.fixture
+def record(tmp_path):
+    """Write a recording whose stamps [ns] are edited; messages without one are left out."""
+
+    def make(
+        edit: Edit = lambda _topic, _seconds, stamp: stamp,
+        more: list[Event] | None = None,
+        name: str = 'bag',
+        received: Callable[[float], float] = lambda seconds: seconds,
+        change: Callable[[str, float, Any], None] = lambda *_: None,
+    ) -> Path:
+        with BagWriter(tmp_path / name) as writer:
+            recorded: list[Event] = [*events(), *(more or [])]
+            recorded.sort(key=lambda event: event[0])
+            for seconds, topic, kind, message in recorded:
+                told: Any = message
+                items = [told] if hasattr(told, 'header') else getattr(told, 'transforms', [])
+                stamps = [messages.header_stamp(item) for item in items]
+                edited = [edit(topic, seconds, stamp) for stamp in stamps]
+                kept = [stamp for stamp in edited if stamp is not None]
+                if len(kept) < len(edited):
+                    continue
+                for item, stamp in zip(items, kept, strict=True):
+                    item.header.stamp.sec, item.header.stamp.nanosec = divmod(stamp, NANO)
+                change(topic, seconds, message)
+                data = messages.serialize(kind, message)
+                writer.write_raw(topic, kind, ns(received(seconds)), data)
+        return tmp_path / name
+
+    return make
+
+
+@pytest.fixture
+def run(tmp_path, capsys):
+    """Import a bag; return the exit status and what was printed."""
+
+    def imported(bag: Path, *more: str, **mapping: Any) -> tuple[int, str]:
+        file = tmp_path / 'mapping.yaml'
+        views = {view: f'/{view}/image_raw' for view in VIEWS}
+        file.write_text(yaml.safe_dump({'robot': 'franka', 'views': views, **mapping}))
+        out = str(tmp_path / 'out')
+        status = main(['import', 'bag', str(bag), '--topics', str(file), '--out', out, *more])
+        printed = capsys.readouterr()
+        return status, printed.out + printed.err
+
+    return imported

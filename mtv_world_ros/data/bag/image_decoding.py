@@ -14,7 +14,7 @@ import simplejpeg
 from mtv_world_ros.core.bounded_input import check_limit, LimitError
 from mtv_world_ros.core.data_types import ByteArray
 from mtv_world_ros.core.errors import ObservationError
-from mtv_world_ros.data.bag.jpeg_padding import is_only_padded, SURPLUS
+from mtv_world_ros.data.bag.jpeg_padding import is_only_padded
 
 #: encodings of sensor_msgs/Image: bytes a pixel in a row, conversion to RGB (None = is RGB).
 #: OpenCV names a Bayer pattern by its second row, and `yuv422` is ROS' older name of `uyvy`
@@ -53,8 +53,6 @@ _PNG = b'\x89PNG'
 _SIGNATURES = {b'\xff\xd8\xff': b'\xff\xd9', _PNG: b'IEND'}
 #: JPEG marker of a scan
 _SCAN = b'\xff\xda'
-#: last digit of the marker that ends a JPEG file; many USB cameras write a byte too much before it
-_END_OF_IMAGE = '9'
 #: largest padding after the end: some cameras pad their files
 _MAX_PADDING = 4096
 
@@ -235,14 +233,13 @@ def _decode(layout: str, data: NDArray[np.uint8], mode: int) -> NDArray[Any]:
     return image
 
 
-def _decode_jpeg(layout: str, data: NDArray[np.uint8], colours: str, **size: int) -> ByteArray:
+def _decode_jpeg(layout: str, data: NDArray[np.uint8], colours: str, **size: Any) -> ByteArray:
     """Return (H, W, C) pixels; a decoder's warning that data are missing counts as damage."""
     content = data.tobytes()
     try:
         return simplejpeg.decode_jpeg(content, colours, **size)
     except ValueError as error:
-        surplus = SURPLUS.search(str(error))
-        if surplus and (surplus[2] == _END_OF_IMAGE or is_only_padded(content)):
+        if is_only_padded(content, str(error)):
             return simplejpeg.decode_jpeg(content, colours, strict=False, **size)
         raise _damaged(layout, data, f': {error}') from error
 

@@ -16,11 +16,13 @@ import simplejpeg
 #: largest number of surplus bytes before a marker [bytes]; webcams are reported with 1 to 10
 MAX_PADDING_BYTES = 10
 #: text of the decoder's warning about surplus bytes
-SURPLUS = re.compile(r'(\d+) extraneous bytes before marker 0xd([0-79])')
+_SURPLUS = re.compile(r'(\d+) extraneous bytes before marker 0xd([0-79])')
 #: side length of the largest image that a JPEG decoder takes [px]
 _MAX_SIDE_PX = 65500
 _RESTART = re.compile(rb'\xff[\xd0-\xd7]')
 _END = b'\xff\xd9'
+#: last digit of the marker that ends a file, in warnings
+_END_DIGIT = '9'
 #: codes of markers: frame headers of sequential Huffman coding, restart interval, scan
 _FRAMES = (0xC0, 0xC1)
 _INTERVAL = 0xDD
@@ -64,12 +66,19 @@ class _Layout:
         return head + data + _END
 
 
-def is_only_padded(content: bytes) -> bool:
-    """Return True if a file decodes whole but for surplus bytes before restart markers.
+def is_only_padded(content: bytes, warning: str) -> bool:
+    """Return True if a file decodes whole but for surplus bytes before its markers.
 
     Args:
-        content: bytes of a JPEG file whose decoder warns of surplus bytes.
+        content: bytes of a JPEG file.
+        warning: first warning of its decoder.
     """
+    surplus = _SURPLUS.search(warning)
+    if surplus is None:
+        return False
+    if surplus[2] == _END_DIGIT:  # nothing was wrong before the end
+        end, count = content.rindex(_END), int(surplus[1])
+        return count <= MAX_PADDING_BYTES or len(set(content[end - count : end])) == 1
     try:
         layout = _read_layout(content)
         body = content[len(layout.head) : content.rindex(_END)]
@@ -80,8 +89,7 @@ def is_only_padded(content: bytes) -> bool:
         last = layout.units - layout.interval * len(markers)
         counts = [layout.interval] * len(markers) + [last]
         return all(
-            _is_whole(layout.part(part, count))
-            for part, count in zip(parts, counts, strict=True)
+            _is_whole(layout.part(part, count)) for part, count in zip(parts, counts, strict=True)
         )
     except (ValueError, IndexError, struct.error, ZeroDivisionError):
         return False
@@ -92,7 +100,7 @@ def _is_whole(content: bytes) -> bool:
     try:
         simplejpeg.decode_jpeg(content, 'GRAY', min_height=1, min_width=1, min_factor=8)
     except ValueError as error:
-        surplus = SURPLUS.search(str(error))
+        surplus = _SURPLUS.search(str(error))
         return surplus is not None and int(surplus[1]) <= MAX_PADDING_BYTES
     return True
 

@@ -110,6 +110,7 @@ class PolicyNode(Node):
             self,
             parameters.declare_camera_topics(self, self._spec.views),
             compressed=self._spec.views if settings.compressed_input else (),
+            states=settings.joint_state_topics,
             buffer=self._buffer,
             guarded=self._guarded,
         )

@@ -150,6 +150,7 @@ class LiveObserver(Node):
             self,
             self._topics,
             compressed=self._compressed,
+            states=settings.joint_state_topics,
             buffer=self._buffer,
             guarded=self.guarded,
         )

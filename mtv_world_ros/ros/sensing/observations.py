@@ -20,11 +20,12 @@ from mtv_world_ros.cameras.image_window import window_of, windowed_camera
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, Observation
 from mtv_world_ros.core.images import resize_frames
 from mtv_world_ros.data.bag.image_orientation import stored_note
+from mtv_world_ros.data.gripper_sources import GripperWatch, travels
 from mtv_world_ros.data.measured_joints import JointReach, ReachWatch
 from mtv_world_ros.data.transform_tree import Mount
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.ros.messages import image_messages
-from mtv_world_ros.ros.messages.conversions import check_sample, NANO, to_ns, to_sample
+from mtv_world_ros.ros.messages.conversions import check_sample, NANO, to_ns, to_sample, to_stamp
 from mtv_world_ros.ros.messages.rejection import Reason, rejected_as, Rejection
 from mtv_world_ros.ros.parameters import ObservationSettings
 from mtv_world_ros.ros.sensing.samples import NodeTime, Samples
@@ -100,10 +101,13 @@ class ObservationBuffer:
             camera.view: Samples(_NUM_IMAGES) for camera in cameras
         }
         self._reach = ReachWatch(JointReach(robot))
+        self._grippers = GripperWatch(travels(robot))
         #: frame of the images of each view, as they came first
         self._frames: dict[str, str] = {}
         #: note on the EXIF orientation of the images of each view
         self._turns: dict[str, str] = {}
+        #: note on the messages without a stamp, by what they are
+        self._unstamped: dict[str, str] = {}
         self._joints: dict[str, Samples[float]] = {
             name: Samples(_NUM_SAMPLES) for name in robot.joint_names
         }
@@ -132,6 +136,7 @@ class ObservationBuffer:
                 one is not.
         """
         image_messages.check(message)
+        self._stamp(f"images of view '{view}'", message)
         images, stamp_ns = self._images[view], to_ns(message.header.stamp)
         limit_s = self._limits().max_image_age_s
         what = f"an image of view '{view}'"
@@ -143,6 +148,13 @@ class ObservationBuffer:
         images.add(stamp_ns, message)
         if self._on_image is not None:
             self._on_image(view, message)
+
+    def _stamp(self, what: str, message: AnyImage | JointState) -> None:
+        """Stamp a message that has none with the time of receipt, as recordings are read."""
+        now_ns = self._now_ns()
+        if now_ns and not to_ns(message.header.stamp):
+            message.header.stamp = to_stamp(now_ns)
+            self._unstamped.setdefault(what, f'{what} have no stamp: the time of receipt is taken')
 
     def _now_ns(self) -> int:
         """Return the node's time [ns]; 0 = there is none."""
@@ -173,6 +185,7 @@ class ObservationBuffer:
             Rejection: no positions, not one a name, a joint of the robot has none or jumps, or the
                 message comes from the future, or is stale while newer states are not.
         """
+        self._stamp('joint states', message)
         stamp_ns, now_ns = to_ns(message.header.stamp), self._now_ns()
         limit_s = self._limits().max_joint_state_age_s
         sample = to_sample(message, self._joints.keys())
@@ -185,6 +198,7 @@ class ObservationBuffer:
             stale = stale or joint.refusal
             if joint.refusal:
                 continue
+            self._grippers.add(name, stamp_ns / NANO, position)
             jump = self._reach.add(name, stamp_ns, position)
             if jump:
                 faults[name] = jump
@@ -199,14 +213,17 @@ class ObservationBuffer:
     def use_robot(self, robot: RobotModel) -> None:
         """Take the limits of the same robot as it describes itself."""
         self._reach = ReachWatch(JointReach(robot))
+        self._grippers = GripperWatch(travels(robot))
 
     def clear(self) -> None:
         """Forget images and joint states (the clock jumped); camera infos stay."""
         for samples in (*self._images.values(), *self._joints.values()):
             samples.clear()
         self._reach.clear()
+        self._grippers.clear()
         self._frames.clear()
         self._turns.clear()
+        self._unstamped.clear()
 
     def accept_cameras(self, cameras: Sequence[CameraModel]) -> None:
         """Take changed camera infos as the valid ones from now on.
@@ -235,9 +252,10 @@ class ObservationBuffer:
 
     @property
     def notes(self) -> list[str]:
-        """Assumptions about images that their camera infos do not settle, as text."""
+        """Assumptions about images and joint states that the messages do not settle, as text."""
         turns = [f"view '{view}': {note}" for view, note in self._turns.items() if note]
-        return [*turns, *(note for note in self._intrinsics.notes.values() if note)]
+        cameras = [note for note in self._intrinsics.notes.values() if note]
+        return [*turns, *cameras, *self._unstamped.values()]
 
     def problems(self, now_ns: int) -> list[str]:
         """Return what is missing or too old for an observation, as text."""
@@ -254,7 +272,13 @@ class ObservationBuffer:
         names = [name for name, text in old.items() if text]
         if names:
             missing.append(f'no fresh joint_states of {", ".join(names)}')
+        if contradiction := self._contradiction():
+            missing.append(contradiction)
         return missing
+
+    def _contradiction(self) -> str:
+        """Return which joints are reported at two places in turn, or an empty text."""
+        return self._reach.contradiction() or self._grippers.contradiction()
 
     def observe(self, now_ns: int) -> SensedScene:
         """Make an observation of the newest images that belong together.
@@ -369,7 +393,7 @@ class ObservationBuffer:
                 Reason.JOINT_STATE_MISSING,
                 f'no joint state of {missing} was received{_because(why)}',
             )
-        if contradiction := self._reach.contradiction():
+        if contradiction := self._contradiction():
             raise Rejection(Reason.JOINT_STATE_INVALID, contradiction)
         for name, samples in self._joints.items():
             what, limit = f"the newest state of joint '{name}'", limits.max_joint_state_age_s

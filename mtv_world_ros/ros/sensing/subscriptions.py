@@ -44,6 +44,7 @@ class Inputs:
         node: owner of the subscriptions.
         views: names of the views; parameters give each its camera topic.
         compressed: whether images come as JPEG or PNG.
+        states: topics of joint states.
         buffer: buffer of images, camera infos and joint states.
         events: takes instructions, names of objects and plans.
 
@@ -57,6 +58,7 @@ class Inputs:
         views: Sequence[str],
         *,
         compressed: bool,
+        states: Sequence[str],
         buffer: ObservationBuffer,
         events: NodeEvents,
     ) -> None:
@@ -64,6 +66,7 @@ class Inputs:
             node,
             parameters.declare_camera_topics(node, views),
             compressed=views if compressed else (),
+            states=states,
             buffer=buffer,
             guarded=events.guarded,
         )
@@ -93,7 +96,7 @@ class Inputs:
         )
         self._all.append(self._plans)
         self._watch = QosWatch(node)
-        urgent = [node.resolve_topic_name(topic) for topic in ('joint_trajectory', 'joint_states')]
+        urgent = [node.resolve_topic_name(topic) for topic in ('joint_trajectory', *states)]
         self._paths = {f'receive_path.{topic}': PATHS.of(topic) for topic in urgent}
 
     def refresh(self) -> None:
@@ -130,6 +133,7 @@ def subscribe_observations(
     topics: Mapping[str, str],
     *,
     compressed: Collection[str],
+    states: Sequence[str],
     buffer: ObservationBuffer,
     guarded: Callable[[Handler], Handler],
 ) -> list[MatchedSubscription]:
@@ -139,6 +143,7 @@ def subscribe_observations(
         node: owner of the subscriptions.
         topics: camera topic of each view; `image_raw` and `camera_info` lie below.
         compressed: views whose images come as JPEG or PNG.
+        states: topics of joint states.
         buffer: buffer of images, camera infos and joint states.
         guarded: returns a handler as a callback that no message makes raise.
     """
@@ -152,7 +157,7 @@ def subscribe_observations(
             (CameraInfo, f'{topic}/camera_info', add_info, 1),
             (kind, f'{topic}/image_raw{suffix}', partial(buffer.add_image, view), 1),
         ]
-    newest.append((JointState, 'joint_states', buffer.add_joint_state, 10))
+    newest += [(JointState, topic, buffer.add_joint_state, 10) for topic in states]
     return [
         MatchedSubscription(node, kind, topic, guarded(bounded(kind, handle)), depth=depth)
         for kind, topic, handle, depth in newest

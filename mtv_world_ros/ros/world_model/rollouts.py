@@ -282,6 +282,7 @@ class Rollouts:
             node,
             self._spec.views,
             compressed=settings().compressed_input,
+            states=settings().joint_state_topics,
             buffer=self._buffer,
             events=self,
         )

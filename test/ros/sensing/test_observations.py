@@ -8,6 +8,8 @@ import pytest
 from sensor_msgs.msg import JointState
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
+from mtv_world_ros.core.files import share_path
+from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.parameters import NodeSettings
@@ -443,3 +445,33 @@ def test_a_step_is_believed_once_two_readings_agree_on_it():
     assert [time.step_s() for _ in range(3)] == [0.0, 0.0, 0.0]
     now = -90
     assert time.step_s() == pytest.approx(-90.0)
+
+
+def test_joint_states_without_a_stamp_have_the_time_of_receipt(make_buffer):
+    buffer = make_buffer(clock=[NOW])
+    for _ in range(3):
+        buffer.add_joint_state(joints(0, a=0.5, b=0.1))
+    assert buffer.ages(NOW)['joint_state_age_s'] == 0
+    assert buffer.notes == ['joint states have no stamp: the time of receipt is taken']
+
+
+def test_images_without_a_stamp_have_the_time_of_receipt(ros, make_buffer):
+    buffer = make_buffer(clock=[NOW])
+    buffer.add_image('low', shade(ros, 'low', 0, 80))
+    assert buffer.ages(NOW)['image_age_s.low'] == 0
+    assert "images of view 'low' have no stamp" in buffer.notes[0]
+
+
+def test_a_gripper_of_two_publishers_is_no_observation():
+    robot = load_robot(share_path('config', 'robots', 'franka', 'robot.yaml'))
+    buffer = ObservationBuffer(
+        cameras=(), robot=robot, width=96, height=72, limits=NodeSettings, time=None
+    )
+    for k in range(30):
+        stamp = NOW + k * 20 * MS
+        named = dict.fromkeys(robot.joint_names, 0.0)
+        buffer.add_joint_state(joints(stamp, **{**named, 'panda_finger_joint1': 0.03}))
+        assert not any('contradict' in text for text in buffer.problems(stamp)) or k > 4
+        buffer.add_joint_state(joints(stamp + MS, panda_finger_joint1=0.0))
+    (text,) = [text for text in buffer.problems(stamp) if 'contradict' in text]
+    assert "'panda_finger_joint1' goes forth and back between 0 and 0.03" in text
