@@ -2,7 +2,7 @@
 
     python experiments/unseen_faults.py --seeds 72046,16337,64608 --logs out/unseen --readme
 
-For each seed the expert and seven fault kinds that the seed drew act in `--physics`, as
+For each seed the expert and fault kinds that the seed drew (`--policies`) act in `--physics`, as
 `shifted_worlds.py` has it; logs are kept in `--logs` and the same command goes on. Seeds are drawn
 after the code is frozen, so that nothing could be fitted to them. All seeds are pooled; intervals
 are over scenes (tasks of a seed): AUROC jackknife, shares clustered Wilson. `--readme` writes the
@@ -189,6 +189,8 @@ def judged(rows: Sequence[Row]) -> list[list[str]]:
     lines = []
     for judge in (BOTH, FORESEEN, AS_FITTED, RULE):
         of = [r for r in rows if r.judge == judge]
+        if not of:
+            continue
         nominal = next((r for r in of if r.physics == NOMINAL), None)
         others = [r for r in of if r.physics != NOMINAL]
         if nominal is None and judge == AS_FITTED:
@@ -199,12 +201,12 @@ def judged(rows: Sequence[Row]) -> list[list[str]]:
     return lines
 
 
-def block(rows: Sequence[Row], num_scenes: int, seeds: str, count: int) -> str:
+def block(rows: Sequence[Row], num_scenes: int, seeds: str, count: int, num_kinds: int = 7) -> str:
     """Return the table of docs/results.md."""
     truths = sorted({r.physics for r in rows} - {NOMINAL})
     note = (
-        f'*The expert and seven fault kinds that each of {len(seeds.split(","))} seeds ({seeds}) '
-        f'drew after the code was frozen, x 6 tasks = {num_scenes} scenes; {count} rollouts in '
+        f'*The expert and {num_kinds} fault kinds that each of {len(seeds.split(","))} seeds '
+        f'({seeds}) drew after the code was frozen, x 6 tasks = {num_scenes} scenes; {count} rollouts in '
         f'the nominal physics, and as many in each of {", ".join(f"`{t}`" for t in truths)}; '
         f'{date.today().isoformat()}, `experiments/unseen_faults.py`. Brackets: 95 % intervals '
         'over scenes.*'
@@ -334,7 +336,7 @@ def main() -> None:
     rows = [row(physics, judge, *pair) for (physics, judge), pair in found.items()]
     scenes = {tuple(line['job'][1:4:2]) for line in lines}
     count = sum(r['job'][0] == NOMINAL for r in lines)
-    first = block(rows, len(scenes), options.seeds, count)
+    first = block(rows, len(scenes), options.seeds, count, options.policies - 1)
     if options.readme:
         short = readme_block(rows, len(scenes), count)
         for name, text in (('README.md', short), ('docs/results.md', first)):
