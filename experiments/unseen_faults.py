@@ -206,8 +206,9 @@ def block(rows: Sequence[Row], num_scenes: int, seeds: str, count: int, num_kind
     truths = sorted({r.physics for r in rows} - {NOMINAL})
     note = (
         f'*The expert and {num_kinds} fault kinds that each of {len(seeds.split(","))} seeds '
-        f'({seeds}) drew after the code was frozen, x 6 tasks = {num_scenes} scenes; {count} rollouts in '
-        f'the nominal physics, and as many in each of {", ".join(f"`{t}`" for t in truths)}; '
+        f'({seeds}) drew after the code was frozen, x 6 tasks = {num_scenes} scenes; {count} '
+        'rollouts in the nominal physics, and as many in each of '
+        f'{", ".join(f"`{t}`" for t in truths)}; '
         f'{date.today().isoformat()}, `experiments/unseen_faults.py`. Brackets: 95 % intervals '
         'over scenes.*'
     )

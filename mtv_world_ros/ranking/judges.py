@@ -202,7 +202,7 @@ def scores(
     judge: str,
     flips: Mapping[str, bool] | None = None,
 ) -> dict[str, Score]:
-    """Return the `MEASURES` of a judge.
+    """Return the `MEASURES` of a judge, and how many of the verdicts are right.
 
     Args:
         results: rollouts that shares are of.
@@ -213,9 +213,13 @@ def scores(
     given = flips if flips is not None and judge == 'imagined' else {}
     flipped = [r for r in results if r.name in given]
     of_contact = [r for r in flipped if is_contact(r)]
+    said = {call: [r for r in results if judged_by(r, judge).success == call] for call in (0, 1)}
     return {
         **agreements(compared, judge),
         'auroc': _area(compared, judge),
+        'auroc_all': _area_of_all(compared, judge),
+        'right_success': Score.share(said[1], lambda r: r.final),
+        'right_failure': Score.share(said[0], lambda r: not r.final),
         'false_success': false_success(results, judge),
         'abstention': Score.share(results, lambda r: not has_verdict(r, judge)),
         'contact_flips': Score.share(of_contact, lambda r: given[r.name]),
@@ -233,6 +237,17 @@ def _area(results: Sequence[Result], *judges: str) -> Score:
     said = [np.array([judged_by(r, j).probability for r in known], np.float64) for j in judges]
     value, interval = area_interval(said, real, [(r.task, r.index) for r in known])
     return Score(value=value, interval=interval, count=len(known))
+
+
+def _area_of_all(results: Sequence[Result], judge: str) -> Score:
+    """Area under the ROC of all rollouts, with an estimate of .5 where there is no verdict."""
+    real = np.array([r.final for r in results], np.bool_)
+    if real.all() or not real.any():
+        return Score(count=len(results))
+    judged = [judged_by(r, judge) for r in results]
+    said = np.array([one.probability if isfinite(one.success) else 0.5 for one in judged])
+    value, interval = area_interval([said], real, [(r.task, r.index) for r in results])
+    return Score(value=value, interval=interval, count=len(results))
 
 
 def area_interval(

@@ -249,9 +249,12 @@ def _worth(summary: Summary) -> Table:
     rate = true_rate(summary.results)
     return Table(
         caption=f'What a picture is worth: {rate.count} rollouts, {rate.value:.0%} really succeed',
-        head=['judged by', 'n', 'AUROC', 'false success', 'no verdict', 'r'],
+        head=[
+            'judged by', 'n', 'verdicts', 'right: success', 'right: failure', 'AUROC',
+            'AUROC, all', 'r',
+        ],
         rows=[[judge.title, *_worth_of(summary.worth[key])] for key, judge in JUDGES.items()],
-    )
+    )  # fmt: skip
 
 
 def _worth_of(found: Mapping[str, Score]) -> list[str]:
@@ -260,9 +263,11 @@ def _worth_of(found: Mapping[str, Score]) -> list[str]:
     around = f' [{_number(low)} {_number(high)}]' if isfinite(low) else ''
     return [
         str(found['auroc'].count),
+        _number(1 - found['abstention'].value),
+        _cell(found['right_success']),
+        _cell(found['right_failure']),
         _value(found['auroc']),
-        _cell(found['false_success']),
-        _value(found['abstention']),
+        _value(found['auroc_all']),
         f'{_number(r.value)}{around}',
     ]
 

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
-from mtv_world_ros.ranking.judges import JUDGES
+from mtv_world_ros.ranking.judges import judged_by, JUDGES
 from mtv_world_ros.ranking.ranking_summary import Summary
 from mtv_world_ros.ranking.rollout_jobs import Job, Result, StoredEstimate
 from mtv_world_ros.reports.ranking_report import console, markdown, remarks, tables, write_ranking
@@ -180,6 +180,17 @@ def test_what_a_picture_is_worth_stands_beside_what_is_foreseen(make_result):
         'seen': 1.0,
     }
     assert worth['foreseen']['false_success'].value == 0.5
+    for judge, scores in worth.items():  # of what was said, and of all rollouts
+        said = {call: [r for r in summary.results if judged_by(r, judge).success == call]
+                for call in (0, 1)}  # fmt: skip
+        for call, key in ((1, 'right_success'), (0, 'right_failure')):
+            assert scores[key].count == len(said[call])
+            if said[call]:
+                right = sum(r.final == call for r in said[call]) / len(said[call])
+                assert scores[key].value == pytest.approx(right)
+        assert scores['auroc_all'].count == len(summary.results)
+    # by hand: one success and two failures without a verdict tie, of 6 x 12 pairs
+    assert worth['pictures']['auroc_all'].value == pytest.approx(1 / 72)
     assert worth['pictures']['abstention'].value == pytest.approx(3 / 18)
     assert worth['pictures']['auroc'].count == 15
     said_in_json = summary.as_json()['worth']['pictures']['false_success']
