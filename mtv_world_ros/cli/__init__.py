@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack, suppress
+from contextlib import contextmanager, ExitStack, suppress
 import signal
 
 # Ctrl-C while the rest is imported ends the process, without a traceback; see `main` for later
@@ -13,7 +13,7 @@ if _interrupt is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import argparse  # noqa: E402
-from collections.abc import Sequence  # noqa: E402
+from collections.abc import Iterator, Sequence  # noqa: E402
 import errno  # noqa: E402
 from importlib import import_module, metadata  # noqa: E402
 import os  # noqa: E402
@@ -23,6 +23,7 @@ import shlex  # noqa: E402
 import sys  # noqa: E402
 from types import ModuleType  # noqa: E402
 from typing import Any  # noqa: E402
+import warnings  # noqa: E402
 
 from mtv_world_ros.cli.commands import (  # noqa: E402
     ADVANCED_OPTIONS,
@@ -38,7 +39,7 @@ from mtv_world_ros.core.errors import (  # noqa: E402
     nearest,
     TrainingInterrupted,
 )
-from mtv_world_ros.core.files import check_output  # noqa: E402
+from mtv_world_ros.core.files import check_name, check_output  # noqa: E402
 from mtv_world_ros.core.processes import (  # noqa: E402
     ended_by_signals,
     escape_unprintable_output,
@@ -259,6 +260,8 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
     if '_ARGCOMPLETE' in os.environ:  # completion in the shell, where this is installed
         with suppress(ImportError):
             import_module('argcomplete').autocomplete(make_parser())
+    for word in words:
+        check_name(word)
     words = _current(words)
     parser = _parser_for(words)
     arguments, more = parser.parse_known_args(words)
@@ -300,7 +303,7 @@ def main(argv: list[str] | None = None) -> int:
     except MtvWorldError as error:  # of the installation, or of an option that only prints
         return _said(str(error), 1)
     try:
-        with stopped_by_sigterm(), ExitStack() as locks:
+        with stopped_by_sigterm(), _own_warnings(), ExitStack() as locks:
             for path, option in [] if is_helper_rank() else _outputs(arguments):
                 locks.enter_context(only_writer(path, option))
             return arguments.handler(arguments)
@@ -322,6 +325,22 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt as stopped:
         number = getattr(stopped, 'signum', signal.SIGINT)
         return _said(f'stopped ({signal.Signals(number).name})', 128 + number)
+
+
+@contextmanager
+def _own_warnings() -> Iterator[None]:
+    """Print warnings of this package as one line, without the place in its source."""
+    others = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if category.__module__.startswith(_OWN):
+            _said(str(message), 0)
+        else:
+            others(message, category, *place, **more)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
 
 
 def _extra_of(package: str) -> str:

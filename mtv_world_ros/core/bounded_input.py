@@ -194,6 +194,21 @@ def _open_regular(path: Path | str) -> Iterator[tuple[BinaryIO, int]]:
         yield file, status.st_size
 
 
+def require_regular(*paths: Path | str) -> None:
+    """Check files that a library opens by their paths, before it blocks on a pipe.
+
+    Args:
+        paths: files; of a folder all files directly in it. A missing path is left to the reader.
+
+    Raises:
+        OSError: one is a pipe, a device or a socket.
+    """
+    for path in map(Path, paths):
+        for file in path.iterdir() if path.is_dir() else [path]:
+            if file.exists() and not (file.is_file() or file.is_dir()):
+                raise OSError(errno.EINVAL, 'it is no regular file', str(file))
+
+
 #: beginning of a file that is enough to tell a placeholder [bytes]
 _HEAD_BYTES = 512
 

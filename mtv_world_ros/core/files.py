@@ -158,6 +158,7 @@ def check_output(path: Path, option: str = '--out') -> None:
     Raises:
         ConfigError: it cannot be written; names the path, the reason and the option.
     """
+    check_name(os.path.realpath(path))
     try:
         with tempfile.TemporaryFile(dir=_written_folder(path)):
             return
@@ -220,8 +221,16 @@ def copy_folder(source: Path, target: Path) -> None:
     """Copy a folder's regular files; a link in it is replaced by the file that it points to.
 
     Raises:
-        OSError: a file cannot be read, or is a device or a pipe, which may have no end.
+        OSError: a file cannot be read, or is a device or a pipe, which may have no end, or a link
+            leads to a folder outside.
     """
+    inside = os.path.realpath(source)
+    for place, folders, _ in os.walk(source):
+        for link in (Path(place) / name for name in folders):
+            outside = os.path.commonpath([os.path.realpath(link), inside]) != inside
+            if link.is_symlink() and outside:
+                text = f"it is a link to the folder '{os.path.realpath(link)}', which is outside"
+                raise OSError(errno.EXDEV, f'{text}; copy the folder itself', str(link))
     shutil.copytree(source, target, copy_function=_copy_regular)
 
 
@@ -262,7 +271,7 @@ def write_whole(path: Path, content: bytes | str) -> None:
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, f"'{path}' is a folder; name a file")
-    data = content.encode() if isinstance(content, str) else content
+    data = encoded(content) if isinstance(content, str) else content
     beside = _own_name(path, _NEW)  # others may write the same file
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -271,6 +280,37 @@ def write_whole(path: Path, content: bytes | str) -> None:
     except BaseException:  # a signal, too
         beside.unlink(missing_ok=True)
         raise
+
+
+def encoded(text: str) -> bytes:
+    """Return a text as UTF-8; bytes of file names that are no UTF-8 become escapes."""
+    data = text.encode(errors='surrogateescape')
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        return text.encode(errors='backslashreplace')
+    return data
+
+
+def check_name(text: str) -> None:
+    """Check that a path, or another word of a command line, is UTF-8, as libraries want it.
+
+    Raises:
+        ConfigError: it is not, or the locale of this process cannot hold it.
+    """
+    if text.isascii():
+        return
+    try:
+        os.fsencode(text).decode()
+    except (UnicodeError, ValueError):
+        raise ConfigError(
+            f'{ascii(text)} holds bytes that are no UTF-8; give the file or folder another name'
+        ) from None
+    if any('\udc80' <= char <= '\udcff' for char in text):
+        raise ConfigError(
+            f'{ascii(os.fsencode(text).decode())} cannot be used in a locale of ASCII names; set '
+            'LC_ALL=C.UTF-8, or PYTHONUTF8=1'
+        )
 
 
 @contextmanager

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 import re
 from typing import Any, TypeVar
+import warnings
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from mtv_world_ros.core.errors import (
     nearest,
     TrajectoryError,
 )
+from mtv_world_ros.core.files import check_name
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.image_decoding import check_decodable, check_image, to_ids, to_rgb
 from mtv_world_ros.data.bag.image_orientation import stored_note
@@ -171,23 +173,57 @@ def read_info(path: Path | str) -> EpisodeInfo:
     return _info(reader, texts)
 
 
+#: environment variable that has links followed out of folders of episodes
+FOLLOW_LINKS = 'MTV_WORLD_FOLLOW_LINKS'
+
+
+class LinkWarning(UserWarning):
+    """A link that leads out of a folder was not followed."""
+
+
 def list_episodes(folder: Path | str) -> list[Path]:
-    """Return the episode folders anywhere in a folder, by path, links followed.
+    """Return the episode folders anywhere in a folder, by path.
 
     A folder with files of a bag is one without metadata.yaml, too: its recorder was killed. Hidden
-    folders are left out.
+    folders are left out. Links are followed within the folder, and to single episodes; others that
+    lead out of it are named in a `LinkWarning`, unless `MTV_WORLD_FOLLOW_LINKS` is 1.
     """
-    found, seen = [], set()
+    found, seen, inside = [], set(), os.path.realpath(folder)
+    follows = os.environ.get(FOLLOW_LINKS) == '1'
     for place, folders, names in os.walk(folder, followlinks=True):
         real = os.path.realpath(place)
         if real in seen:  # links may lead in a circle
             folders.clear()
             continue
         seen.add(real)
-        is_bag = 'metadata.yaml' in names or any(is_storage(Path(name)) for name in names)
-        if is_bag and not Path(place).name.startswith('.'):
+        if _holds_bag(names) and not Path(place).name.startswith('.'):
+            check_name(real)
             found.append(Path(place))
+        if not follows:
+            folders[:] = [name for name in folders if _is_followed(Path(place) / name, inside)]
     return sorted(found)
+
+
+def _holds_bag(names: Sequence[str]) -> bool:
+    return 'metadata.yaml' in names or any(is_storage(Path(name)) for name in names)
+
+
+def _is_followed(entry: Path, inside: str) -> bool:
+    """Return whether a folder below `inside` is searched; name links that are not followed."""
+    if not entry.is_symlink():
+        return True
+    target = os.path.realpath(entry)
+    if os.path.commonpath([target, inside]) == inside:
+        return True
+    if _holds_bag(os.listdir(entry) if os.access(entry, os.R_OK) else []):
+        return True
+    warnings.warn(
+        f"'{entry}' leads out of its folder to '{target}' and is not followed; give that folder "
+        f'itself, or set {FOLLOW_LINKS}=1',
+        LinkWarning,
+        stacklevel=3,
+    )
+    return False
 
 
 class _EpisodeReader:

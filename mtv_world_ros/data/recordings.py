@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.core.bounded_input import parse_json, read_arrays
+from mtv_world_ros.core.bounded_input import parse_json, read_arrays, require_regular
 from mtv_world_ros.core.data_types import (
     ByteArray,
     CameraModel,
@@ -242,6 +242,7 @@ def _key(path: Path, spec: WorldModelSpec, robot: RobotModel, source: EpisodeSou
              robot.name, robot.joint_names]  # fmt: skip
     if source != DEFAULT:
         calibration = source.calibration
+        require_regular(*filter(None, [calibration]))
         parts += [
             source.mapping.model_dump() if source.mapping else None,
             calibration.read_text() if calibration else None,

@@ -26,6 +26,7 @@ from mtv_world_ros.core.bounded_input import (
     read_bytes,
     read_json,
     read_text,
+    require_regular,
 )
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest, ObservationError
@@ -242,6 +243,7 @@ class LeRobotDataset:
         """Return the names of a table's columns; empty where the table cannot be read."""
         pyarrow, parquet = pyarrow_modules()
         try:
+            require_regular(entry.data_file)
             return set(parquet.read_schema(entry.data_file).names)
         except (OSError, pyarrow.ArrowException):
             return set()  # the reader of the rows says why
@@ -580,6 +582,7 @@ def _place(row: Mapping[str, Any], prefix: str) -> dict[str, int]:
 def _read_table(file: Path, **options: Any) -> Any:
     pyarrow, parquet = pyarrow_modules()
     try:
+        require_regular(file)
         _check_table(parquet.read_metadata(file), file, options.get('columns'))
         return parquet.read_table(file, **options)
     except (OSError, pyarrow.ArrowException) as error:

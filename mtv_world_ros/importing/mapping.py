@@ -19,6 +19,7 @@ from pydantic import (
 )
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
+from mtv_world_ros.core.bounded_input import require_regular
 from mtv_world_ros.core.config import ListOf, read_yaml, validated, wrong
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import ConfigError, nearest
@@ -303,5 +304,6 @@ def digest_of(*files: Path | None, start: bytes = b'') -> str:
     """Return a key that changes with the contents of the files."""
     digest = hashlib.sha256(start)
     for file in files:
+        require_regular(*filter(None, [file]))
         digest.update(b'' if file is None else file.read_bytes())
     return digest.hexdigest()[:16]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mtv_world_ros.core.bounded_input import require_regular
 from mtv_world_ros.core.config import read_yaml
 from mtv_world_ros.core.data_types import BoolArray, ByteArray
 from mtv_world_ros.data.episode import MASKS_BY
@@ -100,6 +101,7 @@ def stage_key(describer: Path | None, segmenter: str) -> bytes:
     values = read_yaml(describer, 'describer file', '--describer')
     listed = values.get('list') if isinstance(values, dict) else None
     file = describer.parent / listed if isinstance(listed, str) else None
+    require_regular(describer)
     more = file.read_bytes() if file is not None and file.is_file() else b''
     return b'\0'.join([segmenter.encode(), describer.read_bytes(), more])
 

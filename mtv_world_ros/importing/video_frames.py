@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtv_world_ros.core.bounded_input import check_limit, placeholder
+from mtv_world_ros.core.bounded_input import check_limit, placeholder, require_regular
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.core.errors import EpisodeError
 
@@ -210,6 +210,7 @@ def open_video(path: Path) -> Iterator[VideoStream]:
         EpisodeError: the file is missing or damaged, or holds no video; also while it is read.
     """
     try:
+        require_regular(path)
         with av.open(str(path)) as container:
             yield VideoStream(container, path)
     except (av.FFmpegError, OSError, ValueError) as error:  # names in it may be no UTF-8

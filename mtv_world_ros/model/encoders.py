@@ -10,7 +10,7 @@ import torch
 from torch import nn, Tensor
 import torch.nn.functional as F
 
-from mtv_world_ros.core.bounded_input import check_weights
+from mtv_world_ros.core.bounded_input import check_weights, require_regular
 from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.core.files import copy_folder
 from mtv_world_ros.core.network_sizes import check_config_file
@@ -71,6 +71,7 @@ class TextEncoder:
         encoder, tokenizer = (str(self._checkpoint / name) for name in FOLDERS)
         check_config_file(Path(encoder) / 'config.json')
         try:
+            require_regular(encoder, tokenizer)
             model = transformers.UMT5EncoderModel.from_pretrained(
                 encoder, dtype=self._dtype, local_files_only=True, use_safetensors=True
             )
@@ -118,6 +119,7 @@ class ImageEncoder:
         folder = checkpoint / _FOLDER
         check_config_file(folder / 'config.json')
         try:
+            require_regular(folder)
             model = import_transformers().CLIPVisionModel.from_pretrained(
                 str(folder), dtype=dtype, local_files_only=True, use_safetensors=True
             )

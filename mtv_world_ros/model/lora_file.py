@@ -17,7 +17,7 @@ from pydantic import Field
 from safetensors import safe_open, SafetensorError
 from torch import nn, Tensor
 
-from mtv_world_ros.core.bounded_input import check_finite, parse_json, read_json
+from mtv_world_ros.core.bounded_input import check_finite, parse_json, read_json, require_regular
 from mtv_world_ros.core.config import Count, Number, Schema, validated
 from mtv_world_ros.core.errors import CheckpointError, ConfigError, nearest
 from mtv_world_ros.model.tensor_files import pickle_error, PICKLES
@@ -171,6 +171,7 @@ def _read(file: Path) -> tuple[dict[str, Tensor], PeftSettings | None]:
     if file.suffix in PICKLES:
         raise pickle_error([file])
     try:
+        require_regular(file)
         with safe_open(file, framework='pt') as handle:
             tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
             for name, tensor in tensors.items():

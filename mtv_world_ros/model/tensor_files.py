@@ -14,7 +14,7 @@ from typing import Any
 from safetensors import safe_open, SafetensorError
 from torch import Tensor
 
-from mtv_world_ros.core.bounded_input import check_finite, placeholder, read_json
+from mtv_world_ros.core.bounded_input import check_finite, placeholder, read_json, require_regular
 from mtv_world_ros.core.errors import CheckpointError, ConfigError
 
 PICKLES = ('.bin', '.pt', '.pth', '.ckpt', '.pkl')
@@ -139,6 +139,7 @@ def _open_files(files: list[Path]) -> dict[str, StoredTensor]:
 @contextmanager
 def _opened(file: Path) -> Iterator[Any]:
     try:
+        require_regular(file)
         with safe_open(file, framework='pt') as handle:
             yield handle
     except (OSError, SafetensorError) as error:

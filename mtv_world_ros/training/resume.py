@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
 
-from mtv_world_ros.core.bounded_input import check_finite, read_json
+from mtv_world_ros.core.bounded_input import check_finite, read_json, require_regular
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.core.files import recover_folder, whole_folder
 from mtv_world_ros.training.averaged_weights import AveragedWeights
@@ -142,6 +142,7 @@ def load_state(folder: Path, weights: AveragedWeights, optimizer: torch.optim.Op
     card, file = read_card(folder), folder / STATE / _TENSORS_FILE
     assert card is not None
     try:
+        require_regular(file)
         tensors = load_file(file)
         for name, tensor in tensors.items():
             check_finite(tensor, name, file)

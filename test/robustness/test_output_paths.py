@@ -14,8 +14,9 @@ import pytest
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import ConfigError
-from mtv_world_ros.core.files import check_output
+from mtv_world_ros.core.files import check_output, write_whole
 from mtv_world_ros.data.bag.writer import BagWriter
+from mtv_world_ros.data.episode_reader import list_episodes
 from test.robustness.test_commands import AT, COMMANDS, DEMO, OUT
 
 #: longest time until it is said, once a process runs [s]
@@ -158,8 +159,11 @@ def test_a_bag_is_written_into_an_empty_folder_and_through_a_link(kind, tmp_path
     assert sorted(os.listdir(tmp_path)) == ['bag', 'disk']
 
 
+#: of a process whose file names are ASCII
+ASCII = {'LC_ALL': 'C', 'PYTHONUTF8': '0', 'PYTHONCOERCECLOCALE': '0'}
+
+
 def test_ascii_terminals_get_every_text(tmp_path):
-    environment = {**os.environ, 'LC_ALL': 'C', 'PYTHONUTF8': '0', 'PYTHONCOERCECLOCALE': '0'}
     code = (
         'import sys\n'
         'from mtv_world_ros.cli import main\n'
@@ -168,7 +172,48 @@ def test_ascii_terminals_get_every_text(tmp_path):
         'print("\\u2026 \\udcff")\n'
         'sys.exit(status)\n'
     )
-    command = [sys.executable, '-c', code, 'robot', 'yam_bimanual', '--picture', 'ü.png']
+    command = [sys.executable, '-c', code, 'robot', 'yam_bimanual', '--picture', 'a.png']
+    environment = {**os.environ, **ASCII}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, timeout=60)
     assert done.returncode == 0 and b'Traceback' not in done.stderr, done.stderr
     assert done.stdout.endswith(b'\\u2026 \\udcff\n')
+
+
+@pytest.mark.parametrize(
+    ('locale', 'name', 'said'),
+    [(ASCII, 'ü'.encode(), b"'\\xfc' cannot be used in a locale of ASCII names; set LC_ALL="),
+     ({'PYTHONUTF8': '1'}, b'\xfc', b"'\\udcfc' holds bytes that are no UTF-8"),
+     (ASCII, b'\xfc', b"'\\udcfc' holds bytes that are no UTF-8")],
+)  # fmt: skip
+@pytest.mark.parametrize('words', [['collect', '--out'], ['evaluate', '--out', 'x'], ['check']])
+def test_names_that_cannot_be_written_into_files_are_told_before_any_work(
+    locale, name, said, words, tmp_path
+):
+    command = [sys.executable, '-m', 'mtv_world_ros.cli', *words, name]
+    environment = {**os.environ, **locale}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, timeout=60)
+    assert done.returncode == 1 and said in done.stderr, done.stderr
+    assert len(done.stderr.splitlines()) == 1 and os.listdir(tmp_path) == []
+
+
+def test_a_present_folder_whose_name_is_no_utf8_is_told_before_any_work(tmp_path):
+    folder = os.fsencode(tmp_path) + b'/\xff'
+    os.mkdir(folder)
+    command = [sys.executable, '-m', 'mtv_world_ros.cli', 'robot', 'panda', '--picture', 'x']
+    done = subprocess.run(command, cwd=folder, capture_output=True, timeout=60)
+    assert done.returncode == 1 and b'holds bytes that are no UTF-8' in done.stderr
+
+
+def test_an_episode_whose_name_is_no_utf8_is_told_when_a_folder_is_listed(tmp_path):
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b'/\xff'))
+    folder.mkdir()
+    (folder / 'metadata.yaml').write_text('')
+    with pytest.raises(ConfigError, match='holds bytes that are no UTF-8'):
+        list_episodes(tmp_path)
+
+
+def test_texts_with_names_that_are_no_utf8_are_written(tmp_path):
+    write_whole(tmp_path / 'page', 'über \udcff')
+    assert (tmp_path / 'page').read_text('utf-8') == 'über \\udcff'
+    write_whole(tmp_path / 'page', os.fsdecode('ü'.encode()) + ' \udcc3\udcbc')
+    assert (tmp_path / 'page').read_text('utf-8') == 'ü ü'

@@ -12,6 +12,7 @@ from typing import Any, TYPE_CHECKING
 
 from mtv_world_ros.cli.bundled_help import segmenters
 from mtv_world_ros.cli.shared_options import add_options
+from mtv_world_ros.core.bounded_input import require_regular
 from mtv_world_ros.core.errors import ConfigError
 
 #: folder of the robot in OUT
@@ -204,6 +205,7 @@ def _object_stage(
         how = 'its colours' if stands_out else 'its picture: its colours are around it, too'
         print(f'object {name}: found by {how}')
     print(f'objects: {file}')
+    require_regular(arguments.objects)
     return ObjectStage(segmenter=segmenter, boxed=boxed, key=arguments.objects.read_bytes())
 
 

@@ -20,7 +20,14 @@ from mcap.records import Channel, Metadata, Schema
 import yaml
 import zstandard
 
-from mtv_world_ros.core.bounded_input import limits, parse_yaml, placeholder, PREFIX, read_bytes
+from mtv_world_ros.core.bounded_input import (
+    limits,
+    parse_yaml,
+    placeholder,
+    PREFIX,
+    read_bytes,
+    require_regular,
+)
 from mtv_world_ros.core.errors import EpisodeError
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -106,6 +113,7 @@ class BagReader:
             if problem := placeholder(file):
                 raise EpisodeError(f"'{file}' {problem}")
             try:
+                require_regular(file)
                 with _decompressed(file) as plain:
                     read = self._sqlite if plain.suffix == '.db3' else self._mcap
                     for message in read(plain, file, topics):

@@ -13,7 +13,7 @@ import torch
 from torch import nn, Tensor
 import torch.nn.functional as F
 
-from mtv_world_ros.core.bounded_input import check_weights
+from mtv_world_ros.core.bounded_input import check_weights, require_regular
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.core.errors import CheckpointError, ConfigError, EpisodeError
 from mtv_world_ros.evaluation.metrics.inception import InceptionV3
@@ -208,10 +208,12 @@ def _of_network(state: dict[str, Any], network: torch.nn.Module) -> dict[str, An
 def _state_dict(path: Path, option: str) -> dict[str, Any]:
     if path.suffix == '.safetensors':
         try:
+            require_regular(path)
             return load_file(path)
         except (OSError, SafetensorError) as error:
             raise CheckpointError(f"{option} '{path}' cannot be loaded: {error}") from error
     try:
+        require_regular(path)
         state = torch.load(path, map_location='cpu', weights_only=True)
     except Exception as error:  # torch raises pickle, zip and runtime errors alike
         raise CheckpointError(

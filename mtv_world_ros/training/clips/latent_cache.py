@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from mtv_world_ros.core.bounded_input import parse_json, read_json
+from mtv_world_ros.core.bounded_input import parse_json, read_json, require_regular
 from mtv_world_ros.core.data_types import WorldModelSpec
 from mtv_world_ros.core.errors import ConfigError, TrainingError
 from mtv_world_ros.core.files import content_digest, write_whole
@@ -142,6 +142,7 @@ class LatentCache:
 
     def _open(self, file: Path) -> None:
         try:
+            require_regular(file)
             shard: Any = safe_open(file, framework='pt')
             labels = dict(
                 parse_json((shard.metadata() or {})[_LABELS], 'what it says of its clips')

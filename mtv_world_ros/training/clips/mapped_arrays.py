@@ -12,7 +12,7 @@ from zipfile import BadZipFile, ZIP_STORED, ZipFile, ZipInfo
 import numpy as np
 import torch
 
-from mtv_world_ros.core.bounded_input import check_limit, read_arrays
+from mtv_world_ros.core.bounded_input import check_limit, read_arrays, require_regular
 
 #: arrays of fewer bytes are read: a mapping takes whole pages
 MAPPED_BYTES = 1 << 16
@@ -42,6 +42,7 @@ def read_mapped(path: Path | str, limit: str = 'array_bytes') -> dict[str, np.nd
         ValueError: it is too large, damaged, or holds objects (pickles).
     """
     try:
+        require_regular(path)
         with ZipFile(path) as archive:
             members = archive.infolist()
         large = [m for m in members if _is_mapped(m)]
@@ -57,6 +58,7 @@ def _is_mapped(member: ZipInfo) -> bool:
 
 
 def _mapped(path: Path, members: list[ZipInfo]) -> dict[str, np.ndarray]:
+    require_regular(path)
     size = path.stat().st_size
     # unlike mmap of Python, torch closes the file once it is mapped
     whole = torch.from_file(str(path), shared=False, size=size, dtype=torch.uint8).numpy()

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
+from mtv_world_ros.core.bounded_input import require_regular
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import write_whole
@@ -202,6 +203,7 @@ class ObjectExamples:
         from safetensors import safe_open
 
         try:
+            require_regular(path)
             tensors = load_file(path)
             with safe_open(path, 'numpy') as file:
                 names: dict[str, str] = file.metadata() or {}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mtv_world_ros.core.bounded_input import check_weights, read_json
+from mtv_world_ros.core.bounded_input import check_weights, read_json, require_regular
 from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.core.network_sizes import check_sizes
 
@@ -109,6 +109,7 @@ def load_vision_model(folder: Path, kind: str, device: str) -> Any:
 
     transformers.utils.logging.disable_progress_bar()
     try:
+        require_regular(folder)
         model, report = getattr(transformers, class_name).from_pretrained(
             folder,
             local_files_only=True,
@@ -151,6 +152,7 @@ def load_tokenizer(folder: Path) -> Any:
     """
     if not any((folder / name).is_file() for name in ('tokenizer.json', 'vocab.txt')):
         raise CheckpointError(f"'{folder}' has no tokenizer.json; download the whole repository")
+    require_regular(folder)
     return import_transformers().AutoTokenizer.from_pretrained(folder, local_files_only=True)
 
 
