@@ -184,9 +184,9 @@ def test_what_a_picture_is_worth_stands_beside_what_is_foreseen(make_result):
         said = {call: [r for r in summary.results if judged_by(r, judge).success == call]
                 for call in (0, 1)}  # fmt: skip
         for call, key in ((1, 'right_success'), (0, 'right_failure')):
-            assert scores[key].count == len(said[call])
-            if said[call]:
-                right = sum(r.final == call for r in said[call]) / len(said[call])
+            assert scores[key].count == len(called[call])
+            if called[call]:
+                right = sum(r.final == call for r in called[call]) / len(called[call])
                 assert scores[key].value == pytest.approx(right)
         assert scores['auroc_all'].count == len(summary.results)
     # by hand: one success and two failures without a verdict tie, of 6 x 12 pairs
