@@ -181,7 +181,7 @@ def test_what_a_picture_is_worth_stands_beside_what_is_foreseen(make_result):
     }
     assert worth['foreseen']['false_success'].value == 0.5
     for judge, scores in worth.items():  # of what was said, and of all rollouts
-        said = {call: [r for r in summary.results if judged_by(r, judge).success == call]
+        called = {call: [r for r in summary.results if judged_by(r, judge).success == call]
                 for call in (0, 1)}  # fmt: skip
         for call, key in ((1, 'right_success'), (0, 'right_failure')):
             assert scores[key].count == len(called[call])
