@@ -23,13 +23,32 @@ PAGE = Path(__file__).parent / 'topics.md'
 _HEAD = """\
 # Topics, services and actions
 
+## What a client sends, in order
+
+[`examples/ros_client.py`](../examples/ros_client.py) is such a client, in one screen. It needs rclpy and standard messages alone; the rates are those that the tests use.
+
+| | topic | rate | what |
+|---|---|---|---|
+| 1 | `instruction`, `objects` | once, transient local | texts. A publisher that does not keep them must wait for the node's subscription: without an instruction there is no known task, and no verdict |
+| 2 | `<camera>/image_raw`, `<camera>/camera_info` of each view | 5 Hz or more | rgb8 or another encoding of ROS, of any size from half the model's (bundled: 96x72) on; best with the pixels of the camera, since objects are found in them. Views of one moment have one stamp: the newest stamp that all views have is taken, else the nearest within `max_view_skew_s`. `frame_id` stays the same |
+| 3 | `joint_states` | 10 Hz or more | all joints of the robot, by name, in one message or several; stamped by the same clock as the images |
+| 4 | `joint_trajectory` | for each plan | points in joint space with `time_from_start`; stamp 0 = it begins when it arrives |
+
+Poses of cameras come from TF where tf2_msgs is installed, else from the parameter `calibration_file`; without both they are those that the checkpoint was trained with, and `/diagnostics` (`cameras`) says how far the arm is from where they would show it.
+
+A plan gives frames at the model's rate from the images' stamp on, up to its last point, rounded up: 3.2 s are 16 frames of 5 Hz, in chunks of the model's length. A plan that is stamped .1 s after the images ends .1 s later, and gives 17; one that is stamped .4 s before them gives 14.
+
+The node says in its log and in `/diagnostics` what it waits for: at once, and every 5 s until the first plan. Of the plans that come while it loads it keeps the last one and answers it. A first plan waits up to a second for images, joint states and kept texts, and each plan for images of one moment. Each plan gets one end on `~/report`: `done` (with `success`, `success_reasons`), `rejected` (with `reason`, `text`), `preempted`, `failed` or `reset`; frames follow, and then `published`.
+
+## Names
+
 Names that begin with `~` are below the node's name, `/world_model` or `/policy`; the others are in
 its namespace. `<view>` is a view of the checkpoint, `<camera>` the topic prefix of its camera: the
 view's name, or the parameter `camera_topics.<view>`. With `compressed_input` images are taken from
 `<camera>/image_raw/compressed` (sensor_msgs/CompressedImage). What the messages mean in detail,
 and their quality of service, is on the page of [the node](node.md). This page is written by
 `python docs/topics_page.py`.
-"""
+"""  # noqa: E501
 #: namespace of the nodes while names are read; the page leaves it out
 _NAMESPACE = f'/topics_page_{os.getpid()}'
 #: names that every ROS 2 node has

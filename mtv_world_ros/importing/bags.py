@@ -27,7 +27,7 @@ from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag.unused_topics import unused_line
 from mtv_world_ros.data.bag_mapping import BagMapping, key_of
-from mtv_world_ros.data.episode import Episode, MASKS_BY, parse_outcome, UNKNOWN_CAMERAS
+from mtv_world_ros.data.episode import Episode, MASKS_BY, parse_outcome, PLACE, UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.stream_clocks import ClockBreakError, WHOLE, Window
@@ -512,6 +512,8 @@ def _instructions(episode: Episode, mapping: BagMapping, start_ns: int) -> list[
 def _metadata(episode: Episode, source: str, key: str) -> dict[str, str]:
     """Return the metadata on the source of the episode and the segmenter of its masks."""
     values = {'source': source, MAPPING_KEY: key}
+    place = episode.info.place  # of simulated episodes the simulator, whose name has the physics
+    values |= {PLACE: place} if place else {}
     values |= {UNKNOWN_CAMERAS: ', '.join(episode.unknown)} if episode.unknown else {}
     by = episode.info.metadata.get(MASKS_BY, '')
     return {**values, MASKS_BY: by} if episode.masks and by else values

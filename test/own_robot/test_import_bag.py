@@ -10,9 +10,10 @@ import pytest
 import yaml
 
 from mtv_world_ros.cli import main
+from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag_mapping import load_bag_mapping
-from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.data.recording import motion_digest
 from mtv_world_ros.importing.view_names import guess_views
 from mtv_world_ros.robot.file import load_robot
@@ -257,6 +258,14 @@ def test_an_import_keeps_what_a_recording_is_known_by(robot, make_bag, tmp_path,
     assert motion_digest(raw) == motion_digest(episode) != ''
     other = replace(raw.joint_states, positions=raw.joint_states.positions + 0.01)
     assert motion_digest(replace(raw, joint_states=other)) != motion_digest(raw)
+
+
+def test_an_import_keeps_the_robot_cell_of_an_episode(tmp_path, capsys):
+    demo = share_path('resource', 'demo_episode')
+    out = tmp_path / 'out'
+    assert main(['import', 'bag', str(demo), '--robot', 'yam_bimanual', '--out', str(out)]) == 0
+    original, imported = read_info(demo), read_info(out / 'demo_episode')
+    assert imported.place == original.place == 'simulator/nominal'
 
 
 def test_four_bags_are_split_and_the_command_says_so(make_bag, tmp_path, capsys):

@@ -361,15 +361,7 @@ class ObservationBuffer:
         for view, stamp in newest.items():
             what = f"the newest image of view '{view}'"
             _check_age(Reason.IMAGE_STALE, what, stamp, now_ns, limits.max_image_age_s)
-        common = min(newest.values())
-        earliest_ns = now_ns - round(limits.max_image_age_s * NANO)
-        moments = {stamp for images in self._images.values() for stamp in images.stamps}
-        earlier = sorted((m for m in moments if earliest_ns <= m < common), reverse=True)
-        choices = [
-            [images.nearest(moment) for images in self._images.values()]
-            for moment in (common, *earlier)
-        ]
-        picked = next((c for c in choices if _skew_s(c) <= limits.max_view_skew_s), choices[0])
+        picked = self._picked(now_ns, limits)
         stamps = [stamp for stamp, _ in picked]
         skew = _skew_s(picked)
         if skew > limits.max_view_skew_s:
@@ -383,6 +375,35 @@ class ObservationBuffer:
                 f"'max_view_skew_s' allows {limits.max_view_skew_s:g} s",
             )
         return picked
+
+    def are_views_apart(self, now_ns: int) -> bool:
+        """Return whether all views have fresh images, and none of them belong together."""
+        limits = self._limits()
+        if not all(self._images.values()):
+            return False
+        fresh_ns = now_ns - round(limits.max_image_age_s * NANO)
+        if min(images.newest[0] for images in self._images.values()) < fresh_ns:
+            return False
+        return _skew_s(self._picked(now_ns, limits)) > limits.max_view_skew_s
+
+    def _picked(self, now_ns: int, limits: ObservationSettings) -> list[tuple[int, AnyImage]]:
+        """Return per view the image of the newest moment at which the views are together.
+
+        Where all views have images of one stamp, as those of synchronised cameras, these are
+        taken, unless others that belong together are newer by more than the skew that is allowed.
+        """
+        common = min(images.newest[0] for images in self._images.values())
+        earliest_ns = now_ns - round(limits.max_image_age_s * NANO)
+        moments = {stamp for images in self._images.values() for stamp in images.stamps}
+        earlier = sorted((m for m in moments if earliest_ns <= m < common), reverse=True)
+        shared = set.intersection(*(set(images.stamps) for images in self._images.values()))
+        oldest_ns = max(earliest_ns, common - round(limits.max_view_skew_s * NANO))
+        same = sorted((m for m in shared if oldest_ns <= m <= common), reverse=True)[:1]
+        choices = [
+            [images.nearest(moment) for images in self._images.values()]
+            for moment in (*same, common, *earlier)
+        ]
+        return next((c for c in choices if _skew_s(c) <= limits.max_view_skew_s), choices[0])
 
     def _positions(self, stamp_ns: int, now_ns: int, limits: ObservationSettings) -> FloatArray:
         """Return (J,) positions nearest in time to the images."""

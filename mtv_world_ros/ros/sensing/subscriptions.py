@@ -72,10 +72,15 @@ class Inputs:
         )
         self._all = [*self._observations]
         instruction = events.guarded(bounded(String, events.on_instruction))
-        self._all.append(MatchedSubscription(node, String, 'instruction', instruction, depth=1))
         objects = events.guarded(bounded(String, events.on_objects))
-        self._all.append(MatchedSubscription(node, String, 'objects', objects, depth=1))
+        self._texts = [
+            MatchedSubscription(node, String, 'instruction', instruction, depth=1),
+            MatchedSubscription(node, String, 'objects', objects, depth=1),
+        ]
+        self._all += self._texts
         take, refuse = events.guarded(events.on_plan), events.guarded(events.on_refused_plan)
+
+        self._early: set[int] = set()
 
         def handle(data: bytes, info: Mapping[str, int]) -> None:
             try:
@@ -84,8 +89,11 @@ class Inputs:
                 stamp_ns = read_stamp(data) if len(data) >= MIN_STAMPED_BYTES else 0
                 refuse(error, stamp_ns)
                 return
+            if info['source_timestamp'] in self._early:
+                return  # came while the node was loading, to the subscription of that time
             take(message, (info['received_timestamp'] - info['source_timestamp']) / NANO)
 
+        self._handle = handle
         self._plans = MatchedSubscription(
             node,
             JointTrajectory,
@@ -104,6 +112,18 @@ class Inputs:
         for subscription in self._all:
             subscription.refresh()
         self._watch.refresh()
+
+    def take_early(self, data: bytes, info: Mapping[str, int]) -> None:
+        """Take a plan, as it was sent, that another subscription received before this was made."""
+        self._handle(data, info)
+        self._early.add(info['source_timestamp'])
+
+    def awaits_texts(self) -> bool:
+        """Return whether an instruction, or names of objects, are kept for this node.
+
+        A publisher keeps its last text for subscribers that come later (transient local).
+        """
+        return any(not text.num_received and text.is_kept_for_it() for text in self._texts)
 
     def mismatches(self) -> list[str]:
         """Return the peers whose QoS prevents messages to or from this node."""
@@ -233,6 +253,11 @@ class MatchedSubscription:
     def num_publishers(self) -> int:
         """Publishers it is connected to."""
         return self._current.get_publisher_count()
+
+    def is_kept_for_it(self) -> bool:
+        """Return whether a publisher keeps messages for subscribers that come later."""
+        infos = self._node.get_publishers_info_by_topic(self.topic)
+        return any(i.qos_profile.durability == _HIGHEST[1] for i in infos)
 
     def refresh(self) -> None:
         """Look at the publishers again; to be called now and then."""

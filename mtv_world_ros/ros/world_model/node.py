@@ -19,6 +19,7 @@ from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.ros.sensing.subscriptions import OWN_PATHS
 from mtv_world_ros.ros.world_model.loading import load_named_pipeline
+from mtv_world_ros.ros.world_model.loading_watch import LoadingWatch, WaitingLog
 from mtv_world_ros.ros.world_model.reporter import Reporter
 from mtv_world_ros.ros.world_model.rollouts import Rollouts
 
@@ -46,6 +47,8 @@ class WorldModelNode(LifecycleNode):
         self._rollouts: Rollouts | None = None
         self._error: Exception | None = None
         self._is_starting = False
+        self._loading = ''
+        self._waits = WaitingLog(self.get_logger())
         self._reporter = Reporter(self, self.settings, self._state, self._missing)
         self.create_timer(
             self._settings.diagnostics_period_s,
@@ -80,12 +83,14 @@ class WorldModelNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the model; where that fails, says why and stays unconfigured."""
-        self._error = None
+        self._error, self._loading = None, ''
         try:
-            pipeline = self._load(self._settings)
-            self._reporter.name_robot(pipeline.robot.name)
-            self._rollouts = Rollouts(self, pipeline, self.settings, self._reporter)
-            parameters.refuse_unknown(self)
+            with LoadingWatch(self, f"'{self._settings.checkpoint}'", self._on_loading) as watch:
+                pipeline = self._load(self._settings)
+                self._reporter.name_robot(pipeline.robot.name)
+                self._rollouts = Rollouts(self, pipeline, self.settings, self._reporter)
+                parameters.refuse_unknown(self)
+                self._rollouts.take_early(watch.take())
         except Exception as error:
             self._release()
             self._error = error
@@ -93,6 +98,8 @@ class WorldModelNode(LifecycleNode):
                 self._say(error)
                 self._reporter.publish_diagnostics()
             return TransitionCallbackReturn.FAILURE
+        finally:
+            self._loading = ''
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -144,6 +151,12 @@ class WorldModelNode(LifecycleNode):
         else:
             self._reporter.crash(error)
 
+    def _on_loading(self, text: str) -> None:
+        """Say what is loaded, in the log and in `/diagnostics`; called from another thread."""
+        self._loading = text
+        self.get_logger().info(text)
+        self._reporter.publish_diagnostics()
+
     def _release(self) -> None:
         if self._rollouts is not None:
             self._rollouts.close()
@@ -157,6 +170,8 @@ class WorldModelNode(LifecycleNode):
             self._release()
         if self._rollouts is not None:
             self._rollouts.refresh()
+        if self._rollouts is not None and self._lifecycle() == 'active':
+            self._waits.update(self._rollouts.missing(), self._rollouts.has_begun)
         self._reporter.publish_diagnostics()
 
     def _lifecycle(self) -> str:
@@ -167,6 +182,8 @@ class WorldModelNode(LifecycleNode):
         """Return the reason why the node takes no plans."""
         if self._error is not None:
             return [f'not configured: {self._error}']
+        if self._loading:
+            return [self._loading]
         if self._rollouts is None or self._lifecycle() != 'active':
             return [f'the node is {self._lifecycle()}']
         return self._rollouts.missing()

@@ -154,8 +154,8 @@ class RequestMaker:
 #: the first plan of an imagined episode may come this long before what it answers [s]: a lost
 #: message without a next one comes again after the sender's heartbeat, by default every 3 s
 _EARLY_S = 5.0
-#: a plan may come this long before the first images and joint states of topics that have a
-#: publisher [s]
+#: a plan may come this long before the first images, joint states and kept texts of topics that
+#: have a publisher, and before images of its moment in all views [s]
 _FIRST_S = 1.0
 #: a plan that is under way for longer was lost and sent again [s]
 _LATE_S = 0.5
@@ -415,6 +415,16 @@ class Rollouts:
         while self._arrived and not (self._is_active and self._is_early(self._arrived[0])):
             self.guarded(self._start_rollout)(self._arrived.popleft())
 
+    def take_early(self, taken: tuple[bytes, Mapping[str, int]] | None) -> None:
+        """Queue the last plan that came while the node was loading; None = none came."""
+        if taken is not None:
+            self._inputs.take_early(*taken)
+
+    @property
+    def has_begun(self) -> bool:
+        """True if a plan was taken."""
+        return self._maker.num_requests > 0
+
     def _look_again(self) -> None:
         """Check a waiting plan again: its observation may be here, or it waited long enough."""
         if self._arrived:
@@ -428,9 +438,13 @@ class Rollouts:
         """
         if self._maker.is_stop(arrived.message):
             return False
+        if not self.has_begun and self._inputs.awaits_texts():
+            return time.monotonic() - arrived.received_s < _FIRST_S
         if not self._maker.imagine:
             is_first = self._buffer.awaits_first and not self._inputs.unpublished()
-            return is_first and time.monotonic() - arrived.received_s < _FIRST_S
+            now_ns = self._node.get_clock().now().nanoseconds
+            is_early = is_first or self._buffer.are_views_apart(now_ns)
+            return is_early and time.monotonic() - arrived.received_s < _FIRST_S
         if self._worker.last_scene is not None or self._worker.busy:
             return False
         is_behind = self._buffer.newest_stamp_ns < to_ns(arrived.message.header.stamp)

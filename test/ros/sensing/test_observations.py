@@ -119,6 +119,27 @@ def test_skew_within_the_limit_is_stamped_with_the_older_view(make_buffer, ros):
     assert refused.value.reason == Reason.VIEWS_OUT_OF_SYNC
 
 
+def test_the_newest_stamp_that_all_views_have_goes_before_a_nearer_pair(make_buffer, ros):
+    """Synchronised cameras: of the last stamp one view has no image yet, or lost it."""
+    buffer = make_buffer()
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    for view, stamps in {'low': (0, 20, 40), 'high': (0, 20, 60)}.items():
+        for stamp in stamps:
+            buffer.add_image(view, ros.make_image(view, NOW + stamp * MS))
+    assert buffer.observe(NOW + 80 * MS).source_stamp_ns == NOW + 20 * MS
+    assert not buffer.are_views_apart(NOW + 80 * MS)
+
+
+def test_views_without_a_common_moment_are_apart_until_the_next_images(make_buffer, ros):
+    buffer = make_buffer()
+    assert not buffer.are_views_apart(NOW)  # nothing came: another reason
+    buffer.add_image('low', ros.make_image('low', NOW - 154 * MS))
+    buffer.add_image('high', ros.make_image('high', NOW))
+    assert buffer.are_views_apart(NOW)
+    buffer.add_image('low', ros.make_image('low', NOW))
+    assert not buffer.are_views_apart(NOW)
+
+
 def test_joint_states_of_several_publishers_are_merged_at_the_images_time(make_buffer, ros):
     buffer = make_buffer()
     for view in ('low', 'high'):

@@ -293,6 +293,18 @@ def test_refuses_views_that_are_out_of_sync(node, client, ros):
     expect_goes_on(client)
 
 
+def test_a_plan_waits_for_images_of_one_moment(node, client, ros):
+    assert client.set(max_view_skew_s=0.001) == ''
+    send_views_out_of_sync(client, ros)
+    since = len(client.report_values())
+    client.send_trajectory()
+    client.spin_for(0.05)
+    client.send_scene()  # both views with one stamp
+    ended = client.next_end(since)
+    assert client.set(max_view_skew_s=0.05) == ''
+    assert ended['state'] == 'done', ended
+
+
 @pytest.mark.parametrize(
     ('seed', 'reason', 'text'),
     [
