@@ -60,6 +60,7 @@ COMMANDS = {
     'robot': CommandEntry(
         'robot', 'print and draw a robot, and make its YAML from a URDF', 'Prepare'
     ),
+    'task': CommandEntry('task', 'draft the YAML of a task from an instruction', 'Prepare'),
     'check': CommandEntry(
         'check', 'check calibration, joints, clocks and images of recordings', 'Prepare'
     ),

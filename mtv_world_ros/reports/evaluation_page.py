@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from mtv_world_ros.core.documents import DASH, number, render, Table
 from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.estimate_words import estimate_words
 from mtv_world_ros.core.files import write_whole
 from mtv_world_ros.evaluation import tables
 from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, TRAINING
@@ -162,7 +163,7 @@ def _episodes(found: EvaluationSummary) -> Table:
     rows = []
     for result in worst_first:
         numbers = [number(by_key[key].get(result.episode)) for key in keys]
-        estimate = number(result.probability) if isfinite(result.probability) else 'abstains'
+        estimate = estimate_words(result.probability, result.reasons)
         rows.append([result.episode, result.task, result.outcome, *numbers, estimate])
     return Table(head=head, rows=rows, num_labels=3)
 

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from mtv_world_ros.core.data_types import Observation, SuccessEstimate
 from mtv_world_ros.core.errors import EpisodeError, MtvWorldError, ObservationError
+from mtv_world_ros.core.estimate_words import estimate_lines
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
@@ -38,6 +39,7 @@ class ReplaySummary:
         model_s: time spent in the pipeline [s].
         video_s: time the written frames cover [s].
         probabilities: success estimate at the end of each trajectory; NaN = abstains.
+        reasons: reasons of these estimates.
         rejected: stamps [ns] and reasons of trajectories that were not imagined.
         warnings: problems of the episode.
     """
@@ -49,6 +51,7 @@ class ReplaySummary:
     model_s: float = 0.0
     video_s: float = 0.0
     probabilities: list[float] = field(default_factory=list)
+    reasons: list[tuple[str, ...]] = field(default_factory=list)
     rejected: list[tuple[int, str]] = field(default_factory=list)
     warnings: tuple[str, ...] = ()
 
@@ -58,14 +61,11 @@ class ReplaySummary:
         return self.video_s / self.model_s if self.model_s else float('nan')
 
     def __str__(self) -> str:
-        estimates = ', '.join(
-            'abstains' if np.isnan(value) else f'{value:.2f}' for value in self.probabilities
-        )
         counts = f'{self.num_trajectories} trajectories, {self.num_chunks} chunks'
         lines = [
             f'{counts}, {self.num_frames} frames a view -> {self.out}',
             f'{self.model_s:.1f} s of computing, real-time factor {self.real_time_factor:.2f}',
-            f'success estimates: {estimates}',
+            *estimate_lines('success after each plan', self.probabilities, self.reasons),
             *(f'rejected at {stamp / 1e9:.3f} s: {why}' for stamp, why in self.rejected),
             *(f'warning: {text}' for text in self.warnings),
         ]
@@ -176,6 +176,7 @@ def _write_rollout(
     if last is not None:
         summary.num_trajectories += 1
         summary.probabilities.append(last.success.probability)
+        summary.reasons.append(last.success.reasons)
 
 
 def _write_observed(writer: PredictionWriter, episode: Episode, fps: float) -> None:

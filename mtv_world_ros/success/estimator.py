@@ -268,7 +268,9 @@ class SuccessEstimator:
         if self.is_given and len(names) == len(self.tasks[0].roles):
             return self.tasks[0], dict(zip(self.tasks[0].roles, names, strict=True))
         known = '; '.join(task.instruction for task in self.tasks) or 'none'
-        raise CannotTell(f"'{instruction}' is no known task (known: {known})")
+        raise CannotTell(
+            f"'{instruction}' is no known task ('mtv-world task' drafts one; known: {known})"
+        )
 
     def _judge_futures(
         self,

@@ -11,6 +11,7 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import ByteArray
 from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.estimate_words import estimate_lines
 from mtv_world_ros.core.images import resize_frames, write_png
 from mtv_world_ros.viewing.streams import read_streams, Streams
 from mtv_world_ros.viewing.video import Comparison, contact_sheet, KINDS, side_by_side, write_video
@@ -46,10 +47,7 @@ def write_pictures(bags: Sequence[Path], out: Path, *, has_video: bool = True) -
     streams = read_streams(bags)
     comparison = comparison_frames(streams)
     instructions = [t for _, t in streams.words if t.startswith('instruction: ')]
-    estimates = ', '.join(
-        'abstains' if np.isnan(value) else f'{value:.2f}' for _, value in streams.success
-    )
-    notes = [f'success estimates: {estimates}'] if estimates else []
+    notes = _estimates(streams)
     title = instructions[0] if instructions else ''
     write_png(out / SHEET, contact_sheet(comparison, title=title, notes=notes))
     if not has_video:
@@ -59,6 +57,18 @@ def write_pictures(bags: Sequence[Path], out: Path, *, has_video: bool = True) -
     frames = side_by_side(every_nth_frame(comparison, stride))
     write_video(out / VIDEO, frames, 1 / (period * stride), max_bytes=MAX_VIDEO_BYTES)
     return [out / SHEET, out / VIDEO]
+
+
+def _estimates(streams: Streams) -> list[str]:
+    """Return the success estimates and their first reasons, where these were recorded."""
+    if not streams.success:
+        return []
+    reasons = [text for _, text in streams.reasons]
+    if len(reasons) != len(streams.success):  # a bag without reports, or one that was cut off
+        reasons = [''] * len(streams.success)
+    return estimate_lines(
+        'success after each chunk', [value for _, value in streams.success], reasons
+    )
 
 
 def every_nth_frame(comparison: Comparison, stride: int) -> Comparison:

@@ -48,6 +48,7 @@ class Streams:
         masks: (kind, view) -> stamp and (H, W) uint8 object numbers, 0 = none.
         joints: kind (`real`, `imagined`), stamp, names and positions [rad or m].
         success: stamp and probability; NaN = abstains.
+        reasons: stamp and reasons of the estimate of each chunk, as its report joins them.
         words: stamp and text: instructions, reports with the reasons of estimates.
     """
 
@@ -55,6 +56,7 @@ class Streams:
     masks: dict[tuple[str, str], list[tuple[int, ByteArray]]] = field(default_factory=dict)
     joints: list[tuple[str, int, tuple[str, ...], np.ndarray]] = field(default_factory=list)
     success: list[tuple[int, float]] = field(default_factory=list)
+    reasons: list[tuple[int, str]] = field(default_factory=list)
     words: list[tuple[int, str]] = field(default_factory=list)
 
     @property
@@ -95,7 +97,7 @@ def read_streams(bags: Sequence[Path]) -> Streams:
     for found in (*streams.images.values(), *streams.masks.values()):
         found.sort(key=lambda item: item[0])
     streams.joints.sort(key=lambda item: item[1])
-    for rows in (streams.success, streams.words):
+    for rows in (streams.success, streams.reasons, streams.words):
         rows.sort(key=lambda item: item[0])
     return streams
 
@@ -135,6 +137,12 @@ def add_message(streams: Streams, message: BagMessage) -> None:
     elif what[0] == '/report':
         texts = [f'{one.message} {_reasons(one)}'.strip() for one in read.status]
         streams.words.extend((message.stamp_ns, text) for text in texts)
+        values = [{pair.key: pair.value for pair in one.values} for one in read.status]
+        streams.reasons.extend(
+            (message.stamp_ns, one.get('success_reasons', ''))
+            for one in values
+            if 'observation_stamp_ns' in one  # a chunk
+        )
     else:
         streams.words.append((message.stamp_ns, f'instruction: {read.data}'))
 

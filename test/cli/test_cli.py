@@ -128,7 +128,7 @@ def test_the_demo_runs_over_the_middleware_and_beats_the_held_frame(tmp_path):
     assert sheet.shape[1] > 800
     assert (tmp_path / 'out' / 'comparison.mp4').stat().st_size > 10_000
     assert (tmp_path / 'out' / 'predictions' / 'metadata.yaml').is_file()
-    assert 'success estimate after each chunk' in done.stdout
+    assert 'success after each chunk (recorded outcome: success)' in done.stdout
     assert 'plan/s' not in done.stderr  # a bar is drawn on a terminal only
     # which counts these
     log = (tmp_path / 'out' / 'logs' / 'player.log').read_text()

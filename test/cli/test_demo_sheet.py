@@ -8,6 +8,7 @@ def test_the_sheet_has_a_line_of_every_view():
     report = {
         'views': {view: _J | {'j_moving': 0.1 * k} for k, view in enumerate(views)},
         'success_by_chunk': [0.25, None],
+        'reasons_by_chunk': ['4 of 16 foreseen motions succeed; more', "abstains: 'x' is no task"],
         'outcome': 'success',
         'latency_s': [1.5],
         'lead_s': [0.5],
@@ -21,4 +22,9 @@ def test_the_sheet_has_a_line_of_every_view():
     assert [note.split()[note.split().index('J') + 1] for note in notes[:3]] == [
         '0.000,', '0.100,', '0.200,',
     ]  # fmt: skip
-    assert '0.25, abstains (recorded outcome: success)' in notes[3] and len(notes) == 6
+    assert notes[3:6] == [
+        'success after each chunk (recorded outcome: success):',
+        '  1. 0.25: 4 of 16 foreseen motions succeed',
+        "  2. no estimate: 'x' is no task",
+    ]
+    assert len(notes) == 8

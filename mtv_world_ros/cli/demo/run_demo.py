@@ -13,6 +13,7 @@ import numpy as np
 from mtv_world_ros.cli.demo.node_processes import DemoOptions, NODE, record_through_node
 from mtv_world_ros.core.data_types import ByteArray
 from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.estimate_words import estimate_lines
 from mtv_world_ros.core.files import write_whole
 from mtv_world_ros.core.images import write_png
 from mtv_world_ros.data.bag.image_decoding import raw_to_rgb
@@ -120,6 +121,7 @@ def _report(
         'success': _known(success),
         'success_by_chunk': [_known(float(chunk.report['success'])) for chunk in judged],
         'success_reasons': judged[-1].report['success_reasons'],
+        'reasons_by_chunk': [chunk.report['success_reasons'] for chunk in judged],
         'views': {view: {key: _known(means[view][key]) for key in keys} for view in views},
         'objects': [
             {
@@ -150,7 +152,7 @@ def _known(value: float) -> float | None:
 
 
 def _object_rows(report: dict[str, Any]) -> list[str]:
-    lines = [f'{"view":8} {"object":16} {"chunk":>5} {"moves":>5} {"J":>6} {"J copy":>6}']
+    lines = [f'{"view":8} {"object":16} {"chunk":>5} {"moves":>5} {"J":>6} {"J held":>6}']
     for row in report['objects']:
         lines.append(
             f'{row["view"]:8} {row["object"]:16} {row["chunk"]:5d} '
@@ -169,15 +171,14 @@ def sheet_notes(report: dict[str, Any], views: tuple[str, ...]) -> list[str]:
             f'{view:8} moving objects: J {_number(means["j_moving"])}, first frame held '
             f'{_number(means["j_copy_moving"])}; all objects: J {_number(means["j_object_mean"])}'
         )
-    estimates = ', '.join(
-        'abstains' if value is None else f'{value:.2f}' for value in report['success_by_chunk']
-    )
-    lines.append(
-        f'success estimate after each chunk: {estimates} (recorded outcome: {report["outcome"]})'
+    lines += estimate_lines(
+        f'success after each chunk (recorded outcome: {report["outcome"]})',
+        report['success_by_chunk'],
+        report['reasons_by_chunk'],
     )
     latencies = ', '.join(f'{value:.2f}' for value in report['latency_s'])
     leads = ', '.join(f'{value:.2f}' for value in report['lead_s'])
-    lines.append(f'each chunk was judged {leads} s before its end')
+    lines.append(f'from its verdict to the end of a chunk (negative: after it): {leads} s')
     lines.append(
         f'{report["chunks"]} chunks, {report["frames_received"]} of '
         f'{report["frames_published"]} frames received; latency {latencies} s; '
