@@ -115,11 +115,17 @@ def windowed_pixels(
         )
         return np.eye(3), note
     if not _has_aspect(size, sent) or window != WHOLE and size > sent:
+        is_turned = _has_aspect((height, width), sent)
+        turned = (
+            ' They seem to be turned by 90 degrees: switch that off in the driver, or calibrate '
+            'the turned images.'
+        )
         raise CalibrationError(
             f"view '{camera.view}' has images of {width}x{height}, but a camera_info or "
             f'calibration for {full[0]}x{full[1]} with {window}, that is images of '
-            f'{sent[0]}x{sent[1]}; no resizing keeps that aspect. Where they are a part of the '
-            'image, say which in roi of camera_info; else publish the camera_info of these images'
+            f'{sent[0]}x{sent[1]}; no resizing keeps that aspect.{turned if is_turned else ""} '
+            'Where they are a part of the image, say which in roi of camera_info; else publish '
+            'the camera_info of these images'
         )
     scale = np.array([width / sent[0], height / sent[1]])
     resized = np.diag([*scale, 1.0])

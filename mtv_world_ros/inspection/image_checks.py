@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -170,29 +170,67 @@ def check_lengths(stamps_ns: Stamps, joints: JointTrack) -> tuple[dict[str, str]
     return {}, findings
 
 
-class MirroredFrames:
-    """Frames that are mirrored left to right when asked for.
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """A way in which a camera or its driver turns or mirrors frames.
+
+    Attributes:
+        text: what the frames are.
+        quarters: counterclockwise quarter turns that undo it, after the mirroring.
+        is_mirrored: whether frames are mirrored left to right.
+    """
+
+    text: str
+    quarters: int
+    is_mirrored: bool = False
+
+    def undo(self, frame: ByteArray) -> ByteArray:
+        """Return a frame (H, W, 3) as it was before."""
+        flipped = frame[:, ::-1] if self.is_mirrored else frame
+        return np.rot90(flipped, self.quarters)
+
+
+#: orientations that are tried where frames do not show the drawn robot
+ORIENTATIONS = (
+    Orientation('mirrored left to right', 0, is_mirrored=True),
+    Orientation('turned by 180 degrees', 2),
+    Orientation('mirrored top to bottom', 2, is_mirrored=True),
+    Orientation('turned by 90 degrees clockwise', 1),
+    Orientation('turned by 90 degrees counterclockwise', 3),
+)
+
+
+class TurnedFrames:
+    """Frames that are turned or mirrored back when asked for.
 
     Args:
         track: frames of the recording.
+        orientation: the way in which they were turned or mirrored.
     """
 
-    def __init__(self, track: Track) -> None:
-        self._frames = track.frames
+    def __init__(self, track: Track, orientation: Orientation) -> None:
+        self._frames, self._orientation = track.frames, orientation
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def __getitem__(self, index: int) -> ByteArray:
-        return np.asarray(self._frames[index])[..., ::-1, :]
+        return self._orientation.undo(np.asarray(self._frames[index]))
 
     def __array__(self, dtype: object = None, copy: bool | None = None) -> NDArray[np.uint8]:
-        return np.asarray(self._frames)[..., ::-1, :]
+        return np.stack([self[index] for index in range(len(self))])
 
 
-def mirrored(track: Track, camera: CameraModel) -> tuple[Track, CameraModel]:
-    """Return a view's frames mirrored left to right, with the camera of such frames."""
+def turned_back(
+    track: Track, camera: CameraModel, orientation: Orientation
+) -> tuple[Track, CameraModel]:
+    """Return a view's frames turned or mirrored back, with the camera of such frames."""
     K = camera.K.copy()
-    K[0, 2] = camera.width - 1 - K[0, 2]
-    frames = MirroredFrames(track)
+    if orientation.is_mirrored:
+        K[0, 2] = camera.width - 1 - K[0, 2]
+    width, height = camera.width, camera.height
+    for _ in range(orientation.quarters):  # (x, y) becomes (y, width - 1 - x)
+        K[0, 0], K[1, 1], K[0, 2], K[1, 2] = K[1, 1], K[0, 0], K[1, 2], width - 1 - K[0, 2]
+        width, height = height, width
+    frames = TurnedFrames(track, orientation)
     return Track(track.stamps_ns, frames), replace(camera, K=K)  # type: ignore[arg-type]

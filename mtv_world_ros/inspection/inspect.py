@@ -29,7 +29,13 @@ from mtv_world_ros.inspection.clocks import (
     check_skew,
     JointTrack,
 )
-from mtv_world_ros.inspection.image_checks import check_frozen, check_lengths, mirrored
+from mtv_world_ros.inspection.image_checks import (
+    check_frozen,
+    check_lengths,
+    Orientation,
+    ORIENTATIONS,
+    turned_back,
+)
 from mtv_world_ros.inspection.inspection_report import (
     broken,
     Finding,
@@ -88,9 +94,17 @@ _LAG_GAIN = 0.03
 #: relative gain of the correlation above which a delay of one frame is measured reliably
 _LAG_GAIN_OF_A_FRAME = 0.1
 #: what else may be wrong, and by how much more drawn and seen motion then correlate
-_MIRRORED = 'the drawn robot moves like the mirrored image: the camera mirrors its images'
+_TURNED = (
+    'the drawn robot moves like the image {}: the camera or its driver shows it so; switch that '
+    'off, or calibrate these images'
+)
 _SWAPPED = "fingers move like those of '{}' with open and closed swapped"
 _MIRRORED_GAIN = 0.02
+#: factor on the best match by any other change of the camera, above which turned or mirrored
+#: images are the one fault: other findings would follow from it
+_TURNED_FACTOR = 1.3
+#: match from which a view is not turned, and turns are not tried
+_UPRIGHT_MATCH = 0.3
 #: the same of what a gripper moves: on ten real recordings, two views each, right ones lost .073
 #: to .229, and swapped ones gain as much
 _SWAPPED_GAIN = 0.04
@@ -138,15 +152,27 @@ class Inspector:
             for view in progress(episode.views)
             if view not in (*episode.camera_tracks, *episode.unknown)
         }
+        measured = {v: r for v, r in residuals.items() if isinstance(r, MotionResidual)}
+        turned = {v: self._turned(episode, v, joints, r) for v, r in measured.items()}
         late = delays(
-            {view: (found, episode.images[view]) for view, found in residuals.items()
-             if isinstance(found, MotionResidual)}
-        )  # fmt: skip
+            {
+                view: (found, episode.images[view])
+                for view, found in measured.items()
+                if not any(sure for _, sure in turned[view])
+            }
+        )
         return Inspection(
             episode=episode.info.path,
             robot=self.robot.name,
             views=tuple(
-                self._view(episode, view, joints, residuals.get(view), late.get(view, []))
+                self._view(
+                    episode,
+                    view,
+                    joints,
+                    residuals.get(view),
+                    late.get(view, []),
+                    turned.get(view, []),
+                )
                 for view in episode.views
             ),
             recording=self._recording(episode, joints),
@@ -168,6 +194,7 @@ class Inspector:
         joints: JointTrack,
         residual: MotionResidual | Finding | None,
         late: list[Finding],
+        turned: list[tuple[Finding, bool]],
     ) -> Section:
         track, camera = episode.images[view], episode.cameras[view]
         measured: Checked
@@ -188,7 +215,7 @@ class Inspector:
         elif residual is None:
             measured = {}, [not_checked(_MOVES)]
         else:
-            measured, notes = self._measured(episode, view, joints, residual)
+            measured, notes = self._measured(episode, view, joints, residual, turned)
         section = _section(
             view,
             [
@@ -206,12 +233,23 @@ class Inspector:
         return replace(section, numbers=_numbers(residual))
 
     def _measured(
-        self, episode: Episode, view: str, joints: JointTrack, residual: MotionResidual | Finding
+        self,
+        episode: Episode,
+        view: str,
+        joints: JointTrack,
+        residual: MotionResidual | Finding,
+        turned: list[tuple[Finding, bool]],
     ) -> tuple[Checked, tuple[str, ...]]:
         if isinstance(residual, Finding):
             return ({}, [residual]), ()
         measured, notes = self._judge(residual, episode.cameras[view])
-        findings = [*measured[1], *self._alternatives(episode, view, joints, residual)]
+        if sure := [finding for finding, is_sure in turned if is_sure]:
+            return (measured[0], sure), notes  # what else seems wrong follows from it
+        findings = [
+            *(finding for finding, _ in turned),
+            *measured[1],
+            *self._alternatives(episode, view, joints, residual),
+        ]
         return (measured[0], findings), notes
 
     def stands_still(self, episode: Episode, view: str) -> bool:
@@ -224,30 +262,54 @@ class Inspector:
         on_arm = episode.cameras[view].mount_link in moving_links(self.robot)
         return not on_arm and view not in episode.camera_tracks
 
-    def _alternatives(
+    def _match(
+        self, track: Track, camera: CameraModel, joints: JointTrack, parts: Sequence[LinkShape]
+    ) -> float:
+        """Return the correlation of drawn and seen motion where the robot is drawn."""
+        return measure_residual(track, camera, self.robot, parts, joints, _ALONE).match_here
+
+    def _turned(
         self, episode: Episode, view: str, joints: JointTrack, residual: MotionResidual
-    ) -> list[Finding]:
-        """Mirrored frames or a gripper that opens the other way, where they fit much better."""
+    ) -> list[tuple[Finding, bool]]:
+        """Return turned or mirrored frames where they fit much better, and whether that is sure.
+
+        They are looked for before lengths and clocks: these fit by chance in frames that are
+        turned.
+        """
         if residual.reason or not self.shape.is_known:
             return []
         track, camera = episode.images[view], episode.cameras[view]
+        found: dict[Orientation, float] = {}
+        for orientation in ORIENTATIONS:
+            is_turn = orientation.quarters > 0
+            if is_turn and residual.match_here >= _UPRIGHT_MATCH:
+                continue
+            if orientation.quarters % 2 and camera.width != camera.height:
+                continue
+            seen = turned_back(track, camera, orientation)
+            found[orientation] = self._match(*seen, joints, self.shape.parts)
+        best = max(found, key=found.__getitem__)
+        if not found[best] > max(residual.match_here + _MIRRORED_GAIN, _MIN_MATCH):
+            return []
+        finding = broken(_instead(_TURNED.format(best.text), found[best], residual.match_here))
+        others = np.nanmax([residual.match, residual.best_change[1], 0.0])
+        return [(finding, bool(found[best] > _TURNED_FACTOR * others))]
 
-        def match(
-            frames: Track, seen_by: CameraModel, states: JointTrack, parts: Sequence[LinkShape]
-        ) -> float:
-            return measure_residual(frames, seen_by, self.robot, parts, states, _ALONE).match_here
-
+    def _alternatives(
+        self, episode: Episode, view: str, joints: JointTrack, residual: MotionResidual
+    ) -> list[Finding]:
+        """A gripper that opens the other way, where that fits much better."""
+        if residual.reason or not self.shape.is_known:
+            return []
+        track, camera = episode.images[view], episode.cameras[view]
         found = []
-        there = match(*mirrored(track, camera), joints, self.shape.parts)
-        if there > max(residual.match_here + _MIRRORED_GAIN, _MIN_MATCH):
-            found.append(broken(_instead(_MIRRORED, there, residual.match_here)))
         for tool in self.robot.tools:
             moved = gripper_links(self.robot, tool)
             fingers = [part for part in self.shape.parts if part.link in moved]
             if not fingers:
                 continue
-            here = match(track, camera, joints, fingers)
-            there = match(track, camera, joints.swapped(self.robot, tool), fingers)
+            here = self._match(track, camera, joints, fingers)
+            there = self._match(track, camera, joints.swapped(self.robot, tool), fingers)
             if there > max(here + _SWAPPED_GAIN, _MIN_MATCH):
                 text = _SWAPPED.format(tool.gripper_joint)
                 found.append(suspicious(_instead(text, there, here)))

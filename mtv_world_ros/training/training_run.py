@@ -52,6 +52,7 @@ from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
+from mtv_world_ros.training.unknown_cameras import unknown_camera_lines
 from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
@@ -306,6 +307,7 @@ def train(
             f'{processes.count} processes'
         )
         left_out = [f'left out: {line}' for line in reason_lines(skipped)]
+        left_out += unknown_camera_lines(skipped, len(recordings) + len(skipped))
         told = training_notes(trainer.config, recordings, None if resumed else run.initial)
         for line in [*left_out, *told]:
             tqdm.write(line)

@@ -14,6 +14,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.core.images import encode_jpeg
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.episode_reader import read_episode
+from mtv_world_ros.training.unknown_cameras import unknown_camera_lines
 from test.support.robot_recordings import (
     Event,
     FPS,
@@ -146,6 +147,16 @@ def test_the_command_that_estimates_an_unknown_camera_runs(record, run, tmp_path
     monkeypatch.chdir(tmp_path)
     assert main(words) == 0
     assert (tmp_path / 'points.html').is_file()
+
+
+def test_training_says_what_unknown_cameras_cost_and_the_remedy(record, run, tmp_path):
+    run(record(change=only_in_the_camera('side')))
+    skipped = [str(tmp_path / 'out' / 'bag')]
+    (line,) = unknown_camera_lines(skipped, 10)
+    assert line.startswith('1 of 10 episodes (10%) are left out')
+    assert f'fit camera {tmp_path / "out"} --view side --apply, and' in line
+    assert '--apply-doubted' in line
+    assert unknown_camera_lines([str(record(name='other'))], 10) == []
 
 
 # Grippers

@@ -15,8 +15,13 @@ from mtv_world_ros.core.errors import CalibrationError
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.inspection.camera_pose import displaced_pose
 from mtv_world_ros.inspection.cameras import joint_camera
-from mtv_world_ros.inspection.cameras.shared_camera import expected_within, stated_error
-from mtv_world_ros.inspection.places import background, find_places, turn_between
+from mtv_world_ros.inspection.cameras.shared_camera import (
+    expected_within,
+    SharedEstimate,
+    stated_error,
+)
+from mtv_world_ros.inspection.motion_residual import MotionResidual
+from mtv_world_ros.inspection.places import background, CameraPlaces, find_places, turn_between
 from test.support.crane import (
     load,
     looking_at,
@@ -219,3 +224,36 @@ def test_the_stated_error_holds_for_95_of_100_points_however_few_were_left_out()
             inside.append(np.linalg.norm(generator.normal(0, 0.8, 2)) < 2.4477 * error)
     assert 0.93 < np.mean(inside) < 0.97
     assert stated_error(np.zeros(0)) is None
+
+
+def estimated(matches, places, shifts=None):
+    """Return the estimate of recordings with these correlations, at these places."""
+    width = 100
+    measures = [
+        MotionResidual(
+            shift_px=(0.0, shift), match=1.2 * match if shift else match, match_here=match,
+            reason='' if np.isfinite(match) else 'no link moves within the image',
+        )
+        for match, shift in zip(matches, shifts or [0.0] * len(matches), strict=True)
+    ]  # fmt: skip
+    camera = make_cameras()['door']
+    return SharedEstimate(
+        cameras=(replace(camera, width=width),) * len(matches),
+        places=CameraPlaces(
+            place=np.array(places), apart=np.zeros((len(places),) * 2), matches={}
+        ),
+        measures=tuple(measures), guess_measures=(), kept_guess=False, focal_px=1.0, bent=False,
+        fits=np.ones(len(matches)), apart_px=np.zeros(0), strays=(),
+    )  # fmt: skip
+
+
+def test_a_doubted_pose_at_a_place_that_others_confirm_is_taken():
+    one = estimated([0.33, 0.41, 0.37, 0.33, np.nan, np.nan], [0, 0, 0, 1, 0, 1])
+    assert 'correlate by 0.33' in one.doubts(0) and one.doubts(4).startswith('not checked')
+    assert [bool(one.objection(n)) for n in range(6)] == [False] * 3 + [True, False, True]
+    assert one.confirming(0) == (1, 2) and one.confirming(3) == ()
+
+
+def test_a_recording_that_contradicts_its_place_stays_doubted():
+    one = estimated([0.33, 0.45, 0.41], [0, 0, 0], [5.0, 0.0, 0.0])
+    assert one.objection(0) and not one.objection(1)

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from mtv_world_ros.robot.model import RobotModel
     from mtv_world_ros.robot.shape import LinkShape
 
+#: recordings that confirm a place and are named at most
+_MAX_NAMES = 3
+
 
 def is_shared(arguments: argparse.Namespace) -> bool:
     """Return whether the options need the search over several recordings."""
@@ -265,6 +268,9 @@ def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_kno
             parts.append(f'guess {estimate.guess_measures[number].match_here:.2f}')
         doubt = estimate.doubts(number)
         parts += [f'doubted: {doubt}'] if doubt else []
+        others = estimate.confirming(number) if doubt else ()
+        names = ', '.join(episodes[other].info.path.name for other in others[:_MAX_NAMES])
+        parts += [f'taken, as its place is confirmed by {names}'] if others else []
         lines.append(f'{episode.info.path.name}: {"; ".join(parts)}')
     return '\n'.join(lines)
 

@@ -125,27 +125,45 @@ class SharedEstimate:
         measure = self.measures[number]
         if measure.reason:
             return f'not checked: {measure.reason}'
-        apart = float(np.hypot(*measure.shift_px)) / self.cameras[number].width
         if measure.match_here < _LEAST_MATCH:
             return (
                 f'drawn and seen motion correlate by {measure.match_here:.2f}, below '
                 f'{_LEAST_MATCH:g}: pose or focal length may be wrong'
             )
-        if apart > _DOUBTED and measure.match > 1.05 * measure.match_here:
+        if self._is_beside(number):
+            apart = float(np.hypot(*measure.shift_px)) / self.cameras[number].width
             return f'the robot moves {apart:.1%} of the width beside where it is drawn'
         return ''
 
     def objection(self, number: int) -> str:
         """Return the reason why the pose of a recording is not to be relied on; empty = it is.
 
-        A pose that could not be checked in a recording is good if it was in another recording of
-        the same place.
+        A pose that a recording could not check, or with too little correlation to rely on, is
+        good if another recording of the same place confirms it; not where the robot is seen to
+        move beside where it is drawn.
         """
-        same = np.flatnonzero(self.places.place == self.places.place[number])
-        is_checked = not self.measures[number].reason
-        if not is_checked and any(not self.doubts(int(other)) for other in same):
+        doubt = self.doubts(number)
+        if doubt and self.confirming(number):
             return ''
-        return self.doubts(number)
+        return doubt
+
+    def confirming(self, number: int) -> tuple[int, ...]:
+        """Return the recordings that confirm the pose of another recording of their place.
+
+        None do where that recording contradicts them.
+        """
+        if self._is_beside(number):
+            return ()
+        same = np.flatnonzero(self.places.place == self.places.place[number])
+        return tuple(int(n) for n in same if n != number and not self.doubts(int(n)))
+
+    def _is_beside(self, number: int) -> bool:
+        """Return whether the robot moves beside where it is drawn."""
+        measure = self.measures[number]
+        if measure.reason:
+            return False
+        apart = float(np.hypot(*measure.shift_px)) / self.cameras[number].width
+        return apart > _DOUBTED and measure.match > 1.05 * measure.match_here
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
