@@ -11,6 +11,11 @@ import sys
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.bundled_help import policies
+from mtv_world_ros.cli.imagine_table import (
+    add_options_of_tables,
+    imagine_table,
+    is_asked_for,
+)
 from mtv_world_ros.cli.shared_options import (
     add_options,
     add_watch,
@@ -166,6 +171,7 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--no-video', dest='video', action='store_false', help='write no comparison.mp4'
     )
+    add_options_of_tables(parser)
     add_watch(parser, 'every episode')
     add_options(parser, 'overwrite checkpoint model describer segmenter task')
     parser.set_defaults(
@@ -178,6 +184,8 @@ def _imagine(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.core.errors import ConfigError
     from mtv_world_ros.data.episode_reader import list_episodes
 
+    if is_asked_for(arguments):
+        return imagine_table(arguments)
     (arguments.checkpoint,) = open_checkpoints(arguments.device, arguments.checkpoint)
     watch_arguments(arguments)
     for folder in arguments.episodes:
@@ -186,8 +194,9 @@ def _imagine(arguments: argparse.Namespace) -> int:
     episodes = [path for folder in arguments.episodes for path in list_episodes(folder)]
     if bool(episodes) == arguments.live:
         raise ConfigError(
-            'give --episodes with recorded episodes to start from, or --live to start from the '
-            f'cameras; --episodes has {len(episodes)}'
+            'give --episodes with recorded episodes to start from, --live to start from the '
+            'cameras, or --image and --joints to imagine a table of joints; --episodes has '
+            f'{len(episodes)}'
         )
     results = _in_world_model(arguments, episodes)
     from mtv_world_ros.viewing.sheets import write_pictures

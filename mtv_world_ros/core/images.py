@@ -30,6 +30,19 @@ def resize_labels(labels: ByteArray, width: int, height: int) -> ByteArray:
     )
 
 
+def read_rgb(path: Path) -> ByteArray:
+    """Return an image file as (H, W, 3) uint8 RGB.
+
+    Raises:
+        EpisodeError: there is no such file, or it is no image.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+    if image is None:
+        what = 'is no image (PNG or JPEG)' if path.is_file() else 'is no file'
+        raise EpisodeError(f"'{path}' {what}")
+    return image[..., ::-1].astype(np.uint8)
+
+
 def encode_jpeg(rgb: ByteArray, quality: int) -> bytes:
     """Return the JPEG file of an (H, W, 3) RGB image.
 
