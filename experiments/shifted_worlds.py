@@ -156,7 +156,9 @@ def more(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--policies', type=int, default=13, help='in each scene, with the expert')
     parser.add_argument('--log', type=Path, required=True, help='JSON lines of what was done')
     parser.add_argument('--no-camera-check', action='store_true')
-    parser.add_argument('--until', type=float, default=1e9, help='begins no policy after so long')
+    parser.add_argument(
+        '--until', type=float, default=1e9, help='begins no policy after so long; 0 = read the log'
+    )
 
 
 def policies_of(faults: str, size: float, count: int) -> list[str]:
@@ -480,7 +482,11 @@ def run(options: argparse.Namespace, pipelines: dict[str, Pipeline]) -> list[dic
     found, last = [], None
     for job in jobs(options):
         known = done.get(job)
-        if known is None or not is_whole(known, scenes.wanted(job[0]), pipelines):
+        is_missing = known is None or not is_whole(known, scenes.wanted(job[0]), pipelines)
+        if is_missing and options.until <= 0:
+            if known is None:
+                continue
+        elif is_missing:
             # all physics of a policy or none, so that they are comparable
             if time.monotonic() - begun > options.until and job[1:] != last:
                 break
@@ -491,6 +497,7 @@ def run(options: argparse.Namespace, pipelines: dict[str, Pipeline]) -> list[dic
             with options.log.open('a') as stream:
                 stream.write(json.dumps(known) + '\n')
         last = job[1:]
+        assert known is not None
         if 'skipped' not in known:
             found.append(known)
     return found
@@ -657,11 +664,11 @@ def rows_of(
             continue
         for name, pipeline in pipelines.items():
             for judge in scenes.wanted(physics):
-                said = [
-                    estimated(pipeline, judge, r['said'][name][judge], physics) for r in chosen
-                ]
+                asked = [r for r in chosen if judge in r['said'][name]]
+                said = [estimated(pipeline, judge, r['said'][name][judge], physics) for r in asked]
                 title = judge if len(pipelines) == 1 else f'{judge}, {name}'
-                rows.append(row(physics, title, chosen, said))
+                if asked:
+                    rows.append(row(physics, title, asked, said))
         rows.append(row(physics, RULE, chosen, [ruled(r) for r in chosen]))
     return rows
 

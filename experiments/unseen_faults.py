@@ -82,12 +82,12 @@ EDGES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0 + 1e-9)
 #: judge: the estimate of before, of `--before`
 BEFORE = 'both, before'
 COVERED = ('truth', 'judged by', 'estimates', 'covered', 'up to the sampling error of rates')
-BLOCK = ('judged by', 'nominal: verdicts', 'right, said success', 'right, said failure',
-         'AUROC, no verdict .5', 'other truths: verdicts', 'right, said success',
-         'right, said failure', 'AUROC, mean (worst)', 'AUROC, no verdict .5, mean (worst)',
-         'from .9 on succeed')  # fmt: skip
+BLOCK = ('judged by', 'nominal: verdicts', 'right: said success; said failure',
+         'AUROC, no verdict .5', 'other truths: verdicts',
+         'right there: said success; said failure', 'AUROC there, mean (worst)',
+         'AUROC there, no verdict .5, mean (worst)', 'from .9 on succeed there')  # fmt: skip
 #: columns and judges of the table in README.md
-README_COLUMNS = (0, 1, 2, 3, 5, 6, 7, 9)
+README_COLUMNS = (0, 1, 2, 4, 5, 7)
 README_JUDGES = (f'**{BOTH}**', FORESEEN, RULE)
 _MARKED = re.compile(
     r'(<!-- unseen-faults: begin -->\n).*?(<!-- unseen-faults: end -->)', re.DOTALL
@@ -130,8 +130,10 @@ def estimates_of(
     for physics in options.physics.split(','):
         chosen = [line for line in lines if line['job'][0] == physics]
         for judge in scenes.wanted(physics) if chosen else ():
-            said = [estimated(pipeline, judge, r['said'][name][judge], physics) for r in chosen]
-            found[physics, judge] = chosen, said
+            asked = [line for line in chosen if judge in line['said'][name]]
+            said = [estimated(pipeline, judge, r['said'][name][judge], physics) for r in asked]
+            if asked:
+                found[physics, judge] = asked, said
         if chosen:
             found[physics, RULE] = chosen, [ruled(line) for line in chosen]
     if options.before is not None:
@@ -195,8 +197,14 @@ def judged(rows: Sequence[Row]) -> list[list[str]]:
         others = [r for r in of if r.physics != NOMINAL]
         if nominal is None and judge == AS_FITTED:
             nominal = next(r for r in rows if r.physics == NOMINAL and r.judge == FORESEEN)
-        cells = ['–'] * 4 if nominal is None else [nominal.cells[k] for k in (4, 5, 6, 8)]
-        more = over_truths(others)[:6] if others else ['–'] * 6
+        cells = ['–'] * 3
+        if nominal is not None:
+            verdicts, success, failure, area = (nominal.cells[k] for k in (4, 5, 6, 8))
+            cells = [verdicts, f'{success}; {failure}', area]
+        more = ['–'] * 5
+        if others:
+            verdicts, success, failure, *areas = over_truths(others)[:6]
+            more = [verdicts, f'{success}; {failure}', *areas]
         lines.append([f'**{judge}**' if judge == BOTH else judge, *cells, *more])
     return lines
 
