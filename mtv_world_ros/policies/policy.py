@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -60,6 +60,16 @@ class Policy(Protocol):
         Raises:
             PolicyError: the policy cannot answer, e.g. its server is gone.
         """
+        ...
+
+
+@runtime_checkable
+class PlannedPolicy(Protocol):
+    """A policy that plans the whole episode at its begin, and answers with parts of that plan."""
+
+    @property
+    def plan(self) -> JointTrajectory:
+        """Commands of the whole episode; times count from its first observation."""
         ...
 
 

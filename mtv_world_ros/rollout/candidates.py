@@ -12,7 +12,7 @@ from mtv_world_ros.core.errors import CheckpointError, ConfigError, PlanError
 from mtv_world_ros.core.processes import threads_each
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.physics.checkpoint_files import load_foresight
-from mtv_world_ros.policies.policy import Policy
+from mtv_world_ros.policies.policy import PlannedPolicy, Policy
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import Plan
 from mtv_world_ros.robot.shape import load_shape
@@ -28,7 +28,8 @@ class CandidatePolicy:
 
     The first question of an episode goes to all candidates. Their plans are compared in simulated
     futures of the scene, and the first candidate than which no other one is better acts for the
-    rest of the episode, since later observations may show objects half hidden in a grip.
+    rest of the episode, since later observations may show objects half hidden in a grip. The plan
+    of a policy is its answer, or that of the whole episode where it knows it (`PlannedPolicy`).
     Candidate k gets seed + k, so that the first one acts as the policy would alone.
 
     Attributes:
@@ -81,9 +82,11 @@ class CandidatePolicy:
         """Return the index of the best candidate, and set the choice."""
         count = len(answers)
         plans = {
-            number: answer
-            for number, answer in enumerate(answers)
-            if answer is not None and self._can_execute(answer, observation)
+            number: plan
+            for number, (policy, answer) in enumerate(zip(self._policies, answers, strict=True))
+            if answer is not None
+            for plan in [policy.plan if isinstance(policy, PlannedPolicy) else answer]
+            if self._can_execute(plan, observation)
         }
         if len(plans) < 2:
             best = next(iter(plans), 0)
@@ -98,10 +101,10 @@ class CandidatePolicy:
         self.choice = found.told_as([number + 1 for number in numbers], count)
         return numbers[found.best]
 
-    def _can_execute(self, answer: JointTrajectory, observation: Observation) -> bool:
-        """Return True if the robot can execute an answer."""
+    def _can_execute(self, plan: JointTrajectory, observation: Observation) -> bool:
+        """Return True if the robot can execute a plan."""
         try:
-            Plan.of(answer, self._pipeline.robot, observation, self._options.limits)
+            Plan.of(plan, self._pipeline.robot, observation, self._options.limits)
         except PlanError:
             return False
         return True

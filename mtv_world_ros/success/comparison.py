@@ -189,6 +189,8 @@ class Comparison:
         if self.reason:
             return f'{title}: not told, {self.reason}'
         done = self.num_successes
+        if not any(done):
+            return f'{title}: no plan does the task by its end in any future'
         text = f'{title}: succeeds in {done[best]} of {self.num_futures} futures'
         pair = self.pair(0, best) if best else None
         if pair is None:

@@ -82,6 +82,25 @@ def first_joint(recording):
 ALL, NONE = (True,) * 4, (False,) * 4
 
 
+class Planned(Fixed):
+    """A policy that answers with the first part of a plan that it knows."""
+
+    def __init__(self, plan, answer):
+        super().__init__(answer)
+        self.plan = plan
+
+
+@pytest.mark.slow
+def test_a_policy_that_knows_its_whole_plan_is_judged_by_it(pipeline, plan, start, first_joint):
+    good, part = round(first_joint + 0.05, 3), plan(first_joint)
+    told = Told(pipeline.robot, {first_joint: NONE, good: ALL})
+    asked = [Planned(plan(first_joint, 3.0), part), Planned(plan(good, 3.0), part)]
+    policy = CandidatePolicy(asked, told)
+    policy.reset(seed=0)
+    assert policy.act(start, '') is part and policy.choice.startswith('plan 2 of 2')
+    assert {one.times[-1] for one in told.asked[0][0]} == {3.0}
+
+
 @pytest.mark.slow
 def test_the_best_candidate_acts_for_the_rest_of_the_episode(pipeline, plan, start, first_joint):
     bad, good = first_joint, round(first_joint + 0.05, 3)

@@ -47,6 +47,13 @@ def test_equal_plans_are_not_told_and_the_first_is_the_choice():
     assert found.best == 0 and 'no other plan is better' in found.text
 
 
+def test_plans_that_end_before_the_task_are_not_told_and_say_so():
+    found = compared('----', '----')
+    assert found.best == 0 and found.text.endswith(
+        'no plan does the task by its end in any future'
+    )
+
+
 def test_the_choice_is_a_later_plan_only_where_it_is_better():
     # one future more is not enough, two are
     assert compared('+---', '++--').best == 0
