@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.physics_option import add_physics
-from mtv_world_ros.cli.shared_options import names
+from mtv_world_ros.cli.shared_options import add_options, names, workers_of
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -79,7 +79,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_physics(parser)
     parser.add_argument('--seed', type=int, default=0, help='seed of the scenes')
     parser.add_argument('--out', type=Path, required=True, help='folder of the data set')
-    parser.add_argument('--workers', type=int, default=1, help='number of processes')
+    add_options(parser, 'workers')
     parser.add_argument('--width', type=int, default=384, help='width of the images [px]')
     parser.add_argument('--height', type=int, default=288, help='height of the images [px]')
     parser.add_argument(
@@ -105,7 +105,7 @@ def _collect(arguments: argparse.Namespace) -> int:
         arguments.seed,
         arguments.out,
         zero_shot=arguments.zero_shot,
-        workers=arguments.workers,
+        workers=workers_of(arguments),
         failures_of_ten=arguments.failures_of_ten,
         config=CollectConfig(
             robot=arguments.robot,

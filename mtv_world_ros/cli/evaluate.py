@@ -13,11 +13,12 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import (
     add_options,
+    device_here,
     names,
     open_checkpoints,
     pipeline_choices,
     provenance,
-    threads_of_workers,
+    workers_of,
 )
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import check_free
@@ -67,9 +68,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar='NAME',
         help='only the episodes that were collected with this physics; default: all, counted',
     )
-    parser.add_argument(
-        '--workers', type=int, default=1, help='number of processes that score episodes'
-    )
+    add_options(parser, 'workers')
     parser.add_argument(
         '--actions',
         type=names,
@@ -165,7 +164,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.splits import of_physics, select
 
     entries = parse_entries(arguments.checkpoints)
-    checkpoints = open_checkpoints(arguments.device, *(entry.path for entry in entries))
+    checkpoints = open_checkpoints(device_here(arguments), *(entry.path for entry in entries))
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
     selection, truth = of_physics(selection, arguments.physics)
     from mtv_world_ros.reports.comparison import write_comparison
@@ -243,14 +242,15 @@ def _slug(label: str) -> str:
 def load_pipelines(
     arguments: argparse.Namespace, checkpoint: Checkpoint, **options: Any
 ) -> tuple[Pipeline, Parallel]:
-    """Return the pipeline of this process, and what makes those of worker processes."""
+    """Return the pipeline of this process, and the workers with what makes theirs."""
     from mtv_world_ros.evaluation.evaluate_episodes import Parallel
     from mtv_world_ros.rollout.pipeline import Pipeline
 
-    load = partial(Pipeline.load, checkpoint, **pipeline_choices(arguments), **options)
-    pipeline, threads = load(num_threads=arguments.threads), threads_of_workers(arguments)
-    make = partial(load, num_threads=threads)
-    return pipeline, Parallel(workers=arguments.workers, make_pipeline=make, threads=threads)
+    workers = workers_of(arguments, checkpoint.folder, arguments.dataset)
+    load = partial(Pipeline.load, checkpoint, **pipeline_choices(arguments) | options)
+    pipeline = load(num_threads=arguments.threads, device=device_here(arguments))
+    make = partial(load, num_threads=workers.num_threads)
+    return pipeline, Parallel(workers=workers, make_pipeline=make)
 
 
 def _score(

@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from mtv_world_ros.cli.bundled_help import policies
 from mtv_world_ros.cli.imagine_table import (
@@ -19,14 +19,19 @@ from mtv_world_ros.cli.imagine_table import (
 from mtv_world_ros.cli.shared_options import (
     add_options,
     add_watch,
+    device_here,
     open_checkpoints,
+    pipeline_choices,
     pipeline_of,
     watch_arguments,
+    workers_of,
 )
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.core.files import check_free
 
 if TYPE_CHECKING:
+    from mtv_world_ros.core.executor import Workers
+    from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.rollout.episode_viewer import EpisodeViewer
     from mtv_world_ros.rollout.imagined_episodes import EpisodeStart
     from mtv_world_ros.rollout.pipeline import Pipeline
@@ -173,7 +178,7 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
     )
     add_options_of_tables(parser)
     add_watch(parser, 'every episode')
-    add_options(parser, 'overwrite checkpoint model describer segmenter task')
+    add_options(parser, 'overwrite checkpoint workers model describer segmenter task')
     parser.set_defaults(
         handler=_imagine,
         takes_more=lambda chosen, more: chosen.live and more[0] == '--ros-args',
@@ -184,9 +189,16 @@ def _imagine(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.core.errors import ConfigError
     from mtv_world_ros.data.episode_reader import list_episodes
 
-    if is_asked_for(arguments):
+    is_table = is_asked_for(arguments)
+    workers = workers_of(arguments, arguments.checkpoint, *arguments.episodes)
+    if not workers.are_here and (is_table or arguments.live or arguments.watch is not None):
+        raise ConfigError(
+            '--live, --watch and a table of joints are of one process; leave them out, or '
+            '--workers and --ray'
+        )
+    if is_table:
         return imagine_table(arguments)
-    (arguments.checkpoint,) = open_checkpoints(arguments.device, arguments.checkpoint)
+    (arguments.checkpoint,) = open_checkpoints(device_here(arguments), arguments.checkpoint)
     watch_arguments(arguments)
     for folder in arguments.episodes:
         if not folder.exists():
@@ -198,7 +210,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
             'cameras, or --image and --joints to imagine a table of joints; --episodes has '
             f'{len(episodes)}'
         )
-    results = _in_world_model(arguments, episodes)
+    results = _in_world_model(arguments, episodes, workers)
     from mtv_world_ros.viewing.sheets import write_pictures
 
     for result in results:
@@ -217,7 +229,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
 
 
 def _in_world_model(
-    arguments: argparse.Namespace, episodes: Sequence[Path]
+    arguments: argparse.Namespace, episodes: Sequence[Path], workers: Workers
 ) -> Sequence[Mapping[str, object]]:
     """Run the policy from recorded frames, or from what the cameras show."""
     from mtv_world_ros.core.errors import MtvWorldError
@@ -226,6 +238,8 @@ def _in_world_model(
         check_start,
         EpisodeOptions,
         imagine_episodes,
+        imagine_recorded,
+        RecordedSource,
     )
     from mtv_world_ros.success.own_tasks import named_here
 
@@ -235,8 +249,6 @@ def _in_world_model(
     for bag in sorted(arguments.out.glob('episode_*')):
         check_free(bag, arguments.overwrite)
     arguments.task = named_here(arguments.task, episodes)
-    describer = asked_describer(arguments.describer)
-    pipeline = replace(pipeline_of(arguments), describer=describer)
     options = EpisodeOptions(
         policy=arguments.policy,
         count=arguments.count or len(episodes) or 1,
@@ -247,9 +259,16 @@ def _in_world_model(
         num_inference_steps=arguments.steps,
         num_candidates=arguments.candidates,
     )
-    starts = _starts(arguments, episodes, pipeline)
-    if arguments.place is not None:
-        starts = (start.at_place(arguments.place) for start in starts)
+    source = RecordedSource(paths=episodes, start_s=arguments.start, place=arguments.place)
+    if not workers.are_here:
+        make = partial(_described_pipeline, arguments.checkpoint, workers.num_threads,
+                       arguments.describer, pipeline_choices(arguments))  # fmt: skip
+        return imagine_recorded(
+            make, options, source, arguments.out, workers, overwrite=arguments.overwrite
+        )
+    describer = asked_describer(arguments.describer)
+    pipeline = replace(pipeline_of(arguments), describer=describer)
+    starts = _live_starts(arguments, pipeline) if arguments.live else source.starts(pipeline)
     viewer = _viewer(arguments)
     watched = {'on_start': viewer.begin, 'on_chunk': viewer.add} if viewer else {}
     results = imagine_episodes(
@@ -263,23 +282,30 @@ def _in_world_model(
     return results
 
 
-def _starts(
-    arguments: argparse.Namespace, episodes: Sequence[Path], pipeline: Pipeline
-) -> Iterator[EpisodeStart]:
-    """Return the starts of the episodes: recorded frames, or what the cameras show."""
-    if not arguments.live:
-        from mtv_world_ros.rollout.imagined_episodes import recorded_starts
+def _described_pipeline(
+    checkpoint: Checkpoint, threads: int, describer: Path | None, choices: Mapping[str, Any]
+) -> Pipeline:
+    """Return the pipeline of a worker, with what names the objects."""
+    from mtv_world_ros.rollout.assembly import asked_describer
+    from mtv_world_ros.rollout.pipeline import Pipeline
 
-        return recorded_starts(episodes, pipeline, arguments.start)
+    pipeline = Pipeline.load(checkpoint, num_threads=threads, **choices)
+    return replace(pipeline, describer=asked_describer(describer))
+
+
+def _live_starts(arguments: argparse.Namespace, pipeline: Pipeline) -> Iterator[EpisodeStart]:
+    """Return what the cameras show at the start of each episode."""
     from mtv_world_ros.ros.sensing.live_start import live_starts
 
-    return live_starts(
+    starts = live_starts(
         pipeline.spec,
         pipeline.robot,
         arguments.checkpoint.cameras_file,
         arguments.ros,
         tell=partial(print, flush=True),
     )
+    place = arguments.place
+    return starts if place is None else (start.at_place(place) for start in starts)
 
 
 def _viewer(arguments: argparse.Namespace) -> EpisodeViewer | None:

@@ -16,11 +16,12 @@ from mtv_world_ros.cli.physics_option import add_physics, physics_text
 from mtv_world_ros.cli.shared_options import (
     add_options,
     add_watch,
+    device_here,
     open_checkpoints,
     pipeline_choices,
     provenance,
-    threads_of_workers,
     watch_arguments,
+    workers_of,
 )
 from mtv_world_ros.core.errors import ConfigError, PolicyError
 
@@ -92,15 +93,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='a second checkpoint that is ranked, too; every rollout is simulated once. Its own '
         'ranking goes to DIR/compared',
     )
-    parser.add_argument('--workers', type=int, default=1, help='number of processes')
-    parser.add_argument(
-        '--ray',
-        nargs='?',
-        const='',
-        metavar='ADDRESS',
-        help='run on a Ray cluster; default address: RAY_ADDRESS, else a new cluster on this '
-        'machine',
-    )
+    add_options(parser, 'workers')
     parser.add_argument(
         '--true-episodes',
         type=int,
@@ -138,7 +131,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _rank(arguments: argparse.Namespace) -> int:
     names, truth = _names(arguments), physics_text(arguments.physics)
-    opened = open_checkpoints(arguments.device, *names)
+    opened = open_checkpoints(device_here(arguments), *names)
     watched = watch_arguments(arguments)
     if watched and not arguments.clips:
         raise ConfigError('--watch shows what --no-video leaves out; give one of them')
@@ -170,8 +163,7 @@ def _rank(arguments: argparse.Namespace) -> int:
         jobs,
         checkpoints,
         config=config,
-        workers=arguments.workers,
-        ray_address=arguments.ray,
+        workers=workers_of(arguments, *(one.folder for one in opened)),
         overwrite=arguments.overwrite,
         watch=viewer.add if viewer else lambda _: None,
     )
@@ -241,7 +233,7 @@ def _ranked(arguments: argparse.Namespace, checkpoint: Checkpoint, out: Path) ->
     make_pipeline = partial(
         Pipeline.load,
         checkpoint,
-        num_threads=threads_of_workers(arguments),
+        num_threads=workers_of(arguments).num_threads,
         describer=arguments.describer,
         **pipeline_choices(arguments),
     )

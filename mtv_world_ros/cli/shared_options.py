@@ -16,6 +16,7 @@ from mtv_world_ros.cli import bundled_help
 from mtv_world_ros.viewing.viewer_process import PageAddress
 
 if TYPE_CHECKING:
+    from mtv_world_ros.core.executor import Workers
     from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.rollout.pipeline import Pipeline
 
@@ -139,6 +140,32 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
             'names stored with the episode, else the colour words of its instruction',
         }
     },
+    'workers': {
+        '--workers': {
+            'type': int,
+            'default': 1,
+            'help': 'number of processes that share the work; with --ray, of workers over all '
+            'machines',
+        },
+        '--ray': {
+            'nargs': '?',
+            'const': '',
+            'metavar': 'ADDRESS',
+            'help': 'run on a Ray cluster; default address: RAY_ADDRESS, else a new cluster on '
+            'this machine. DIR has to be on a file system that all machines share',
+        },
+        '--gpus-per-worker': {
+            'type': float,
+            'metavar': 'N',
+            'help': 'GPUs that Ray reserves for a worker, e.g. 0.5; default: 1 with --device '
+            'cuda, else 0',
+        },
+        '--cpus-per-worker': {
+            'type': int,
+            'metavar': 'N',
+            'help': 'CPU cores that Ray reserves for a worker, and its threads; default: 1',
+        },
+    },
     'checkpoint': {
         '--checkpoint': {
             'default': 'bundled',
@@ -223,11 +250,44 @@ class Watch:
             raise argparse.ArgumentTypeError(f'{error}; or a file that ends in .rrd') from error
 
 
-def threads_of_workers(arguments: argparse.Namespace) -> int:
-    """Return the CPU threads of each of `--workers` processes: as asked, else its share."""
-    from mtv_world_ros.core.processes import threads_each
+def workers_of(
+    arguments: argparse.Namespace, *reads: Path | str | None, writes: Path | None = None
+) -> Workers:
+    """Return the workers that `--workers`, `--ray` and the resources of each ask for.
 
-    return arguments.threads or threads_each(arguments.workers)
+    Args:
+        arguments: options of the command.
+        reads: files and folders that jobs read; names that are no path here are left out.
+        writes: folder that jobs write to; None = results come back to this process.
+
+    Raises:
+        ConfigError: resources of Ray without Ray, or less than none.
+    """
+    from mtv_world_ros.core.errors import ConfigError
+    from mtv_world_ros.core.executor import Workers
+
+    for name in ('gpus', 'cpus'):
+        value = getattr(arguments, f'{name}_per_worker')
+        if value is not None and arguments.ray is None:
+            raise ConfigError(f'--{name}-per-worker {value:g} is for --ray; leave it out')
+        if value is not None and value < 0:
+            raise ConfigError(f'--{name}-per-worker is {value:g}; it must be 0 or more')
+    gpus, cpus = arguments.gpus_per_worker, arguments.cpus_per_worker
+    is_on_gpu = getattr(arguments, 'device', 'cpu') != 'cpu'
+    return Workers(
+        count=arguments.workers,
+        threads=getattr(arguments, 'threads', 0),
+        ray=arguments.ray,
+        cpus=1 if cpus is None else cpus,
+        gpus=float(is_on_gpu) if gpus is None else gpus,
+        reads=tuple(Path(one) for one in reads if one is not None and Path(one).exists()),
+        writes=writes,
+    )
+
+
+def device_here(arguments: argparse.Namespace) -> str:
+    """Return the device of this process: with `--ray` others use the GPU."""
+    return 'cpu' if arguments.ray is not None else arguments.device
 
 
 def pipeline_of(arguments: argparse.Namespace) -> Pipeline:

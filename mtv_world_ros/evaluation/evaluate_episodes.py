@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
+from mtv_world_ros.core.executor import IN_PROCESS, score_all, Workers
 from mtv_world_ros.core.files import plain, write_json
-from mtv_world_ros.core.processes import threads_each
-from mtv_world_ros.core.worker_pool import score_all
 from mtv_world_ros.data.recordings import described_objects
 from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, EvaluationJob, Instruments
 from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, Group, TRAINING
@@ -54,14 +53,12 @@ class Parallel:
     """Settings of the parallel evaluation of episodes.
 
     Attributes:
-        workers: number of processes.
-        make_pipeline: picklable function that makes the pipeline in each process.
-        threads: number of threads of each process; 0 = the cores shared evenly.
+        workers: workers that score, which write to `out`.
+        make_pipeline: picklable function that makes the pipeline in each worker.
     """
 
-    workers: int
+    workers: Workers
     make_pipeline: MakePipeline
-    threads: int = 0
 
 
 def evaluate(
@@ -98,7 +95,7 @@ def evaluate(
         provenance: command, date and versions, by heading; goes into metrics.json.
         trained_on: episodes that the checkpoint was trained on; how many of them are scored goes
             into the provenance. None = nothing is said.
-        parallel: processes to score with; None = this one.
+        parallel: workers to score with; None = this process.
         describer: names the objects from each episode's first frame; None = see `EvaluationJob`.
         overwrite: replace results of other settings; only asked where there is a name.
         show_progress: draw a progress bar, on a terminal.
@@ -299,12 +296,11 @@ class _Run:
     def _scored(
         self, jobs: Sequence[EvaluationJob]
     ) -> Iterator[tuple[EvaluationJob, dict[str, Any] | str]]:
-        if self.parallel is None or self.parallel.workers == 1:
+        if self.parallel is None or self.parallel.workers.are_here:
             here = partial(make_scorer, lambda: self.pipeline, self.config, self.out)
-            return score_all(jobs, here, 1, 1)
+            return score_all(jobs, here, IN_PROCESS)
         there = partial(make_scorer, self.parallel.make_pipeline, self.config, self.out)
-        workers = self.parallel.workers
-        return score_all(jobs, there, workers, self.parallel.threads or threads_each(workers))
+        return score_all(jobs, there, replace(self.parallel.workers, writes=self.out))
 
     def _file(self, job: EvaluationJob) -> Path:
         return self.out / 'episodes' / f'{job.name}.json'

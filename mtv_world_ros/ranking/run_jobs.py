@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,9 +13,8 @@ from tqdm import tqdm
 
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+from mtv_world_ros.core.executor import IN_PROCESS, score_all, Workers
 from mtv_world_ros.core.files import plain, write_json, write_whole
-from mtv_world_ros.core.processes import threads_each
-from mtv_world_ros.core.worker_pool import Outcome, score_all
 from mtv_world_ros.evaluation.result_settings import check_same_settings
 from mtv_world_ros.ranking.rollout_jobs import Job, Result
 from mtv_world_ros.ranking.rollout_runner import make_runner, RolloutConfig, WantedJob
@@ -45,8 +44,7 @@ def run_jobs(
     checkpoints: Sequence[RankedCheckpoint],
     *,
     config: RolloutConfig,
-    workers: int = 1,
-    ray_address: str | None = None,
+    workers: Workers = IN_PROCESS,
     overwrite: bool = False,
     show_progress: bool = True,
     watch: Callable[[Sequence[Result]], object] = lambda _: None,
@@ -61,16 +59,15 @@ def run_jobs(
         jobs: the jobs; each is simulated once for all checkpoints.
         checkpoints: one or more checkpoints.
         config: denoising steps, limits and physics of the episodes.
-        workers: number of processes; with Ray, the most that run at once.
-        ray_address: address of a Ray cluster; empty = a running or a new one; None = no Ray.
+        workers: where the rollouts run.
         overwrite: replace results of other settings.
         show_progress: draw a progress bar, on a terminal.
         watch: called with the first checkpoint's results: at first with those of an earlier run,
             then with each as it comes.
 
     Raises:
-        ConfigError: less than one worker, Ray is not installed, or the checkpoints' frame rates
-            differ, or a folder holds results of other settings.
+        ConfigError: see `started` of `core/executor.py`; the checkpoints' frame rates differ, or a
+            folder holds results of other settings.
         MtvWorldError: a worker died, or no job has a result.
     """
     stores = [_Store(checkpoint, config, jobs, overwrite) for checkpoint in checkpoints]
@@ -80,7 +77,7 @@ def run_jobs(
     if stores and stores[0].found:
         watch(list(stores[0].found.values()))
     make = partial(make_runner, [c.make_pipeline for c in checkpoints], config)
-    outcomes = _scored(left, make, workers, ray_address)
+    outcomes = score_all(left, make, workers)
     bar = tqdm(outcomes, total=len(left), unit='rollout', disable=None if show_progress else True)
     for done, outcome in bar:
         if isinstance(outcome, str):
@@ -159,16 +156,6 @@ class _Store:
             stored['task_definition'] = job.task_definition
         write_json(path, stored)
         self.found[job] = Result.from_json(values)
-
-
-def _scored(
-    jobs: Sequence[WantedJob], make: Callable[[], Any], workers: int, ray_address: str | None
-) -> Iterator[tuple[WantedJob, Outcome]]:
-    if ray_address is not None:
-        from mtv_world_ros.core.worker_pool import score_with_ray
-
-        return score_with_ray(jobs, make, workers, ray_address)
-    return score_all(jobs, make, workers, threads_each(workers))
 
 
 def _path(out: Path, job: Job) -> Path:

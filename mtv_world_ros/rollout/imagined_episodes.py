@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, cycle, islice
+from functools import partial
+from itertools import chain, count, islice
 import json
 from math import isfinite, nan
 from pathlib import Path
@@ -24,6 +25,7 @@ from mtv_world_ros.core.errors import (
     PolicyError,
     RolloutPreempted,
 )
+from mtv_world_ros.core.executor import run_all, Workers
 from mtv_world_ros.core.files import check_free, check_room, write_whole
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.observations import observation_after
@@ -144,11 +146,29 @@ def recorded_start(path: Path, pipeline: Pipeline, start_s: float = 0.0) -> Epis
     )
 
 
-def recorded_starts(
-    paths: Sequence[Path], pipeline: Pipeline, start_s: float = 0.0
-) -> Iterator[EpisodeStart]:
-    """Return a moment of each recorded episode in turn, without end; see `recorded_start`."""
-    return (recorded_start(path, pipeline, start_s) for path in cycle(paths))
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedSource:
+    """Recorded episodes that imagined ones start from, in turn.
+
+    Attributes:
+        paths: folders of the recorded episodes.
+        start_s: time since the first frame of the first view [s].
+        place: name of the robot cell; None = what the recording states.
+    """
+
+    paths: Sequence[Path]
+    start_s: float = 0.0
+    place: str | None = None
+
+    def start(self, number: int, pipeline: Pipeline) -> EpisodeStart:
+        """Return the start of the imagined episode of a number; see `recorded_start`."""
+        path = self.paths[number % len(self.paths)]
+        start = recorded_start(path, pipeline, self.start_s)
+        return start if self.place is None else start.at_place(self.place)
+
+    def starts(self, pipeline: Pipeline) -> Iterator[EpisodeStart]:
+        """Return the starts one after the other, without end."""
+        return (self.start(number, pipeline) for number in count())
 
 
 def check_start(policy: str, robot: RobotModel, start_s: float, *, is_recorded: bool) -> None:
@@ -191,6 +211,10 @@ def clear_episodes(out: Path, *, overwrite: bool) -> None:
     (out / 'episodes.json').unlink(missing_ok=True)
 
 
+def _bag(out: Path, number: int) -> Path:
+    return out / f'episode_{number:05d}'
+
+
 def imagine_episodes(
     pipeline: Pipeline,
     options: EpisodeOptions,
@@ -230,13 +254,75 @@ def imagine_episodes(
     chosen = islice(chain([first], starts), options.count)
     for number, start in enumerate(tqdm(chosen, total=options.count, unit='ep', disable=None)):
         on_start(start)
-        run = _EpisodeRun(pipeline, options, number, start, out / f'episode_{number:05d}')
+        run = _EpisodeRun(pipeline, options, number, start, _bag(out, number))
         try:
             run.imagine(makers, on_chunk)
         finally:
             results.append({**run.result(), 'start': start.source})
             write_whole(out / 'episodes.json', json.dumps(results, indent=2) + '\n')
     return results
+
+
+def imagine_recorded(
+    make_pipeline: Callable[[], Pipeline],
+    options: EpisodeOptions,
+    source: RecordedSource,
+    out: Path,
+    workers: Workers,
+    *,
+    overwrite: bool = False,
+) -> list[dict[str, Any]]:
+    """Run episodes that start from recorded ones on several workers; see `imagine_episodes`.
+
+    Args:
+        make_pipeline: returns the pipeline; called once in every worker; has to be picklable.
+        options: policy, number of episodes and limits.
+        source: recorded episodes that imagination starts from.
+        out: folder of the results.
+        workers: where the episodes are imagined.
+        overwrite: remove the episodes of an earlier run from it.
+
+    Returns:
+        Contents of `episodes.json`, one entry for each episode.
+
+    Raises:
+        ConfigError, EpisodeError: see `imagine_episodes` and `executor.started`.
+    """
+    clear_episodes(out, overwrite=overwrite)
+    make_run = partial(_RecordedRun, make_pipeline, options, source, out)
+    results = list[dict[str, Any]]()
+    done = run_all(range(options.count), make_run, replace(workers, writes=out))
+    for _, result in tqdm(done, total=options.count, unit='ep', disable=None):
+        results.append(result)
+        results.sort(key=lambda one: one['episode'])
+        write_whole(out / 'episodes.json', json.dumps(results, indent=2) + '\n')
+    for unfinished in out.glob('.episode_*.tmp'):  # of workers that died
+        shutil.rmtree(unfinished, ignore_errors=True)
+    return results
+
+
+class _RecordedRun:
+    """Imagines the episode of a number in a worker."""
+
+    def __init__(
+        self,
+        make_pipeline: Callable[[], Pipeline],
+        options: EpisodeOptions,
+        source: RecordedSource,
+        out: Path,
+    ) -> None:
+        self._pipeline, self._options = make_pipeline(), options
+        self._source, self._out = source, out
+        self._make_policy = assemble_policy(options.policy, self._pipeline.robot)
+
+    def __call__(self, number: int) -> dict[str, Any]:
+        start = self._source.start(number, self._pipeline)
+        bag = _bag(self._out, number)
+        if bag.exists():  # of a worker that died
+            shutil.rmtree(bag)
+        run = _EpisodeRun(self._pipeline, self._options, number, start, bag)
+        run.imagine(self._make_policy, lambda _: None)
+        return {**run.result(), 'start': start.source}
 
 
 class _EpisodeRun:

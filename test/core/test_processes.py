@@ -11,8 +11,9 @@ import time
 import pytest
 
 from mtv_world_ros.core.errors import MtvWorldError, TrainingError
+from mtv_world_ros.core.executor import run_all, Workers
 from mtv_world_ros.core.processes import stop_process, STOPPED_S, StoppedProcesses
-from mtv_world_ros.core.worker_pool import run_all, run_job, WorkerPool
+from mtv_world_ros.core.worker_pool import run_job, WorkerPool
 from mtv_world_ros.training.clips.batches import ClipWorkers
 from test.robustness.worker_jobs import LongJobs, make_held_back, make_stopping
 
@@ -57,7 +58,7 @@ def test_one_that_stands_still_hears_that_it_is_to_end(child):
 def test_a_stopped_worker_is_an_error_within_seconds():
     begin_s, done = time.monotonic(), []
     with pytest.raises(MtvWorldError, match='2 workers died'):
-        for number, result in run_all([1, 2, 3, 4], make_stopping, 2):
+        for number, result in run_all([1, 2, 3, 4], make_stopping, Workers(count=2, threads=1)):
             assert number == result
             done.append(number)
     assert done and 3 not in done
@@ -114,7 +115,7 @@ def test_an_interrupted_command_does_not_wait_for_the_jobs_of_its_workers(tmp_pa
     begin_s = time.monotonic()
     try:
         with pytest.raises(KeyboardInterrupt):
-            list(run_all([1, 2, 3], LongJobs(tmp_path), 2))
+            list(run_all([1, 2, 3], LongJobs(tmp_path), Workers(count=2, threads=1)))
     finally:
         signal.signal(signal.SIGINT, before)
     assert time.monotonic() - begin_s < 45.0  # of a busy machine; a job takes 60

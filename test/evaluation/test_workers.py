@@ -3,6 +3,7 @@ from functools import partial
 import pytest
 
 from mtv_world_ros.core.errors import ConfigError, EpisodeError
+from mtv_world_ros.core.executor import Workers
 from mtv_world_ros.core.files import plain
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate, make_jobs, Parallel
 from mtv_world_ros.evaluation.settings import EvaluationConfig
@@ -20,7 +21,7 @@ def make(make_pipeline):
 @pytest.mark.slow
 def test_two_workers_find_what_one_finds(make, episodes, tmp_path):
     paths = [*episodes, tmp_path / 'nothing']
-    parallel = Parallel(workers=2, make_pipeline=make, threads=1)
+    parallel = Parallel(workers=Workers(count=2, threads=1), make_pipeline=make)
     alone = evaluate(make(), paths, tmp_path / 'one', **QUIET)
     both = evaluate(make(), paths, tmp_path / 'two', parallel=parallel, **QUIET)
     assert list(both.failed) == [str(tmp_path / 'nothing')]
@@ -34,14 +35,14 @@ def test_two_workers_find_what_one_finds(make, episodes, tmp_path):
 
 @pytest.mark.slow
 def test_what_a_worker_lacks_is_the_reason(make, episodes, tmp_path):
-    parallel = Parallel(workers=2, make_pipeline=make, threads=1)
+    parallel = Parallel(workers=Workers(count=2, threads=1), make_pipeline=make)
     config = EvaluationConfig(fid_weights=tmp_path / 'weights.pth')
     with pytest.raises(EpisodeError, match="fid_weights '.*weights.pth' does not exist"):
         evaluate(make(), episodes[:2], tmp_path / 'o', config, parallel=parallel, **QUIET)
 
 
 def test_less_than_one_worker_is_an_error(make, episodes, tmp_path):
-    parallel = Parallel(workers=0, make_pipeline=make)
+    parallel = Parallel(workers=Workers(count=0), make_pipeline=make)
     with pytest.raises(ConfigError, match='workers is 0'):
         evaluate(make(), episodes, tmp_path, parallel=parallel, **QUIET)
 

@@ -100,9 +100,9 @@ def _job(number: int) -> int:
 
 def worker(folder: Path, one: Signal) -> None:
     """Two workers do eight jobs."""
-    from mtv_world_ros.core.worker_pool import run_all
+    from mtv_world_ros.core.executor import run_all, Workers
 
-    assert len(list(run_all(list(range(8)), _make_job, 2))) == 8
+    assert len(list(run_all(list(range(8)), _make_job, Workers(count=2, threads=1)))) == 8
 
 
 # processes that prepare clips for train

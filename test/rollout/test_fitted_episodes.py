@@ -20,7 +20,7 @@ from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.rollout.imagined_episodes import (
     EpisodeOptions,
     imagine_episodes,
-    recorded_starts,
+    RecordedSource,
 )
 from mtv_world_ros.rollout.offline import replay_offline
 
@@ -55,7 +55,7 @@ def test_offline_replay_imagine_and_judge_take_it_as_they_take_the_recorded_one(
     summary = replay_offline(pipeline, fitted, tmp_path / 'off', show_progress=False)
     assert summary.num_trajectories == 1 and not summary.rejected
     options = EpisodeOptions(policy='recorded', max_chunks=1)
-    starts = recorded_starts((fitted,), pipeline)
+    starts = RecordedSource(paths=(fitted,)).starts(pipeline)
     (imagined,) = imagine_episodes(pipeline, options, starts, tmp_path / 'imagined')
     assert imagined['how'] in ('done', 'max_chunks') and imagined['num_chunks'] == 1
     assert (tmp_path / 'imagined' / 'episode_00000' / 'metadata.yaml').is_file()

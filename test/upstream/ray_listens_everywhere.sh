@@ -3,7 +3,7 @@
 #
 # Expected, written down before the run: the cluster is for one machine, but its ports are open on
 # every address; with RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER=0, whose name speaks of other systems, all
-# of them are on the loopback address. It guards mtv_world_ros/core/worker_pool.py, which sets it.
+# of them are on the loopback address. It guards mtv_world_ros/core/ray_actors.py, which sets it.
 set -eu
 place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from mtv_world_ros.cli.bundled_help import robots
-from mtv_world_ros.cli.shared_options import add_options, names, number_or_0
+from mtv_world_ros.cli.shared_options import add_options, names, number_or_0, workers_of
 from mtv_world_ros.core.files import check_free
 
 
@@ -52,14 +52,13 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--threads', type=number_or_0, default=0, help='CPU threads; 0 = all but one'
     )
-    add_options(parser, 'overwrite')
+    add_options(parser, 'overwrite workers')
     parser.set_defaults(handler=_fit, default_out=lambda given: given.checkpoint)
 
 
 def _fit(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
-    from mtv_world_ros.core.processes import threads_each
     from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
     from mtv_world_ros.physics.arms.arms import Arms
@@ -102,7 +101,7 @@ def _fit(arguments: argparse.Namespace) -> int:
         recordings,
         arms,
         first,
-        threads=arguments.threads or threads_each(1),
+        workers=workers_of(arguments),
         report=tqdm.write,
         progress=partial(tqdm, desc='foreseeing', unit='ep', disable=None),
         place=_place_of(paths) if arguments.place is None else arguments.place,

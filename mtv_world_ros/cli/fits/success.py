@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.evaluate import load_pipelines, say_failed
-from mtv_world_ros.cli.shared_options import add_options, open_checkpoints, provenance
+from mtv_world_ros.cli.shared_options import add_options, device_here, open_checkpoints, provenance
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.files import check_free
 from mtv_world_ros.core.writer_lock import only_writer
@@ -51,10 +51,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--split', help="split of dataset.json, or 'all'; default: test where there is one"
     )
     parser.add_argument('--episodes', type=int, help='use only the first N episodes')
-    parser.add_argument(
-        '--workers', type=int, default=1, help='number of processes that imagine episodes'
-    )
-    add_options(parser, 'seeds')
+    add_options(parser, 'workers seeds')
     parser.add_argument(
         '--l2', type=float, default=1.0, help='strength of the prior on the weights'
     )
@@ -71,7 +68,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _calibrate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.data.splits import select
 
-    (checkpoint,) = open_checkpoints(arguments.device, arguments.checkpoint)
+    (checkpoint,) = open_checkpoints(device_here(arguments), arguments.checkpoint)
     _check_places(arguments, checkpoint)
     selection = select(arguments.dataset, arguments.split, arguments.episodes)
     from mtv_world_ros.data.splits import refuse_test_kinds

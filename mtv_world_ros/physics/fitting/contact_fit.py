@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from scipy.stats import multivariate_normal, qmc
 from mtv_world_ros.cameras.mask_geometry import block_size, CENTROID_NOISE_PX, centroids, locate
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import TrainingError
+from mtv_world_ros.core.executor import IN_PROCESS, RunJobs, started, Workers
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.physics.arms.arm_response import PERIOD_S
@@ -391,7 +393,7 @@ def fit_contact(
     recordings: Sequence[ContactRecording],
     arms: Arms,
     first: ContactSettings | None = None,
-    threads: int = 1,
+    workers: Workers = IN_PROCESS,
     report: Callable[[str], None] = lambda line: None,
     progress: Callable[[Sequence[int]], Iterable[int]] = iter,
     place: str = '',
@@ -403,7 +405,7 @@ def fit_contact(
         arms: response of the recorded robot to its commands.
         first: numbers that were found before, where the search begins; None = it begins with
             `first_settings`, and with fingers as `fit_fingers` finds them.
-        threads: CPU threads of the engine.
+        workers: where objects are foreseen.
         report: takes a line about each number and round.
         progress: wraps the numbers of what is foreseen, e.g. in a progress bar.
         place: robot cell of the recordings; empty = not stated.
@@ -435,9 +437,10 @@ def fit_contact(
         }
     )
     first = settings_of_place(first, recordings, report)
-    engine = Engine(arms, threads)
     trials = [_Trial.of(one, first) for one in recordings]
-    factors, likelihoods, weights = _populations(engine, trials, first, report, progress)
+    make_run = partial(_TrialRunner, arms, trials, workers.num_threads)
+    with started(make_run, workers, len(trials)) as run:
+        factors, likelihoods, weights = _populations(run, len(trials), first, report, progress)
     logs = factors + np.log([_scales(first)[name] for name in RANGES])
     known = _conditional(logs, weights).tolist()
     found = [
@@ -518,13 +521,21 @@ def _scales(first: ContactSettings) -> dict[str, float]:
 
 
 def _populations(
-    engine: Engine,
-    trials: Sequence[_Trial],
+    run: RunJobs,
+    num_trials: int,
     first: ContactSettings,
     report: Callable[[str], None],
     progress: Callable[[Sequence[int]], Iterable[int]],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Draw (N, P) as logarithms, their log likelihoods (N, E), and weights (N,)."""
+    """Draw (N, P) as logarithms, their log likelihoods (N, E), and weights (N,).
+
+    Args:
+        run: runs a `_TrialRunner`.
+        num_trials: the E trials.
+        first: settings that the search begins with.
+        report: takes a line about each round.
+        progress: wraps the numbers of what is foreseen.
+    """
     low, high = np.log(np.array(list(RANGES.values())).T)
     uniform = -float(np.log(high - low).sum())
     middle = np.log([1.0 if n in FACTORS else getattr(first, n) for n in RANGES])
@@ -533,16 +544,16 @@ def _populations(
         low,
         high,
     )
-    draws, likelihoods = np.zeros((0, len(RANGES))), np.zeros((0, len(trials)))
+    draws, likelihoods = np.zeros((0, len(RANGES))), np.zeros((0, num_trials))
     proposals: list[tuple[FloatArray, FloatArray] | None] = [None]
-    weights, steps = np.zeros(0), iter(progress(range(_FIT.num_rounds * len(trials))))
+    weights, steps = np.zeros(0), iter(progress(range(_FIT.num_rounds * num_trials)))
     for number in range(_FIT.num_rounds):
         draws = np.concatenate([draws, drawn])
         settings = [_settings(first, one) for one in drawn]
-        rows = np.stack(
-            [trial.likelihoods(engine, settings) for trial, _ in zip(trials, steps, strict=False)],
-            axis=-1,
-        )
+        rows = np.zeros((len(settings), num_trials))
+        jobs = [(trial, settings) for trial in range(num_trials)]
+        for ((trial, _), found), _ in zip(run(jobs), steps, strict=False):
+            rows[:, trial] = found
         likelihoods = np.concatenate([likelihoods, rows])
         densities = [
             np.full(len(draws), uniform)
@@ -707,7 +718,8 @@ class _Trial:
         return cls(
             solids=tuple(solid for solid in found if solid is not None),
             positions=recording.positions,
-            displacements=recording.displacements[:, known],
+            # one memory layout: sums of a pickled copy, in a worker, round alike
+            displacements=np.ascontiguousarray(recording.displacements[:, known]),
             table_m=table,
         )
 
@@ -739,6 +751,23 @@ class _Trial:
             (_FIT.lost_distance_m / _FIT.position_scale_m) ** 2
         ) * len(self.solids)
         return found
+
+
+class _TrialRunner:
+    """Foresees trials in a worker; a job is the number of a trial and settings.
+
+    Args:
+        arms: arms of the robot.
+        trials: the E trials.
+        threads: CPU threads of the engine.
+    """
+
+    def __init__(self, arms: Arms, trials: Sequence[_Trial], threads: int) -> None:
+        self._engine, self._trials = Engine(arms, threads), trials
+
+    def __call__(self, job: tuple[int, Sequence[ContactSettings]]) -> FloatArray:
+        number, settings = job
+        return self._trials[number].likelihoods(self._engine, settings)
 
 
 def find_delay(recordings: Sequence[ContactRecording], arms: Arms) -> FittedNumber:

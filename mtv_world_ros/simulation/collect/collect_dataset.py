@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 import fcntl
 from functools import partial
 from pathlib import Path
@@ -12,8 +13,8 @@ from typing import Any
 from tqdm import tqdm
 
 from mtv_world_ros.core.errors import SimulatorError
+from mtv_world_ros.core.executor import IN_PROCESS, run_all, Workers
 from mtv_world_ros.core.images import encode_png
-from mtv_world_ros.core.worker_pool import run_all
 from mtv_world_ros.simulation.collect.contact_sheet import contact_sheet, SHEET_FILE
 from mtv_world_ros.simulation.collect.dataset_card import (
     card_of,
@@ -57,7 +58,7 @@ def collect(
     out: Path | str,
     *,
     zero_shot: str | Sequence[str] = (),
-    workers: int = 1,
+    workers: Workers = IN_PROCESS,
     config: CollectConfig | None = None,
     failures_of_ten: int = NUM_MISSED,
     sheets: bool = False,
@@ -74,7 +75,7 @@ def collect(
         seed: the data set's random seed.
         out: folder of the data set; one episode folder appears in it at a time.
         zero_shot: kinds of a zero-shot set (`view`, `task`, `object`); none = an ordinary set.
-        workers: number of processes.
+        workers: where the episodes are simulated, each with one thread.
         config: randomisation and sampling.
         failures_of_ten: number of episodes in ten of a task that miss their grasp; none in
             zero-shot sets.
@@ -90,9 +91,9 @@ def collect(
     """
     chosen = tasks_named(tasks if isinstance(tasks, str) else ','.join(tasks))
     kinds = kinds_named(zero_shot)
-    if num_episodes < 1 or workers < 1:
+    if num_episodes < 1 or workers.count < 1:
         raise SimulatorError(
-            f'episodes is {num_episodes} and workers is {workers}; both must be at least 1'
+            f'episodes is {num_episodes} and workers is {workers.count}; both must be at least 1'
         )
     out, config = Path(out), config or CollectConfig()
     if kinds and (config.policies or config.moved_share):
@@ -108,13 +109,22 @@ def collect(
         jobs = jobs_of(chosen, num_episodes, seed, out, num_missed, config.policies)
     with dataset_lock(out):
         data_set = _DataSet(out, ZERO_SHOT_SET if kinds else TASKS_SET, seed, config, jobs)
+        workers = replace(workers, threads=1, writes=out)
         data_set.make(jobs, workers, config, progress=progress)
+        remove_leftovers(out)  # of workers that died
         data_set.describe(sheets=sheets)
     return [data_set.entries[job.path.name] for job in jobs]
 
 
 def _maker(config: CollectConfig) -> Callable[[CollectJob], None]:
-    return EpisodeMaker(config).make
+    maker = EpisodeMaker(config)
+
+    def make(job: CollectJob) -> None:
+        # a worker that died may have finished it; an episode gets its name when it is whole
+        if not job.path.exists():
+            maker.make(job)
+
+    return make
 
 
 @contextmanager
@@ -160,7 +170,12 @@ class _DataSet:
         self._write_card()
 
     def make(
-        self, jobs: Sequence[CollectJob], workers: int, config: CollectConfig, *, progress: bool
+        self,
+        jobs: Sequence[CollectJob],
+        workers: Workers,
+        config: CollectConfig,
+        *,
+        progress: bool,
     ) -> None:
         """Make the missing episodes."""
         missing = [job for job in jobs if job.path.name not in self.entries]
