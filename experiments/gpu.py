@@ -9,6 +9,14 @@ pipeline, and plain, offloaded and with a tiny autoencoder; its training, plain,
 without recomputing blocks; the tests marked `gpu`; `wan-14b` for two steps. `run --tiny` runs the
 same parts on a CPU with a small model, to see that they run. Only the standard library is used
 here.
+
+    python experiments/gpu.py pack gpu.tar.xz --data data/full
+    python3 gpu/experiments/gpu.py run --paper
+
+packs episodes, too, and runs other parts, also in ten minutes: two rows of the paper's tables with
+60,000 clips each, and training of `wan-1.3b` with random weights by all GPUs together and by one.
+`back.tar.xz` in the folder of the results has what is worth keeping: the page, logs, tables,
+checkpoints and scores.
 """
 
 from __future__ import annotations
@@ -17,6 +25,7 @@ import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date
+import json
 import os
 from pathlib import Path
 import re
@@ -46,6 +55,20 @@ _TESTS = (
     'test/vision/segmenters/test_prompted.py',
 )
 _SERVING = 'compile=true'
+#: rows of the paper's tables that are trained, the full method first
+_ROWS = ('mtv_world', 'ee_mlp')
+#: clips that each row is trained with, and clips of a step of one GPU
+_CLIPS, _BATCH = 60_000, 64
+#: files of the results that are brought back; caches and training states are left out
+_BACK = (
+    'page.md',
+    '*.log',
+    'tables/tables.md',
+    'tables/rows/*/seed_*/times.json',
+    'tables/rows/*/seed_*/training/log.jsonl',
+    'tables/rows/*/seed_*/clips_*/checkpoint',
+    'tables/rows/*/seed_*/clips_*/*/metrics.json',
+)
 _COMPARED = (
     _SERVING,
     'compile=true tiny_decoder=random tiny_encoder=true',
@@ -58,6 +81,18 @@ _TINY = (
     'transformer.image_dim=32', 'transformer.added_kv_proj_dim=24', 'video.num_frames=4',
     'video.width=32', 'video.height=32', 'autoencoder.base_dim=4',
 )  # fmt: skip
+
+
+#: the preset of the tables with as few numbers
+_TINY_ROW = (
+    'transformer.num_layers=1',
+    'transformer.num_attention_heads=1',
+    'transformer.ffn_dim=32',
+    'video.num_frames=4',
+    'video.width=32',
+    'video.height=24',
+    'optimizer.batch_size=2',
+)
 
 
 @dataclass(frozen=True)
@@ -90,6 +125,56 @@ def parts(tiny: bool) -> list[Part]:
     ]
 
 
+def paper_parts(tiny: bool, data: Path) -> list[Part]:
+    """Rows of the paper's tables, and training by all GPUs together; 590 s in all."""
+    count = 2 if tiny else max(_num_gpus(), 1)
+    device = ('--device', 'cpu' if tiny else 'cuda', '--repeats', '1' if tiny else '5')
+    launcher = ('-m', 'torch.distributed.run', '--standalone', '--nproc-per-node', str(count))
+    tables = [
+        'experiments/paper_tables.py', '--out', '{out}/tables', '--data', str(data.absolute()),
+        '--zero-shot-episodes', '0', '--no-lite-features', *device[:2], '--clips',
+        '2' if tiny else str(_CLIPS), '--test-episodes', '2' if tiny else '30',
+    ]  # fmt: skip
+    sets = _TINY_ROW if tiny else (f'optimizer.batch_size={_BATCH}',)
+    tables += [x for value in sets for x in ('--set', value)]
+    if count > 1 and not tiny:
+        tables += ['--launcher', f'{sys.executable} {" ".join(launcher)}']
+    if (data / 'dataset.json').is_file():
+        tables += ['--tasks', ','.join(_tasks(data))]
+    one = _training(device, tiny)
+    together = tuple(
+        value.replace('optimizer.batch_size=1', f'optimizer.batch_size={count}') for value in one
+    )
+    rows = [Part(f'Row {row}', 230, (*tables, '--rows', row)) for row in _ROWS]
+    return [
+        *rows,
+        Part('One process', 60, one),
+        Part('All processes', 70, (*launcher, *together)),
+    ]
+
+
+def _num_gpus() -> int:
+    if not shutil.which('nvidia-smi'):
+        return 0
+    listed = subprocess.run(['nvidia-smi', '-L'], capture_output=True, text=True, check=False)
+    return listed.stdout.count('GPU ')
+
+
+def _tasks(data: Path) -> list[str]:
+    """Return the tasks of a data set."""
+    episodes = json.loads((data / 'dataset.json').read_text())['episodes']
+    return sorted({episode['task'] for episode in episodes})
+
+
+def _bring_back(out: Path) -> None:
+    """Pack the results that are worth keeping, without links out of their folder."""
+    names = sorted({str(p.relative_to(out)) for glob in _BACK for p in out.glob(glob)})
+    if names:
+        file = out / 'back.tar.xz'
+        subprocess.run(['tar', 'cJf', str(file), '-C', str(out), *names], check=True)
+        print(f'\nbring back: {file} ({file.stat().st_size / 2**20:.1f} MiB)', flush=True)
+
+
 def _training(device: tuple[str, ...], tiny: bool, *values: str) -> tuple[str, ...]:
     set_ = (*(_TINY if tiny else ()), 'optimizer.batch_size=1', *values)
     options = (x for value in set_ for x in ('--set', value))
@@ -102,15 +187,19 @@ def run(options: argparse.Namespace) -> int:
     environment = {**os.environ, **_environment(options.out)}
     head, sections, failed = f'# Run on a GPU, {date.today()}\n\n{_machine()}', [], 0
     print(head, flush=True)
-    for part in parts(options.tiny):
+    data = options.data or ROOT.parent / 'data'
+    chosen = paper_parts(options.tiny, data) if options.paper else parts(options.tiny)
+    out = str(options.out.absolute())
+    for part in chosen:
         if part.title not in (options.parts or [part.title]):
             continue
+        command = [word.replace('{out}', out) for word in part.command]
         begun = time.monotonic()
         log = options.out / f'{part.title.lower().replace(" ", "_")}.log'
         with log.open('wb') as stream:
             try:
                 status = subprocess.run(
-                    [sys.executable, *part.command],
+                    [sys.executable, *command],
                     cwd=ROOT,
                     env=environment,
                     stdout=stream,
@@ -129,6 +218,7 @@ def run(options: argparse.Namespace) -> int:
         # at once: the machine may be gone before the next part ends
         (options.out / 'page.md').write_text('\n\n'.join([head, *sections]) + '\n')
         print(f'\n{sections[-1]}', flush=True)
+    _bring_back(options.out)
     return failed
 
 
@@ -227,9 +317,12 @@ def pack(options: argparse.Namespace) -> int:
         # commands are found by entry points, which stand in a package's metadata
         subprocess.run([sys.executable, 'setup.py', '--quiet', 'egg_info'], cwd=tree, check=True)
         _install(work / 'site', options.python)
-        subprocess.run(
-            ['tar', 'cJf', str(options.file.absolute()), '-C', name, 'gpu', 'site'], check=True
-        )
+        members = ['-C', name, 'gpu', 'site']
+        if options.data is not None:
+            # under the name that `run` looks for
+            (work / 'data').symlink_to(options.data.absolute())
+            members.append('data')
+        subprocess.run(['tar', 'chJf', str(options.file.absolute()), *members], check=True)
     print(f'{options.file}: {options.file.stat().st_size / 2**20:.0f} MiB')
     return 0
 
@@ -262,11 +355,14 @@ def main() -> int:
     packing = commands.add_parser('pack', help='make a file for a machine without network')
     packing.add_argument('file', type=Path)
     packing.add_argument('--python', default='3.12', help="the other machine's version")
+    packing.add_argument('--data', type=Path, help='episodes of mtv-world collect, to be packed')
     packing.set_defaults(handler=pack)
     running = commands.add_parser('run', help='run, and print the page')
     running.add_argument('--out', type=Path, default=ROOT / 'out' / 'gpu')
     running.add_argument('--tiny', action='store_true', help='on a CPU, with a small model')
-    titles = [part.title for part in parts(tiny=False)]
+    running.add_argument('--paper', action='store_true', help="rows of the paper's tables, DDP")
+    running.add_argument('--data', type=Path, help='episodes of --paper; default: the packed ones')
+    titles = [part.title for part in [*parts(tiny=False), *paper_parts(False, Path('data'))]]
     running.add_argument('--parts', nargs='+', choices=titles, help='default: all')
     running.set_defaults(handler=run)
     options = parser.parse_args()

@@ -47,7 +47,7 @@ from lite_features import NAME as LITE
 import numpy as np
 
 from mtv_world_ros.cli import main as mtv_world
-from mtv_world_ros.cli.shared_options import machine
+from mtv_world_ros.cli.shared_options import add_options, machine
 from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.control.registry import control_class, TRAJECTORY_VIDEO
 from mtv_world_ros.core.bounded_input import read_json
@@ -67,12 +67,13 @@ from mtv_world_ros.model.card import read_card
 from mtv_world_ros.model.runtime import check_device
 from mtv_world_ros.reports.read_back import read_evaluations
 from mtv_world_ros.success.task import load_tasks
-from mtv_world_ros.training.training_config import load_training_config
+from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
 from mtv_world_ros.training.training_run import spread
 
 ROOT = Path(__file__).resolve().parents[1]
 #: views of the simulated episodes: the paper's View 1 and View 2
 VIEWS = ('low', 'high')
+CHECKPOINT_CARD = 'world_model.json'
 SETTINGS, TIMES, TABLES = 'settings.json', 'times.json', 'tables.md'
 #: default stages: training clips a row
 STAGES = (500, 1000, 2000, 4000, 8000)
@@ -289,7 +290,9 @@ class PaperTables:
     def _check_before(self) -> None:
         """Refuse what would fail after hours: weights of another network, missing packages."""
         options = self.options
-        check_device(options.device)
+        if options.ray is None:  # else other machines test
+            check_device(options.device)
+        self._check_adapters()
         for row in self.rows:
             control_class(row.control)
         if options.fid_weights is not None:
@@ -302,6 +305,21 @@ class PaperTables:
             given = ','.join(map(str, self.stages))
             raise ConfigError(f'--clips is {given}; give numbers that rise, from 1 on')
 
+    def _check_adapters(self) -> None:
+        """Refuse adapters without a checkpoint to train on, or to start from."""
+        options = self.options
+        if self.product == 'adapter' and options.init is None:
+            raise ConfigError(
+                f"preset '{options.preset}' trains a LoRA adapter: give --init, the checkpoint "
+                "that 'mtv-world import wan' made"
+            )
+        started = next((row.name for row in self.rows if row.starts_from), '')
+        if started and options.init is not None:
+            raise ConfigError(
+                f"row '{started}' starts from the weights of another row, and all rows from "
+                f"--init '{options.init}'; leave one of them out (--rows)"
+            )
+
     def _settings(self) -> dict[str, Any]:
         """Settings that all rows and stages share; others would mix two experiments."""
         options = self.options
@@ -313,6 +331,9 @@ class PaperTables:
             'zero_shot_episodes': options.zero_shot_episodes,
             'preset': str(options.preset),
             'set': sorted(options.set),
+            # absent by default, so that earlier runs can be continued
+            **({} if options.init is None else {'init': str(options.init.resolve())}),
+            **({} if options.fps is None else {'fps': options.fps}),
             'rates': options.rates,
             'rate_clips': options.rate_clips if options.rates else None,
         }
@@ -334,12 +355,27 @@ class PaperTables:
             self._command(
                 'data', ['collect', '--task', ','.join(options.tasks), '--episodes',
                          str(options.episodes), '--seed', str(options.data_seed), '--out',
-                         str(self.data), '--workers', str(options.workers)],
+                         str(self.data), *self._workers, *self._rate_of_frames],
                 done=_has_episodes(self.data, options.episodes * len(options.tasks)),
             )  # fmt: skip
         check_tasks(self.data, options.tasks)
         if options.real is not None:
             self._split_real()
+
+    @property
+    def _workers(self) -> list[str]:
+        """Options of commands that run many jobs."""
+        options, words = self.options, ['--workers', str(self.options.workers)]
+        if options.ray is not None:
+            words += ['--ray', options.ray] if options.ray else ['--ray']
+        for name in ('gpus', 'cpus'):
+            value = getattr(options, f'{name}_per_worker')
+            words += [] if value is None else [f'--{name}-per-worker', f'{value:g}']
+        return words
+
+    @property
+    def _rate_of_frames(self) -> list[str]:
+        return [] if self.options.fps is None else ['--fps', f'{self.options.fps:g}']
 
     def _make_zero_shot(self) -> None:
         """Make the zero-shot episodes, which the last row of the simulation is tested on."""
@@ -349,7 +385,7 @@ class PaperTables:
                 'zero-shot data', ['collect', '--zero-shot', ZERO_SHOT_KINDS, '--episodes',
                                    str(options.zero_shot_episodes), '--seed',
                                    str(options.data_seed + 1), '--out', str(self.zero_shot),
-                                   '--workers', str(options.workers)],
+                                   *self._workers, *self._rate_of_frames],
                 done=options.zero_shot is not None
                 or _has_episodes(self.zero_shot, options.zero_shot_episodes),
             )  # fmt: skip
@@ -382,19 +418,19 @@ class PaperTables:
         label = f'{row.name}, seed {seed}, {stage} clips'
         folder, training = self.folder(row, seed), self.folder(row, seed) / 'training'
         held = self.stage_folder(row, seed, stage)
-        checkpoint, steps = held / 'checkpoint', self.steps(stage)
+        checkpoint, steps = held / self.product, self.steps(stage)
         check_method(folder, row)
         rate = self._find_rate(row, seed, label)
         if trained_steps(checkpoint) != steps:
-            if (trained_steps(training / 'checkpoint') or 0) > steps:
+            if (trained_steps(training / self.product) or 0) > steps:
                 print(f'{label}: left out, the row was trained further before', flush=True)
                 return
             self._command(
                 f'{label}: training', self._training(row, seed, stage, rate),
-                done=trained_steps(training / 'checkpoint') == steps, times=folder,
+                done=trained_steps(training / self.product) == steps, times=folder,
             )  # fmt: skip
             with whole_folder(checkpoint) as new:
-                shutil.copytree(training / 'checkpoint', new, dirs_exist_ok=True)
+                shutil.copytree(training / self.product, new, dirs_exist_ok=True)
         for name, dataset in self._tests(row, stage):
             out = held / name
             self._command(
@@ -435,22 +471,33 @@ class PaperTables:
         found: list[str] = []
         if row.is_real:
             robot = options.real_robot or options.real / 'robot' / 'robot.yaml'
-            found += [*REAL_SETTINGS, f'video.robot={robot}', f'video.views=[{options.real_view}]']
+            found += [] if options.init else REAL_SETTINGS
+            found += [f'video.robot={robot}', f'video.views=[{options.real_view}]']
             # weights of two views know the first
-            found += [] if row.starts_from else [ONE_VIEW]
+            found += [] if row.starts_from or options.init else [ONE_VIEW]
         elif row.views:
-            found += [f'video.views=[{",".join(row.views)}]', ONE_VIEW]
+            found += [
+                f'video.views=[{",".join(row.views)}]',
+                *([] if options.init else [ONE_VIEW]),
+            ]
         if row.control != TRAJECTORY_VIDEO:
             found.append(f'video.control={row.control}')
         found += METHOD_SETTINGS.get(row.control, ())
         return [*found, f'video.object_mask={str(row.object_mask).lower()}', *options.set]
 
     @property
+    def _config(self) -> TrainingConfig:
+        return load_training_config(self.options.preset, set_overrides(self.options.set))
+
+    @property
+    def product(self) -> str:
+        """Name of the folder that a training writes: an adapter where the preset trains LoRA."""
+        return 'adapter' if self._config.lora.rank else 'checkpoint'
+
+    @property
     def batch_size(self) -> int:
         """Clips of a training step, the same for all rows."""
-        options = self.options
-        config = load_training_config(options.preset, set_overrides(options.set))
-        return config.optimizer.batch_size
+        return self._config.optimizer.batch_size
 
     def steps(self, stage: int) -> int:
         """Return the training steps of a number of clips."""
@@ -466,7 +513,7 @@ class PaperTables:
             folder = self.folder(row, seed) / f'rate_{rate:g}'
             self._command(
                 f'{label}: training', self._training(row, seed, clips, rate, folder),
-                done=trained_steps(folder / 'checkpoint') == self.steps(clips),
+                done=trained_steps(folder / self.product) == self.steps(clips),
                 times=self.folder(row, seed),
             )  # fmt: skip
             losses[rate] = last_loss(folder)
@@ -494,11 +541,31 @@ class PaperTables:
             words += self._real_segmenter()
         if row.starts_from:
             words += ['--init', str(self._start(row, seed))]
+        elif self.options.init is not None:
+            words += ['--init', str(self._base(row))]
+        if self.options.latent_cache is not None:
+            words += ['--latent-cache', str(self.options.latent_cache / row.name)]
         # the learning rate of a step must not depend on how many more there are
         schedule = [f'optimizer.warmup_steps={WARMUP_STEPS}', 'optimizer.decay_share=0.0']
         schedule += [] if rate is None else [f'optimizer.learning_rate={rate:g}']
         sets = [*schedule, *self._overrides(row), f'optimizer.steps={self.steps(stage)}']
         return [*words, *(f'--set={text}' for text in sets)]
+
+    def _base(self, row: Row) -> Path:
+        """Return the checkpoint that a row trains on top of: that of `--init` for its views."""
+        views = (self.options.real_view,) if row.is_real else row.views
+        if not views:
+            return self.options.init
+        folder, card = self.out / 'bases' / '_'.join(views), CHECKPOINT_CARD
+        if not folder.is_dir():
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            with whole_folder(folder) as new:
+                for part in self.options.init.iterdir():
+                    if part.name != card:
+                        (new / part.name).symlink_to(part.resolve())
+                values = read_json(self.options.init / card)
+                write_json(new / card, {**values, 'views': list(views)})
+        return folder
 
     def _start(self, row: Row, seed: int) -> Path:
         """Return the checkpoint that a row starts from.
@@ -507,7 +574,7 @@ class PaperTables:
             ConfigError: the row of the simulated episodes has no such stage so far.
         """
         source = next(one for one in ROWS if one.name == row.starts_from)
-        checkpoint = self.stage_folder(source, seed, self.options.real_init) / 'checkpoint'
+        checkpoint = self.stage_folder(source, seed, self.options.real_init) / self.product
         if trained_steps(checkpoint) is None:
             raise ConfigError(
                 f"row '{row.name}' starts from row '{source.name}' with "
@@ -520,13 +587,16 @@ class PaperTables:
         self, row: Row, seed: int, checkpoint: Path, dataset: Path, out: Path, test: str
     ) -> list[str]:
         options = self.options
+        is_adapter = self.product == 'adapter'
+        tested = self._base(row) if is_adapter else checkpoint
         words = [
-            'evaluate', f'{row.name}={checkpoint}', str(dataset), '--split', EVERY, '--actions',
+            'evaluate', f'{row.name}={tested}', str(dataset), '--split', EVERY, '--actions',
             'true,shuffled', '--no-ceiling', '--no-report', '--seed', str(seed),
             '--mode', MODES[test],
             '--device', options.device, '--threads', str(options.threads),
-            '--workers', str(options.workers), '--out', str(out),
+            *self._workers, '--out', str(out),
         ]  # fmt: skip
+        words += ['--adapter', str(checkpoint)] if is_adapter else []
         for name in ('fid', 'fvd'):
             file = getattr(options, f'{name}_weights')
             words += [] if file is None else [f'--{name}-weights', str(file)]
@@ -561,13 +631,21 @@ class PaperTables:
         print(f'{label}: {shlex.join(["mtv-world", *words])}', flush=True)
         begun, cpu = time.monotonic(), time.process_time()
         try:
-            status = self._run(words)
+            is_launched = self.options.launcher is not None and words[0] == 'train'
+            status = self._launch(words) if is_launched else self._run(words)
         finally:
             if times is not None:
                 spent = time.monotonic() - begun, time.process_time() - cpu
                 add_time(times / TIMES, label.rpartition(': ')[2], *spent)
         if status:
             raise StepFailed(label, words, status)
+
+    def _launch(self, words: list[str]) -> int:
+        """Run a training in the processes of the launcher; return its exit status."""
+        launcher = shlex.split(self.options.launcher)
+        return subprocess.run(
+            [*launcher, '-m', 'mtv_world_ros.cli', *words], check=False
+        ).returncode
 
     def write_tables(self) -> str:
         """Write the tables of what is finished, and return them."""
@@ -680,7 +758,7 @@ class Sections:
         for row in ROWS:
             for seed in self._run.seeds:
                 folder = self._run.folder(row, seed)
-                steps = trained_steps(folder / 'training' / 'checkpoint')
+                steps = trained_steps(folder / 'training' / self._run.product)
                 if steps is None:
                     continue
                 spent = read_json(folder / TIMES) if (folder / TIMES).is_file() else {}
@@ -1250,7 +1328,20 @@ def parser() -> argparse.ArgumentParser:
     add('--set', action='append', default=[], metavar='SECTION.KEY=VALUE', help='of all rows')
     add('--device', default='cpu', help='of trainings and tests, e.g. cuda')
     add('--threads', type=int, default=1, help='CPU threads')
-    add('--workers', type=int, default=1, help='processes that make and score episodes')
+    add(
+        '--init',
+        type=Path,
+        help="checkpoint that all rows train on top of, e.g. of 'mtv-world import wan'; a preset "
+        'with LoRA needs it, and its rows are tested as adapters of it',
+    )
+    add('--latent-cache', type=Path, help='of trainings: latents go to a folder a row in it')
+    add('--fps', type=float, help='frames a second of episodes that are made; 16 for Wan')
+    add(
+        '--launcher',
+        metavar='COMMAND',
+        help="of trainings on several GPUs, e.g. 'torchrun --nproc-per-node 8'",
+    )
+    add_options(made, 'workers')
     add('--fid-weights', type=Path, help='Inception-v3 of 2015-12-05, state dict')
     add('--fvd-weights', type=Path, help='I3D state dict')
     add(

@@ -8,12 +8,16 @@ weights, AdamW, gradient checkpointing as in the preset) on latents at hand, as 
 Medians of wall time after one step to warm up. MFU: operations of the transformer's forward and
 backward in a second, without what gradient checkpointing computes again, as a share of those of
 the fastest product of large matrices, which takes turns with the steps.
+
+Under `torchrun --nproc-per-node N` N processes, a GPU each, train one model (optimizer.batch_size
+counts the clips of all): `clips/s` beside that of one process says what communication costs.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+import os
 from pathlib import Path
 import shlex
 import statistics
@@ -106,6 +110,10 @@ def main() -> None:
     """Measure, and print the page."""
     options = parse_arguments(__doc__, repeats=5, more=add_options)
     torch.set_num_threads(options.threads)
+    # of `torchrun`: each process has a GPU and a share of the clips
+    count, rank = int(os.environ.get('WORLD_SIZE', '1')), int(os.environ.get('RANK', '0'))
+    if options.device == 'cuda':
+        torch.cuda.set_device(int(os.environ.get('LOCAL_RANK', '0')))
     config = load_training_config(options.preset, set_overrides(options.set)).with_steps(10**6)
     bench = Bench(config, options, ServingOptions())
     encoders = Encoders(autoencoder=bench.autoencoder, history=config.history)
@@ -116,7 +124,7 @@ def main() -> None:
         clip.clean.sum().item()  # waits for the device
         filling.append(time.perf_counter() - begun)
     size = config.optimizer.batch_size
-    batch = repeated(clip, bench, size)
+    batch = repeated(clip, bench, size // count)
     with tempfile.TemporaryDirectory() as work:
         trainer = make(bench, config, encoders, Path(work))
         peaks: list[float] = []
@@ -127,6 +135,8 @@ def main() -> None:
             },
             options.repeats,
         )
+    if rank:
+        return
     step, peak = statistics.median(spent['step']), statistics.median(peaks[1:])
     ideal = ideal_seconds(config, bench.dtype, peak)
     memory = '–'
@@ -135,7 +145,7 @@ def main() -> None:
     rows = [
         ['seconds a step', f'{step:.3f}'],
         ['clips/s', f'{size / step:.3f}'],
-        ['MFU', f'{100 * ideal / step:.1f} %'],
+        ['MFU', f'{100 * ideal / count / step:.1f} %'],
         ['measured peak', f'{peak / 1e12:.3f} TFLOP/s'],
         ['operations a step', f'{ideal * peak / 1e12:.3f} TFLOP'],
         ['clips/s into the latent cache', f'{1 / statistics.median(filling[1:]):.3f}'],
@@ -143,7 +153,8 @@ def main() -> None:
     ]
     video = config.video
     body = (
-        f'Preset `{options.preset}`, batch {size}, {len(video.views)} views of '
+        f'Preset `{options.preset}`, batch {size} on {count} process{"es" * (count > 1)}, '
+        f'{len(video.views)} views of '
         f'{1 + video.num_frames} frames of {video.width}x{video.height}, {bench.dtype}, '
         f'device {options.device}, {options.threads} threads, n = {options.repeats}, '
         'random weights.\n\n' + table(['what', 'median'], rows)

@@ -211,6 +211,12 @@ def clear_episodes(out: Path, *, overwrite: bool) -> None:
     (out / 'episodes.json').unlink(missing_ok=True)
 
 
+def _makers(options: EpisodeOptions, robot: RobotModel) -> list[PolicyMaker]:
+    """Return what makes the policies of an episode, one for each candidate plan."""
+    check_candidates(options.policy, robot, options.num_candidates)
+    return [assemble_policy(options.policy, robot) for _ in range(options.num_candidates)]
+
+
 def _bag(out: Path, number: int) -> Path:
     return out / f'episode_{number:05d}'
 
@@ -244,10 +250,7 @@ def imagine_episodes(
         EpisodeError: a recorded episode cannot be used, or the disk is full.
         ObservationError: the cameras or the robot gave no observation.
     """
-    check_candidates(options.policy, pipeline.robot, options.num_candidates)
-    makers = [
-        assemble_policy(options.policy, pipeline.robot) for _ in range(options.num_candidates)
-    ]
+    makers = _makers(options, pipeline.robot)
     results = list[dict[str, Any]]()
     first = next(starts)
     clear_episodes(out, overwrite=overwrite)
@@ -313,7 +316,7 @@ class _RecordedRun:
     ) -> None:
         self._pipeline, self._options = make_pipeline(), options
         self._source, self._out = source, out
-        self._make_policy = assemble_policy(options.policy, self._pipeline.robot)
+        self._makers = _makers(options, self._pipeline.robot)
 
     def __call__(self, number: int) -> dict[str, Any]:
         start = self._source.start(number, self._pipeline)
@@ -321,7 +324,7 @@ class _RecordedRun:
         if bag.exists():  # of a worker that died
             shutil.rmtree(bag)
         run = _EpisodeRun(self._pipeline, self._options, number, start, bag)
-        run.imagine(self._make_policy, lambda _: None)
+        run.imagine(self._makers, lambda _: None)
         return {**run.result(), 'start': start.source}
 
 

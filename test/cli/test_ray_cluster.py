@@ -41,10 +41,10 @@ COMMANDS = {
         4,
     ),
     'imagine': (
-        ['imagine', '--policy', 'recorded', '--episodes', 'DATA', '--max-chunks', '1',
-         '--no-video', *MODEL],
+        ['imagine', '--policy', 'recorded', '--episodes', 'DATA', '--count', '12',
+         '--max-chunks', '1', '--no-video', *MODEL],
         'episode_*/metadata.yaml',
-        4,
+        12,
     ),
     'rank': (
         ['rank', '--policies', 'expert,expert-miss-1', '--tasks', TASK, '--episodes', '2',
@@ -112,7 +112,7 @@ def bag_bytes(bag: Path) -> list[bytes]:
         ]
 
 
-def run_and_kill(cluster: Any, words: list[str], out: Path, pattern: str) -> str:
+def run_and_kill(cluster: Any, words: list[str], out: Path, pattern: str, count: int) -> str:
     """Run a command on two nodes, kill one after the first result; return what it prints."""
     node = cluster.add_node(num_cpus=1, num_gpus=1)
     process = subprocess.Popen(
@@ -126,8 +126,8 @@ def run_and_kill(cluster: Any, words: list[str], out: Path, pattern: str) -> str
             assert process.poll() is None, process.communicate()
             assert time.monotonic() < end_s, 'there is no result'
             time.sleep(0.05)
-        # four jobs and two workers: each node is at one of them
-        assert len(list(out.glob(pattern))) < 3
+        # two workers: each node is at a job
+        assert len(list(out.glob(pattern))) < count - 1
         cluster.remove_node(node, allow_graceful=False)
         said, _ = process.communicate(timeout=TIMEOUT_S)
     finally:
@@ -145,7 +145,7 @@ def test_results_are_complete_and_the_same_when_a_node_is_killed_in_the_middle(
     command, pattern, count = COMMANDS[name]
     words = [str(data) if word == 'DATA' else word for word in command]
     alone, shared = tmp_path / 'alone', tmp_path / 'shared'
-    said = run_and_kill(cluster, words, shared, pattern)
+    said = run_and_kill(cluster, words, shared, pattern, count)
     assert said.count('a Ray worker died; 1 go on') == 1, said
     assert main([*words, '--out', str(alone)]) == 0
     assert len(list(shared.glob(pattern))) == count

@@ -31,10 +31,10 @@ def make_scorer():
 @pytest.fixture
 def ray_environment():
     """Ray is installed; what it sets in this process is given back."""
-    environment, handler = dict(os.environ), signal.getsignal(signal.SIGTERM)
     ray = pytest.importorskip(
         'ray', reason="Ray is not installed: pip install 'mtv_world_ros[rank]'"
     )
+    environment, handler = dict(os.environ), signal.getsignal(signal.SIGTERM)
     yield ray
     os.environ.clear()
     os.environ.update(environment)

@@ -22,7 +22,9 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.evaluation.metrics.statistics import Estimate
 from mtv_world_ros.training.trainer import learning_rate
 from mtv_world_ros.training.training_config import load_training_config
+from test.support.launched import ENVIRONMENT
 from test.support.sources import set_options, TINY_MODEL
+from test.support.wan_base import make_base, tiny_preset
 
 ROOT = Path(__file__).resolve().parents[2]
 TASK = 'stack_blocks_two'
@@ -147,6 +149,60 @@ def test_distances_asked_for_later_are_measured_alone(
     (words,) = asked.commands
     assert words[0] == 'evaluate' and words[words.index('--fid-weights') + 1] == 'fid.pth'
     assert '--overwrite' in words
+
+
+@pytest.mark.slow
+def test_rows_of_wan_are_adapters_that_two_processes_train(
+    tables: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for name, value in ENVIRONMENT.items():
+        monkeypatch.setenv(name, value)
+    preset = tiny_preset(tmp_path)
+    base = make_base(tmp_path / 'wan', load_training_config(preset))
+    out, latents = tmp_path / 'out', tmp_path / 'latents'
+    launcher = f'{sys.executable} -m torch.distributed.run --standalone --nproc-per-node 2'
+    words = [
+        '--out', str(out), '--data', str(data), '--tasks', TASK, '--clips', '4', '--rows', ROWS,
+        '--test-episodes', '1', '--zero-shot-episodes', '0', '--no-lite-features',
+        '--preset', str(preset), '--init', str(base), '--latent-cache', str(latents),
+        '--launcher', launcher,
+    ]  # fmt: skip
+    tested = Recorder()
+    assert tables.main(words, tested) == 0
+    for row in ROWS.split(','):
+        adapter = out / 'rows' / row / 'seed_0' / 'clips_000004' / 'adapter'
+        assert (adapter / 'pytorch_lora_weights.safetensors').is_file()
+        trained = json.loads((adapter / 'world_model.json').read_text())['trained_on']
+        assert trained['steps'] == 2  # of two clips
+        assert any((latents / row).iterdir())
+    # trainings are of the launcher, tests of this process, with the adapter
+    assert {command[0] for command in tested.commands} == {'evaluate'}
+    assert all('--adapter' in command for command in tested.commands)
+    text = (out / 'tables.md').read_text()
+    assert '## Table 1: methods by view, 4 clips a row' in text
+    assert [line for line in text.splitlines() if line.startswith('| MTV-World') and '0.' in line]
+
+
+def test_an_adapter_without_its_base_is_refused(
+    tables: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    words = ['--out', str(tmp_path / 'out'), '--data', str(data), '--preset', 'wan-1.3b']
+    assert tables.main(words) == 1
+    assert "preset 'wan-1.3b' trains a LoRA adapter: give --init" in capsys.readouterr().err
+
+
+def test_workers_and_frames_a_second_go_to_the_commands_that_take_them(
+    tables: ModuleType, tmp_path: Path
+):
+    asked = Recorder(lambda words: 1)
+    words = ['--out', str(tmp_path / 'out'), '--fps', '16', '--workers', '4', '--ray', 'head:1',
+             '--gpus-per-worker', '0.5', '--no-lite-features']  # fmt: skip
+    assert tables.main(words, asked) == 1
+    (collect,) = asked.commands
+    given = ' '.join(collect)
+    assert collect[0] == 'collect' and given.endswith(
+        '--workers 4 --ray head:1 --gpus-per-worker 0.5 --fps 16'
+    )
 
 
 def test_a_command_that_is_stopped_says_how_to_go_on(
