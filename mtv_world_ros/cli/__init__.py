@@ -46,6 +46,7 @@ from mtv_world_ros.core.processes import (  # noqa: E402
     is_helper_rank,
     stopped_by_sigterm,
 )
+from mtv_world_ros.core.shown_text import MOST_OF_ERROR, shown  # noqa: E402
 from mtv_world_ros.core.writer_lock import only_writer  # noqa: E402
 
 if _interrupt is signal.default_int_handler:
@@ -67,6 +68,8 @@ _GROUPS = {
     'export': 'write episodes and results in other formats',
 }
 _OWN = 'mtv_world_ros.'
+#: control characters that messages may hold
+_LINES = '\n\t'
 _DESCRIPTION = 'An online embodied world model for ROS 2.'
 #: second line of `mtv-world --help`
 _BEGIN = 'Begin with `mtv-world demo`. `mtv-world COMMAND --help` has the options of a command.'
@@ -360,5 +363,5 @@ def _advice(error: Exception) -> str:
 
 def _said(text: str, status: int) -> int:
     """Print the line on stderr and return the status."""
-    print(f'mtv-world: {text}', file=sys.stderr)
+    print(f'mtv-world: {shown(text, MOST_OF_ERROR, _LINES)}', file=sys.stderr)
     return status

@@ -14,6 +14,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from mtv_world_ros.core.data_types import ByteArray
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.core.shown_text import markdown_cell
 
 #: instead of a number that was not measured
 DASH = '–'
@@ -74,7 +75,7 @@ class Table:
 
     def markdown(self, *, aligned: bool = True) -> str:
         """Return the table without its caption, its columns `aligned` for reading as text."""
-        lines = [[str(cell) for cell in row] for row in (self.head, *self.rows)]
+        lines = [[markdown_cell(str(cell)) for cell in row] for row in (self.head, *self.rows)]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         if not aligned:
             widths = [0] * len(widths)

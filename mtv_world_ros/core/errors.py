@@ -6,9 +6,19 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from enum import StrEnum
 
+from mtv_world_ros.core.shown_text import MOST_OF_ERROR, shown
+
 
 class MtvWorldError(Exception):
-    """Base of every error a user can cause; its text is meant to be read by that user."""
+    """Base of every error a user can cause; its text is meant to be read by that user.
+
+    Parts of it come from files, messages and servers: control characters except line ends are
+    shown as escapes, and what is longer than `MOST_OF_ERROR` is cut.
+    """
+
+    def __str__(self) -> str:
+        """Return the text as it may be shown."""
+        return shown(super().__str__(), MOST_OF_ERROR, '\n\t')
 
 
 class ConfigError(MtvWorldError):
@@ -123,8 +133,8 @@ class CannotTell(Exception):
 
 
 def masked(text: str, key: str) -> str:
-    """Return the text with an API key masked, which servers may quote and no log may hold."""
-    return text.replace(key, '***') if key else text
+    """Return a server's text as it may be shown, with an API key masked, which it may quote."""
+    return shown(text.replace(key, '***') if key else text)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

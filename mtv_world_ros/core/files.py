@@ -75,7 +75,7 @@ def bundled(kind: str, name: str | Path, setting: str) -> Path:
     path = Path(name)
     if path.suffix in ('.yaml', '.yml'):
         return path
-    if kind == 'robots' and (path / ROBOT_YAML).is_file():
+    if kind == 'robots' and is_file(path / ROBOT_YAML):
         return path / ROBOT_YAML
     files = _bundled_files(kind)
     if str(name) not in files:
@@ -84,6 +84,14 @@ def bundled(kind: str, name: str | Path, setting: str) -> Path:
             f'to a YAML file or to one of {", ".join(files)}'
         )
     return files[str(name)]
+
+
+def is_file(path: Path) -> bool:
+    """Return whether a path is a file; False for names that no file system takes."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # too long, or a NUL
+        return False
 
 
 def bundled_names(kind: str, holding: str = '') -> list[str]:
@@ -125,19 +133,20 @@ def content_digest(folder: Path, without: Collection[str] = ()) -> str:
     return digest.hexdigest()
 
 
-def check_free(path: Path, overwrite: bool, instead: str = '--out') -> None:
+def check_free(path: Path, overwrite: bool | None, instead: str = '--out') -> None:
     """Refuse to replace an existing file or folder unless the user asked for it.
 
     Args:
         path: file or folder that would be written; an empty folder counts as free.
-        overwrite: the user asked for it.
+        overwrite: the user asked for it; None = the command cannot replace it.
         instead: option that names another place.
 
     Raises:
         ConfigError: the path exists.
     """
     if not (overwrite or is_free(path)):
-        raise ConfigError(f"'{path}' exists; give another {instead}, or --overwrite to replace it")
+        how = 'remove it' if overwrite is None else '--overwrite to replace it'
+        raise ConfigError(f"'{path}' exists; give another {instead}, or {how}")
     check_output(path, instead)
 
 

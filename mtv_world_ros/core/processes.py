@@ -16,6 +16,8 @@ import threading
 import time
 from types import FrameType
 
+from mtv_world_ros.core.shown_text import shown
+
 #: longest clean-up of a command that a signal stops [s]
 _TIDY_S = 5.0
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -187,7 +189,7 @@ def last_line(log: Path, otherwise: str) -> str:
     """Return the last line of a log; `otherwise` where it is empty."""
     tail = log.read_bytes()[-_TAIL_BYTES:].decode(errors='replace')
     lines = [line.strip() for line in tail.splitlines() if line.strip()]
-    return lines[-1] if lines else otherwise
+    return shown(lines[-1]) if lines else otherwise
 
 
 def how_it_ended(name: str, process: subprocess.Popen[bytes], logs: Path) -> str:

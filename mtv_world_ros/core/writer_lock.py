@@ -8,6 +8,7 @@ import errno
 import fcntl
 import os
 from pathlib import Path
+import re
 import shlex
 import socket
 import sys
@@ -21,6 +22,10 @@ LOCK_NAME = '.mtv-lock'
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL, errno.EROFS)
 #: a link in place of a lock is not followed
 _FLAGS = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+#: time that workers of a process that was killed get to let go of its lock [s]
+_PATIENCE_S = 5.0
+#: a lock of such a process is looked at this often [s]
+_POLL_S = 0.05
 #: longest text about the holder that is read back [bytes]
 _MOST_BYTES = 1_000
 #: characters of the holder's command line that are written
@@ -77,7 +82,7 @@ def _acquire(lock: Path, path: Path, option: str) -> None:
         descriptor, count = _held[lock]
         _held[lock] = descriptor, count + 1
         return
-    descriptor = -1
+    descriptor, end_s = -1, time.monotonic() + _PATIENCE_S
     while descriptor < 0:
         try:
             descriptor = os.open(lock, _FLAGS, 0o666)
@@ -88,6 +93,10 @@ def _acquire(lock: Path, path: Path, option: str) -> None:
         except BlockingIOError:
             holder = os.pread(descriptor, _MOST_BYTES, 0).decode(errors='replace').strip()
             os.close(descriptor)
+            descriptor = -1
+            if _has_ended(holder) and time.monotonic() < end_s:
+                time.sleep(_POLL_S)  # a worker that it forked has yet to let go
+                continue
             raise ConfigError(
                 f"'{path}' is being written by {holder or 'another process'}; wait until it has "
                 f'ended, or give another {option}'
@@ -103,6 +112,14 @@ def _acquire(lock: Path, path: Path, option: str) -> None:
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, _this_process().encode(errors='replace'), 0)
     _held[lock] = descriptor, 1
+
+
+def _has_ended(holder: str) -> bool:
+    """Return whether a holder was a process of this machine that is there no more."""
+    found = re.match(r"process (\d+) on host '(.*?)' since", holder)
+    if found is None or found[2] != socket.gethostname():
+        return False
+    return Path('/proc/self').exists() and not Path(f'/proc/{found[1]}').exists()
 
 
 def _is_file_of(lock: Path, descriptor: int) -> bool:

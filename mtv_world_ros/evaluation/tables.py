@@ -8,6 +8,7 @@ import io
 
 from mtv_world_ros.core.documents import DASH, Table, with_interval
 from mtv_world_ros.core.files import write_json, write_whole
+from mtv_world_ros.core.shown_text import markdown_cell
 from mtv_world_ros.evaluation.evaluation_summary import (
     ALL,
     EvaluationSummary,
@@ -99,7 +100,8 @@ def rows_csv(summary: EvaluationSummary) -> str:
 def markdown(summary: EvaluationSummary) -> str:
     """Return the tables: view by number, task and view by number, statuses, failures."""
     counts = ', '.join(
-        f'{len(summary.chosen(Group(task=t)))} of {t or "no task"}' for t in summary.tasks
+        f'{len(summary.chosen(Group(task=t)))} of {markdown_cell(t or "no task")}'
+        for t in summary.tasks
     )
     training = summary.provenance.get(TRAINING, '')
     of_objects = [
@@ -114,15 +116,23 @@ def markdown(summary: EvaluationSummary) -> str:
     ]
     parts = [
         summary.following.line,
-        f'# {summary.name or "Evaluation"}\n\n{len(summary.results)} episodes: {counts}.'
+        f'# {markdown_cell(summary.name) or "Evaluation"}\n\n'
+        f'{len(summary.results)} episodes: {counts}.'
         + (f' The checkpoint: {training}.' if training else ''),
         *(of_objects if summary.has_objects else [_NO_OBJECTS, BRACKETS]),
         quality_table(summary),
         pictures_table(summary),
         compared_line(summary),
         status_table(summary) if summary.has_objects else None,
-        '\n'.join(f'- not scored: {path}: {why}' for path, why in summary.failed.items()),
-        '\n'.join(f'- {r.episode}: {note}' for r in summary.results for note in r.notes),
+        '\n'.join(
+            f'- not scored: {markdown_cell(str(path))}: {markdown_cell(str(why))}'
+            for path, why in summary.failed.items()
+        ),
+        '\n'.join(
+            f'- {markdown_cell(r.episode)}: {markdown_cell(note)}'
+            for r in summary.results
+            for note in r.notes
+        ),
     ]
     texts = [part.text() if isinstance(part, Table) else part for part in parts]
     return '\n\n'.join(text for text in texts if text) + '\n'

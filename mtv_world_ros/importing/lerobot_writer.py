@@ -103,7 +103,7 @@ def export_dataset(
         EpisodeError: there is no episode, one lacks joint states or commands, or its views are
             not those of the others.
     """
-    check_free(out, overwrite=False)
+    check_free(out, overwrite=None)
     pyarrow_modules()
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f'.{out.name}.') as folder:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mtv_world_ros.core.data_types import ByteArray, CameraModel
 from mtv_world_ros.core.errors import MtvWorldError
+from mtv_world_ros.core.shown_text import markdown_cell
 from mtv_world_ros.core.transforms import inverse
 from mtv_world_ros.data.episode import Episode, MASKS_BY
 from mtv_world_ros.inspection.inspect import Inspector
@@ -309,7 +310,7 @@ def folder_markdown(found: FolderInspection, picture: str) -> str:
     head, *rows = table(found)
     lines = [f'# {found.verdict}', '', *(f'- {line}' for line in _conclusions(found))]
     lines += ['', f'| {" | ".join(head)} |', f'|{"---|" * len(head)}']
-    lines += [f'| {" | ".join(cell.replace("|", "/") for cell in row)} |' for row in rows]
+    lines += [f'| {" | ".join(map(markdown_cell, row))} |' for row in rows]
     return '\n'.join([*lines, '', f'![all episodes]({picture})', ''])
 
 

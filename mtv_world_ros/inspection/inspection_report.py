@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mtv_world_ros.core.shown_text import markdown_cell
+
 #: file of a folder's report: what is broken, by episode and view
 BROKEN = 'broken.json'
 #: from best to worst
@@ -150,14 +152,16 @@ def to_markdown(inspection: Inspection, pictures: Mapping[str, str]) -> str:
         f'|---|---|{"---|" * len(NUMBERS)}---|',
     ]
     lines += [
-        f'| {s.name} | {s.verdict} | {" | ".join(s.cells())} | {_reasons(s)} |'
+        f'| {markdown_cell(s.name)} | {s.verdict} | {" | ".join(s.cells())} | {_reasons(s)} |'
         for s in inspection.sections
     ]
     for section in inspection.sections:
         lines += ['', f'## {section.name}', '']
         if section.name in pictures:
             lines += [f'![{section.name}]({pictures[section.name]})', '']
-        lines += [f'- {finding.verdict}: {finding.text}' for finding in section.findings]
+        lines += [
+            f'- {finding.verdict}: {markdown_cell(finding.text)}' for finding in section.findings
+        ]
         lines += [f'- note: {note}' for note in section.notes]
         lines += ['', '| measured | |', '|---|---|']
         lines += [f'| {name} | {value} |' for name, value in section.measures.items()]
@@ -210,4 +214,4 @@ def aligned_rows(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _reasons(section: Section) -> str:
-    return '; '.join(finding.text for finding in section.findings).replace('|', '/') or '–'
+    return markdown_cell('; '.join(finding.text for finding in section.findings)) or '–'

@@ -18,6 +18,7 @@ from mtv_world_ros.core.bounded_input import limits
 from mtv_world_ros.core.config import Count, Schema, Seconds
 from mtv_world_ros.core.data_types import FloatArray, JointTrajectory, Observation
 from mtv_world_ros.core.errors import ConfigError, PolicyError, PolicyServerError
+from mtv_world_ros.core.shown_text import shown
 from mtv_world_ros.policies.policy import EpisodeOrigin, PolicySettings
 from mtv_world_ros.policies.server_mapping import ServerMapping
 from mtv_world_ros.policies.timed_actions import read_timed_actions
@@ -199,7 +200,8 @@ class LeRobotPolicy:
             self.close()
             code, details = error.code().name, error.details()  # type: ignore[attr-defined]
             raise PolicyServerError(
-                f"the policy server '{self._config.server}' did not do it: {code}: {details}"
+                f"the policy server '{self._config.server}' did not do it: {code}: "
+                f'{shown(details)}'
             ) from error
 
 

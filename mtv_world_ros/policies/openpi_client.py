@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+import logging
 import os
 import socket
 import struct
@@ -21,9 +22,17 @@ from mtv_world_ros.core.bounded_input import limits
 from mtv_world_ros.core.config import Seconds
 from mtv_world_ros.core.data_types import JointTrajectory, Observation
 from mtv_world_ros.core.errors import ConfigError, masked, PolicyError, PolicyServerError
+from mtv_world_ros.core.shown_text import shown
 from mtv_world_ros.policies.policy import EpisodeOrigin, PolicySettings
 from mtv_world_ros.policies.server_mapping import find, Key, ServerMapping
 from mtv_world_ros.robot.model import RobotModel
+
+#: close code of a message that is larger than `max_size` [RFC 6455]
+_MESSAGE_TOO_BIG = 1009
+#: websockets logs tracebacks of what it raises as well
+_SILENT = logging.getLogger(f'{__name__}.websockets')
+_SILENT.addHandler(logging.NullHandler())
+_SILENT.propagate = False
 
 
 def _address(server: str) -> str:
@@ -162,6 +171,7 @@ class OpenPiPolicy:
                 close_timeout=min(config.timeout_s, _GOODBYE_S),
                 # a busy server does not answer pings
                 ping_interval=None,
+                logger=_SILENT,
                 additional_headers={'Authorization': f'Api-Key {key}'} if key else None,
             )
             self._connection = self._opened.enter_context(connecting)
@@ -200,7 +210,20 @@ class OpenPiPolicy:
                     f"the policy server '{server}' did not answer within {timeout_s:g} s "
                     "('timeout_s')"
                 ) from error
-            raise PolicyServerError(f"the policy server '{server}' is gone: {error}") from error
+            raise PolicyServerError(
+                f"the policy server '{server}' is gone: {masked(str(error), self._key)}"
+                f'{_too_large(error)}'
+            ) from error
+
+
+def _too_large(error: Exception) -> str:
+    sent = getattr(error, 'sent', None)
+    if getattr(sent, 'code', None) != _MESSAGE_TOO_BIG:
+        return ''
+    return (
+        f'; its answer has more than {limits().answer_bytes} bytes (the environment variable '
+        'MTV_WORLD_MAX_ANSWER_BYTES allows more)'
+    )
 
 
 def limit_sending(connected: socket.socket, seconds: float) -> None:
@@ -239,7 +262,9 @@ def unpack(data: bytes) -> Any:
         RecursionError, msgpack.UnpackException,
     ) as error:  # fmt: skip
         reason = str(error) or 'values lie too deep in each other'  # msgpack's StackError has none
-        raise PolicyError(f'the answer is not msgpack as openpi writes it: {reason}') from error
+        raise PolicyError(
+            f'the answer is not msgpack as openpi writes it: {shown(reason)}'
+        ) from error
 
 
 def _encode(value: Any) -> Any:

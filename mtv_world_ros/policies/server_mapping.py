@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from itertools import islice
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import cv2
@@ -19,9 +20,12 @@ from mtv_world_ros.core.data_types import (
     Observation,
 )
 from mtv_world_ros.core.errors import ConfigError, nearest, PolicyError
+from mtv_world_ros.core.shown_text import shown
 from mtv_world_ros.robot.joint_columns import JointColumn, JointTable, to_columns, to_positions
 from mtv_world_ros.robot.model import RobotModel
 
+#: names in an answer that an error lists
+_MOST_NAMES = 100
 #: offset of a velocity below which 0 means rest; rounding of a range such as [-1, 1] [rad/s, m/s]
 _ZERO = 1e-9
 
@@ -187,7 +191,7 @@ class ActionOutput(JointTable):
         try:
             values = np.atleast_2d(np.asarray(actions, np.float64))
         except (TypeError, ValueError) as error:
-            raise PolicyError(f'the actions are no table of numbers: {error}') from error
+            raise PolicyError(f'the actions are no table of numbers: {shown(error)}') from error
         if values.ndim == 3 and len(values) == 1:  # a batch of one answer
             values = values[0]
         if values.ndim != 2 or not values.size:
@@ -265,7 +269,10 @@ def find(answer: Any, key: Key) -> Any:
     found = answer
     for part in key:
         if not isinstance(found, Mapping) or part not in found:
-            has = sorted(map(str, found)) if isinstance(found, Mapping) else type(found).__name__
-            raise PolicyError(f"the answer has nothing under '{'/'.join(key)}'; it has {has}")
+            names = islice(map(str, found), _MOST_NAMES) if isinstance(found, Mapping) else ()
+            has = sorted(names) if isinstance(found, Mapping) else type(found).__name__
+            raise PolicyError(
+                f"the answer has nothing under '{'/'.join(key)}'; it has {shown(has)}"
+            )
         found = found[part]
     return found

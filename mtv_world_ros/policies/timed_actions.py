@@ -19,6 +19,7 @@ import numpy as np
 from mtv_world_ros.core.bounded_input import check_limit, limits
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import PolicyError
+from mtv_world_ros.core.shown_text import shown
 
 #: maximum number of instructions of a pickle; a chunk of 50 actions has about 3,000
 _MOST_STEPS = 200_000
@@ -47,7 +48,7 @@ def read_timed_actions(data: bytes) -> FloatArray:
         ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError,
         struct.error,
     ) as error:  # fmt: skip
-        raise PolicyError(f'the answer is no list of timed actions: {error}') from error
+        raise PolicyError(f'the answer is no list of timed actions: {shown(error)}') from error
 
 
 def _stacked(actions: Any) -> FloatArray:

@@ -21,7 +21,7 @@ from mtv_world_ros.core.bounded_input import check_limit, LimitError, read_text
 from mtv_world_ros.core.config import ListOf, Metres, Quaternion, read_yaml, Schema, validated
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import ConfigError, RobotError
-from mtv_world_ros.core.files import bundled, ROBOT_YAML, whole_folder
+from mtv_world_ros.core.files import bundled, is_file, ROBOT_YAML, whole_folder
 from mtv_world_ros.core.transforms import denavit_hartenberg, pose
 from mtv_world_ros.robot.mesh_pieces import (
     convex_pieces,
@@ -47,8 +47,8 @@ def robot_path(name: str | Path) -> Path:
         ConfigError: no such file, and no bundled robot of this name.
     """
     path = bundled('robots', name, 'robot_file')
-    if not path.is_file():
-        problem = 'is no regular file' if path.exists() else 'does not exist'
+    if not is_file(path):
+        problem = 'is no regular file' if os.path.exists(path) else 'does not exist'
         raise ConfigError(f"robot file '{path}' {problem}; set 'robot_file' to one")
     return path
 

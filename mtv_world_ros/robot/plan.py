@@ -103,6 +103,12 @@ class Plan:
             check_positions(robot, checked, tolerance=limits.tolerance)
         except TrajectoryError as error:
             raise PlanError(PlanFault.LIMITS, str(error)) from error
+        if trajectory.times[0] < 0:
+            raise PlanError(
+                PlanFault.TIMES,
+                f'point 0 is {-trajectory.times[0]:g} s before the stamp of the trajectory; '
+                'time_from_start counts from there and must not be negative',
+            )
         given_ns = observation.stamp_ns if stamp_ns is None else stamp_ns
         whole = _from_observation(whole, (given_ns - observation.stamp_ns) / 1e9, limits)
         check_speeds(robot, whole, start, tolerance=limits.tolerance)

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+import errno
 import os
 from pathlib import Path
 import random
@@ -38,6 +39,8 @@ _BUFFER_LIMIT = Path('/proc/sys/net/core/rmem_max')
 #: ports above Linux' ephemeral ones; Fast DDS itself takes them for domains above 214 only
 _PORTS = range(61_000, 65_536)
 _NUM_TRIES = 200
+#: errors of a machine without IPv4
+_NO_IPV4 = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT)
 #: built-in transports of Fast DDS that can receive over UDPv4
 _UDP_TRANSPORTS = ('DEFAULT', 'UDPV4', 'LARGE_DATA')
 _SPACE = 'http://www.eprosima.com'
@@ -265,8 +268,14 @@ def _free_port() -> tuple[int, socket.socket]:
         lock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
             lock.bind(('127.0.0.1', port))
-        except OSError:
+        except OSError as error:
             lock.close()
+            if error.errno in _NO_IPV4:
+                raise ConfigError(
+                    'this machine has no IPv4 loopback address (127.0.0.1), over which nodes '
+                    f'receive plans: {error.strerror}; bring it up (ip link set lo up; ip address '
+                    'add 127.0.0.1/8 dev lo)'
+                ) from error
             continue
         if _is_free(port):
             return port, lock

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
+import errno
 from importlib.util import find_spec
 import ipaddress
 import os
@@ -112,6 +113,11 @@ def _check_port(host: str, port: int, option: str) -> None:
             probe.bind((host, port))
         except OSError as error:
             where = '' if host == LOOPBACK else f' on {host}'
+            if error.errno in (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT):
+                raise ConfigError(
+                    f"this machine does not have the address '{host}' ({error.strerror}); give "
+                    f'one that it has: {option} [ADDRESS:]PORT'
+                ) from error
             raise ConfigError(
                 f'port {port} cannot be used{where} ({error.strerror}): another viewer may still '
                 f'be served there; give another {option} (the data take the one above it)'

@@ -86,6 +86,7 @@ class Rate:
         self.ended: list[Ended] = []
         self.stops: list[tuple[float, float]] = []
         self.memory: list[tuple[int, float]] = []
+        self.diagnostics: dict[str, str] = {}
         program = {'program': NODE} if bundled else {}
         values = ('pace:=burst', 'max_horizon_s:=60.0', 'max_trajectory_age_s:=60.0')
         self.process = ros().start_node_process(out, *values, **program)
@@ -113,6 +114,7 @@ class Rate:
         end_s = time.monotonic() + seconds
         while True:
             self.client.executor.spin_once(timeout_sec=max(min(end_s - time.monotonic(), 0.02), 0))
+            self.diagnostics = self.client.diagnostic_values() or self.diagnostics
             for received in self.client.received.values():
                 received.clear()
             if time.monotonic() > end_s:
@@ -159,6 +161,11 @@ class Rate:
             self.spin(0.2)
         self.spin(1.0)
 
+    @property
+    def not_received(self) -> int:
+        """Number of plans that the node counts as never received."""
+        return int(self.diagnostics.get(f'not_received.{PLANS}', 0))
+
     def row(self) -> dict[str, Any]:
         """What became of the plans."""
         log = self.process.output()
@@ -167,7 +174,9 @@ class Rate:
             'model': 'bundled' if self.bundled else 'small',
             'commit': commit(),
             'plans': len(self.sent),
-            'without_end': len(set(self.sent) - set(self.ends)),
+            'without_end': max(len(set(self.sent) - set(self.ends)) - self.not_received, 0),
+            'not_received': self.not_received,
+            'memory_mb': usage(self.process.process.pid)['memory_mb'],
             'several_ends': sum(count > 1 for count in self.ends.values()),
             'unknown_ends': len(set(self.ends) - set(self.sent)),
             'late': sum(one.net_s > LATE_S for one in self.ended),

@@ -195,9 +195,7 @@ class BagWriter:
         if is_free(self.path):
             return
         if not self._overwrite:
-            raise EpisodeError(
-                f"'{self.path}' exists already; choose another name or overwrite it"
-            )
+            raise EpisodeError(f"'{self.path}' exists already; choose another name, or remove it")
         if not (self.path / 'metadata.yaml').is_file():
             raise EpisodeError(f"'{self.path}' is not a bag folder; it will not be overwritten")
 

@@ -78,7 +78,7 @@ class Samples(Generic[Value]):
     """The newest samples of a stream, by stamp; each stamp once.
 
     Samples that arrive out of order take their place. One that is older than the newest by more
-    than `RESTART_S` begins the stream anew.
+    than `RESTART_S` begins the stream anew, unless the newest is recent by the node's time.
 
     Attributes:
         refusal: reason why the last sample was refused; empty if it was taken.
@@ -90,6 +90,7 @@ class Samples(Generic[Value]):
     def __init__(self, length: int) -> None:
         self._items: deque[tuple[int, Value]] = deque(maxlen=length)
         self.refusal = ''
+        self._is_fresh = False
 
     def __bool__(self) -> bool:
         return bool(self._items)
@@ -111,7 +112,7 @@ class Samples(Generic[Value]):
     def add(self, stamp_ns: int, value: Value) -> None:
         """Take a sample; one with the stamp of another replaces it."""
         items = self._items
-        if items and items[-1][0] - stamp_ns > RESTART_S * NANO:
+        if items and not self._is_fresh and items[-1][0] - stamp_ns > RESTART_S * NANO:
             items.clear()
         if not items or stamp_ns > items[-1][0]:
             items.append((stamp_ns, value))
@@ -137,11 +138,12 @@ class Samples(Generic[Value]):
         if stamp_ns > now_ns + limit_ns:
             return f'is stamped {(stamp_ns - now_ns) / NANO:.3f} s in the future'
         is_late = stamp_ns < now_ns - limit_ns
-        if is_late and self._items and self._items[-1][0] >= now_ns - limit_ns:
+        self._is_fresh = bool(self._items) and self._items[-1][0] >= now_ns - limit_ns
+        if is_late and self._is_fresh:
             return f'is {(now_ns - stamp_ns) / NANO:.3f} s old; there are newer ones'
         return ''
 
     def clear(self) -> None:
         """Drop all samples."""
         self._items.clear()
-        self.refusal = ''
+        self.refusal, self._is_fresh = '', False

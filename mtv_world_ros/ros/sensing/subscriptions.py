@@ -143,9 +143,13 @@ class Inputs:
         return self._paths
 
     def publisher_counts(self) -> dict[str, int]:
-        """Publishers by topic, as `publishers.<topic>`, and `policies`: those of trajectories."""
+        """Publishers by topic, as `publishers.<topic>`, and messages that did not come.
+
+        Those are `not_received.<topic>`; `policies` is the number of publishers of trajectories.
+        """
         counts = {f'publishers.{i.topic}': i.num_publishers for i in self._all}
-        return {**counts, 'policies': self._plans.num_publishers}
+        lost = {f'not_received.{i.topic}': i.num_lost for i in self._all}
+        return {**counts, **lost, 'policies': self._plans.num_publishers}
 
 
 def subscribe_observations(
@@ -195,6 +199,8 @@ class MatchedSubscription:
     Attributes:
         topic: resolved name of the topic.
         num_received: number of messages received.
+        num_lost: number of messages that the middleware gave up, or that its publisher dropped
+            before they came.
 
     Args:
         node: node that subscribes.
@@ -217,7 +223,7 @@ class MatchedSubscription:
         default: str = 'match',
     ) -> None:
         self._node, self._kind = node, kind
-        self.num_received = 0
+        self.num_received = self.num_lost = 0
 
         @wraps(callback)  # rclpy looks at its signature
         def count(*arguments: Any) -> None:
@@ -287,6 +293,7 @@ class MatchedSubscription:
             events = SubscriptionEventCallbacks(
                 matched=lambda event: self._on_matched(event, qos),
                 incompatible_qos=lambda _: self.refresh(),
+                message_lost=self._on_lost,
             )
             return self._node.create_subscription(
                 self._kind, self.topic, self._callback, profile, event_callbacks=events, raw=True
@@ -295,6 +302,9 @@ class MatchedSubscription:
             return self._node.create_subscription(
                 self._kind, self.topic, self._callback, profile, raw=True
             )
+
+    def _on_lost(self, event: Any) -> None:
+        self.num_lost += event.total_count_change
 
     def _on_matched(self, event: Any, qos: tuple[Any, ...]) -> None:
         if self._next is None:

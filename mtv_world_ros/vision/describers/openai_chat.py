@@ -19,6 +19,7 @@ from mtv_world_ros.core.bounded_input import parse_json
 from mtv_world_ros.core.config import expected, Schema, Seconds
 from mtv_world_ros.core.data_types import ByteArray
 from mtv_world_ros.core.errors import ConfigError, DescriptionError, masked
+from mtv_world_ros.core.shown_text import shown
 from mtv_world_ros.vision.describers.vlm import ANSWER_SCHEMA, ChatAnswer, excerpt
 
 #: from the strictest to none; a server that refuses one is asked with the next
@@ -112,9 +113,9 @@ class OpenAIChat:
         except openai.APIStatusError as error:
             if wanted is not None and error.status_code in _REFUSED_FORMAT:
                 raise _FormatRefused from error
-            raise self._failed(error.status_code, str(error)) from error
+            raise self._failed(error.status_code, shown(error)) from error
         except openai.OpenAIError as error:
-            cause = f'{error} {error.__cause__ or ""}'
+            cause = shown(f'{error} {error.__cause__ or ""}')
             raise DescriptionError(
                 f'{self.identity} cannot be reached ({cause}); is the server '
                 "up, and the describer's 'base_url' right?",
@@ -143,7 +144,7 @@ class OpenAIChat:
             raise self._too_slow() from error
         except httpx2.HTTPError as error:
             raise DescriptionError(
-                f'{self.identity} broke off in its answer: {error}', 'unreachable'
+                f'{self.identity} broke off in its answer: {shown(error)}', 'unreachable'
             ) from error
         return bytes(body)
 
