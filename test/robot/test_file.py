@@ -8,7 +8,7 @@ from mtv_world_ros.cli.robot import describe
 from mtv_world_ros.core.data_types import JointTrajectory
 from mtv_world_ros.core.errors import ConfigError, RobotError, TrajectoryError
 from mtv_world_ros.importing.convert import joints_too_fast
-from mtv_world_ros.robot.file import described_robot, load_robot, save_robot
+from mtv_world_ros.robot.file import described_robot, load_robot, robot_path, save_robot
 from mtv_world_ros.robot.plan_limits import check_speeds
 
 PLANAR = """<robot name="two">
@@ -237,3 +237,10 @@ def test_wrong_dh_rows_are_named(tmp_path, row, message):
     arm['joints'][0].update(row)
     with pytest.raises(ConfigError, match=message):
         load_robot(write(tmp_path, dh_robot(arm, 'j0_link')))
+
+
+def test_a_name_that_no_file_system_takes_is_no_robot():
+    with pytest.raises(ConfigError, match='is not in config/robots'):
+        robot_path('x' * 300)
+    with pytest.raises(ConfigError, match='does not exist'):
+        robot_path('x' * 300 + '.yaml')

@@ -128,3 +128,14 @@ def test_arrays_of_plans_and_chunks_are_read_only(yam):
     for array in (chunk.times, chunk.positions, chunk.plan.start_positions):
         with pytest.raises(ValueError, match='read-only'):
             array[...] = 0
+
+
+def test_a_first_point_before_the_stamp_is_refused(yam):
+    for times, is_refused in (((-5.0, 1.0), True), ((0.0, 1.0), False)):
+        plan = moving(yam, times=times, by=0.0)
+        if not is_refused:
+            Plan.of(plan, yam, standing(), LIVE)
+            continue
+        with pytest.raises(PlanError, match='point 0 is 5 s before the stamp') as refused:
+            Plan.of(plan, yam, standing(), LIVE)
+        assert refused.value.fault is PlanFault.TIMES

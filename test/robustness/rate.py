@@ -41,6 +41,11 @@ PATIENCE_S = 180.0
 BUFFERS_FULL = 3000
 #: samples from then on, one with every tenth plan, that a line is fitted to
 LEAST_SAMPLES = 100
+#: images of `--images`
+IMAGE_SIZE = (640, 480)
+IMAGES = {
+    view: np.full((IMAGE_SIZE[1], IMAGE_SIZE[0], 3), 128, np.uint8) for view in ('low', 'high')
+}
 PLANS, REPORT = '/joint_trajectory', '/world_model/report'
 #: what a plan is given to be answered with the bundled model
 NODE = ('-m', 'mtv_world_ros.ros.world_model.node')
@@ -79,8 +84,10 @@ class Ended(NamedTuple):
 class Rate:
     """A node, a client that sends plans, and the ends of each by its stamp."""
 
-    def __init__(self, out: Path, *, bundled: bool) -> None:
+    def __init__(self, out: Path, *, bundled: bool, image_hz: float = 0.0) -> None:
         self.out, self.bundled = out, bundled
+        self.image_s = 1 / image_hz if image_hz else 0.0
+        self.image_due_s, self.num_images = 0.0, 0
         self.sent: dict[int, tuple[float, dict[str, float]]] = {}
         self.ends: Counter[int] = Counter()
         self.ended: list[Ended] = []
@@ -100,7 +107,10 @@ class Rate:
         self.plans = self.client.node.create_publisher(ros().PLAN, PLANS, 1000)
         self.client.wait(self.plans.get_subscription_count, 'the node')
         self.client.spin_for(1.0)
-        self.client.send_scene()
+        if image_hz:
+            self._show()
+        else:
+            self.client.send_scene()
 
     def send(self) -> None:
         """Send a plan of its own stamp."""
@@ -117,8 +127,21 @@ class Rate:
             self.diagnostics = self.client.diagnostic_values() or self.diagnostics
             for received in self.client.received.values():
                 received.clear()
+            if self.image_s and time.monotonic() > self.image_due_s:
+                self._show()
             if time.monotonic() > end_s:
                 return
+
+    def _show(self) -> None:
+        """Publish 640x480 images of both views with what belongs to them."""
+        now_s, stamp_ns = time.monotonic(), self.client.now_ns()
+        self.image_due_s = max(self.image_due_s + self.image_s, now_s)
+        scene = {}
+        for view, pixels in IMAGES.items():
+            scene[f'image_{view}'] = ros().to_image(pixels, ros().make_header(view, stamp_ns))
+            scene[f'info_{view}'] = ros().make_info(view, stamp_ns, size=IMAGE_SIZE)
+        self.client.send_scene(stamp_ns, **scene)
+        self.num_images += 1
 
     def _take(self, report: Any) -> None:
         now_s = time.monotonic()
@@ -135,16 +158,19 @@ class Rate:
                     Ended(sent_s, now_s - sent_s, stopped_s, starved, node_s, values['state'])
                 )
 
-    def run(self, count: int, rate_hz: float) -> None:
-        """Send so many plans."""
+    def run(self, count: int, rate_hz: float, *, steady: bool = False) -> None:
+        """Send so many plans; `steady` = without bursts and stops of the node."""
+        burst_every = 0 if steady else BURST_EVERY
+        stop_every = 0 if steady else STOP_EVERY
         begin_s, paced = time.monotonic(), 0
         while len(self.sent) < count and self.process.process.poll() is None:
             number = len(self.sent)
-            stops = number and number % STOP_EVERY < (BURST if number % BURST_EVERY == 0 else 1)
+            is_burst = burst_every and number % burst_every == 0
+            stops = number and stop_every and number % stop_every < (BURST if is_burst else 1)
             stop_s = time.monotonic()
             if stops:
                 self.process.process.send_signal(signal.SIGSTOP)
-            for _ in range(BURST if number % BURST_EVERY == 0 else 1):
+            for _ in range(BURST if is_burst else 1):
                 self.send()
             if stops:
                 time.sleep(STOP_S)
@@ -152,7 +178,8 @@ class Rate:
                 self.stops.append((stop_s, time.monotonic()))
                 begin_s += STOP_S
             if number % 10 == 0:
-                self.client.send_scene()
+                if not self.image_s:
+                    self.client.send_scene()
                 self.memory.append((number, usage(self.process.process.pid)['memory_mb']))
             paced += 1
             self.spin(max(begin_s + paced / rate_hz - time.monotonic(), 0.0))
@@ -181,6 +208,7 @@ class Rate:
             'unknown_ends': len(set(self.ends) - set(self.sent)),
             'late': sum(one.net_s > LATE_S for one in self.ended),
             'late_on_quiet_cores': sum(one.quiet_s > LATE_S for one in self.ended),
+            'images_a_view': self.num_images,
             'stops': len(self.stops),
             **answer_times([one for one in self.ended if not one.stopped_s], ''),
             **answer_times(waited, 'stopped_'),
@@ -237,14 +265,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     parser.add_argument('--cases', type=int, default=20_000, help='plans')
     parser.add_argument('--rate', type=float, default=10.0, help='[Hz]')
+    parser.add_argument('--images', type=float, default=0.0, help='640x480 of both views [Hz]')
+    parser.add_argument('--steady', action='store_true', help='no bursts, and no stops')
     parser.add_argument('--bundled', action='store_true', help='the bundled model, not a fake')
     parser.add_argument('--busy', action='store_true', help='the machine is busy: late is allowed')
     parser.add_argument('--out', type=Path, default=ROOT / 'out' / 'rate')
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    rate = Rate(arguments.out, bundled=arguments.bundled)
+    rate = Rate(arguments.out, bundled=arguments.bundled, image_hz=arguments.images)
     try:
-        rate.run(arguments.cases, arguments.rate)
+        rate.run(arguments.cases, arguments.rate, steady=arguments.steady)
         row = rate.row()
         rate.write()
     finally:

@@ -160,3 +160,18 @@ def test_a_port_that_another_program_took_is_an_error_not_silence(own_paths):
             own_paths.of('/a')
         other.stdin.close()
     assert own_paths.of('/a') == 'shared'  # nobody has it: the profile came too late
+
+
+def test_a_machine_without_ipv4_is_told_the_cause(monkeypatch):
+    from mtv_world_ros.core.errors import ConfigError
+    from mtv_world_ros.ros import receive_paths as module
+
+    def refuse(*_):
+        raise OSError(99, 'Cannot assign requested address')
+
+    class Socket(module.socket.socket):
+        bind = refuse
+
+    monkeypatch.setattr(module.socket, 'socket', Socket)
+    with pytest.raises(ConfigError, match=r'no IPv4 loopback address \(127\.0\.0\.1\)'):
+        module._free_port()

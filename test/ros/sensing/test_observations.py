@@ -418,6 +418,23 @@ def test_samples_are_in_the_order_of_their_stamps():
     assert samples.stamps == [30 - 2 * NANO]
 
 
+def test_an_older_frame_that_comes_late_does_not_displace_newer_ones():
+    """By more than a stream's restart, where images may be that old."""
+    samples, now = Samples(8), 100 * NANO
+    for stamp in (now - NANO // 2, now - NANO // 4):
+        assert samples.refuse_reason(stamp, now, 3.0) == ''
+        samples.add(stamp, 'new')
+    late = now - 2 * NANO
+    assert samples.refuse_reason(late, now, 3.0) == ''
+    samples.add(late, 'old')
+    assert samples.newest == (now - NANO // 4, 'new') and samples.stamps[0] == late
+    # a recording that starts over: what is stored is not recent any more
+    later = now + 60 * NANO
+    samples.refuse_reason(late, later, 3.0)
+    samples.add(late, 'anew')
+    assert samples.stamps == [late]
+
+
 def test_steps_of_the_system_clock_are_told_from_its_drift():
     now, steady, simulated = [NOW], [0], [False]
     time = NodeTime(lambda: now[0], lambda: simulated[0], lambda: steady[0])
