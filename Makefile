@@ -1,6 +1,6 @@
 # `make` installs into .venv; nothing here needs root. `make help` lists the targets.
 .DEFAULT_GOAL := install
-.PHONY: help install demo test test-all fast-tests slow-tests tiers style types fuzz kills soak attacks lint format pages docs clean distclean upstream lerobot-tests
+.PHONY: help install dev demo test test-all fast-tests slow-tests tiers style types fuzz kills soak attacks lint format pages docs clean distclean upstream lerobot-tests
 
 # .venv has its own ROS: a native one that is sourced, or wheels of another environment, would load
 # in its place.
@@ -10,17 +10,20 @@ endif
 unexport AMENT_PREFIX_PATH PYTHONPATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 BIN := .venv/bin
-STAMP := .venv/.installed
+DEV := .venv/.dev
 INTERFACES := .venv/interfaces/.built
-# what the demo needs; an installation of everything has it, too
+# an installation of more has what one of less needs
+STAMP := $(if $(wildcard $(DEV)),$(DEV),.venv/.installed)
 DEMO_STAMP := $(if $(wildcard $(STAMP)),$(STAMP),.venv/.demo)
 
 help:  ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
 
-install: $(STAMP)  ## install everything into .venv; the second call does nothing
+install: $(STAMP)  ## install what the commands of README and tutorials need into .venv
 
-$(STAMP) .venv/.demo: setup.py requirements/constraints.txt requirements/install.sh
+dev: $(DEV)  ## install every extra, for tests, linters and pages
+
+.venv/.installed $(DEV) .venv/.demo: setup.py requirements/constraints.txt requirements/install.sh
 	@PYTHON="$(PYTHON)" requirements/install.sh $(subst .,,$(@F))
 	@touch $@
 
@@ -29,12 +32,12 @@ demo: $(DEMO_STAMP)  ## replay the bundled episode through the node; results und
 
 lint: style types  ## ruff, import-linter and pyright
 
-style: $(STAMP)
+style: $(DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
 
-types: $(STAMP)
+types: $(DEV)
 	$(BIN)/pyright
 
 # a worker has a core: torch's threads would only take turns
@@ -46,32 +49,32 @@ test: style  ## the linters and the fast tests (5 minutes)
 
 test-all: test slow-tests  ## the linters and all tests (20 minutes)
 
-fast-tests: $(STAMP) $(INTERFACES)
+fast-tests: $(DEV) $(INTERFACES)
 	$(PYTEST) -m 'not slow'
 
-slow-tests: $(STAMP) $(INTERFACES)  ## the tests that `make test` leaves out
+slow-tests: $(DEV) $(INTERFACES)  ## the tests that `make test` leaves out
 	$(PYTEST) -m slow
 
-tiers: $(STAMP) $(INTERFACES)  ## time all tests, one by one; list those whose marker `slow` is wrong
+tiers: $(DEV) $(INTERFACES)  ## time all tests, one by one; list those whose marker `slow` is wrong
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q --tiers
 
 # Python modules of ROS interfaces that have no wheel, for tests
-$(INTERFACES): test/support/interfaces.py $(STAMP)
+$(INTERFACES): test/support/interfaces.py $(DEV)
 	@mkdir -p $(@D) out
 	@$(BIN)/python -m test.support.interfaces $(@D) 2>out/interfaces.log || cat out/interfaces.log
 	@mkdir -p $(@D) && touch $@
 
-fuzz: $(STAMP)  ## damage everything that is read from outside (minutes); prints seed and table
+fuzz: $(DEV)  ## damage everything that is read from outside (minutes); prints seed and table
 	@mkdir -p out
 	$(BIN)/python -m test.robustness.fuzz --json out/fuzz.json
 
-kills: $(STAMP)  ## kill nodes, recorder and player at random moments (an hour); prints a table
+kills: $(DEV)  ## kill nodes, recorder and player at random moments (an hour); prints a table
 	$(BIN)/python -m test.robustness.kills
 
-soak: $(STAMP)  ## 10,000 rollouts with faults (an hour); memory, threads, latency under out/soak/
+soak: $(DEV)  ## 10,000 rollouts with faults (an hour); memory, threads, latency under out/soak/
 	$(BIN)/python -m test.robustness.soak
 
-attacks: $(STAMP)  ## plans at 10 Hz, clients in default settings, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, open ports, hostile peers and paths (three hours)
+attacks: $(DEV)  ## plans at 10 Hz, clients in default settings, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, open ports, hostile peers and paths (three hours)
 	@mkdir -p out
 	$(BIN)/python -m test.robustness.rate
 	$(BIN)/python -m test.robustness.node_inputs
@@ -88,7 +91,7 @@ attacks: $(STAMP)  ## plans at 10 Hz, clients in default settings, lifecycle cyc
 
 # LeRobot needs older versions of some packages: an environment that has them first, then those of .venv
 LEROBOT := .venv/lerobot
-$(LEROBOT)/.installed: requirements/lerobot_reader.txt $(STAMP)
+$(LEROBOT)/.installed: requirements/lerobot_reader.txt $(DEV)
 	@rm -rf $(LEROBOT) && $(BIN)/python -m venv $(LEROBOT)
 	@$(LEROBOT)/bin/python -m pip install --quiet --no-deps --requirement $<
 	@site=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))') && \
@@ -103,15 +106,15 @@ upstream:  ## show what libraries do otherwise than documented, and which work-a
 	@for script in test/upstream/*.sh; do echo "== $$script"; bash $$script || failed="$$failed $$script"; done; \
 		[ -z "$$failed" ] || { echo "changed:$$failed"; exit 1; }
 
-format: $(STAMP)  ## sort imports and format the code
+format: $(DEV)  ## sort imports and format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-pages: $(STAMP)  ## write the pages anew that are made from the code; tests compare them
+pages: $(DEV)  ## write the pages anew that are made from the code; tests compare them
 	@for page in command_pages configuration_page parameter_tables bundled_tables topics_page; do \
 		$(BIN)/python docs/$$page.py || exit; done
 
-docs: $(STAMP)  ## build the documentation; open out/docs/index.html
+docs: $(DEV)  ## build the documentation; open out/docs/index.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 	@echo 'open out/docs/index.html'
 

@@ -65,7 +65,7 @@ setup(
     extras_require={
         'train': ['accelerate>=1.15', 'tensorboard>=2.21'],
         # Control fast_tokens: byte-pair encoding of actions, one of the paper's baselines.
-        'fast_tokens': ['tokenizers>=0.22'],
+        'fast-tokens': ['tokenizers>=0.22'],
         # Vision-language models that name objects: behind a server, or here.
         'describe': ['httpx2>=2.16', 'openai>=3.52,<4'],
         # Segmenters with public weights: MM-Grounding-DINO with SAM 2, SAM 3.

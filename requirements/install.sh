@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Makes .venv and installs the package with everything that its commands and tests need, or with
-# the argument `demo` what its demo needs; no root. Called by `make`; running it again completes an
-# interrupted or outdated installation.
+# Makes .venv and installs the package with what the commands of README and tutorials need; with the
+# argument `demo` what its demo needs, with `dev` every extra, for tests and pages; no root. Called
+# by `make`; running it again completes an interrupted or outdated installation.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -10,7 +10,8 @@ TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
 VENV=.venv
 case ${1-} in
     demo) EXTRAS=ros ;;
-    *) EXTRAS=dart,experiments,fast_tokens,gym,train,describe,vision,evaluate,import,wan,policies,rank,ros,view,test,lint,docs ;;
+    dev) EXTRAS=dart,experiments,fast-tokens,gym,train,describe,vision,evaluate,import,wan,policies,rank,ros,view,test,lint,docs ;;
+    *) EXTRAS=ros,train,evaluate,view ;;
 esac
 
 say() { printf '%s\n' "$*" >&2; }
@@ -69,20 +70,21 @@ PYTHON
         say "Installing $TORCH for the NVIDIA GPU from the configured index"
     elif cpu_index_answers; then
         say "No NVIDIA GPU: installing $TORCH from $TORCH_CPU_INDEX"
-        pip install --quiet --no-deps --retries 0 --index-url "$TORCH_CPU_INDEX" "$TORCH" && return
+        pip install --no-deps --retries 0 --index-url "$TORCH_CPU_INDEX" "$TORCH" && return
         say 'That did not work; taking the configured index'
     else
         say "No NVIDIA GPU, and $TORCH_CPU_INDEX does not answer: installing $TORCH from the configured index"
     fi
-    pip install --quiet -c requirements/constraints.txt "$TORCH"
+    pip install -c requirements/constraints.txt "$TORCH"
 }
 
 make_venv
 install_torch
 # setuptools first, so that the package builds in place instead of in an environment of its own.
 pip install --quiet -c requirements/constraints.txt setuptools
-say 'Installing the other packages'
-pip install --quiet --no-build-isolation -c requirements/constraints.txt -e ".[$EXTRAS]"
+say "Installing the other packages: extras $EXTRAS"
+pip install --no-build-isolation -c requirements/constraints.txt -e ".[$EXTRAS]" |
+    sed -u '/already satisfied/d'
 if ! "$VENV/bin/python" -c 'import rclpy' 2>/dev/null; then
     say 'rclpy is not available: its wheels exist for x86_64 Linux only. Elsewhere use a native'
     say 'ROS 2 Jazzy (docs/native_ros.md). What needs no ROS works, the rest is skipped.'

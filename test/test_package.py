@@ -216,8 +216,8 @@ def test_help_starts_without_torch_and_diffusers():
 
 def test_the_page_of_installation_has_every_extra(setup_arguments):
     table = (ROOT / 'docs' / 'installation.md').read_text().partition('## Extras')[2]
-    rows = re.findall(r'^\| ((?:`\w+`(?:, )?)+) \|', table, re.M)
-    named = [name for row in rows for name in re.findall(r'`(\w+)`', row)]
+    rows = re.findall(r'^\| ((?:`[\w-]+`(?:, )?)+) \|', table, re.M)
+    named = [name for row in rows for name in re.findall(r'`([\w-]+)`', row)]
     assert sorted(named) == sorted(setup_arguments['extras_require'])
 
 

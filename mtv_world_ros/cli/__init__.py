@@ -18,7 +18,6 @@ import errno  # noqa: E402
 from importlib import import_module, metadata  # noqa: E402
 import os  # noqa: E402
 from pathlib import Path  # noqa: E402
-import re  # noqa: E402
 import shlex  # noqa: E402
 import sys  # noqa: E402
 from types import ModuleType  # noqa: E402
@@ -278,6 +277,10 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
     _check_texts(leaf, arguments)
     for path, option in _outputs(arguments):
         check_output(path, option)
+    if words:
+        from mtv_world_ros.cli.needs import check_needs  # not for the overview
+
+        check_needs(words, arguments)
     return arguments
 
 
@@ -319,12 +322,12 @@ def main(argv: list[str] | None = None) -> int:
     except (MtvWorldError, OSError, MemoryError) as error:
         return _said(f'{error}{_advice(error)}', 1)
     except ModuleNotFoundError as error:
+        from mtv_world_ros.cli.needs import extra_of, missing_text
+
         package = (error.name or '').partition('.')[0]
-        extra = _extra_of(package)
-        if not extra:
+        if not extra_of(package):
             raise
-        ways = f"make in the folder of mtv_world_ros, or pip install 'mtv_world_ros[{extra}]'"
-        return _said(f'{package} is not installed: {ways}', 1)
+        return _said(missing_text([package]), 1)
     except KeyboardInterrupt as stopped:
         number = getattr(stopped, 'signum', signal.SIGINT)
         return _said(f'stopped ({signal.Signals(number).name})', 128 + number)
@@ -344,15 +347,6 @@ def _own_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.showwarning = show
         yield
-
-
-def _extra_of(package: str) -> str:
-    """Return the first extra of this package that asks for another one; empty = none does."""
-    for line in metadata.requires('mtv_world_ros') or ():
-        found = re.match(rf'{re.escape(package)}\b(?!-).*extra == .(\w+)', line)
-        if found and package:
-            return found[1]
-    return ''
 
 
 def _advice(error: Exception) -> str:

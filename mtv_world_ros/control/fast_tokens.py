@@ -46,7 +46,7 @@ class FastTokens(Control):
 
     FAST (Pertsch et al., "FAST: Efficient Action Tokenization for Vision-Language-Action Models",
     2025): scaled actions, orthonormal cosine transform along time, coefficients times 10 rounded,
-    lowest frequency first, byte-pair encoding of 1,024. Needs the extra `fast_tokens`.
+    lowest frequency first, byte-pair encoding of 1,024. Needs the extra `fast-tokens`.
 
     Attributes:
         scaling: percentiles of the joint positions in the training set.
