@@ -85,15 +85,16 @@ class TaskEvidence(Schema):
         Evidence beyond what confirms is not kept, so that unforeseen ends soon withdraw it.
         """
         if is_foreseen is None:
-            return self.replace(num_unseen=self.num_unseen + 1)
+            return self.model_copy(update={'num_unseen': self.num_unseen + 1})
         ratio = (
             CONFIRMATION.foreseen_log_ratio if is_foreseen else CONFIRMATION.unforeseen_log_ratio
         )
-        return self.replace(
-            log_evidence=min(self.log_evidence + ratio, CONFIRMATION.log_evidence),
-            num_foreseen=self.num_foreseen + is_foreseen,
-            num_unforeseen=self.num_unforeseen + (not is_foreseen),
-        )
+        changed = {
+            'log_evidence': min(self.log_evidence + ratio, CONFIRMATION.log_evidence),
+            'num_foreseen': self.num_foreseen + is_foreseen,
+            'num_unforeseen': self.num_unforeseen + (not is_foreseen),
+        }
+        return self.model_copy(update=changed)
 
     @property
     def num_missing(self) -> int:

@@ -186,8 +186,8 @@ def test_parameters_that_do_not_hold_are_confirmed_as_rarely_as_stated():
     rng = np.random.default_rng(0)
     # three standard errors of 400 trials above the stated rate: .05 + .033
     assert share_confirmed(CONFIRMATION.other_unforeseen_fraction, 150, rng) < 0.083
-    assert share_confirmed(0.54, 150, rng) < 0.02
-    assert share_confirmed(0.03, 60, rng) > 0.95
+    assert share_confirmed(0.54, 150, rng, 100) < 0.02
+    assert share_confirmed(0.03, 60, rng, 100) > 0.95
     assert share_confirmed(0.0, 10, rng, 1) == 1.0
 
 
