@@ -171,12 +171,12 @@ def test_rollouts_in_which_nothing_moved_tell_nothing():
 
 def share_confirmed(rate, num_rollouts, rng, num_trials=400):
     """Return in which share of trials the test is ever confirmed, of ends unforeseen at a rate."""
-    hits = 0
+    hits, ends = 0, {True: seen_end(FAR), False: seen_end(NEAR)}
     for _ in range(num_trials):
         test = ContactConfirmation()
         for rollout, is_far in enumerate(rng.random(num_rollouts) < rate):
-            test.take(seen_end(FAR if is_far else NEAR), rollout, TASK)
-            if test.trust(TASK).is_confirmed:
+            test.take(ends[is_far], rollout, TASK)
+            if test.tasks[TASK].is_confirmed:
                 hits += 1
                 break
     return hits / num_trials
