@@ -82,12 +82,12 @@ EDGES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0 + 1e-9)
 #: judge: the estimate of before, of `--before`
 BEFORE = 'both, before'
 COVERED = ('truth', 'judged by', 'estimates', 'covered', 'up to the sampling error of rates')
-BLOCK = ('judged by', 'nominal: verdicts', 'right: said success; said failure',
-         'AUROC, no verdict .5', 'other truths: verdicts',
-         'right there: said success; said failure', 'AUROC there, mean (worst)',
+BLOCK = ('judged by', 'nominal: verdicts', 'right: success; failure',
+         'AUROC, no verdict .5', 'others: verdicts',
+         'right there: success; failure', 'AUROC there, mean (worst)',
          'AUROC there, no verdict .5, mean (worst)', 'from .9 on succeed there')  # fmt: skip
 #: columns and judges of the table in README.md
-README_COLUMNS = (0, 1, 2, 4, 5, 7)
+README_COLUMNS = (0, 1, 2, 4, 5)
 README_JUDGES = (f'**{BOTH}**', FORESEEN, RULE)
 _MARKED = re.compile(
     r'(<!-- unseen-faults: begin -->\n).*?(<!-- unseen-faults: end -->)', re.DOTALL
@@ -229,7 +229,7 @@ def readme_block(rows: Sequence[Row], num_scenes: int, count: int) -> str:
     truths = len({r.physics for r in rows} - {NOMINAL})
     note = (
         f'*{num_scenes} scenes, n = {count} in the nominal physics and in each of {truths} '
-        'others; [95 % intervals]. [All results](docs/results.md).*'
+        'others; [95 % intervals]. [Results](docs/results.md).*'
     )
     cells = [[line[k] for k in README_COLUMNS] for line in lines]
     return f'{table([BLOCK[k] for k in README_COLUMNS], cells)}\n\n{note}\n'
