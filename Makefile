@@ -74,13 +74,14 @@ kills: $(DEV)  ## kill nodes, recorder and player at random moments (an hour); p
 soak: $(DEV)  ## 10,000 rollouts with faults (an hour); memory, threads, latency under out/soak/
 	$(BIN)/python -m test.robustness.soak
 
-attacks: $(DEV)  ## plans at 10 Hz, clients in default settings, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, open ports, hostile peers and paths (three hours)
+attacks: $(DEV)  ## plans at 10 Hz, clients in default settings, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, open ports, hostile peers and paths, damaged pictures (three hours)
 	@mkdir -p out
 	$(BIN)/python -m test.robustness.rate
 	$(BIN)/python -m test.robustness.node_inputs
 	$(BIN)/python -m test.robustness.default_client
 	$(BIN)/python -m test.robustness.default_client --cameras 3 --transports UDPv4
 	$(BIN)/python -m test.robustness.cycles --bundled
+	$(BIN)/python -m test.robustness.pictures
 	$(BIN)/python -m test.robustness.odd_worlds
 	$(BIN)/python -m test.robustness.policy_servers --json out/servers.json
 	$(BIN)/python -m test.robustness.children

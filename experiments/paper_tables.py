@@ -99,16 +99,17 @@ MODES = {WHOLE: 'imagine', CHUNKS: 'observe', 'zero_shot': 'imagine'}
 #: what a row is made and tested by; rows of another version are not mixed with it
 METHODS = {
     'policy2vec': 'version 2: three layers of 1,280; scale .1 at first; tested on whole episodes',
-    'ee_mlp': 'version 2: 1,024 wide, Kaiming, rotation columns, six history frames, guidance on '
-    'the control; tested on whole episodes',
+    'ee_mlp': 'version 2: 1,024 wide, Kaiming, rotation columns, eight history frames, guidance '
+    'on the control; tested on whole episodes',
     'fast_tokens': 'version 2: tested on whole episodes',
     TRAJECTORY_VIDEO: 'version 2: tested on whole episodes',
 }
 METHOD = 'method.json'
-#: settings of a method beyond the preset, as its authors have it (Ctrl-World: history, guidance)
+#: settings of a method beyond the preset, as its authors have it: Ctrl-World's history and
+#: guidance. It has six history frames; eight are the next number of whole tokens of four frames
 METHOD_SETTINGS = {
     'ee_mlp': (
-        'history.num_frames=6', 'history.reference=first_frame', 'sampling.guidance_scale=2.0',
+        'history.num_frames=8', 'history.reference=first_frame', 'sampling.guidance_scale=2.0',
     ),
 }  # fmt: skip
 #: lines of the training log whose mean loss a learning rate is judged by

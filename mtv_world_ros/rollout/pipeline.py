@@ -50,6 +50,7 @@ from mtv_world_ros.success.rollout_memory import footage_of
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
+from mtv_world_ros.vision.frame_check import check_frames, frame_doubt, lost_objects
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
@@ -428,6 +429,8 @@ class Pipeline:
         motion = Motion.of(self.robot, start.cameras, plan.positions, self._links)
         in_view = motion.tools_in_view()
         start_masks = self.find(state, options)
+        if state.starts_later:
+            state = replace(state, frame_doubt=self._frame_doubt(state, start_masks))
         clock.lap('start masks')
         objects = state.objects
         if options.contact.is_confirmed:
@@ -478,7 +481,7 @@ class Pipeline:
         success, memory = self.judge(state, motion, start_masks, masks, options, foreseen)
         unseen = () if control.video is None or in_view.any() else (_UNSEEN,)
         success = doubted(success, (*objects.reasons, *unseen))
-        success = doubted(success, refusal=objects.refusal)
+        success = doubted(success, refusal=state.frame_doubt or objects.refusal)
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
@@ -643,6 +646,14 @@ class Pipeline:
             word = 'open: ' if is_open and not options.contact.is_confirmed else ''
             estimate = doubted(estimate, (f'{word}{options.contact.text}',))
         return judged._replace(estimate=estimate)
+
+    def _frame_doubt(self, state: RolloutState, start_masks: ObjectMasks) -> str:
+        """Return why the real frames that a later plan starts from allow no verdict."""
+        objects = state.objects
+        reasons = check_frames(
+            objects.source, objects.first, state.camera_check, self.camera_checker
+        )
+        return frame_doubt(reasons, lost_objects(start_masks))
 
     def _majority(self, state: RolloutState, options: RolloutOptions) -> Majority:
         """Return the rule that selects futures of majority outcome, for pictures and estimate."""

@@ -49,6 +49,8 @@ class RolloutState:
             applied.
         scene: memory of the background; None = nothing is held.
         followed: objects in the last frame, as they were followed there; None = nothing was.
+        frame_doubt: reason why the real frames that the plan starts from allow no verdict; empty =
+            none.
     """
 
     observation: Observation
@@ -59,6 +61,7 @@ class RolloutState:
     camera_check: CameraCheck = CameraCheck()
     scene: SceneMemory | None = None
     followed: Followed | None = None
+    frame_doubt: str = ''
 
     @classmethod
     def at(
@@ -80,6 +83,11 @@ class RolloutState:
             objects=objects,
             camera_check=camera_check,
         )
+
+    @property
+    def starts_later(self) -> bool:
+        """True if a plan starts here from real frames later than the episode's first ones."""
+        return not self.num_imagined and self.objects.source is not self.objects.first
 
     @property
     def is_begun(self) -> bool:
@@ -134,7 +142,9 @@ class RolloutState:
             corrected = self.camera_check.corrected(cameras)
             observation = replace(observation, cameras=corrected)
         objects = self.objects.branch(observation)
-        return replace(self, observation=observation, num_imagined=0, objects=objects)
+        return replace(
+            self, observation=observation, num_imagined=0, objects=objects, frame_doubt=''
+        )
 
 
 def fit_observation(observation: Observation, spec: WorldModelSpec) -> Observation:

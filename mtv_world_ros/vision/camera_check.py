@@ -183,6 +183,27 @@ class CameraChecker:
             fits=tuple(self._fit(camera, frame, observation.positions) for camera, frame in views)
         )
 
+    def shows_arm(self, observation: Observation) -> tuple[bool, ...]:
+        """Return for each camera whether the arm's outline is met where the camera puts it.
+
+        No other pose is searched: a fifth of the time of `check`. False where the shape of the
+        robot is not known or the arm is hardly in view.
+        """
+        if not self._shape.is_known:
+            return (False,) * len(observation.cameras)
+        return tuple(
+            self._is_met(camera, frame, observation.positions)
+            for camera, frame in zip(observation.cameras, observation.frames, strict=True)
+        )
+
+    def _is_met(self, camera: CameraModel, frame: ByteArray, positions: FloatArray) -> bool:
+        camera = _checked_size(camera)
+        links = _links(self._robot, self._shape.parts, positions)
+        pose = camera_poses(camera, self._robot, positions[None])[0]
+        outline = _outline(camera, links, pose)
+        is_in_view = len(outline.pixels) >= _CHECK.min_points
+        return is_in_view and _met(_edges(frame, camera), outline) >= _CHECK.accepted_fraction
+
     def _fit(self, camera: CameraModel, frame: ByteArray, positions: FloatArray) -> CameraFit:
         if not self._shape.is_known:
             why = f'the shape of the robot is not known: {self._shape.source}'
@@ -246,12 +267,7 @@ def _search(
     positions: FloatArray,
 ) -> _Found | str:
     """Return the pose at which outline and picture agree, or why there is none."""
-    if camera.width > _CHECK.image_width_px:
-        camera = scaled(
-            camera,
-            _CHECK.image_width_px,
-            round(camera.height * _CHECK.image_width_px / camera.width),
-        )
+    camera = _checked_size(camera)
     edges, links = _edges(frame, camera), _links(robot, parts, positions)
     T_given = camera_poses(camera, robot, positions[None])[0]
     given = _outline(camera, links, T_given)
@@ -278,6 +294,14 @@ def _search(
     moved, _ = project(camera, T_given_found, given.points)
     offset = float(np.nanmean(np.linalg.norm(moved - given.pixels, axis=-1)))
     return _Found(T_given_found, offset / camera.width)
+
+
+def _checked_size(camera: CameraModel) -> CameraModel:
+    """Return a camera at the size that pictures are checked at."""
+    if camera.width <= _CHECK.image_width_px:
+        return camera
+    height = round(camera.height * _CHECK.image_width_px / camera.width)
+    return scaled(camera, _CHECK.image_width_px, height)
 
 
 def _edges(frame: ByteArray, camera: CameraModel) -> _Edges:
