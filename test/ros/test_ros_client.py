@@ -34,7 +34,9 @@ def test_a_plan_gets_a_verdict_with_its_reason_and_frames_of_all_views(tmp_path,
 @pytest.mark.slow
 def test_the_bundled_model_answers_a_client_that_does_not_wait_for_it(tmp_path, ros):
     program = ('-m', 'mtv_world_ros.ros.world_model.node')
-    process = ros.start_node_process(tmp_path, 'place:=simulator/nominal', program=program)
+    calibration = ROOT / 'resource' / 'demo_episode' / 'calibration.yaml'
+    parameters = ('place:=simulator/nominal', f'calibration_file:={calibration}')
+    process = ros.start_node_process(tmp_path, *parameters, program=program)
     try:
         said = run_client(ros)
     finally:
