@@ -1,6 +1,6 @@
 # `make` installs into .venv; nothing here needs root. `make help` lists the targets.
 .DEFAULT_GOAL := install
-.PHONY: help install dev demo test test-all fast-tests slow-tests tiers style types fuzz kills soak attacks lint format pages docs clean distclean upstream lerobot-tests
+.PHONY: help install dev demo test test-all fast-tests slow-tests tiers style types fuzz kills soak attacks lint format pages advisories docs clean distclean upstream lerobot-tests
 
 # .venv has its own ROS: a native one that is sourced, or wheels of another environment, would load
 # in its place.
@@ -112,8 +112,11 @@ format: $(DEV)  ## sort imports and format the code
 	$(BIN)/ruff format .
 
 pages: $(DEV)  ## write the pages anew that are made from the code; tests compare them
-	@for page in command_pages configuration_page parameter_tables bundled_tables topics_page; do \
+	@for page in command_pages configuration_page parameter_tables bundled_tables topics_page third_party_page; do \
 		$(BIN)/python docs/$$page.py || exit; done
+
+advisories: $(DEV)  ## published vulnerabilities of the pinned versions, by pip-audit
+	$(BIN)/python docs/third_party_page.py --advisories
 
 docs: $(DEV)  ## build the documentation; open out/docs/index.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
