@@ -27,8 +27,9 @@ import time
 
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.documents import Table
-from mtv_world_ros.core.executor import run_all, Workers
+from mtv_world_ros.core.executor import run_all
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.core.workers import Workers
 from mtv_world_ros.data.episode_reader import list_episodes, read_info
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -30,7 +30,7 @@ from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.core.files import check_free
 
 if TYPE_CHECKING:
-    from mtv_world_ros.core.executor import Workers
+    from mtv_world_ros.core.workers import Workers
     from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.rollout.episode_viewer import EpisodeViewer
     from mtv_world_ros.rollout.imagined_episodes import EpisodeStart

@@ -16,7 +16,7 @@ from mtv_world_ros.cli import bundled_help
 from mtv_world_ros.viewing.viewer_process import PageAddress
 
 if TYPE_CHECKING:
-    from mtv_world_ros.core.executor import Workers
+    from mtv_world_ros.core.workers import Workers
     from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.rollout.pipeline import Pipeline
 
@@ -264,7 +264,7 @@ def workers_of(
         ConfigError: resources of Ray without Ray, or less than none.
     """
     from mtv_world_ros.core.errors import ConfigError
-    from mtv_world_ros.core.executor import Workers
+    from mtv_world_ros.core.workers import Workers
 
     for name in ('gpus', 'cpus'):
         value = getattr(arguments, f'{name}_per_worker')

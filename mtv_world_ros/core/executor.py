@@ -6,21 +6,18 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.files import plain
-from mtv_world_ros.core.processes import STOPPED_S, threads_each
+from mtv_world_ros.core.processes import STOPPED_S
 from mtv_world_ros.core.worker_pool import raising, Run, run_job, thread_limit, WorkerPool
+from mtv_world_ros.core.workers import RunJobs, Workers
 
 #: scores as plain values, or why there are none
 Outcome = dict[str, Any] | str
 Job = TypeVar('Job')
-#: runs jobs, and yields each with its result when it is done
-RunJobs = Callable[[Sequence[Job]], Iterator[tuple[Job, Any]]]
 
 
 class Scores(Protocol):
@@ -38,47 +35,6 @@ class Scorer(Protocol):
     def score(self) -> Callable[[Any], Scores]:
         """Function that returns a job's scores; it raises MtvWorldError where there are none."""
         ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Workers:
-    """Workers of a command: processes of this machine, or actors of a Ray cluster.
-
-    Attributes:
-        count: number of workers, i.e. of jobs that run at once; 1 without Ray = this process.
-        threads: CPU threads of each worker; 0 = with Ray `cpus`, else the cores shared evenly.
-        ray: address of a Ray cluster; empty = `RAY_ADDRESS`, else a new one on this machine;
-            None = no Ray.
-        cpus: CPU cores that Ray reserves for a worker.
-        gpus: GPUs that Ray reserves for a worker; 0.5 = two workers share one.
-        reads: files and folders that jobs read; every machine of the cluster must have them.
-        writes: folder that jobs write to; every machine of the cluster must see the same one.
-            None = results come back to this process.
-    """
-
-    count: int = 1
-    threads: int = 0
-    ray: str | None = None
-    cpus: int = 1
-    gpus: float = 0.0
-    reads: tuple[Path, ...] = ()
-    writes: Path | None = None
-
-    @property
-    def are_here(self) -> bool:
-        """Whether this process runs the jobs itself."""
-        return self.count == 1 and self.ray is None
-
-    @property
-    def num_threads(self) -> int:
-        """Number of CPU threads of each worker."""
-        if self.threads:
-            return self.threads
-        return threads_each(self.count) if self.ray is None else max(self.cpus, 1)
-
-
-#: this process runs the jobs itself, on one thread
-IN_PROCESS = Workers(threads=1)
 
 
 def run_all(

@@ -20,7 +20,7 @@ from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.worker_pool import made_run, Run
 
 if TYPE_CHECKING:
-    from mtv_world_ros.core.executor import RunJobs, Workers
+    from mtv_world_ros.core.workers import RunJobs, Workers
 
 #: a job that was running when this many actors of a Ray cluster died is not tried again
 MAX_LOST_ACTORS = 3

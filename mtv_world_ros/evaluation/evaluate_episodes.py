@@ -15,8 +15,9 @@ from tqdm import tqdm
 
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
-from mtv_world_ros.core.executor import IN_PROCESS, score_all, Workers
+from mtv_world_ros.core.executor import score_all
 from mtv_world_ros.core.files import plain, write_json
+from mtv_world_ros.core.workers import IN_PROCESS, Workers
 from mtv_world_ros.data.recordings import described_objects
 from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, EvaluationJob, Instruments
 from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary, Group, TRAINING

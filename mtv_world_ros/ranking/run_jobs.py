@@ -13,8 +13,9 @@ from tqdm import tqdm
 
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
-from mtv_world_ros.core.executor import IN_PROCESS, score_all, Workers
+from mtv_world_ros.core.executor import score_all
 from mtv_world_ros.core.files import plain, write_json, write_whole
+from mtv_world_ros.core.workers import IN_PROCESS, Workers
 from mtv_world_ros.evaluation.result_settings import check_same_settings
 from mtv_world_ros.ranking.rollout_jobs import Job, Result
 from mtv_world_ros.ranking.rollout_runner import make_runner, RolloutConfig, WantedJob

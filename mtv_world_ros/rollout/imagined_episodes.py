@@ -25,8 +25,9 @@ from mtv_world_ros.core.errors import (
     PolicyError,
     RolloutPreempted,
 )
-from mtv_world_ros.core.executor import run_all, Workers
+from mtv_world_ros.core.executor import run_all
 from mtv_world_ros.core.files import check_free, check_room, write_whole
+from mtv_world_ros.core.workers import Workers
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.observations import observation_after
 from mtv_world_ros.policies.policy import EpisodeOrigin, Policy

@@ -78,8 +78,9 @@ class ObservationSettings(Schema):
         'episode begins (`~/reset`, `~/start`).',
     )
     joint_state_topics: Names = at_start(
-        ('joint_states',),
-        'Topics of the measured positions; several where an arm and its gripper have their own.',
+        (),
+        'Topics of the measured positions, several where an arm and its gripper have their own; '
+        'empty = joint_states.',
     )
     max_image_age_s: float = parameter(0.5, 'Older images are no observation [s].', _SECONDS)
     max_joint_state_age_s: float = parameter(

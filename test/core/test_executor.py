@@ -5,7 +5,8 @@ import sys
 import pytest
 
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
-from mtv_world_ros.core.executor import run_all, score_all, Workers
+from mtv_world_ros.core.executor import run_all, score_all
+from mtv_world_ros.core.workers import Workers
 
 
 @pytest.fixture

@@ -11,9 +11,10 @@ import time
 import pytest
 
 from mtv_world_ros.core.errors import MtvWorldError, TrainingError
-from mtv_world_ros.core.executor import run_all, Workers
+from mtv_world_ros.core.executor import run_all
 from mtv_world_ros.core.processes import stop_process, STOPPED_S, StoppedProcesses
 from mtv_world_ros.core.worker_pool import run_job, WorkerPool
+from mtv_world_ros.core.workers import Workers
 from mtv_world_ros.training.clips.batches import ClipWorkers
 from test.robustness.worker_jobs import LongJobs, make_held_back, make_stopping
 

@@ -3,8 +3,8 @@ from functools import partial
 import pytest
 
 from mtv_world_ros.core.errors import ConfigError, EpisodeError
-from mtv_world_ros.core.executor import Workers
 from mtv_world_ros.core.files import plain
+from mtv_world_ros.core.workers import Workers
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate, make_jobs, Parallel
 from mtv_world_ros.evaluation.settings import EvaluationConfig
 from test.support.small_episodes import persistence

@@ -100,7 +100,8 @@ def _job(number: int) -> int:
 
 def worker(folder: Path, one: Signal) -> None:
     """Two workers do eight jobs."""
-    from mtv_world_ros.core.executor import run_all, Workers
+    from mtv_world_ros.core.executor import run_all
+    from mtv_world_ros.core.workers import Workers
 
     assert len(list(run_all(list(range(8)), _make_job, Workers(count=2, threads=1)))) == 8
 

@@ -22,7 +22,8 @@ from scipy.stats import multivariate_normal, qmc
 from mtv_world_ros.cameras.mask_geometry import block_size, CENTROID_NOISE_PX, centroids, locate
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import TrainingError
-from mtv_world_ros.core.executor import IN_PROCESS, RunJobs, started, Workers
+from mtv_world_ros.core.executor import started
+from mtv_world_ros.core.workers import IN_PROCESS, RunJobs, Workers
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.physics.arms.arm_response import PERIOD_S

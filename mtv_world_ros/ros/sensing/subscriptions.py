@@ -167,7 +167,7 @@ def subscribe_observations(
         node: owner of the subscriptions.
         topics: camera topic of each view; `image_raw` and `camera_info` lie below.
         compressed: views whose images come as JPEG or PNG.
-        states: topics of joint states.
+        states: topics of joint states; empty = `joint_states`.
         buffer: buffer of images, camera infos and joint states.
         guarded: returns a handler as a callback that no message makes raise.
     """
@@ -181,7 +181,8 @@ def subscribe_observations(
             (CameraInfo, f'{topic}/camera_info', add_info, 1),
             (kind, f'{topic}/image_raw{suffix}', partial(buffer.add_image, view), 1),
         ]
-    newest += [(JointState, topic, buffer.add_joint_state, 10) for topic in states]
+    measured = states or ('joint_states',)
+    newest += [(JointState, topic, buffer.add_joint_state, 10) for topic in measured]
     return [
         MatchedSubscription(node, kind, topic, guarded(bounded(kind, handle)), depth=depth)
         for kind, topic, handle, depth in newest

@@ -156,7 +156,7 @@ class RequestMaker:
 _EARLY_S = 5.0
 #: a plan may come this long before the first images, joint states and kept texts of topics that
 #: have a publisher, and before images of its moment in all views [s]
-_FIRST_S = 1.0
+_FIRST_S = 0.5
 #: a plan that is under way for longer was lost and sent again [s]
 _LATE_S = 0.5
 #: what a node makes and can destroy

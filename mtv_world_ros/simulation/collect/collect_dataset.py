@@ -13,8 +13,9 @@ from typing import Any
 from tqdm import tqdm
 
 from mtv_world_ros.core.errors import SimulatorError
-from mtv_world_ros.core.executor import IN_PROCESS, run_all, Workers
+from mtv_world_ros.core.executor import run_all
 from mtv_world_ros.core.images import encode_png
+from mtv_world_ros.core.workers import IN_PROCESS, Workers
 from mtv_world_ros.simulation.collect.contact_sheet import contact_sheet, SHEET_FILE
 from mtv_world_ros.simulation.collect.dataset_card import (
     card_of,
