@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mtv_world_ros.cameras.camera import camera_poses
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, MtvWorldError, TrajectoryError
+from mtv_world_ros.data.bag.unused_topics import unused_line
 from mtv_world_ros.data.episode import Episode, EpisodeInfo, Track, UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.data.episode_writer import EpisodeWriter
@@ -26,6 +27,7 @@ from mtv_world_ros.importing.camera_parameters import camera_track
 from mtv_world_ros.importing.lerobot import EpisodeEntry, LeRobotDataset
 from mtv_world_ros.importing.mapping import DatasetMapping, digest_of, load_mapping, Stream
 from mtv_world_ros.importing.stored_objects import AS_RECORDED, ObjectStage
+from mtv_world_ros.importing.unused_parts import unused_features
 from mtv_world_ros.robot.file import save_robot
 from mtv_world_ros.robot.joint_columns import to_positions
 from mtv_world_ros.robot.model import check_positions, RobotModel
@@ -44,6 +46,7 @@ class ImportSummary(Generic[Item]):
         failed: reasons of the episodes that could not be converted.
         warnings: problems and how they were handled.
         robot_notes: problems of the robot's description.
+        notes: problems that concern no single recording.
     """
 
     made: list[Item] = field(default_factory=list)
@@ -51,6 +54,7 @@ class ImportSummary(Generic[Item]):
     failed: dict[Item, str] = field(default_factory=dict)
     warnings: dict[Item, tuple[str, ...]] = field(default_factory=dict)
     robot_notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def import_each(
@@ -180,6 +184,8 @@ def import_dataset(
     summary = import_each(
         progress(wanted), key, lambda number: out / episode_name(number), convert
     )
+    if line := unused_line(unused_features(source, chosen)):
+        summary.notes = (line,)
     if summary.made or summary.kept:
         summary.robot_notes = save_robot(chosen.robot_file, out / 'robot').notes
     return summary

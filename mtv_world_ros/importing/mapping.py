@@ -229,20 +229,16 @@ def load_mapping(path: Path) -> DatasetMapping:
     return mapping
 
 
-def guess_mapping(
-    dataset: LeRobotDataset, robot: str, calibration: Path | None
-) -> tuple[dict[str, Any], tuple[str, ...]]:
+def guess_mapping(dataset: LeRobotDataset, robot: str, calibration: Path | None) -> dict[str, Any]:
     """Return the values of a mapping for columns that are named like the robot's joints.
 
-    Views are the colour features that the calibration has, by the last part of their names; the
-    names of the other image features are returned as the second value. Without a calibration all
-    colour features are views, whose cameras are not known.
+    Views are the colour features that the calibration has, by the last part of their names.
+    Without a calibration all colour features are views, whose cameras are not known.
 
     Raises:
         ConfigError: the calibration has none of the views, or there is no colour feature.
         CalibrationError: the calibration cannot be used.
     """
-    pictures = [n for n, f in dataset.features.items() if f.get('dtype') in ('video', 'image')]
     found = _view_names(dataset.colour_features())
     known = found.keys() if calibration is None else load_calibration(calibration).keys()
     views = {view: {'feature': name} for view, name in found.items() if view in known}
@@ -257,14 +253,12 @@ def guess_mapping(
     joints = load_robot(_robot_path(robot, Path())).joint_names
     action = _guess_features(dataset, joints, _ACTIONS)
     is_path = Path(robot).suffix in ('.yaml', '.yml')
-    values = {
+    return {
         'robot': str(Path(robot).resolve()) if is_path else robot,
         'views': views,
         'state': {'feature': _guess_features(dataset, joints, _STATES) or _STATES[0]},
         'action': {'feature': action} if action else 'state',
     }
-    taken = {view['feature'] for view in views.values()}
-    return values, tuple(name for name in pictures if name not in taken)
 
 
 def _view_names(features: Sequence[str]) -> dict[str, str]:

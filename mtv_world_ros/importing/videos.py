@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from glob import escape
 from pathlib import Path
@@ -28,6 +28,7 @@ from mtv_world_ros.importing.mapping import ActionStream, digest_of, load_mapped
 from mtv_world_ros.importing.number_tables import NumberTable, read_table
 from mtv_world_ros.importing.stored_objects import AS_RECORDED, ObjectStage
 from mtv_world_ros.importing.tool_poses import joints_of_poses
+from mtv_world_ros.importing.unused_parts import unused_columns, unused_files, unused_keys
 from mtv_world_ros.importing.video_frames import FrameTimes, match_frames, VideoFileFrames
 from mtv_world_ros.robot.file import save_robot
 from mtv_world_ros.robot.joint_columns import column_number, to_positions
@@ -185,6 +186,10 @@ def import_videos(
         return write_imported(episode, one.name, path, written, mapping.robot, key, stage)
 
     summary = import_each(progress(recordings), key, lambda one: out / one.name, convert)
+    patterns = (mapping.rows, *mapping.views.values())
+    used = [one.file(pattern) for one in recordings for pattern in patterns]
+    if line := unused_files(folder, used, out):
+        summary.notes = (line,)
     summary.robot_notes = saved.notes
     return summary
 
@@ -245,7 +250,27 @@ def read_recording(
         instructions=[],
         unknown=unknown,
         warnings=tuple(notes),
+        unused=_unused(table, mapping),
     )
+
+
+def _unused(table: NumberTable, mapping: VideoMapping) -> dict[str, str]:
+    """Return why keys and columns of a recording's table are not used."""
+    stream = mapping.state
+    columns = stream.used_columns()
+    keys = {mapping.time, key_of(mapping.outcome), key_of(mapping.instruction)}
+    if table.names:
+        return unused_keys(table.names, {*keys, *map(str, columns)} | _at(table.names, columns))
+    label = ', '.join(stream.features)
+    return {
+        **unused_keys(table.keys, {*keys, *stream.features}),
+        **unused_columns(label, (), table.values.shape[1], columns),
+    }
+
+
+def _at(names: Sequence[str], columns: Sequence[int | str]) -> set[str]:
+    """Return the names of columns that are given by number."""
+    return {names[n] for n in columns if isinstance(n, int) and n < len(names)}
 
 
 def _track(

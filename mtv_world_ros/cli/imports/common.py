@@ -246,6 +246,8 @@ def _stage_without_boxes(arguments: argparse.Namespace) -> ObjectStage:
 def _import_status(summary: ImportSummary[Any], name: Callable[[Any], str]) -> int:
     """Print what came of an import, with the names of its recordings; return the exit status."""
     _print_each((name(one), line) for one, lines in summary.warnings.items() for line in lines)
+    for note in summary.notes:
+        print(note, file=sys.stderr)
     for note in summary.robot_notes:
         print(f'robot: {note}', file=sys.stderr)
     print(f'{len(summary.made)} made, {len(summary.kept)} kept, {len(summary.failed)} failed')

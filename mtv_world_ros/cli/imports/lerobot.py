@@ -93,15 +93,12 @@ def _guessed_mapping(arguments: argparse.Namespace) -> Path:
             'give --mapping (config/datasets/example.yaml has all keys), or --robot where the '
             "columns are named like the robot's joints"
         )
-    values, left_out = guess_mapping(
+    values = guess_mapping(
         LeRobotDataset(arguments.dataset), arguments.robot, arguments.calibration
     )
     file = arguments.out / 'mapping.yaml'
     write_whole(file, yaml.safe_dump(values, sort_keys=False))
     print(f'mapping: {file}')
-    if left_out:
-        where = f", not in '{arguments.calibration}'" if arguments.calibration else ', no colours'
-        print(f'left out{where}: {", ".join(left_out)}')
     return file
 
 
