@@ -222,6 +222,19 @@ class JointTrack:
         other.positions[:, column] = both - self.positions[:, column]
         return other
 
+    def shifted(self, robot: RobotModel, joint: str, offset: float) -> JointTrack:
+        """Return the track with another zero of a joint.
+
+        Args:
+            robot: robot whose order of joints is used.
+            joint: name of the joint.
+            offset: added to its positions [rad or m].
+        """
+        other = copy(self)
+        other.positions = self.positions.copy()
+        other.positions[:, robot.joint_names.index(joint)] += offset
+        return other
+
     def covers(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return True for each stamp (N,) within the recorded joint states."""
         return (stamps_ns >= self.stamps_ns[0]) & (stamps_ns <= self.stamps_ns[-1])

@@ -57,6 +57,7 @@ from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.resample import match_joints
 from mtv_world_ros.robot.shape import (
+    arm_links,
     gripper_links,
     LinkShape,
     load_shape,
@@ -108,6 +109,12 @@ _UPRIGHT_MATCH = 0.3
 #: the same of what a gripper moves: on ten real recordings, two views each, right ones lost .073
 #: to .229, and swapped ones gain as much
 _SWAPPED_GAIN = 0.04
+#: zeros of joints that are tried where all views are off [rad]
+_ZEROS_RAD = (-0.25, -0.1, 0.1, 0.25)
+#: relative gain of the summed correlation above which a joint's zero is named
+_ZERO_GAIN = 0.15
+#: settings of the comparison of zeros
+_ZERO_SEARCH = ResidualSearch(max_pairs=8, lags_s=(0.0,), rolls_deg=(), zooms=())
 _ALONE = ResidualSearch(lags_s=(0.0,), rolls_deg=(), zooms=())
 
 
@@ -175,8 +182,66 @@ class Inspector:
                 )
                 for view in episode.views
             ),
-            recording=self._recording(episode, joints),
+            recording=self._recording(
+                episode, joints, self._joint_zero(episode, joints, measured, turned)
+            ),
         )
+
+    def _joint_zero(
+        self,
+        episode: Episode,
+        joints: JointTrack,
+        measured: Mapping[str, MotionResidual],
+        turned: Mapping[str, list[tuple[Finding, bool]]],
+    ) -> list[Finding]:
+        """Return the joint whose zero may be off, where all views are off alike.
+
+        A wrong camera puts one view off; a wrong zero puts off all that see the arm.
+        """
+        views = {view: found for view, found in measured.items() if not found.reason}
+        is_off = [bool(self._distance(r, episode.cameras[v])) for v, r in views.items()]
+        if len(views) < 2 or not all(is_off) or any(turned.get(view) for view in views):
+            return []
+
+        def match(states: JointTrack) -> float:
+            return sum(
+                measure_residual(
+                    episode.images[view], episode.cameras[view], self.robot, self.shape.parts,
+                    states, _ZERO_SEARCH,
+                ).match_here
+                for view in views
+            )  # fmt: skip
+
+        here = match(joints)
+        fits = {
+            (joint, offset): match(joints.shifted(self.robot, joint, offset))
+            for joint in self._zero_candidates(views.values())
+            for offset in _ZEROS_RAD
+        }
+        joint, offset = max(fits, key=lambda key: np.nan_to_num(fits[key], nan=-1.0))
+        best = fits[joint, offset]
+        count = len(views)
+        if not best > max(here * (1 + _ZERO_GAIN), count * _MIN_MATCH):
+            return []
+        text = (
+            f"all {count} views are off alike, and fit better with the zero of joint '{joint}' "
+            f'{offset:+g} rad from where it is (mean match {best / count:.2f}, as it is '
+            f"{here / count:.2f}): check the joint's zero before the cameras"
+        )
+        return [suspicious(text)]
+
+    def _zero_candidates(self, compared: Iterable[MotionResidual]) -> list[str]:
+        """Return the joints that carry a compared link, without those of grippers."""
+        links = {link for residual in compared for link in residual.links}
+        model = self.robot.pinocchio_model
+        above = {
+            model.names[joint]
+            for frame in model.frames
+            if frame.name in links
+            for joint in model.supports[frame.parentJoint]
+        }
+        grippers = {tool.gripper_joint for tool in self.robot.tools}
+        return [name for name in self.robot.joint_names if name in above - grippers]
 
     def picture(self, episode: Episode, view: str) -> ByteArray:
         """Return the overlay picture of a view, (H, W, 3) RGB; bare where its pose is unknown."""
@@ -343,13 +408,28 @@ class Inspector:
             'motion match': f'{residual.match:.2f} over {residual.num_pairs} pairs of frames',
             'image delay': f'{residual.lag_s:+.1f} s against the joint states',
         }
-        findings = [*self._distance(residual, camera), *self._better_fit(residual)]
+        findings = [
+            *self._distance(residual, camera),
+            *self._better_fit(residual),
+            *self._unseen_arms(residual),
+        ]
         if not self.shape.is_known:
             text = (
                 f'only gross errors were looked for: the robot is drawn with {self.shape.source}'
             )
             findings.append(not_checked(text))
         return (measures, findings), (f'the robot is drawn with {self.shape.source}',)
+
+    def _unseen_arms(self, residual: MotionResidual) -> list[Finding]:
+        """Return the arms of a robot with several that were not compared in a view."""
+        return [
+            not_checked(
+                f"arm '{arm}' not checked against the images: it does not move in this view, or "
+                'is not in it'
+            )
+            for arm, links in (arm_links(self.robot) if len(self.robot.tools) > 1 else {}).items()
+            if links.isdisjoint(residual.links)
+        ]
 
     def _distance(self, residual: MotionResidual, camera: CameraModel) -> list[Finding]:
         if residual.match < _MIN_MATCH:
@@ -385,7 +465,7 @@ class Inspector:
         )
         return [suspicious(text)]
 
-    def _recording(self, episode: Episode, joints: JointTrack) -> Section:
+    def _recording(self, episode: Episode, joints: JointTrack, zero: Sequence[Finding]) -> Section:
         frames_ns = episode.images[episode.views[0]].stamps_ns
         origin = int(frames_ns[0])
         checks = [
@@ -401,7 +481,7 @@ class Inspector:
         except MtvWorldError as error:
             checks.append(({}, [broken(f'commands: {error}')]))
         warnings = [suspicious(text) for text in (*episode.warnings, *self.shape.doubts)]
-        return _section('recording', [*checks, ({}, warnings)], ())
+        return _section('recording', [*checks, ({}, [*zero, *warnings])], ())
 
     def _commands(self, episode: Episode, origin_ns: int) -> JointTrajectory | None:
         if not episode.trajectories:

@@ -78,6 +78,7 @@ class MotionResidual:
             in which it is less; below zero where a half fits worse.
         best_change: change of the camera that fits best among those tried, and its match.
         num_pairs: pairs of frames in which the robot moves.
+        links: links that move within the image, which are what was compared.
         reason: reason why it could not be measured; empty if it was.
     """
 
@@ -89,6 +90,7 @@ class MotionResidual:
     lag_gain: float = 0.0
     best_change: tuple[str, float] = ('', float('nan'))
     num_pairs: int = 0
+    links: frozenset[str] = frozenset()
     reason: str = ''
 
 
@@ -132,10 +134,10 @@ def measure_residual(
 
     def match(drawn_by: CameraModel, lag_s: float = 0.0, part: slice = slice(None)) -> float:
         stamps_ns = track.stamps_ns[some[part]].ravel() - round(lag_s * 1e9)
-        return _top(_surface(seen[part], joints.at(stamps_ns), drawn_by, robot, shapes))
+        return _top(_surface(seen[part], joints.at(stamps_ns), drawn_by, robot, shapes)[0])
 
     positions = joints.at(track.stamps_ns[pairs].ravel())
-    now = _surface(_seen_motion(track, pairs, small), positions, small, robot, shapes)
+    now, links = _surface(_seen_motion(track, pairs, small), positions, small, robot, shapes)
     if now is None:
         return MotionResidual(reason='no link moves within the image')
     shift = _peak(now) * camera.width / small.width
@@ -153,6 +155,7 @@ def measure_residual(
         lag_gain=lag_gain,
         best_change=(best, changes[best] + gain) if best else ('', float('nan')),
         num_pairs=len(pairs),
+        links=links,
     )
 
 
@@ -237,8 +240,11 @@ def _surface(
     small: CameraModel,
     robot: RobotModel,
     shapes: Sequence[LinkShape],
-) -> FloatArray | None:
-    """Return (2R + 1, 2R + 1) mean correlation of the links over shifts; None where none moves."""
+) -> tuple[FloatArray | None, frozenset[str]]:
+    """Return (2R + 1, 2R + 1) mean correlation of the links over shifts, and the links that move.
+
+    None where none moves.
+    """
     poses = robot.forward_kinematics(positions)
     T_base_camera = camera_poses(small, robot, positions)
     radius = _radius(small.width)
@@ -248,11 +254,13 @@ def _surface(
         parts.setdefault(shape.link, []).append(pixels)
     whole = fill([pixels for link in parts.values() for pixels in link], small)
     total, weights = np.zeros((2 * radius + 1,) * 2), 0.0
-    for link in parts.values():
+    moving = []
+    for name, link in parts.items():
         surface, count = _correlate(seen, fill(link, small), whole, radius)
         total += np.sqrt(count) * surface
         weights += np.sqrt(count)
-    return total / weights if weights else None
+        moving += [name] if count else []
+    return (total / weights if weights else None), frozenset(moving)
 
 
 def _correlate(

@@ -213,6 +213,23 @@ def gripper_links(robot: RobotModel, tool: Tool) -> set[str]:
     }
 
 
+def arm_links(robot: RobotModel) -> dict[str, set[str]]:
+    """Return the links that each arm moves and no other arm does, by the name of the arm."""
+    model, frames = robot.pinocchio_model, _joint_frames(robot)
+    above = {
+        tool.arm: {joint for joint in model.supports[frames[tool.link]] if joint}
+        for tool in robot.tools
+    }
+    own = {}
+    for arm, joints in above.items():
+        others = {joint for name, each in above.items() if name != arm for joint in each}
+        wanted = joints - others
+        own[arm] = {
+            link for link, joint in frames.items() if not wanted.isdisjoint(model.supports[joint])
+        }
+    return own
+
+
 def _joint_frames(robot: RobotModel) -> dict[str, int]:
     """Return the joint that carries each link."""
     return {
