@@ -465,7 +465,9 @@ class Inspector:
         )
         return [suspicious(text)]
 
-    def _recording(self, episode: Episode, joints: JointTrack, zero: Sequence[Finding]) -> Section:
+    def _recording(
+        self, episode: Episode, joints: JointTrack, zero: Sequence[Finding] = ()
+    ) -> Section:
         frames_ns = episode.images[episode.views[0]].stamps_ns
         origin = int(frames_ns[0])
         checks = [
