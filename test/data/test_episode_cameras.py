@@ -308,8 +308,12 @@ def measured_as(monkeypatch):
         ({'door': [GOOD, GOOD], 'side': [GOOD, GOOD]}, (0, 1), ['a door side', 'b door side']),
         ({'door': [POOR, POOR], 'side': [POOR, POOR]}, (0, 1), ['a', 'b']),
         ({'door': [GOOD, POOR], 'side': [GOOD, UNMEASURED]}, (0, 1), ['a door side', 'b']),
-        # the camera did not move between them, and was measured in the other one
-        ({'door': [GOOD, POOR], 'side': [GOOD, UNMEASURED]}, (0, 0), ['a door side', 'b side']),
+        # the camera did not move between them: the other recording confirms its place
+        (
+            {'door': [GOOD, POOR], 'side': [GOOD, UNMEASURED]},
+            (0, 0),
+            ['a door side', 'b door side'],
+        ),
     ],
 )
 def test_apply_writes_poses_that_are_not_doubted_and_fails_where_some_are(
