@@ -259,3 +259,24 @@ def test_a_delay_is_told_where_the_data_show_it(views, told):
     assert set(found) == told
     for view in told:
         assert f'{views[view][0]:+.1f} s later' in found[view][0].text
+
+
+def test_an_arm_that_rests_is_not_checked_and_says_so(episode, inspector):
+    states = episode.joint_states
+    positions = states.positions.copy()
+    left = [index for index, name in enumerate(states.joint_names) if name.startswith('left_')]
+    positions[:, left] = positions[0, left]
+    view = inspector.inspect(replace(episode, joint_states=replace(states, positions=positions)))
+    said = ' '.join(texts(section) for section in view.views)
+    assert "arm 'left' not checked against the images" in said
+
+
+@pytest.mark.slow
+def test_a_joints_zero_is_named_where_all_views_are_off_alike(episode, inspector):
+    states = episode.joint_states
+    positions = states.positions.copy()
+    positions[:, list(states.joint_names).index('right_joint2')] += 0.25
+    found = inspector.inspect(replace(episode, joint_states=replace(states, positions=positions)))
+    assert "off alike, and fit better with the zero of joint 'right_joint2' -0.25 rad" in texts(
+        found.recording
+    )
