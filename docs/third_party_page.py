@@ -66,7 +66,7 @@ class Notice(NamedTuple):
 def closure() -> dict[str, Distribution]:
     """Return the distributions that the package needs, by normalised name, without itself."""
     found: dict[str, Distribution] = {}
-    waiting = [(PACKAGE, EXTRAS)]
+    waiting: list[tuple[str, tuple[str, ...]]] = [(PACKAGE, EXTRAS)]
     seen: set[tuple[str, tuple[str, ...]]] = set()
     while waiting:
         name, extras = waiting.pop()
@@ -104,7 +104,7 @@ def licence_of(there: Distribution) -> str:
     """Return the licence of a distribution by its metadata; `not stated` if it names none."""
     metadata = there.metadata
     for key in ('License-Expression', 'License'):
-        text = (metadata.get(key) or '').strip()
+        text = str((metadata.get_all(key) or [''])[0]).strip()
         if text and text.upper() != 'UNKNOWN' and len(text) <= _LONGEST_NAME:
             return text
     named = [

@@ -81,7 +81,7 @@ def check_frames(
 
 def lost_objects(masks: ObjectMasks) -> tuple[str, ...]:
     """Return the names of objects that no view shows in the last frame of masks."""
-    seen = masks.masks[:, :, -1].any((0, 2, 3))
+    seen = np.atleast_1d(masks.masks[:, :, -1].any((0, 2, 3)))
     return tuple(name for name, is_seen in zip(masks.names, seen, strict=True) if not is_seen)
 
 

@@ -65,7 +65,9 @@ def _hand(frame: np.ndarray) -> np.ndarray:
 
 def _jpeg(frame: np.ndarray) -> np.ndarray:
     _, data = cv2.imencode('.jpg', frame, [cv2.IMWRITE_JPEG_QUALITY, 4])
-    return cv2.imdecode(data, cv2.IMREAD_COLOR)
+    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return decoded
 
 
 def _overexposed(frame: np.ndarray) -> np.ndarray:
