@@ -328,19 +328,6 @@ def test_an_inactive_node_aborts_goals_and_says_so(client, new_controller, ros):
 
 
 @needs_control_msgs
-def test_shutting_down_in_mid_rollout_ends_the_goal(client, new_controller, ros):
-    """The last one: the node is finalized after it."""
-    controller = new_controller()
-    client.set(seed=BLOCKS)
-    running = controller.send(ros.make_trajectory())
-    client.wait(lambda: client.diagnostic_values().get('busy') == 'true', 'the model')
-    change(client, Transition.TRANSITION_ACTIVE_SHUTDOWN)
-    status, _, text = controller.result(running)
-    assert status == GoalStatus.STATUS_ABORTED and 'the node was deactivated' in text
-    client.wait(lambda: client.diagnostic_values().get('lifecycle') == 'finalized', 'health')
-
-
-@needs_control_msgs
 def test_a_goal_of_many_points_is_refused_before_it_is_decoded(node, client, new_controller):
     controller = new_controller()
     goal = controller.messages.Goal()
@@ -356,3 +343,16 @@ def test_a_goal_of_many_points_is_refused_before_it_is_decoded(node, client, new
     said = client.diagnostic_values()['last_rejection']
     assert 'the request has 20001 items; at most 20000 are read' in said
     assert client.imagine_one()['state'] == 'done'
+
+
+@needs_control_msgs
+def test_shutting_down_in_mid_rollout_ends_the_goal(client, new_controller, ros):
+    """The last one: the node is finalized after it."""
+    controller = new_controller()
+    client.set(seed=BLOCKS)
+    running = controller.send(ros.make_trajectory())
+    client.wait(lambda: client.diagnostic_values().get('busy') == 'true', 'the model')
+    change(client, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    status, _, text = controller.result(running)
+    assert status == GoalStatus.STATUS_ABORTED and 'the node was deactivated' in text
+    client.wait(lambda: client.diagnostic_values().get('lifecycle') == 'finalized', 'health')
