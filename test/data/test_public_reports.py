@@ -1,6 +1,6 @@
 """Situations that users of other projects reported, each as small valid input.
 
-The table in docs/importing.md names the reports; every row of it has a test of its number here.
+The table in docs/importing_cases.md names the reports; every row of it has a test of its number here.
 """
 
 from types import SimpleNamespace

@@ -397,7 +397,7 @@ def test_a_camera_that_is_said_to_be_no_depth_map_is_one(datasets, make_mapping,
 
 
 def test_reports_9_and_10_times_of_hardware_find_their_frames_or_are_named(write_video, tmp_path):
-    """Of docs/importing.md; by the frame number times would be those of other frames."""
+    """Of docs/importing_cases.md; by the frame number times would be those of other frames."""
     levels = list(range(20, 200, 15))
     write_video(tmp_path / 'v.mp4', levels)
     period = 0.1
