@@ -106,8 +106,14 @@ class BagMapping(Written):
     )
     action: str = Field(
         default='joint_trajectory',
-        description='topic of the commanded positions (JointTrajectory or JointState); `state` = '
-        'the measured ones that follow',
+        description='topic of the commanded positions: JointTrajectory, JointState, state of a '
+        'JointTrajectoryController, goals or feedback of FollowJointTrajectory, or '
+        'Float64MultiArray; `state` = the measured ones that follow',
+    )
+    action_joints: ListOf[str] = Field(
+        default=(),
+        description="joints of a Float64MultiArray of commands, in the order of the controller's "
+        '`joints`',
     )
     tools: dict[str, ToolTopic] = Field(
         default={},

@@ -27,10 +27,16 @@ from mtv_world_ros.core.errors import (
 )
 from mtv_world_ros.core.files import check_name
 from mtv_world_ros.data.bag import messages
+from mtv_world_ros.data.bag.command_messages import (
+    command_topics,
+    CommandReader,
+    FLOAT_ARRAY,
+    READ_AS,
+)
 from mtv_world_ros.data.bag.image_decoding import check_decodable, check_image, to_ids, to_rgb
 from mtv_world_ros.data.bag.image_orientation import stored_note
 from mtv_world_ros.data.bag.messages import IMAGE_TYPES
-from mtv_world_ros.data.bag.reader import BagReader, is_storage
+from mtv_world_ros.data.bag.reader import BagMessage, BagReader, is_storage
 from mtv_world_ros.data.bag.unused_topics import unused_topics
 from mtv_world_ros.data.bag.video_packets import (
     check_packet,
@@ -254,6 +260,7 @@ class _EpisodeReader:
             raise
         further = self.mapping.state_topics[1:]
         self.state_topics = (self.topics.joint_states, *further)
+        self.command_topics = self._find_commands()
         self.with_masks = with_masks
         self.decode_all = True
         self.received: dict[str, Stamped] = {}
@@ -307,9 +314,9 @@ class _EpisodeReader:
         topics, mapping = self.topics, self.mapping
         used = topics.names(with_masks=True) | {self._camera_info(view) for view in topics.views}
         used |= {mapping.topic(tool.topic) for tool in mapping.tools.values()}
-        used |= set(self.state_topics)
+        used |= {*self.state_topics, *self.command_topics}
         if mapping.action == STATE:
-            used.discard(topics.joint_trajectory)
+            used -= {topics.joint_trajectory, *self.command_topics}
         if mapping.instruction:
             used.discard(topics.instruction)
         if not self.is_calibrated:
@@ -331,20 +338,56 @@ class _EpisodeReader:
         names = [name for names in own for name in names]
         return dict.fromkeys(n for n in names if self.mapping.joint_name(n) not in wanted)
 
+    def _find_commands(self) -> tuple[str, ...]:
+        """Return the topics of the commands.
+
+        Where a bag has no JointTrajectory, those of controllers and actions stand in.
+        """
+        topic = self.topics.joint_trajectory
+        is_default = self.mapping.action == BagMapping.model_fields['action'].default
+        has_plans = bool(self._topics_of(messages.JOINT_TRAJECTORY))
+        if topic in self.types or not is_default or has_plans:
+            return (topic,)
+        found = command_topics(self.types)
+        if found:
+            self.warnings.append(
+                f"there is no '{topic}': commands are those of {', '.join(found)} "
+                f'({_kind_of(self.types[found[0]])}); --action names another topic'
+            )
+        return found or (topic,)
+
+    def _parse(self, message: BagMessage, commands: Mapping[str, CommandReader]) -> Any:
+        """Return the type and the message; commands of other types as those they are read as."""
+        if message.topic in commands and message.msgtype in READ_AS:
+            found = commands[message.topic].read(message.msgtype, message.data)
+            return READ_AS[message.msgtype], found
+        return message.msgtype, messages.deserialize(message.msgtype, message.data)
+
     def _receive(self) -> None:
         wanted = self.topics.names(with_masks=self.with_masks) | set(TF_TOPICS)
+        wanted |= set(self.command_topics)
         wanted |= {self._camera_info(view) for view in self.topics.views}
         wanted |= {self.mapping.topic(tool.topic) for tool in self.mapping.tools.values()}
         wanted |= set(self.state_topics)
         logged: dict[str, list[tuple[int, int]]] = {}
+        is_state = self.mapping.action == STATE
+        readers = (
+            {}
+            if is_state
+            else {
+                topic: CommandReader(self.mapping.action_joints) for topic in self.command_topics
+            }
+        )
         for index, message in enumerate(self.bag.messages(wanted)):
             try:
-                parsed = messages.deserialize(message.msgtype, message.data)
+                kind, parsed = self._parse(message, readers)
             except EpisodeError as error:
                 self._refuse(message.topic, error)
                 continue
+            if parsed is None:
+                continue
             stamp = messages.header_stamp(parsed) if hasattr(parsed, 'header') else 0
-            self.received.setdefault(message.topic, []).append((stamp, (message.msgtype, parsed)))
+            self.received.setdefault(message.topic, []).append((stamp, (kind, parsed)))
             logged.setdefault(message.topic, []).append((index, message.stamp_ns))
         places = {topic: np.array(rows, np.int64).T for topic, rows in logged.items()}
         self.arrived = arrival_times(
@@ -405,7 +448,7 @@ class _EpisodeReader:
         keys = {names.image: view for view, names in self.topics.views.items()}
         keys |= dict.fromkeys(self.state_topics, 'joint_states')
         if self.mapping.action != STATE:
-            keys |= {self.topics.joint_trajectory: 'action'}
+            keys |= dict.fromkeys(self.command_topics, 'action')
         keys |= {self.mapping.topic(tool.topic): arm for arm, tool in self.mapping.tools.items()}
         found = []
         for topic, key in keys.items():
@@ -603,7 +646,7 @@ class _EpisodeReader:
     def _other_joints(self) -> dict[str, tuple[str, ...]]:
         """Return the names of the joints in topics of joint states that are not read, by topic."""
         others = [t for t in self._topics_of(messages.JOINT_STATE) if t not in self.state_topics]
-        others = [topic for topic in others if topic != self.topics.joint_trajectory]
+        others = [topic for topic in others if topic not in self.command_topics]
         found: dict[str, dict[str, None]] = {topic: {} for topic in others}
         for message in self.bag.messages(others) if others else ():
             state = messages.deserialize(message.msgtype, message.data)
@@ -680,21 +723,31 @@ class _EpisodeReader:
         return [name for name, found in self.types.items() if found == kind]
 
     def _joint_commands(self, states: JointStates | None) -> Stamped:
-        topic = self.topics.joint_trajectory
+        topics = self.command_topics
+        topic = ', '.join(topics)
         if self.mapping.action == STATE:
             return (
                 []
                 if states is None
                 else trajectories_to(states, self.mapping.chunk_s, self.seen_ns)
             )
-        if self.types.get(topic) == messages.JOINT_STATE:
-            taken = self._take(topic, messages.JOINT_STATE)
+        kind = self.types.get(topics[0], '')
+        if READ_AS.get(kind, kind) == messages.JOINT_STATE:
+            taken = [item for one in topics for item in self._take(one, messages.JOINT_STATE)]
             leader = merge_joint_states(topic, taken, self.warnings, renamed=self._renamed)
             if leader is None:
                 return []
-            return trajectories_to(leader, self.mapping.chunk_s, self.seen_ns)
+            led = trajectories_to(leader, self.mapping.chunk_s, self.seen_ns)
+            return self._completed(topic, led, states)
         plan = self._plan if states is None else self._plan_or_stop
-        plans = self._parsed(topic, messages.JOINT_TRAJECTORY, plan)
+        plans = sorted(
+            (
+                item
+                for one in topics
+                for item in self._parsed(one, messages.JOINT_TRAJECTORY, plan)
+            ),
+            key=lambda item: item[0],
+        )
         if states is not None:
             plans, count = hold_at_stops(plans, states)
             if count:
@@ -702,9 +755,21 @@ class _EpisodeReader:
                     f"'{topic}': {count} empty trajectories stop the plans before them; the "
                     'measured positions are held from then on, until the next plan'
                 )
-        if topic not in self.types and (others := self._topics_of(messages.JOINT_TRAJECTORY)):
-            self._warn_once(f"no trajectories at '{topic}'; there are some at {_listed(others)}")
+        if topics[0] not in self.types:
+            self._warn_of_other_commands(topic)
         return self._whole_plans(topic, plans, states)
+
+    def _warn_of_other_commands(self, topic: str) -> None:
+        """Name the topics that have commands where the one of the mapping has none."""
+        others = self._topics_of(messages.JOINT_TRAJECTORY) or list(command_topics(self.types))
+        if others:
+            self._warn_once(f"no trajectories at '{topic}'; there are some at {_listed(others)}")
+        if arrays := self._topics_of(FLOAT_ARRAY):
+            self._warn_once(
+                f"no trajectories at '{topic}'; {_listed(arrays)} has values without names: with "
+                f"'action: {arrays[0]}' in the mapping (--topics), 'action_joints' names them in "
+                "the order of the controller's 'joints'"
+            )
 
     def _plan_or_stop(self, message: Any) -> JointTrajectory | tuple[str, ...]:
         """Return a plan, or the joints that an empty trajectory stops; empty = all."""
@@ -725,6 +790,11 @@ class _EpisodeReader:
                 f"'{topic}': {count} trajectories of one point are a stream of commands and were "
                 f'joined into plans of {chunk_s:g} s'
             )
+        return self._completed(topic, plans, states)
+
+    def _completed(self, topic: str, plans: Stamped, states: JointStates | None) -> Stamped:
+        """Return the plans with the measured positions of joints that they leave out."""
+        chunk_s = self.mapping.chunk_s
         if self.robot is None or self.mapping.tools:
             return plans
         whole, measured = complete_plans(plans, states, self.robot, chunk_s)
@@ -958,6 +1028,10 @@ class _EpisodeReader:
             for topic, reasons in self.refused.items()
         ]
         return (*cut, *self.bag.problems, *self.warnings, *refused)
+
+
+def _kind_of(msgtype: str) -> str:
+    return msgtype.rpartition('/')[2]
 
 
 def _span(item: tuple[str, Any]) -> int | None:

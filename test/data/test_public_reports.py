@@ -1,6 +1,6 @@
 """Situations that users of other projects reported, each as small valid input.
 
-The table in docs/importing_cases.md names the reports; every row of it has a test of its number here.
+The table in docs/importing_cases.md names the reports; its rows have tests of their numbers here.
 """
 
 from types import SimpleNamespace

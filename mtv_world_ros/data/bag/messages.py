@@ -100,12 +100,22 @@ def deserialize(msgtype: str, data: bytes) -> Any:
     Raises:
         EpisodeError: the type is unknown or the bytes do not hold such a message.
     """
-    store = typestore()
-    check_type(msgtype)
+    return deserialize_as(typestore(), check_type(msgtype), msgtype, data)
+
+
+def deserialize_as(store: Typestore, name: str, msgtype: str, data: bytes) -> Any:
+    """Return the message of CDR bytes by a definition of a store; see `deserialize`.
+
+    Args:
+        store: definitions.
+        name: name of the definition in the store.
+        msgtype: recorded type, for error texts.
+        data: CDR bytes with encapsulation header.
+    """
     try:
         if data[:2] not in (b'\x00\x00', b'\x00\x01'):
             raise EpisodeError(f'{msgtype}: encapsulation {data[:2].hex()} is not plain CDR')
-        parsed = store.get_msgdef(msgtype)
+        parsed = store.get_msgdef(name)
         read = parsed.deserialize_cdr_le if data[1] else parsed.deserialize_cdr_be
         return read(memoryview(data)[4:], 0, parsed.cls, store)[0]
     except _UNREADABLE as error:

@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 from mtv_world_ros.data.bag import messages
+from mtv_world_ros.data.bag.command_messages import READ_AS
 from mtv_world_ros.data.bag_mapping import BagMapping, STATE
 
 #: words in the names of image topics that are not colour images of the scene
 _NO_COLOURS = ('depth', 'infra', 'mask', 'confidence', 'disparity')
+_COMMANDS = "commands; --action, or 'action' in the mapping, names the topic that is read"
 #: key of the mapping, or option, that takes messages of a type
 _TAKEN_BY = {
     messages.CAMERA_INFO: 'camera info of no view',
     messages.JOINT_STATE: "joint states; 'joint_states' in the mapping names the topics that are "
     'read',
-    messages.JOINT_TRAJECTORY: "commands; --action, or 'action' in the mapping, names the topic "
-    'that is read',
+    messages.JOINT_TRAJECTORY: _COMMANDS,
+    **dict.fromkeys(READ_AS, _COMMANDS),
     messages.POSE_STAMPED: "poses; 'tools' in the mapping takes commanded ones",
     messages.STRING: "text; 'instruction_topic' in the mapping names the topic that is read",
     messages.TF_MESSAGE: 'poses of cameras; those of the calibration file are used',
@@ -53,7 +55,7 @@ def unused_topics(
 def _why(topic: str, kind: str, images: Collection[str], mapping: BagMapping) -> str:
     if kind in messages.IMAGE_TYPES:
         return _why_no_view(topic, images)
-    if kind == messages.JOINT_TRAJECTORY and mapping.action == STATE:
+    if kind in (messages.JOINT_TRAJECTORY, *READ_AS) and mapping.action == STATE:
         return "commands; 'action: state' takes the measured positions that follow"
     if kind == messages.STRING and topic == mapping.topic(mapping.instruction_topic):
         return "text; the mapping's 'instruction' is used"
