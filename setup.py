@@ -78,8 +78,8 @@ setup(
         'wan': ['accelerate>=1.15', 'peft>=0.21', 'transformers>=5.23,<6'],
         # `mtv-world view`: the Rerun viewer, native and for browsers.
         'view': ['rerun-sdk>=0.30'],
-        # LeRobot datasets are read with it (mtv-world import lerobot).
-        'import': ['pyarrow>=17'],
+        # Imports: tables of LeRobot data sets, HDF5 files, messages in Protobuf of MCAP files.
+        'import': ['h5py>=3.10', 'mcap-protobuf-support>=0.5.3', 'pyarrow>=17'],
         # Clients of policy servers: LeRobot's (grpcio), openpi's.
         'policies': ['grpcio>=1.60', 'msgpack>=1', 'websockets>=13'],
         # `mtv-world rank --ray`: rollouts on a Ray cluster; pulls no torch.

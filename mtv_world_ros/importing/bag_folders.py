@@ -7,7 +7,7 @@ from pathlib import Path
 import re
 
 from mtv_world_ros.core.errors import EpisodeError
-from mtv_world_ros.data.bag.reader import is_storage
+from mtv_world_ros.data.bag.reader import is_storage, ROS1_SUFFIX
 from mtv_world_ros.data.episode_reader import list_episodes
 
 #: number that rosbag2 adds to the files of a bag that it splits
@@ -39,5 +39,7 @@ def _apart(folder: Path) -> list[Path]:
     if folder.is_file() or (folder / 'metadata.yaml').is_file():
         return [folder]
     files = [file for file in sorted(folder.iterdir()) if is_storage(file) and file.is_file()]
+    if any(ROS1_SUFFIX in file.suffixes for file in files):  # each is a recording of its own
+        return files
     stems = {_PART.sub('', file.name.split('.')[0]) for file in files}
     return [folder] if len(stems) == 1 else files

@@ -79,14 +79,18 @@ def with_guessed_views(mapping: BagMapping, bag: Path) -> BagMapping:
     """
     if mapping.views:
         return mapping
-    found = BagReader(bag).topics()
+    reader = BagReader(bag)
+    found = reader.topics()
     topics = [name for name, kind in found.items() if kind in messages.IMAGE_TYPES]
     inside = [t for t in topics if t.startswith(mapping.topic(''))] or topics
     views = guess_views(inside)
     if not views:
-        raise EpisodeError(
-            f"'{bag}' has no images (topics of Image, CompressedImage or FFMPEGPacket)"
+        others = ', '.join(f'{topic} ({kind})' for topic, kind in found.items()) or 'none'
+        text = (
+            f"'{bag}' has no images (topics of Image, CompressedImage or FFMPEGPacket); its "
+            f'topics are {others}'
         )
+        raise EpisodeError('; '.join([text, *filter(None, [reader.truncated, *reader.problems])]))
     return mapping.replace(views={view: {'image': topic} for view, topic in views.items()})
 
 

@@ -65,7 +65,7 @@ def recover(source: Path, out: Path | None = None) -> Recovered:
             the new bag cannot be written.
     """
     path = out or _default_path(source)
-    reader = BagReader(source)
+    reader = BagReader(source, as_recorded=True)
     counts: dict[str, int] = {}
     first_ns, last_ns = 2**63, 0
     with BagWriter(path) as writer:

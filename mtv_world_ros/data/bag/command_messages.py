@@ -55,18 +55,18 @@ trajectory_msgs/JointTrajectory trajectory
 _SENT_GOAL = 'uint8[16] goal_id\ntrajectory_msgs/JointTrajectory trajectory\n'
 
 
-def _own_name(msgtype: str) -> str:
+def own_name(msgtype: str) -> str:
     """Return the name that the beginning of a message has in the store of beginnings."""
     return f'mtv_world/msg/{msgtype.rpartition("/")[2].replace("_", "")}'
 
 
 @cache
-def _beginnings() -> Typestore:
+def command_store() -> Typestore:
     """Definitions of the part of each message that is read."""
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg(_SENT_GOAL, 'mtv_world/msg/SentGoal'))
     for msgtype, text in _DEFINITIONS.items():
-        store.register(get_types_from_msg(text, _own_name(msgtype)))
+        store.register(get_types_from_msg(text, own_name(msgtype)))
     return store
 
 
@@ -89,7 +89,7 @@ class CommandReader:
         """
         if msgtype == FLOAT_ARRAY:
             return self._named(messages.deserialize(msgtype, data).data)
-        found = messages.deserialize_as(_beginnings(), _own_name(msgtype), msgtype, data)
+        found = messages.deserialize_as(command_store(), own_name(msgtype), msgtype, data)
         if msgtype == SENT_GOAL:  # client and server each record a goal
             new = [goal for goal in found.request if bytes(goal.goal_id) not in self._goals]
             self._goals |= {bytes(goal.goal_id) for goal in new}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, contextmanager
 import io
 from pathlib import Path
@@ -28,8 +28,13 @@ from mtv_world_ros.core.bounded_input import (
     read_bytes,
     require_regular,
 )
-from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
+from mtv_world_ros.data.bag.foxglove import protobuf_reader, Read, ros_reader
+from mtv_world_ros.data.bag.ros1 import MAGIC as ROS1_MAGIC
+from mtv_world_ros.data.bag.ros1 import Ros1Bag, Ros1Error
 
+#: end of the names of ROS 1 bags
+ROS1_SUFFIX = '.bag'
 MAGIC = b'\x89MCAP0\r\n'
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 _SQLITE_MAGIC = b'SQLite format 3\0'
@@ -69,10 +74,17 @@ class _Cut(Exception):
 
 
 class BagReader:
-    """A rosbag2 folder of MCAP or SQLite files, or one such file.
+    """A rosbag2 folder of MCAP or SQLite files, or one such file; or a bag of ROS 1.
+
+    Messages of ROS 1 and of Foxglove's schemas, also in Protobuf, are read as standard messages of
+    ROS 2.
 
     Compression by file or by message (zstd) is undone. A bag that is cut off or damaged is read up
     to there; `truncated` then says where.
+
+    Args:
+        path: folder or file.
+        as_recorded: messages are not translated, for copies.
 
     Attributes:
         truncated: reason why the record ends early; empty where it does not. Known after a pass.
@@ -84,8 +96,10 @@ class BagReader:
         EpisodeError: there is no such bag, or it is stored as something else.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, *, as_recorded: bool = False) -> None:
         self.path = Path(path)
+        self._as_recorded = as_recorded
+        self._readers: dict[tuple[str, bytes], Read | None] = {}
         self.truncated = ''
         self.problems: list[str] = []
         self.metadata: dict[str, dict[str, str]] = {}
@@ -115,14 +129,71 @@ class BagReader:
             try:
                 require_regular(file)
                 with _decompressed(file) as plain:
-                    read = self._sqlite if plain.suffix == '.db3' else self._mcap
-                    for message in read(plain, file, topics):
-                        yield _unpacked(message)
+                    for message in self._reader_of(plain)(plain, file, topics):
+                        found = self._standard(_unpacked(message))
+                        if found is not None:
+                            yield found
             except _Cut as cut:
                 self.truncated = f"'{file}' is cut off or damaged: {cut}"
                 return
             except OSError as error:
                 raise EpisodeError(f"cannot read '{file}': {error}") from error
+
+    def _reader_of(
+        self, plain: Path
+    ) -> Callable[[Path, Path, Collection[str] | None], Iterator[BagMessage]]:
+        if plain.suffix == '.db3':
+            return self._sqlite
+        with plain.open('rb') as stream:
+            is_ros1 = stream.read(len(ROS1_MAGIC)) == ROS1_MAGIC
+        return self._ros1 if is_ros1 else self._mcap
+
+    def _standard(self, message: BagMessage) -> BagMessage | None:
+        """Return a message as a standard one, where it is of Foxglove; None = left out."""
+        if self._as_recorded or not message.msgtype.startswith('foxglove_msgs/'):
+            return message
+        key = (message.msgtype, b'')
+        if key not in self._readers:
+            self._readers[key] = ros_reader(message.msgtype)
+        return self._translated(self._readers[key], message)
+
+    def _translated(self, read: Read | None, message: BagMessage) -> BagMessage | None:
+        if read is None:
+            return message
+        try:
+            msgtype, data = read(message.data)
+        except MtvWorldError as error:
+            self._problem(f"'{message.topic}': a message was left out: {error}")
+            return None
+        return message._replace(msgtype=msgtype, data=data)
+
+    def _protobuf(self, channel: Channel, message: BagMessage) -> BagMessage | None:
+        """Return a message in Protobuf as a standard one; None = it is left out, by name."""
+        schema = self._schemas[channel.schema_id]
+        key = (schema.name, schema.data)
+        if key not in self._readers:
+            self._readers[key] = None
+            try:
+                self._readers[key] = protobuf_reader(schema)
+            except EpisodeError as error:
+                self._problem(f"'{channel.topic}' was left out: {error}")
+        read = self._readers[key]
+        return None if read is None else self._translated(read, message)
+
+    def _ros1(
+        self, plain: Path, file: Path, topics: Collection[str] | None
+    ) -> Iterator[BagMessage]:
+        if self._as_recorded:
+            raise EpisodeError(
+                f"'{file}' is a bag of ROS 1, whose messages are not copied as they are; "
+                'import bag reads it, and rosbag reindex mends it'
+            )
+        bag = Ros1Bag(plain, self._most_bytes, self._problem)
+        try:
+            for topic, msgtype, stamp, data in bag.messages(topics):
+                yield BagMessage(topic, msgtype, stamp, data)
+        except Ros1Error as error:
+            raise _Cut(str(error)) from error
 
     def declared(self) -> dict[str, tuple[str, str, str]]:
         """Return message type, `.msg` text and offered QoS profiles of the topics read by now."""
@@ -268,9 +339,16 @@ class BagReader:
             channel = self._channels.get(number)
             if channel is None:
                 raise _Cut(f'a message of channel {number}, which is not declared')
-            if (topics is None or channel.topic in topics) and self._is_cdr(channel):
+            if topics is not None and channel.topic not in topics:
+                return
+            data = body[_MESSAGE.size :]
+            if self._is_protobuf(channel):
+                packed = BagMessage(channel.topic, '', log_time, data, publish_time)
+                found = self._protobuf(channel, packed)
+                if found is not None:
+                    yield found
+            elif self._is_cdr(channel):
                 msgtype = self._schemas[channel.schema_id].name
-                data = body[_MESSAGE.size :]
                 yield BagMessage(channel.topic, msgtype, log_time, data, publish_time)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
             try:
@@ -291,6 +369,13 @@ class BagReader:
             record = Metadata.read(stream)
             self.metadata[record.name] = record.metadata
 
+    def _is_protobuf(self, channel: Channel) -> bool:
+        return (
+            not self._as_recorded
+            and channel.message_encoding == 'protobuf'
+            and channel.schema_id in self._schemas
+        )
+
     def _is_cdr(self, channel: Channel) -> bool:
         fits = channel.message_encoding == 'cdr' and channel.schema_id in self._schemas
         if not fits:
@@ -303,7 +388,7 @@ class BagReader:
 
 def is_storage(file: Path) -> bool:
     """Return whether a file holds messages of a bag, by its name."""
-    return Path(file.name.removesuffix('.zstd')).suffix in ('.mcap', '.db3')
+    return Path(file.name.removesuffix('.zstd')).suffix in ('.mcap', '.db3', ROS1_SUFFIX)
 
 
 def _lost_pages(file: Path) -> str:

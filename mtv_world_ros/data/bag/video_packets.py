@@ -9,7 +9,7 @@ import av
 from av.video.codeccontext import VideoCodecContext
 import numpy as np
 
-from mtv_world_ros.core.bounded_input import check_limit, LimitError
+from mtv_world_ros.core.bounded_input import check_limit, LimitError, limits
 from mtv_world_ros.core.data_types import ByteArray
 from mtv_world_ros.core.errors import EpisodeError, ObservationError
 from mtv_world_ros.data.episode import LazyFrames
@@ -51,6 +51,56 @@ def codec_of(encoding: str) -> str:
             f"video packets of encoding '{encoding}' cannot be decoded ({error})"
         ) from error
     return name
+
+
+def is_key(encoding: str, data: bytes) -> bool:
+    """Return whether a packet can be decoded without the ones before it.
+
+    Of H.264 and H.265 by the kinds of NAL units in Annex B, of VP9 and AV1 by their first header.
+    """
+    codec = codec_of(encoding)
+    if codec in ('h264', 'hevc'):
+        return any(_starts_anew(codec, kind) for kind in _nal_headers(data))
+    if codec == 'vp9':
+        return bool(data) and not data[0] & _VP9_INTER
+    if codec == 'av1':
+        return any(kind == _AV1_SEQUENCE for kind in _obu_kinds(data))
+    return True
+
+
+#: bit of a VP9 frame's first byte that is set in frames that need others
+_VP9_INTER = 0x04
+#: kinds of OBUs of AV1
+_AV1_SEQUENCE, _AV1_DELIMITER = 1, 2
+#: NAL units that are looked at in a packet
+_MOST_UNITS = 64
+
+
+def _nal_headers(data: bytes) -> Iterator[int]:
+    """Yield the first byte of each NAL unit of a packet in Annex B."""
+    at = -1
+    for _ in range(_MOST_UNITS):
+        at = data.find(b'\0\0\1', at + 1)
+        if at < 0 or at + 3 >= len(data):
+            return
+        yield data[at + 3]
+
+
+def _starts_anew(codec: str, header: int) -> bool:
+    """Return whether a NAL unit is of an IDR frame (H.264) or a random access point (H.265)."""
+    return header & 0x1F == 5 if codec == 'h264' else 16 <= header >> 1 & 0x3F <= 21
+
+
+def _obu_kinds(data: bytes) -> Iterator[int]:
+    """Yield the kinds of the first two OBUs; a delimiter has no content."""
+    at = 0
+    for _ in range(2):
+        if at >= len(data):
+            return
+        yield (kind := data[at] >> 3 & 0x0F)
+        if kind != _AV1_DELIMITER:
+            return
+        at += 2
 
 
 def check_packet(message: Any) -> None:
@@ -107,6 +157,8 @@ class VideoFrames(LazyFrames):
         """Yield number and image of the frames from a key frame on."""
         context = av.CodecContext.create(self._codec, 'r')
         assert isinstance(context, VideoCodecContext)
+        # packets of some recorders do not say how large their pictures are
+        context.options = {'max_pixels': str(limits().image_pixels)}
         try:
             for number in range(key, len(self._messages)):
                 packet = av.Packet(bytes(self._messages[number].data))
