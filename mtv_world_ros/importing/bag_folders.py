@@ -9,6 +9,7 @@ import re
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.bag.reader import is_storage, ROS1_SUFFIX
 from mtv_world_ros.data.episode_reader import list_episodes
+from mtv_world_ros.importing.other_formats import conversion_hint
 
 #: number that rosbag2 adds to the files of a bag that it splits
 _PART = re.compile(r'_\d+$')
@@ -27,10 +28,13 @@ def find_bags(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         if not path.exists():
             raise EpisodeError(f"there is no bag '{path}'")
+        if path.is_file() and not is_storage(path) and (hint := conversion_hint(path)):
+            raise EpisodeError(f"'{path}' is no bag{hint}")
         inside = [path] if path.is_file() else list_episodes(path)
         found += [bag for folder in inside for bag in _apart(folder)]
     if not found:
-        raise EpisodeError(f'there is no bag in {", ".join(map(str, paths))}')
+        hints = ''.join(dict.fromkeys(map(conversion_hint, paths)))
+        raise EpisodeError(f'there is no bag in {", ".join(map(str, paths))}{hints}')
     return found
 
 

@@ -32,6 +32,7 @@ from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest, ObservationError
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data.bag.image_orientation import exif_orientation, turned_upright, UPRIGHT
+from mtv_world_ros.importing.other_formats import conversion_hint
 from mtv_world_ros.importing.video_frames import frames_at, times_in_video, video_note
 
 VERSIONS = ('v2.0', 'v2.1', 'v3.0')
@@ -294,7 +295,10 @@ class LeRobotDataset:
     def _info(self) -> Mapping[str, Any]:
         file = self.root / _INFO
         if not file.is_file():
-            raise EpisodeError(f"'{self.root}' is no LeRobot dataset: '{_INFO}' is not there")
+            raise EpisodeError(
+                f"'{self.root}' is no LeRobot dataset: '{_INFO}' is not there"
+                f'{conversion_hint(self.root)}'
+            )
         try:
             info = read_json(file)
         except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Recordings that are video files and tables of joints or tool poses, a row a frame."""
+"""Recordings that are videos and tables of joints or tool poses, a row a frame, or HDF5 files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from glob import escape
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PrivateAttr
@@ -18,14 +18,24 @@ from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest
 from mtv_world_ros.data.bag_mapping import BagMapping, key_of, keyed, ViewSource, Written
 from mtv_world_ros.data.episode import Episode, EpisodeInfo, JointStates, parse_outcome, Track
+from mtv_world_ros.data.gripper_sources import resting_grippers
 from mtv_world_ros.data.joint_plans import trajectories_to
 from mtv_world_ros.data.measured_joints import mend_rows
 from mtv_world_ros.data.stream_clocks import check_row_times
 from mtv_world_ros.importing.bags import write_imported
 from mtv_world_ros.importing.camera_parameters import sized_camera
 from mtv_world_ros.importing.convert import import_each, ImportSummary, START_NS
+from mtv_world_ros.importing.hdf5_files import (
+    data_set_names,
+    group_names,
+    Hdf5Frames,
+    is_hdf5,
+    read_hdf5_table,
+    split_inside,
+)
 from mtv_world_ros.importing.mapping import ActionStream, digest_of, load_mapped_robot
 from mtv_world_ros.importing.number_tables import NumberTable, read_table
+from mtv_world_ros.importing.other_formats import zarr_hint
 from mtv_world_ros.importing.stored_objects import AS_RECORDED, ObjectStage
 from mtv_world_ros.importing.tool_poses import joints_of_poses
 from mtv_world_ros.importing.unused_parts import unused_columns, unused_files, unused_keys
@@ -37,7 +47,7 @@ from mtv_world_ros.robot.model import RobotModel
 #: units of `time` in a second
 _PER_SECOND = {'s': 1.0, 'ms': 1e3, 'us': 1e6, 'ns': 1e9}
 #: settings that are not among those that older imports were made with
-_LATER = ('time_unit', 'frame_times')
+_LATER = ('time_unit', 'frame_times', 'action', 'channels')
 
 
 def _inside(pattern: str) -> str:
@@ -56,10 +66,26 @@ class VideoMapping(Written):
         description="name of a bundled robot, or a robot's YAML relative to this file"
     )
     rows: Annotated[str, AfterValidator(_inside)] = Field(
-        description='JSON or CSV file of each recording, e.g. `joints/{name}.json`'
+        description='JSON, CSV or HDF5 file of each recording, e.g. `joints/{name}.json`; of '
+        'several recordings in one HDF5 file their groups, e.g. `all.hdf5:data/{name}`'
     )
-    views: dict[str, str] = Field(description='video file by view, e.g. `videos/{name}/0.mp4`')
-    state: ActionStream = Field(description='measured joints, or poses of tools, of each row')
+    views: dict[str, str] = Field(
+        description='video file by view, e.g. `videos/{name}/0.mp4`, or images in an HDF5 file, '
+        'e.g. `{name}.hdf5:observations/images/top`'
+    )
+    state: ActionStream = Field(
+        description='measured joints, or poses of tools, of each row; of HDF5 files `feature` is '
+        'a data set'
+    )
+    action: ActionStream | None = Field(
+        default=None,
+        description='commands of each row; null = the measured positions that follow',
+    )
+    channels: Literal['rgb', 'bgr'] = Field(
+        default='rgb',
+        description='order of the colours of images in HDF5 files; `bgr` where a player shows '
+        'red as blue, as OpenCV stores them',
+    )
     fps: float | None = Field(
         default=None, gt=0, le=1000, description='rows a second, without `time`'
     )
@@ -114,6 +140,8 @@ def load_video_mapping(path: Path) -> VideoMapping:
         raise ConfigError(f"'{path}': 'views' is empty; name at least one")
     if (mapping.fps is None) == (not mapping.time):
         raise ConfigError(f"'{path}': give either 'fps' or 'time'")
+    if mapping.action is not None and mapping.state.tools:
+        raise ConfigError(f"'{path}': 'action' needs measured joints in 'state', not `tools`")
     if mapping.state.differences or 'delay_frames' in mapping.state.model_fields_set:
         raise ConfigError(
             f"'{path}': 'state' is what was measured; 'differences' and 'delay_frames' are of "
@@ -132,7 +160,11 @@ class VideoRecording:
 
     def file(self, pattern: str) -> Path:
         """Return the path of a file of the recording."""
-        return self.folder / pattern.replace('{name}', self.name)
+        return self.folder / split_inside(pattern)[0].replace('{name}', self.name)
+
+    def inside(self, pattern: str) -> str:
+        """Return the path in an HDF5 file; empty = the whole file."""
+        return split_inside(pattern)[1].replace('{name}', self.name)
 
 
 def find_recordings(folder: Path, mapping: VideoMapping) -> list[VideoRecording]:
@@ -141,7 +173,10 @@ def find_recordings(folder: Path, mapping: VideoMapping) -> list[VideoRecording]
     Raises:
         EpisodeError: there is none.
     """
-    before, _, after = mapping.rows.partition('{name}')
+    file, inside = split_inside(mapping.rows)
+    if '{name}' not in file:
+        return _in_one_file(folder, file, inside)
+    before, _, after = file.partition('{name}')
     found = []
     for path in folder.glob(f'{escape(before)}*{escape(after)}'):
         text = path.relative_to(folder).as_posix()
@@ -149,7 +184,26 @@ def find_recordings(folder: Path, mapping: VideoMapping) -> list[VideoRecording]
         if path.is_file() and name and '/' not in name:
             found.append(VideoRecording(folder, name))
     if not found:
-        raise EpisodeError(f"'{folder}' has no '{mapping.rows}'; give the folder that has them")
+        raise EpisodeError(
+            f"'{folder}' has no '{mapping.rows}'; give the folder that has them{zarr_hint(folder)}"
+        )
+    return sorted(found, key=lambda one: one.name)
+
+
+def _in_one_file(folder: Path, file: str, inside: str) -> list[VideoRecording]:
+    """Return the recordings that are groups of one HDF5 file."""
+    before, _, after = inside.partition('{name}')
+    parent = before.rpartition('/')[0]
+    names = [name for name in group_names(folder / file, parent) if name]
+    start = before[len(parent) :].lstrip('/')
+    end = after.partition('/')[0]
+    found = [
+        VideoRecording(folder, name[len(start) : len(name) - len(end)])
+        for name in names
+        if name.startswith(start) and name.endswith(end) and len(name) > len(start) + len(end)
+    ]
+    if not found:
+        raise EpisodeError(f"'{folder / file}' has no group '{inside}'")
     return sorted(found, key=lambda one: one.name)
 
 
@@ -209,7 +263,7 @@ def read_recording(
         ConfigError: a column is not there.
     """
     path = recording.file(mapping.rows)
-    table = read_table(path, mapping.state.features)
+    table = _table(recording, mapping, mapping.state)
     times, paused = _times(table, mapping)
     stamps = START_NS + np.round(times * 1e9).astype(np.int64)
     positions, notes = _positions(table, mapping)
@@ -220,7 +274,7 @@ def read_recording(
     images, cameras, unknown = {}, {}, {}
     known = {} if calibration is None else load_calibration(calibration)
     for view, pattern in mapping.views.items():
-        frames = VideoFileFrames(recording.file(pattern))
+        frames = _frames(recording, pattern, mapping)
         images[view], said = _track(frames, times, mapping)
         notes += [f"view '{view}': {text}" for text in said]
         height, width = frames[0].shape[:2]
@@ -239,32 +293,55 @@ def read_recording(
         instruction=_instruction(table.keys, mapping),
         outcome=_outcome(table.keys, mapping, path),
     )
+    commands = _commanded(recording, mapping, states)
+    notes += commands.notes
     return Episode(
         info=info,
         views=tuple(mapping.views),
         cameras=cameras,
         images=images,
         joint_states=states,
-        trajectories=trajectories_to(states, mapping.chunk_s, int(stamps[0])),
+        trajectories=trajectories_to(commands.positions, mapping.chunk_s, int(stamps[0])),
         masks=None,
         instructions=[],
         unknown=unknown,
         warnings=tuple(notes),
-        unused=_unused(table, mapping),
+        unused=_unused(recording, mapping, table),
     )
 
 
-def _unused(table: NumberTable, mapping: VideoMapping) -> dict[str, str]:
-    """Return why keys and columns of a recording's table are not used."""
-    stream = mapping.state
-    columns = stream.used_columns()
-    keys = {mapping.time, key_of(mapping.outcome), key_of(mapping.instruction)}
+def _unused(
+    recording: VideoRecording, mapping: VideoMapping, table: NumberTable
+) -> dict[str, str]:
+    """Return why columns, keys or data sets of a recording are not used, by name."""
+    streams = [mapping.state, *([] if mapping.action is None else [mapping.action])]
+    used = {mapping.time, key_of(mapping.outcome), key_of(mapping.instruction)}
+    if is_hdf5(mapping.rows):
+        used |= {feature for stream in streams for feature in stream.features}
+        place = recording.inside(mapping.rows)
+        used |= {
+            recording.inside(pattern).removeprefix(place).strip('/')
+            for pattern in mapping.views.values()
+            if recording.file(pattern) == table.path
+        }
+        found = data_set_names(table.path, place)
+        label, count = mapping.state.label, table.values.shape[1]
+        columns_left = unused_columns(label, (), count, mapping.state.used_columns())
+        return columns_left | {
+            name: "images of no view; 'views' in the mapping"
+            if is_images
+            else 'data set of no stream'
+            for name, is_images in found.items()
+            if name not in {one.strip('/') for one in used}
+        }
+    columns = [column for stream in streams for column in stream.used_columns()]
     if table.names:
-        return unused_keys(table.names, {*keys, *map(str, columns)} | _at(table.names, columns))
-    label = ', '.join(stream.features)
+        return unused_keys(table.names, {*used, *map(str, columns)} | _at(table.names, columns))
+    used |= {feature for stream in streams for feature in stream.features}
+    own = mapping.state.used_columns()
     return {
-        **unused_keys(table.keys, {*keys, *stream.features}),
-        **unused_columns(label, (), table.values.shape[1], columns),
+        **unused_keys(table.keys, used),
+        **unused_columns(mapping.state.label, (), table.values.shape[1], own),
     }
 
 
@@ -273,8 +350,67 @@ def _at(names: Sequence[str], columns: Sequence[int | str]) -> set[str]:
     return {names[n] for n in columns if isinstance(n, int) and n < len(names)}
 
 
+def _table(recording: VideoRecording, mapping: VideoMapping, stream: ActionStream) -> NumberTable:
+    """Return the rows of a recording that a stream needs."""
+    path = recording.file(mapping.rows)
+    if is_hdf5(mapping.rows):
+        return read_hdf5_table(path, recording.inside(mapping.rows), list(stream.features))
+    return read_table(path, stream.features)
+
+
+def _frames(
+    recording: VideoRecording, pattern: str, mapping: VideoMapping
+) -> VideoFileFrames | Hdf5Frames:
+    path, inside = recording.file(pattern), recording.inside(pattern)
+    if inside:
+        return Hdf5Frames(path, inside, is_bgr=mapping.channels == 'bgr')
+    return VideoFileFrames(path)
+
+
+class _Commands(NamedTuple):
+    """Commanded positions at the stamps at which they are to be reached, and notes."""
+
+    positions: JointStates
+    notes: tuple[str, ...] = ()
+
+
+def _commanded(
+    recording: VideoRecording, mapping: VideoMapping, measured: JointStates
+) -> _Commands:
+    """Return the commands of the rows: the positions that follow where there are none."""
+    stream = mapping.action
+    if stream is None:
+        return _Commands(measured)
+    table = _table(recording, mapping, stream)
+    if len(table.values) != len(measured.stamps_ns):
+        raise EpisodeError(
+            f"'{table.path}': '{stream.label}' has {len(table.values)} rows, "
+            f"'{mapping.state.label}' {len(measured.stamps_ns)}, must be as many"
+        )
+    what, count = stream.label or table.path.name, table.values.shape[1]
+    used = {one.column for one in stream.columns_among(table.names, mapping.state)} - {None}
+    if stream.tools:
+        used |= set(stream.used_columns())
+    numbers = [
+        column_number(one, table.names, count, what, 'action') for one in used if one is not None
+    ]
+    table.check_numbers(numbers)
+    positions, odd = stream.commanded(
+        table.values, table.names, measured.positions, mapping.robot, mapping.state
+    )
+    odd = (*odd, *resting_grippers(measured.positions, [positions], mapping.robot).values())
+    stamps = measured.stamps_ns
+    late = round(stream.delay_frames * float(np.median(np.diff(stamps))))
+    reached = JointStates(
+        stamps_ns=np.concatenate([stamps[:1], stamps + late]) if late else stamps,
+        joint_names=measured.joint_names,
+        positions=np.concatenate([measured.positions[:1], positions]) if late else positions,
+    )
+    return _Commands(reached, odd)
+
+
 def _track(
-    frames: VideoFileFrames, times: FloatArray, mapping: VideoMapping
+    frames: VideoFileFrames | Hdf5Frames, times: FloatArray, mapping: VideoMapping
 ) -> tuple[Track, list[str]]:
     """Return the frames within the rows at `times` (T,) [s], and how they were read."""
     match = match_frames(

@@ -1,0 +1,46 @@
+"""Formats of recordings that are not read, and what converts them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+#: what a folder or file of a format is known by, and what converts it
+_ZARR = (
+    'zarr is not read: LeRobot converts it (its scripts for UMI and PushT), then mtv-world import '
+    'lerobot; or copy its arrays into HDF5, one file an episode, for mtv-world import videos'
+)
+_HDF5 = 'HDF5 is read by mtv-world import videos, see config/datasets/aloha.yaml'
+_RLDS = 'RLDS (TFRecord) is not read: LeRobot converts it, then mtv-world import lerobot'
+
+
+def zarr_hint(folder: Path) -> str:
+    """Return what converts the zarr arrays of a folder, after a semicolon; empty = none."""
+    return f'; {_ZARR}' if _is_zarr(folder) else ''
+
+
+def _is_zarr(path: Path) -> bool:
+    """Return whether a path is a zarr array or group, a zipped one, or a folder that holds one."""
+    if path.name.endswith(('.zarr', '.zarr.zip')):
+        return True
+    if not path.is_dir():
+        return False
+    names = {entry.name for entry in path.iterdir()}
+    return bool(names & {'.zgroup', '.zarray', 'zarr.json'}) or any(
+        name.endswith(('.zarr', '.zarr.zip')) for name in names
+    )
+
+
+def conversion_hint(path: Path) -> str:
+    """Return what reads or converts a file or folder that is no bag, after a semicolon."""
+    if hint := zarr_hint(path):
+        return hint
+    names = [path.name] if path.is_file() else []
+    if path.is_dir():
+        names = [entry.name for entry in path.iterdir()]
+    if any(name.endswith(('.hdf5', '.h5')) for name in names):
+        return f'; {_HDF5}'
+    if any('.tfrecord' in name for name in names):
+        return f'; {_RLDS}'
+    if (path / 'meta' / 'info.json').is_file():
+        return '; this is a LeRobot data set: mtv-world import lerobot'
+    return ''
