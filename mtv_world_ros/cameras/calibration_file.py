@@ -11,6 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, Strict
 import yaml
 
 from mtv_world_ros.cameras.camera import check_plausible
+from mtv_world_ros.cameras.foreign_calibrations import foreign_hint
 from mtv_world_ros.core.config import (
     expected,
     ListOf,
@@ -136,7 +137,10 @@ def load_calibration(path: Path | str) -> dict[str, CameraModel]:
     values = read_yaml(path, 'calibration file', 'calibration_file', error=CalibrationError)
     views = values.get('views') if isinstance(values, dict) else None
     if not isinstance(views, dict) or list(values) != ['views']:
-        raise CalibrationError(f"'{path}' must hold 'views: {{<view>: {{...}}}}' and nothing else")
+        raise CalibrationError(
+            f"'{path}' must hold 'views: {{<view>: {{...}}}}' and nothing else"
+            f'{foreign_hint(path, values)}'
+        )
     if not views:
         raise CalibrationError(f"'{path}' has no view; give one for each camera under 'views'")
     return {str(view): _camera(str(view), row, f"'{path}' view '{view}'")

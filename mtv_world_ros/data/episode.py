@@ -308,6 +308,18 @@ class ObjectPoses(NamedTuple):
     T_base_object: FloatArray
 
 
+class OtherDirection(NamedTuple):
+    """Camera whose pose is read the other way round.
+
+    Attributes:
+        camera: the camera.
+        source: transforms of the file, for texts.
+    """
+
+    camera: CameraModel
+    source: str
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Episode:
     """A recorded episode.
@@ -331,6 +343,8 @@ class Episode:
         warnings: problems found and how they were handled, one line each; if
             `truncated`, the first says where the record was cut.
         unused: reason why a recorded topic is not part of the episode, by topic.
+        other_directions: by view the camera with its pose read the other way round, where it is
+            of a program's file whose direction images may confirm.
     """
 
     info: EpisodeInfo
@@ -348,6 +362,7 @@ class Episode:
     truncated: bool = False
     warnings: tuple[str, ...] = ()
     unused: Mapping[str, str] = field(default_factory=dict)
+    other_directions: Mapping[str, OtherDirection] = field(default_factory=dict)
 
     def mask_areas(self) -> dict[str, FloatArray]:
         """Return (O, T) areas of the objects in the stored masks by view [share of the image]."""

@@ -16,6 +16,12 @@ from numpy.typing import NDArray
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.cameras.camera import unknown_camera
 from mtv_world_ros.cameras.camera_info import Intrinsics, is_rectified, read_camera_info
+from mtv_world_ros.cameras.foreign_calibrations import (
+    ForeignCalibration,
+    FramePose,
+    Lens,
+    read_foreign,
+)
 from mtv_world_ros.cameras.image_window import ImageWindow, WHOLE, windowed_camera
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
 from mtv_world_ros.core.errors import (
@@ -59,6 +65,7 @@ from mtv_world_ros.data.episode import (
     OBJECT_POSES,
     ObjectPoses,
     optical_frame,
+    OtherDirection,
     parse_info,
     TF,
     TF_STATIC,
@@ -270,6 +277,8 @@ class _EpisodeReader:
         self.unknown: dict[str, str] = {}
         self.unknown_because: dict[str, str] = {}
         self.is_calibrated = False
+        self.given_tf: list[Any] = []
+        self.other_directions: dict[str, OtherDirection] = {}
         self.infos: dict[str, list[tuple[Any, Intrinsics]]] = {}
         self.seen_ns = 0  # all views have an image from here on
 
@@ -307,6 +316,7 @@ class _EpisodeReader:
             truncated=bool(self.bag.truncated),
             warnings=self._all_warnings(),
             unused=self._unused(),
+            other_directions=self.other_directions,
         )
 
     def _unused(self) -> dict[str, str]:
@@ -823,6 +833,11 @@ class _EpisodeReader:
         images: Mapping[str, Track],
         unknown_mount: str,
     ) -> dict[str, CameraModel]:
+        if calibration:
+            topics = {view: names.image for view, names in self.topics.views.items()}
+            foreign = read_foreign(Path(calibration), topics)
+            if foreign is not None:
+                return self._foreign_cameras(foreign, images, unknown_mount)
         folder = self.path if self.path.is_dir() else self.path.parent
         file = Path(calibration) if calibration else folder / CALIBRATION_FILE
         tree = None
@@ -865,13 +880,80 @@ class _EpisodeReader:
         self.tracks[camera.view] = found.T_link_frame
         return replace(camera, T_mount_camera=found.T_link_frame[0])
 
+    def _foreign_cameras(
+        self, foreign: ForeignCalibration, images: Mapping[str, Track], unknown_mount: str
+    ) -> dict[str, CameraModel]:
+        """Return cameras by calibrations of other programs; TF and CameraInfo have the rest."""
+        self.warnings += foreign.notes
+        frames = {view: self._frame_of(view) for view in self.topics.views}
+        chain = [
+            messages.make_tf(1, frames[one.before], frames[one.view], one.T_before_view)
+            for one in foreign.chain
+        ]
+        self.given_tf = [*map(_as_tf, foreign.poses), *chain]
+        tree = self._tree()
+        self._name_unused_poses(tree, foreign, frames)
+        cameras = {}
+        for view in self.topics.views:
+            lens = foreign.lenses.get(view)
+            camera = self._from_tree(tree, view, unknown_mount, images[view], lens)
+            height, width = images[view].frames[0].shape[:2]
+            is_given = lens is not None
+            cameras[view] = self._at_images(camera, (width, height), is_given=is_given)
+        own = self.given_tf
+        self.given_tf = [*(_as_tf(one.turned_round) for one in foreign.poses), *chain]
+        other = read_tree(*self._tree_of_tf())
+        self.given_tf = own
+        for view in set(cameras) - set(self.unknown) - set(self.tracks):
+            mount = self._mount_in(other, frames[view])
+            camera = cameras[view]
+            if mount is None or np.allclose(mount.T_link_frame, camera.T_mount_camera):
+                continue
+            self.other_directions[view] = OtherDirection(
+                camera=replace(camera, mount_link=mount.link, T_mount_camera=mount.T_link_frame),
+                source=', '.join(f"'{one.parent}' -> '{one.child}'" for one in foreign.poses),
+            )
+        return cameras
+
+    def _tree_of_tf(self) -> tuple[list[Any], str, list[Any]]:
+        moving, static = self._tf()
+        return moving, self.mapping.tf_prefix, static
+
+    def _mount_in(self, tree: TransformTree, frame: str) -> Mount | None:
+        """Return the link that carries a frame in a tree; None = it has none, or it moves."""
+        links = () if self.robot is None else self.robot.posed_links
+        try:
+            if tree.unknown_because(frame, links) is not None or tree.is_moving(frame, links):
+                return None
+            return tree.mount(frame, links)
+        except CalibrationError:
+            return None
+
+    def _frame_of(self, view: str) -> str:
+        """Return the optical frame of a view: the mapping's, the CameraInfo's or the images'."""
+        row, infos = self.mapping.views.get(view), self._camera_infos(view)
+        given = (row.frame if row else '') or (infos[0][0].header.frame_id if infos else '')
+        return given or self.received[self.topics.views[view].image][0][1][1].header.frame_id
+
+    def _name_unused_poses(
+        self, tree: TransformTree, foreign: ForeignCalibration, frames: Mapping[str, str]
+    ) -> None:
+        """Name poses of frames that are of no view and carry none."""
+        for one in foreign.poses:
+            if not any(tree.hangs_from(frame, one.child) for frame in frames.values()):
+                listed = ', '.join(f'{view} {frame}' for view, frame in frames.items())
+                self._warn_once(
+                    f"'{one.file}': frame '{one.child}' carries no view; views have the frames "
+                    f"{listed}: name it as 'frame' of the view in the mapping (--topics)"
+                )
+
     def _tf(self) -> tuple[list[Any], list[Any]]:
-        """Return the messages of /tf and of /tf_static."""
+        """Return the messages of /tf and of /tf_static, then those of given calibrations."""
         moving, static = (
             [message for _, message in self._take(topic, messages.TF_MESSAGE)]
             for topic in TF_TOPICS
         )
-        return moving, static
+        return moving, [*static, *self.given_tf]
 
     def _tree(self) -> TransformTree:
         moving, static = self._tf()
@@ -880,13 +962,18 @@ class _EpisodeReader:
         return tree
 
     def _from_tree(
-        self, tree: TransformTree, view: str, unknown_mount: str, images: Track
+        self,
+        tree: TransformTree,
+        view: str,
+        unknown_mount: str,
+        images: Track,
+        lens: Lens | None = None,
     ) -> CameraModel:
-        """Return the camera's pose by TF; its intrinsics come from CameraInfo."""
+        """Return the camera's pose by TF; without lens its intrinsics come from CameraInfo."""
         infos = self._camera_infos(view)
-        if not infos and unknown_mount:
+        if not infos and lens is None and unknown_mount:
             return self._placeholder(view, unknown_mount, images)
-        if not infos:
+        if not infos and lens is None:
             raise CalibrationError(
                 f"'{self.path}', view '{view}': '{self._camera_info(view)}' has no CameraInfo "
                 'that is calibrated (K[0] is not 0), which intrinsics come from where there is no '
@@ -894,7 +981,7 @@ class _EpisodeReader:
                 f'{_estimate(self.path, view)}'
             )
         of_images = self.received[self.topics.views[view].image][0][1][1].header.frame_id
-        of_info = infos[0][0].header.frame_id
+        of_info = infos[0][0].header.frame_id if infos else ''
         if of_images and of_info and of_images != of_info:
             self._warn_once(
                 f"view '{view}': its images are of frame '{of_images}', its CameraInfo of "
@@ -919,6 +1006,8 @@ class _EpisodeReader:
             )
         else:
             mount = tree.mount(frame, links)
+        if lens is not None:
+            return lens.camera(view, mount.link, mount.T_link_frame)
         return CameraModel(
             view=view,
             width=1,
@@ -981,6 +1070,13 @@ class _EpisodeReader:
         is_full = (camera.width, camera.height) == (first.width, first.height)
         given = self._windowed(camera, size, first.window if is_full else WHOLE)
         apart = np.abs(given.K - seen.K)[:2] / seen.K[0, 0]
+        bends = given.distortion.any() and not _same_distortion(given, seen)
+        if apart.max() < _SAME_K and bends:
+            self._warn_once(
+                f"view '{view}': the calibration file has distortion {_listed_numbers(given)}, "
+                f"CameraInfo {_listed_numbers(seen)}; the file's is used"
+            )
+            return given
         if apart.max() < _SAME_K:
             return seen
         self._warn_once(
@@ -1043,6 +1139,11 @@ def _span(item: tuple[str, Any]) -> int | None:
     return 0 if after is None else after.sec * NANO + after.nanosec
 
 
+def _as_tf(given: FramePose) -> Any:
+    """Return a given pose as TFMessage."""
+    return messages.make_tf(1, given.parent, given.child, given.T_parent_child)
+
+
 def _framed_pose(message: Any) -> tuple[str, FloatArray]:
     """Return the frame and (4, 4) pose of a PoseStamped."""
     return message.header.frame_id, messages.parse_pose(message.pose)
@@ -1056,6 +1157,19 @@ def _info(bag: BagReader, instructions: Sequence[tuple[int, str]]) -> EpisodeInf
 def _estimate(path: Path, view: str) -> str:
     """Return the advice for a camera of unknown pose: the command that estimates it."""
     return f'estimate it from the recording: mtv-world fit camera {path} --view {view} --no-guess'
+
+
+def _same_distortion(one: CameraModel, other: CameraModel) -> bool:
+    """Return whether two cameras bend rays alike; coefficients that are not there are zero."""
+    size = max(len(one.distortion), len(other.distortion))
+    padded = [np.pad(c.distortion, (0, size - len(c.distortion))) for c in (one, other)]
+    models = {'plumb_bob' if c.distortion_model == 'none' else c.distortion_model
+              for c in (one, other)}  # fmt: skip
+    return len(models) == 1 and bool(np.allclose(*padded, atol=1e-6))
+
+
+def _listed_numbers(camera: CameraModel) -> str:
+    return f'{camera.distortion_model} {[round(float(v), 5) for v in camera.distortion]}'
 
 
 def _four(K: FloatArray) -> str:

@@ -368,6 +368,17 @@ class TransformTree:
         self._refuse_circle(name, {mount.link for mount in self._reachable(name, only_still=True)})
         return f"TF does not connect '{self._top(name)}' with the robot"
 
+    def hangs_from(self, frame: str, other: str) -> bool:
+        """Return whether a frame is another one, or is below it."""
+        here: str | None = self.name(frame)
+        seen = set[str]()
+        while here is not None and here not in seen:
+            if here == self.name(other):
+                return True
+            seen.add(here)
+            here = self._parents().get(here)
+        return False
+
     def _top(self, frame: str) -> str:
         """Return the frame that a frame hangs from and that has no parent."""
         parents = self._parents()

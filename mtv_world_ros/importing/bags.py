@@ -31,6 +31,7 @@ from mtv_world_ros.data.episode import Episode, MASKS_BY, parse_outcome, PLACE, 
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.stream_clocks import ClockBreakError, WHOLE, Window
+from mtv_world_ros.importing.calibration_directions import settle_directions
 from mtv_world_ros.importing.convert import (
     import_each,
     ImportSummary,
@@ -272,6 +273,7 @@ def convert_bag(
         window=part.window,
         decode_all=False,  # each frame is decoded once, when it is written
     )
+    episode = settle_directions(episode, robot)
     key_name = key_of(mapping.outcome)
     if key_name:
         outcome = _outcome(episode, key_name)

@@ -295,9 +295,14 @@ def _guess_features(
 
 
 def digest_of(*files: Path | None, start: bytes = b'') -> str:
-    """Return a key that changes with the contents of the files."""
+    """Return a key that changes with the contents of the files, of a folder those in it."""
     digest = hashlib.sha256(start)
-    for file in files:
-        require_regular(*filter(None, [file]))
-        digest.update(b'' if file is None else file.read_bytes())
+    for given in files:
+        is_folder = given is not None and given.is_dir()
+        inside = sorted(given.iterdir()) if given is not None and is_folder else [given]
+        for file in inside:
+            if is_folder and (file is None or not file.is_file()):
+                continue
+            require_regular(*filter(None, [file]))
+            digest.update(b'' if file is None else file.read_bytes())
     return digest.hexdigest()[:16]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from glob import escape
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -13,16 +13,25 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Private
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.cameras.camera import unknown_camera
+from mtv_world_ros.cameras.foreign_calibrations import ForeignCalibration, read_foreign
 from mtv_world_ros.core.config import read_yaml, validated, wrong
-from mtv_world_ros.core.data_types import FloatArray
-from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest
+from mtv_world_ros.core.data_types import CameraModel, FloatArray
+from mtv_world_ros.core.errors import CalibrationError, ConfigError, EpisodeError, nearest
 from mtv_world_ros.data.bag_mapping import BagMapping, key_of, keyed, ViewSource, Written
-from mtv_world_ros.data.episode import Episode, EpisodeInfo, JointStates, parse_outcome, Track
+from mtv_world_ros.data.episode import (
+    Episode,
+    EpisodeInfo,
+    JointStates,
+    OtherDirection,
+    parse_outcome,
+    Track,
+)
 from mtv_world_ros.data.gripper_sources import resting_grippers
 from mtv_world_ros.data.joint_plans import trajectories_to
 from mtv_world_ros.data.measured_joints import mend_rows
 from mtv_world_ros.data.stream_clocks import check_row_times
 from mtv_world_ros.importing.bags import write_imported
+from mtv_world_ros.importing.calibration_directions import settle_directions
 from mtv_world_ros.importing.camera_parameters import sized_camera
 from mtv_world_ros.importing.convert import import_each, ImportSummary, START_NS
 from mtv_world_ros.importing.hdf5_files import (
@@ -235,7 +244,7 @@ def import_videos(
     key = digest_of(mapping.robot_file, calibration, start=stage.key + text)
 
     def convert(one: VideoRecording, path: Path) -> tuple[str, ...]:
-        episode = read_recording(one, mapping, calibration)
+        episode = settle_directions(read_recording(one, mapping, calibration), mapping.robot)
         written = mapping.written()
         return write_imported(episode, one.name, path, written, mapping.robot, key, stage)
 
@@ -272,19 +281,26 @@ def read_recording(
         notes += mended
     notes += paused
     images, cameras, unknown = {}, {}, {}
-    known = {} if calibration is None else load_calibration(calibration)
+    given = _GivenCameras.of(calibration, mapping)
+    notes += given.notes
+    others = {}
     for view, pattern in mapping.views.items():
         frames = _frames(recording, pattern, mapping)
         images[view], said = _track(frames, times, mapping)
         notes += [f"view '{view}': {text}" for text in said]
         height, width = frames[0].shape[:2]
-        if view in known:
-            found = sized_camera(known[view], (width, height))
+        if view in given.cameras:
+            found = sized_camera(given.cameras[view], (width, height))
             cameras[view] = found.camera
             notes += [found.note] if found.note else []
         else:
-            unknown[view] = 'pose and intrinsics'
             cameras[view] = unknown_camera(view, width, height, mapping.robot.base_link)
+        if view not in given.cameras or view in given.without_pose:
+            unknown[view] = 'pose' if view in given.without_pose else 'pose and intrinsics'
+        if view in given.others:
+            other = given.others[view]
+            turned = sized_camera(other.camera, (width, height)).camera
+            others[view] = OtherDirection(camera=turned, source=other.source)
     states = JointStates(
         stamps_ns=stamps, joint_names=mapping.robot.joint_names, positions=positions
     )
@@ -307,7 +323,64 @@ def read_recording(
         unknown=unknown,
         warnings=tuple(notes),
         unused=_unused(recording, mapping, table),
+        other_directions=others,
     )
+
+
+@dataclass(slots=True, kw_only=True)
+class _GivenCameras:
+    """Cameras of the views, by a calibration file of this package or of other programs.
+
+    Attributes:
+        cameras: cameras by view.
+        without_pose: views whose pose no file has; the camera's is a placeholder.
+        others: cameras whose pose is read the other way round, by view.
+        notes: what is not used, and why.
+    """
+
+    cameras: dict[str, CameraModel] = field(default_factory=dict)
+    without_pose: set[str] = field(default_factory=set)
+    others: dict[str, OtherDirection] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, calibration: Path | None, mapping: VideoMapping) -> _GivenCameras:
+        """Return the cameras of a file, or of a folder of files of other programs."""
+        found = cls()
+        if calibration is None:
+            return found
+        foreign = read_foreign(calibration, dict.fromkeys(mapping.views, ''))
+        if foreign is None:
+            found.cameras = load_calibration(calibration)
+            return found
+        found.notes += foreign.notes
+        for view in mapping.views:
+            found._add(view, foreign, mapping)
+        return found
+
+    def _add(self, view: str, foreign: ForeignCalibration, mapping: VideoMapping) -> None:
+        lens, robot = foreign.lenses.get(view), mapping.robot
+        pose = next((one for one in foreign.poses if one.view in (view, one.child)), None)
+        if pose is not None and pose.parent not in robot.link_names:
+            raise CalibrationError(
+                f"'{pose.file}': '{pose.parent}' is no link of robot '{robot.name}'"
+                f'{nearest(pose.parent, robot.link_names)}'
+            )
+        if lens is None:
+            if pose is not None:
+                self.notes.append(
+                    f"view '{view}': '{pose.file}' has a pose, and no file its lens: put one of "
+                    f'camera_calibration, OpenCV or kalibr beside it, named {view}_lens.yaml'
+                )
+            return
+        if pose is None:
+            self.cameras[view] = lens.camera(view, robot.base_link, np.eye(4))
+            self.without_pose.add(view)
+            return
+        self.cameras[view] = lens.camera(view, pose.parent, pose.T_parent_child)
+        turned = lens.camera(view, pose.parent, pose.turned_round.T_parent_child)
+        source = f"'{pose.parent}' -> '{pose.child}'"
+        self.others[view] = OtherDirection(camera=turned, source=source)
 
 
 def _unused(

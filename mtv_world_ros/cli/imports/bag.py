@@ -49,7 +49,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_common_options(
         parser,
         _import_bag,
-        calibration="calibration of the cameras; default: the bags' TF and CameraInfo",
+        calibration='calibration of the cameras, also of camera_calibration, OpenCV, kalibr, '
+        "easy_handeye or MoveIt, or a folder of such files; default: the bags' TF and CameraInfo",
     )
 
 

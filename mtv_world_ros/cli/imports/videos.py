@@ -35,7 +35,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_common_options(
         parser,
         _import_videos,
-        calibration='calibration of the cameras; default: marked as not known',
+        calibration='calibration of the cameras, also of camera_calibration, OpenCV, kalibr, '
+        'easy_handeye or MoveIt, or a folder of such files; default: marked as not known',
     )
 
 
