@@ -15,6 +15,8 @@ from mtv_world_ros.data.tool_targets import ToolTargets
 STATE = 'state'
 #: key of `joints` whose value is taken off the recorded names
 PREFIX = 'prefix'
+#: end of the names of ros2_control's position interfaces, which some broadcasters publish as joints
+_INTERFACE = '/position'
 
 
 class ViewSource(Schema):
@@ -96,6 +98,11 @@ class BagMapping(Written):
         description='topic of the measured positions (JointState), or a list of topics: of an arm '
         'and its gripper',
     )
+    state_joints: ListOf[str] = Field(
+        default=(),
+        description='joints of JointState messages of measured positions that have no names, in '
+        'their order',
+    )
     joints: dict[str, str] = Field(
         default={},
         description="the robot's name of a joint, by the recorded one; `prefix: NAME` takes NAME "
@@ -112,8 +119,8 @@ class BagMapping(Written):
     )
     action_joints: ListOf[str] = Field(
         default=(),
-        description="joints of a Float64MultiArray of commands, in the order of the controller's "
-        '`joints`',
+        description='joints of commands without names (Float64MultiArray, JointState), in the '
+        "order of the controller's `joints`",
     )
     tools: dict[str, ToolTopic] = Field(
         default={},
@@ -150,7 +157,7 @@ class BagMapping(Written):
         """Return the robot's name of a recorded joint."""
         if recorded in self.joints and recorded != PREFIX:
             return self.joints[recorded]
-        return recorded.removeprefix(self.joints.get(PREFIX, ''))
+        return recorded.removeprefix(self.joints.get(PREFIX, '')).removesuffix(_INTERFACE)
 
     def streams(self) -> dict[str, str]:
         """Return the topics by view and by stream, as `read_episode` takes them."""

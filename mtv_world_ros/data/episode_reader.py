@@ -371,7 +371,26 @@ class _EpisodeReader:
         if message.topic in commands and message.msgtype in READ_AS:
             found = commands[message.topic].read(message.msgtype, message.data)
             return READ_AS[message.msgtype], found
-        return message.msgtype, messages.deserialize(message.msgtype, message.data)
+        parsed = messages.deserialize(message.msgtype, message.data)
+        if message.msgtype == messages.JOINT_STATE and not parsed.name and len(parsed.position):
+            parsed.name = self._names_of(message.topic, len(parsed.position))
+        return message.msgtype, parsed
+
+    def _names_of(self, topic: str, count: int) -> list[str]:
+        """Return the names of joint states without names, from the mapping.
+
+        Raises:
+            EpisodeError: it has none, or another number.
+        """
+        is_state = topic in self.state_topics
+        key = 'state_joints' if is_state else 'action_joints'
+        names = self.mapping.state_joints if is_state else self.mapping.action_joints
+        if len(names) != count:
+            raise EpisodeError(
+                f"its joint states have {count} positions and no names; '{key}' in the mapping "
+                f'(--topics) must name as many, in their order, and has: {_listed(names)}'
+            )
+        return list(names)
 
     def _receive(self) -> None:
         wanted = self.topics.names(with_masks=self.with_masks) | set(TF_TOPICS)

@@ -18,13 +18,16 @@ from mtv_world_ros.core.errors import (
     ConfigError,
     DamagedFrameError,
     EpisodeError,
+    MtvWorldError,
     nearest,
+    ObservationError,
     RobotError,
     TrajectoryError,
 )
 from mtv_world_ros.core.files import ROBOT_YAML
 from mtv_world_ros.data.bag import messages
-from mtv_world_ros.data.bag.reader import BagReader
+from mtv_world_ros.data.bag.image_decoding import check_raw
+from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data.bag.unused_topics import unused_line
 from mtv_world_ros.data.bag_mapping import BagMapping, key_of
 from mtv_world_ros.data.episode import Episode, MASKS_BY, parse_outcome, PLACE, UNKNOWN_CAMERAS
@@ -81,8 +84,7 @@ def with_guessed_views(mapping: BagMapping, bag: Path) -> BagMapping:
     if mapping.views:
         return mapping
     reader = BagReader(bag)
-    found = reader.topics()
-    topics = [name for name, kind in found.items() if kind in messages.IMAGE_TYPES]
+    found, topics = _image_topics(reader)
     inside = [t for t in topics if t.startswith(mapping.topic(''))] or topics
     views = guess_views(inside)
     if not views:
@@ -93,6 +95,32 @@ def with_guessed_views(mapping: BagMapping, bag: Path) -> BagMapping:
         )
         raise EpisodeError('; '.join([text, *filter(None, [reader.truncated, *reader.problems])]))
     return mapping.replace(views={view: {'image': topic} for view, topic in views.items()})
+
+
+def _image_topics(reader: BagReader) -> tuple[dict[str, str], list[str]]:
+    """Return the types of all topics, and the topics whose first image has colours or greys."""
+    found: dict[str, str] = {}
+    topics = []
+    for message in reader.messages():
+        if message.topic in found:
+            continue
+        found[message.topic] = message.msgtype
+        if message.msgtype in messages.IMAGE_TYPES and _is_shown(message):
+            topics.append(message.topic)
+    return found, topics
+
+
+def _is_shown(message: BagMessage) -> bool:
+    """Return False for a raw image that no colours can be made of: depth, labels, points."""
+    if message.msgtype != messages.IMAGE:
+        return True
+    try:
+        check_raw(messages.deserialize(message.msgtype, message.data))
+    except ObservationError as error:
+        return 'encoding' not in str(error)
+    except MtvWorldError:  # the reader names what is damaged
+        pass
+    return True
 
 
 def described_robot(bag: Path, mapping: BagMapping, folder: Path) -> tuple[Path, tuple[str, ...]]:

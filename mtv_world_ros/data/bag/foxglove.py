@@ -6,8 +6,10 @@ messages are read where they have joint names, as many positions, and a stamp.
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 from mcap.exceptions import McapError
@@ -16,6 +18,7 @@ import numpy as np
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
+from mtv_world_ros.core.bounded_input import parse_json
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.video_packets import FFMPEG_PACKET, is_key
@@ -99,11 +102,44 @@ def protobuf_reader(schema: Schema) -> Read:
     return read
 
 
+def json_reader(schema: Schema) -> Read:
+    """Return the reader of JSON messages of one of Foxglove's schemas; bytes are in base64.
+
+    Raises:
+        EpisodeError: the schema is not read.
+    """
+    name = schema.name.removeprefix(_PREFIX)
+    if name == schema.name or name not in _MAKERS:
+        known = ', '.join(_PREFIX + name for name in _MAKERS)
+        raise EpisodeError(f"its JSON schema '{schema.name}' is not read; read are {known}")
+
+    def read(data: bytes) -> tuple[str, bytes]:
+        try:
+            values = parse_json(data, f'a {schema.name}')
+            if isinstance(values.get('data'), str):
+                values['data'] = base64.b64decode(values['data'], validate=True)
+            return _standard(name, _namespace(values))
+        except (ValueError, AttributeError, TypeError) as error:
+            raise EpisodeError(f'{len(data)} bytes hold no {schema.name} ({error})') from error
+
+    return read
+
+
+def _namespace(value: Any) -> Any:
+    """Return JSON objects with their keys as attributes; stamps have sec and nanosec."""
+    if isinstance(value, list):
+        return [_namespace(one) for one in value]
+    if not isinstance(value, dict):
+        return value
+    names = {'nsec': 'nanosec'}
+    return SimpleNamespace(**{names.get(k, str(k)): _namespace(v) for k, v in value.items()})
+
+
 def _standard(name: str, found: Any) -> tuple[str, bytes]:
     msgtype, make = _MAKERS[name]
     try:
         return msgtype, messages.serialize(msgtype, make(found))
-    except (ValueError, TypeError, AssertionError, ArithmeticError) as error:
+    except (ValueError, TypeError, AssertionError, ArithmeticError, AttributeError) as error:
         raise EpisodeError(f'a foxglove {name} cannot be used: {error}') from error
 
 

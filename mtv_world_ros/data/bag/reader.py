@@ -29,7 +29,7 @@ from mtv_world_ros.core.bounded_input import (
     require_regular,
 )
 from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
-from mtv_world_ros.data.bag.foxglove import protobuf_reader, Read, ros_reader
+from mtv_world_ros.data.bag.foxglove import json_reader, protobuf_reader, Read, ros_reader
 from mtv_world_ros.data.bag.ros1 import MAGIC as ROS1_MAGIC
 from mtv_world_ros.data.bag.ros1 import Ros1Bag, Ros1Error
 
@@ -167,14 +167,15 @@ class BagReader:
             return None
         return message._replace(msgtype=msgtype, data=data)
 
-    def _protobuf(self, channel: Channel, message: BagMessage) -> BagMessage | None:
-        """Return a message in Protobuf as a standard one; None = it is left out, by name."""
+    def _packed(self, channel: Channel, message: BagMessage) -> BagMessage | None:
+        """Return a message in Protobuf or JSON as a standard one; None = left out, by name."""
         schema = self._schemas[channel.schema_id]
         key = (schema.name, schema.data)
         if key not in self._readers:
             self._readers[key] = None
             try:
-                self._readers[key] = protobuf_reader(schema)
+                make = json_reader if channel.message_encoding == 'json' else protobuf_reader
+                self._readers[key] = make(schema)
             except EpisodeError as error:
                 self._problem(f"'{channel.topic}' was left out: {error}")
         read = self._readers[key]
@@ -342,9 +343,9 @@ class BagReader:
             if topics is not None and channel.topic not in topics:
                 return
             data = body[_MESSAGE.size :]
-            if self._is_protobuf(channel):
+            if self._is_packed(channel):
                 packed = BagMessage(channel.topic, '', log_time, data, publish_time)
-                found = self._protobuf(channel, packed)
+                found = self._packed(channel, packed)
                 if found is not None:
                     yield found
             elif self._is_cdr(channel):
@@ -369,10 +370,10 @@ class BagReader:
             record = Metadata.read(stream)
             self.metadata[record.name] = record.metadata
 
-    def _is_protobuf(self, channel: Channel) -> bool:
+    def _is_packed(self, channel: Channel) -> bool:
         return (
             not self._as_recorded
-            and channel.message_encoding == 'protobuf'
+            and channel.message_encoding in ('protobuf', 'json')
             and channel.schema_id in self._schemas
         )
 
