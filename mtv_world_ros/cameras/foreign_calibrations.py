@@ -228,12 +228,17 @@ class _Reader:
             text = read_text(self._path, 'yaml_bytes')
         except (OSError, ValueError) as error:
             raise CalibrationError(f"'{self._path}' cannot be read: {error}") from error
-        if self._path.suffix == '.py':
-            self._take_transforms(_launch_arguments(text))
-        elif text.lstrip().startswith('<'):
-            self._xml(text)
-        else:
-            return self._yaml(text)
+        try:
+            if self._path.suffix == '.py':
+                self._take_transforms(_launch_arguments(text))
+            elif text.lstrip().startswith('<'):
+                self._xml(text)
+            else:
+                return self._yaml(text)
+        except ValueError as error:  # a number or a quotation that is none
+            if isinstance(error, CalibrationError):
+                raise
+            raise self._fail(str(error)) from error
         return True
 
     def _fail(self, text: str) -> CalibrationError:

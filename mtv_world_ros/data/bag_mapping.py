@@ -15,7 +15,7 @@ from mtv_world_ros.data.tool_targets import ToolTargets
 STATE = 'state'
 #: key of `joints` whose value is taken off the recorded names
 PREFIX = 'prefix'
-#: end of the names of ros2_control's position interfaces, which some broadcasters publish as joints
+#: end of the names of ros2_control's position interfaces, which broadcasters may publish as joints
 _INTERFACE = '/position'
 
 

@@ -30,6 +30,8 @@ from mtv_world_ros.importing.number_tables import NumberTable
 
 #: a file, and a group or data set in it
 _INSIDE = re.compile(r'(?P<file>.*\.(?:hdf5|h5)):(?P<path>.+)')
+#: errors that h5py raises for damaged files
+_DAMAGED = (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError)
 #: soft links that are followed one after the other
 _MOST_LINKS = 16
 #: chunks of a file that are kept in memory [bytes]
@@ -61,7 +63,7 @@ def open_hdf5(path: Path) -> Iterator[Any]:
     file = _open(path)
     try:
         yield file
-    except (OSError, RuntimeError, KeyError, ValueError) as error:
+    except _DAMAGED as error:
         if isinstance(error, MtvWorldError):
             raise
         raise EpisodeError(f"'{path}' cannot be read: {error}") from error
@@ -117,7 +119,7 @@ def _link(group: Any, name: str, where: str) -> Any:
     is_group = hasattr(group, 'keys')
     link = group.get(name, getlink=True) if is_group and name in set(group.keys()) else None
     if link is None:
-        known = list(group.keys())[:_MOST_NAMES] if is_group else []
+        known = [str(name) for name in group][:_MOST_NAMES] if is_group else []
         raise EpisodeError(
             f"{where} has no '{name}' in '{group.name}'{nearest(name, known)}; it has "
             f'{", ".join(known) or "nothing"}'
@@ -160,17 +162,21 @@ class Hdf5Keys(Mapping[str, Any]):
         self._path, self._inside = path, inside
 
     def __getitem__(self, key: str) -> Any:
+        where = f"'{self._path}'"
         with open_hdf5(self._path) as file:
-            group = find_item(file, self._inside, f"'{self._path}'")
+            group = find_item(file, self._inside, where)
             if key in group.attrs:
                 return _plain(group.attrs[key])
             try:
-                item = _checked(find_item(group, key, f"'{self._path}'"), f"'{self._path}'")
-            except EpisodeError as error:
-                raise KeyError(key) from error
-            size = max(item.size or 0, 1) * item.dtype.itemsize
-            _within('array_bytes', size, item, f"'{self._path}'")
-            return _plain(item[()])
+                found = find_item(group, key, where)
+            except EpisodeError:
+                found = None
+            if found is not None:
+                item = _checked(found, where)
+                size = max(item.size or 0, 1) * item.dtype.itemsize
+                _within('array_bytes', size, item, where)
+                return _plain(item[()])
+        raise KeyError(key)
 
     def __iter__(self) -> Iterator[str]:
         with open_hdf5(self._path) as file:
@@ -278,7 +284,12 @@ class Hdf5Frames:
         self.times: FloatArray | None = None
         self.note = ''
         self._file = _open(path)
-        item = _checked(find_item(self._file, inside, self._where), self._where)
+        try:
+            item = _checked(find_item(self._file, inside, self._where), self._where)
+        except _DAMAGED as error:
+            if isinstance(error, MtvWorldError):
+                raise
+            raise EpisodeError(f"'{path}' cannot be read: {error}") from error
         self._item, shape = item, item.shape
         self._is_raw = len(shape) == 4
         is_pixels = self._is_raw and shape[-1] == 3 and item.dtype.str == '|u1'
@@ -323,7 +334,7 @@ class Hdf5Frames:
         try:
             stored = self._item[number]
             pixels = np.asarray(stored, np.uint8) if self._is_raw else self._decoded(stored)
-        except (OSError, RuntimeError, ValueError) as error:
+        except _DAMAGED as error:
             what = f"{self._where}: frame {number} of '{self._item.name}'"
             raise EpisodeError(f'{what}: {error}') from error
         return np.ascontiguousarray(pixels[..., ::-1] if self._is_bgr else pixels)

@@ -153,6 +153,13 @@ def test_without_action_the_measured_positions_that_follow_are_taken(tmp_path):
     np.testing.assert_allclose(first.positions[0][:7], measured()[1][:7], atol=1e-9)
 
 
+def test_an_outcome_that_is_not_there_is_named_with_what_there_is(tmp_path, capsys):
+    write_aloha(tmp_path / 'raw/a.hdf5', pictures())
+    mapping = write_mapping(tmp_path / 'm.yaml', outcome='key: sucess')
+    assert bring_in(tmp_path / 'raw', mapping, tmp_path / 'out') == 1
+    assert "has no outcome 'sucess' (did you mean 'success'?)" in capsys.readouterr().err
+
+
 def test_droids_layout_has_rows_in_hdf5_and_frames_in_videos(tmp_path):
     folder = tmp_path / 'raw/2023-07-07_Fri'
     (folder / 'recordings/MP4').mkdir(parents=True)
