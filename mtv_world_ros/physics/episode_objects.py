@@ -193,6 +193,11 @@ class ObjectForesight:
         return () if self.found is None else self.found.tracked.reasons
 
     @property
+    def starts_later(self) -> bool:
+        """True if motions are to be foreseen from a real frame later than the episode's first."""
+        return self.model is not None and self.source is not self.first
+
+    @property
     def refusal(self) -> str:
         """Reason to give no verdict; empty = none.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import isfinite, nan
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -50,12 +51,14 @@ from mtv_world_ros.success.rollout_memory import footage_of
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
-from mtv_world_ros.vision.frame_check import check_frames, frame_doubt, lost_objects
+from mtv_world_ros.vision.frame_check import check_frames, check_stretch, frame_doubt, lost_objects
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 #: reason against an estimate if the plan is drawn outside of all views
 _UNSEEN = 'no view shows a tool at any time'
+#: reason against an estimate of imagined frames in place of foreseen motions
+_UNPLACED = 'no motion is foreseen from the frames that this plan starts from'
 
 
 class WorldModel(Protocol):
@@ -481,7 +484,9 @@ class Pipeline:
         success, memory = self.judge(state, motion, start_masks, masks, options, foreseen)
         unseen = () if control.video is None or in_view.any() else (_UNSEEN,)
         success = doubted(success, (*objects.reasons, *unseen))
-        success = doubted(success, refusal=state.frame_doubt or objects.refusal)
+        is_foreseen = isfinite(success.features.get('foreseen', nan))
+        unplaced = _UNPLACED if objects.starts_later and not is_foreseen else ''
+        success = doubted(success, refusal=state.frame_doubt or objects.refusal or unplaced)
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
@@ -543,6 +548,8 @@ class Pipeline:
         if self.scene_keeper is not None and options.objects:
             background = self.scene_keeper.seen(background, motion.after_first(), frames, masks)
         success, memory = self.judge(state, motion, start_masks, masks, options, is_real=True)
+        doubts = check_stretch(frames, positions[1:], state.observation.views)
+        success = doubted(success, refusal='; '.join(doubts))
         stamp_ns = state.observation.stamp_ns + round(frames.shape[1] / self.spec.fps * 1e9)
         after = state.after(
             frames,
@@ -554,6 +561,7 @@ class Pipeline:
             background,
             masks,
         )
+        after = replace(after, observed_doubts=doubts)
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success), after
 
     def _kept(
@@ -653,6 +661,7 @@ class Pipeline:
         reasons = check_frames(
             objects.source, objects.first, state.camera_check, self.camera_checker
         )
+        reasons = tuple(dict.fromkeys([*reasons, *state.observed_doubts]))
         return frame_doubt(reasons, lost_objects(start_masks))
 
     def _majority(self, state: RolloutState, options: RolloutOptions) -> Majority:

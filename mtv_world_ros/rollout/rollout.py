@@ -219,6 +219,7 @@ class Rollout:
             memory=before.memory,
             scene=before.scene,
             followed=before.followed if is_next else None,
+            observed_doubts=before.observed_doubts,
         )
         return replace(self, _states=(state,))
 

@@ -51,6 +51,7 @@ class RolloutState:
         followed: objects in the last frame, as they were followed there; None = nothing was.
         frame_doubt: reason why the real frames that the plan starts from allow no verdict; empty =
             none.
+        observed_doubts: reasons why the real frames before that one are no evidence.
     """
 
     observation: Observation
@@ -62,6 +63,7 @@ class RolloutState:
     scene: SceneMemory | None = None
     followed: Followed | None = None
     frame_doubt: str = ''
+    observed_doubts: tuple[str, ...] = ()
 
     @classmethod
     def at(

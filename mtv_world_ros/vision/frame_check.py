@@ -9,6 +9,7 @@ Shape letters: V views, H W pixels, J joints.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,8 @@ class FrameCheckSettings:
     Attributes:
         min_contrast: standard deviation of a picture below which it is blank [grey levels].
         max_still_change: mean difference of two pictures that are the same [grey levels].
+        max_frozen_change: largest difference of any pixel in pictures of a frozen camera [grey
+            levels].
         min_joint_motion: joint motion after which two pictures of an arm differ [rad or m].
         max_offset: shift of the arm's outline since the episode began, of a camera that fitted
             then [fraction of image width].
@@ -32,11 +35,13 @@ class FrameCheckSettings:
 
     min_contrast: float = 4.0
     max_still_change: float = 0.3
+    max_frozen_change: int = 2
     min_joint_motion: float = 0.03
     max_offset: float = 0.03
 
 
 SETTINGS = FrameCheckSettings()
+_BLANK = 'shows a blank picture (contrast {:.1f} grey levels)'
 
 
 def check_frames(
@@ -79,6 +84,38 @@ def check_frames(
     return tuple(f"camera '{view}' {reason}" for view, reason in reasons.items() if reason)
 
 
+def check_stretch(
+    frames: ByteArray,
+    positions: FloatArray,
+    views: Sequence[str],
+    settings: FrameCheckSettings = SETTINGS,
+) -> tuple[str, ...]:
+    """Return why frames that follow one another are no evidence, a reason for each such view.
+
+    Args:
+        frames: (V, N, H, W, 3) uint8 RGB.
+        positions: (N, J) measured joint positions at these frames [rad or m].
+        views: names of the V views.
+        settings: thresholds.
+    """
+    moved = float(np.ptp(positions, axis=0).max(initial=0.0)) if len(positions) else 0.0
+    reasons = []
+    for view, shown in zip(views, frames, strict=True):
+        contrast = _contrast(shown[-1])
+        change = int(np.ptp(shown, axis=0).max(initial=0))
+        if contrast < settings.min_contrast:
+            reasons.append(f"camera '{view}' {_BLANK.format(contrast)}")
+        elif moved >= settings.min_joint_motion and change <= settings.max_frozen_change:
+            reasons.append(
+                f"camera '{view}' shows one picture all the time, although the arm moves"
+            )
+    return tuple(reasons)
+
+
+def _contrast(frame: ByteArray) -> float:
+    return float(frame.astype(np.float32).mean(-1).std())
+
+
 def lost_objects(masks: ObjectMasks) -> tuple[str, ...]:
     """Return the names of objects that no view shows in the last frame of masks."""
     seen = np.atleast_1d(masks.masks[:, :, -1].any((0, 2, 3)))
@@ -108,9 +145,9 @@ def _motions(observation: Observation, first: Observation) -> FloatArray:
 def _picture_doubt(
     frame: ByteArray, before: ByteArray, motion: float, settings: FrameCheckSettings
 ) -> str:
-    contrast = float(frame.astype(np.float32).mean(-1).std())
+    contrast = _contrast(frame)
     if contrast < settings.min_contrast:
-        return f'shows a blank picture (contrast {contrast:.1f} grey levels)'
+        return _BLANK.format(contrast)
     change = float(np.abs(frame.astype(np.int16) - before).mean())
     if motion >= settings.min_joint_motion and change < settings.max_still_change:
         return 'shows the same picture as when the episode began, although the arm has moved'
