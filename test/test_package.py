@@ -25,8 +25,10 @@ DISTRIBUTIONS = {
     'PIL': 'pillow',
     'coal': 'pin',  # which requires it
     'cv2': 'opencv-python-headless',
+    'google': 'mcap-protobuf-support',  # which requires protobuf
     'grpc': 'grpcio',
     'markupsafe': 'Jinja2',  # which requires it
+    'mcap_protobuf': 'mcap-protobuf-support',
     'mcap_ros2': 'mcap-ros2-support',
     'pinocchio': 'pin',
     'rerun': 'rerun-sdk',
@@ -43,6 +45,7 @@ ROS_PACKAGES = {
     'rcl_interfaces',
     'rclpy',
     'rosgraph_msgs',
+    'rosidl_parser',
     'sensor_msgs',
     'std_msgs',
     'std_srvs',

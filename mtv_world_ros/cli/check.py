@@ -30,9 +30,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         'check',
         help='check calibration, joints, clocks and pictures of an episode, of all episodes of a '
         'folder, or of running topics',
-        epilog='Exit status: 0 where everything was checked and is ok, 1 where something is '
-        'suspicious or broken, 3 where nothing wrong was found but not everything could be '
-        'checked.',
+        epilog='Exit status: 0 where every camera was checked and is ok (an arm that rests is '
+        'named), 1 where something is suspicious or broken, 3 where nothing wrong was found but '
+        'a camera or the recording could not be checked.',
     )
     parser.add_argument('episode', type=Path, nargs='?', help='an episode, or a folder of them')
     parser.add_argument('--live', action='store_true', help='check the running ROS topics')

@@ -41,6 +41,7 @@ from mtv_world_ros.inspection.inspection_report import (
     Finding,
     Inspection,
     not_checked,
+    part_not_checked,
     Section,
     suspicious,
 )
@@ -423,8 +424,8 @@ class Inspector:
     def _unseen_arms(self, residual: MotionResidual) -> list[Finding]:
         """Return the arms of a robot with several that were not compared in a view."""
         return [
-            not_checked(
-                f"arm '{arm}' not checked against the images: it does not move in this view, or "
+            part_not_checked(
+                f"arm '{arm}' is not compared with the images: it does not move in this view, or "
                 'is not in it'
             )
             for arm, links in (arm_links(self.robot) if len(self.robot.tools) > 1 else {}).items()

@@ -25,7 +25,7 @@ NUMBERS = {
 #: file with the numbers and findings of every view
 CHECKED = 'check.json'
 _ADVICE = {
-    'ok': 'Everything was checked, and nothing wrong was found.',
+    'ok': 'Every camera was checked, and nothing wrong was found.',
     NOT_CHECKED: 'Nothing wrong was found, but not everything could be checked.',
     'suspicious': 'Look at the overlay pictures before you rely on this recording.',
     'broken': 'Predictions from this recording would be wrong.',
@@ -38,15 +38,28 @@ _LEGEND = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """A verdict worse than `ok`, and why in a sentence."""
+    """A verdict worse than `ok`, and why in a sentence.
+
+    Attributes:
+        verdict: one of `VERDICTS`.
+        text: why.
+        of_a_part: it is of a part of the view, e.g. one of two arms: it is named, and the view
+            keeps the verdict of the rest.
+    """
 
     verdict: str
     text: str
+    of_a_part: bool = False
 
 
 def not_checked(text: str) -> Finding:
     """Return a check that could not be made, and why."""
     return Finding(verdict=NOT_CHECKED, text=text)
+
+
+def part_not_checked(text: str) -> Finding:
+    """Return why a part of what a view shows was not checked, while the rest was."""
+    return Finding(verdict=NOT_CHECKED, text=text, of_a_part=True)
 
 
 def suspicious(text: str) -> Finding:
@@ -84,8 +97,8 @@ class Section:
 
     @property
     def verdict(self) -> str:
-        """The worst of the findings."""
-        return worst_verdict([finding.verdict for finding in self.findings])
+        """The worst of the findings that concern the whole of it."""
+        return worst_verdict([f.verdict for f in self.findings if not f.of_a_part])
 
     @property
     def wrong(self) -> list[str]:
@@ -143,11 +156,15 @@ class Inspection:
 
 def to_markdown(inspection: Inspection, pictures: Mapping[str, str]) -> str:
     """Return the report; `pictures` has the file of each view's overlay picture."""
+    findings = [finding for section in inspection.sections for finding in section.findings]
+    parts = dict.fromkeys(finding.text for finding in findings if finding.of_a_part)
     lines = [
         f'# {inspection.verdict}: {inspection.episode.name}',
         '',
         f'`{inspection.episode}`, robot `{inspection.robot}`. {_ADVICE[inspection.verdict]}',
         '',
+        *(f'- {markdown_cell(text)}' for text in parts),
+        *([''] if parts else []),
         f'| | verdict | {" | ".join(name for name, _ in NUMBERS.values())} | reason |',
         f'|---|---|{"---|" * len(NUMBERS)}---|',
     ]
