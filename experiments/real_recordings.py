@@ -1,7 +1,7 @@
 """What do real recordings show, and what is imagined of them whole? Verdicts, carried objects, sharpness.
 
     python experiments/real_recordings.py verdicts EPISODES [--task TASK.yaml] [--every 8]
-    python experiments/real_recordings.py grips EPISODES [--robot ROBOT]
+    python experiments/real_recordings.py grips EPISODES [--robot ROBOT] [--out FOLDER]
     python experiments/real_recordings.py carried EPISODES --checkpoint CHECKPOINT
     python experiments/real_recordings.py rollouts EPISODES --checkpoint CHECKPOINT [--memory off]
                                 [--foresight off] [--out out/real_rollouts]
@@ -11,7 +11,8 @@ and whose objects were found (`import ... --objects`).
 
 `verdicts` judges recorded frames by the masks of the import: whole, and cut off after every N
 frames, so that most cuts are failures; somebody who looks at the frames says which verdicts are
-right. `grips` prints when something stops the fingers, which somebody compares with the frames; of
+right. `grips` prints when something stops the fingers, and whether it is held by the masks that
+follow, which somebody compares with the frames (--out has pictures of each stop); of
 simulated episodes it counts the frames in which an object goes along with a tool, and in which all
 are far from it, with the stops among them. `carried` compares where objects are foreseen in each chunk, from the recorded frame that it
 starts from, with their recorded masks and with the first frame held; no picture is imagined.
@@ -62,6 +63,7 @@ from mtv_world_ros.evaluation.metrics.statistics import mean_interval
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.physics.grips import watch_fingers
 from mtv_world_ros.robot.file import load_robot, robot_path
+from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
@@ -69,6 +71,7 @@ from mtv_world_ros.success.estimator import SuccessEstimator, verdict_word
 from mtv_world_ros.success.rollout_memory import footage_of
 from mtv_world_ros.success.task import load_task, load_tasks
 from mtv_world_ros.viewing.video import Comparison, contact_sheet
+from mtv_world_ros.vision.held_objects import Hold, judge_stops, Stop, tools_in_views
 from mtv_world_ros.vision.jaccard import jaccard
 from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids
 
@@ -129,6 +132,8 @@ def print_grips(arguments: argparse.Namespace) -> None:
         views=arguments.views, fps=RECORDED_FPS, num_frames=8, width=width, height=height, robot=''
     )
     robot = load_robot(robot_path(arguments.robot or folder / 'robot' / 'robot.yaml'))
+    if arguments.out is not None:
+        arguments.out.mkdir(parents=True, exist_ok=True)
     rows, counts = [], np.zeros((2, 2), np.int64)
     for path in list_episodes(folder):
         recording = load_recording(path, spec, robot)
@@ -136,19 +141,65 @@ def print_grips(arguments: argparse.Namespace) -> None:
         commanded = robot.gripper_openings(commands_at(recording, np.arange(len(recording.times))))
         stopped, _ = watch_fingers(openings, 1 / RECORDED_FPS, commanded=commanded)
         for arm, of_arm in enumerate(stopped):
-            for first, last in runs_of(of_arm):
+            runs = runs_of(of_arm)
+            for (first, last), stop in zip(runs, judged(recording, robot, arm, runs), strict=True):
                 begin, end = recording.times[[first, last]] - recording.times[0]
                 opening = f'{openings[arm, first : last + 1].mean():.2f}'
-                rows.append((path.name, str(arm), f'{begin:.1f}', f'{end:.1f}', opening))
+                name = '-' if stop.item is None else recording.names[stop.item]
+                told = stop.hold.value
+                rows.append(
+                    (path.name, str(arm), f'{begin:.1f}', f'{end:.1f}', opening, name, told)
+                )
+                if arguments.out is not None:
+                    picture = stop_picture(recording, stop, motion_of(recording, robot))
+                    write_png(arguments.out / f'{path.name}_{begin:04.1f}s.png', picture)
         if recording.object_poses is not None and not recording.masks_by:
             tools = robot.tool_poses(recording.positions)
             for of_tool, of_arm in zip(tools, stopped, strict=True):
                 counts += agreement(of_tool, recording.object_poses, of_arm)
-    print(table(('recording', 'arm', 'from [s]', 'to [s]', 'opening'), rows))
+    head = ('recording', 'arm', 'from [s]', 'to [s]', 'opening', 'object', 'by the masks')
+    print(table(head, rows))
     if counts.any():
         (moves, held), (away, wrong) = counts
         print(f'objects that go along: {moves} frames, {held} of them stops; ', end='')
         print(f'all objects far away: {away} frames, {wrong} of them stops')
+
+
+def motion_of(recording: Recording, robot: RobotModel) -> Motion:
+    """Return the motion of the robot and the cameras in all frames of a recording."""
+    return Motion.of(robot, recording.cameras, recording.positions)
+
+
+def judged(
+    recording: Recording, robot: RobotModel, arm: int, runs: Sequence[tuple[int, int]]
+) -> tuple[Stop, ...]:
+    """Return the stops of an arm's fingers in runs of rows, with the evidence of the masks."""
+    stops = [(arm, first, last + 1) for first, last in runs]
+    if recording.object_ids is None:
+        return tuple(
+            Stop(arm=a, closed=c, opened=o, item=None, hold=Hold.NOT_TOLD) for a, c, o in stops
+        )
+    masks = masks_from_ids(recording.object_ids, recording.objects, recording.names).masks
+    return judge_stops(motion_of(recording, robot), masks, stops)
+
+
+def stop_picture(
+    recording: Recording, stop: Stop, motion: Motion, num_columns: int = 5
+) -> ByteArray:
+    """Return frames of all views from the stop until the fingers open, tool points drawn in."""
+    last = min(stop.opened, len(recording.times)) - 1
+    columns = np.unique(np.linspace(stop.closed, last, num_columns).round().astype(int))
+    pixels = tools_in_views(motion, stop.arm)
+    rows = []
+    for view in range(recording.frames.shape[0]):
+        shown = [recording.frames[view, column].copy() for column in columns]
+        for frame, column in zip(shown, columns, strict=True):
+            if np.isfinite(pixels[view, column]).all():
+                x, y = np.rint(pixels[view, column]).astype(int)
+                frame[max(y - 2, 0) : y + 3, max(x, 0) : x + 1] = (255, 0, 255)
+                frame[max(y, 0) : y + 1, max(x - 2, 0) : x + 3] = (255, 0, 255)
+        rows.append(np.concatenate(shown, axis=1))
+    return np.concatenate(rows, axis=0)
 
 
 def runs_of(mask: BoolArray) -> list[tuple[int, int]]:
@@ -277,7 +328,7 @@ def imagine_whole(arguments: argparse.Namespace) -> None:
         'memory': arguments.memory,
         'foresight': arguments.foresight,
     }
-    out: Path = arguments.out
+    out = arguments.out = arguments.out or Path('out/real_rollouts')
     out.mkdir(parents=True, exist_ok=True)
     scores: list[dict[str, Any]] = []
     for recording in recordings(arguments.episodes, pipeline.spec):
@@ -459,7 +510,7 @@ def main() -> None:
     parser.add_argument('--memory', choices=('on', 'off'), default='on')
     parser.add_argument('--foresight', choices=('on', 'off'), default='on')
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--out', type=Path, default=Path('out/real_rollouts'))
+    parser.add_argument('--out', type=Path, help='of grips: pictures; of rollouts: all')
     arguments = parser.parse_args()
     {
         'verdicts': judge_recorded,

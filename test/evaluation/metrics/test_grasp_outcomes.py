@@ -3,15 +3,9 @@
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from mtv_world_ros.cameras.camera import unknown_camera
-from mtv_world_ros.evaluation.metrics.grasp_outcomes import (
-    attempts,
-    Dreams,
-    grasp_outcomes,
-    GraspOutcome,
-)
+from mtv_world_ros.evaluation.metrics.grasp_outcomes import Dreams, grasp_outcomes, GraspOutcome
 
 _WIDTH, _HEIGHT, _FRAMES = 96, 72, 14
 _START, _CLOSED = (30, 40), 4
@@ -84,20 +78,6 @@ def test_a_gripper_that_closes_far_from_every_object_attempts_nothing():
 def test_an_object_without_a_mask_is_not_attempted():
     empty = np.zeros_like(_masks(_STAYS))
     assert _outcome(empty, empty) == ()
-
-
-@pytest.mark.parametrize(
-    ('openings', 'expected'),
-    [
-        ([1, 1, 0.6, 0.3, 0.3, 0.3, 0.9, 1], [(4, 6)]),
-        ([1, 1, 1, 1], []),
-        ([1, 0.5, 0.5, 0.5], [(2, 4)]),
-        ([0.3, 0.3, 0.3, 0.3], []),
-        ([1, 0.2, 0.2, 1, 0.2, 0.2], [(2, 3), (5, 6)]),
-    ],
-)
-def test_a_gripper_attempts_when_its_fingers_have_closed(openings, expected):
-    assert attempts(np.array(openings, float)) == expected
 
 
 def test_shares_of_dreams_count_misses_and_grasps_apart():
