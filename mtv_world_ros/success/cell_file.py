@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+import fcntl
 from hashlib import sha256
 import os
 from pathlib import Path
@@ -20,6 +22,8 @@ from mtv_world_ros.success.confirmation import ContactConfirmation, TaskEvidence
 FOLDER = Path('mtv_world', 'cells')
 #: most characters of a cell's name in the name of its file
 _NAME_LENGTH = 60
+#: a link in place of the lock is not followed
+_LOCK_FLAGS = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 
 
 class _Contents(Schema):
@@ -100,6 +104,41 @@ class CellFile:
                     'the file away, then the evidence begins anew'
                 )
         return ContactConfirmation(found.tasks), ''
+
+    def update(
+        self, confirmation: ContactConfirmation, change: Callable[[ContactConfirmation], object]
+    ) -> str:
+        """Change the evidence, beginning from what the file has by now, and write it.
+
+        Other processes wait meanwhile, so that nodes of one robot cell share its evidence.
+
+        Args:
+            confirmation: gets the evidence of the file, then the change.
+            change: changes it.
+
+        Returns:
+            A remark on a file that was damaged; empty = it was not.
+
+        Raises:
+            ConfigError: the file is of another cell, robot or fit, or cannot be read.
+            OSError: the file cannot be written; `confirmation` is changed all the same.
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            lock = os.open(self.path.with_suffix('.lock'), _LOCK_FLAGS, 0o644)
+        except OSError:
+            change(confirmation)
+            raise
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            found, remark = self.load()
+            confirmation.tasks = dict(found.tasks)
+            change(confirmation)
+            if confirmation.tasks != found.tasks:
+                self.store(confirmation)
+        finally:
+            os.close(lock)
+        return remark
 
     def store(self, confirmation: ContactConfirmation) -> None:
         """Write the evidence.

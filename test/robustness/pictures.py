@@ -1,15 +1,17 @@
 """Damaged pictures from a later plan on: estimate, interval, word and reason beside real frames.
 
-    python -m test.robustness.pictures [EPISODE]
+    python -m test.robustness.pictures [EPISODE | FOLDER]
 
 The first plan of an episode starts from real frames. From the second one on all frames of one
 view, or of all, are damaged. What must hold: no damaged row has the opposite verdict, or a
-narrower interval than the real frames and another answer. The exit status is 1 if one has.
+narrower interval than the real frames and another answer. The exit status is 1 if one has. For
+a folder of episodes the answers are counted for each damage.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
@@ -18,9 +20,11 @@ import sys
 
 import cv2
 import numpy as np
+from tqdm import tqdm
 
 from mtv_world_ros.core.data_types import ByteArray, SuccessEstimate
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.recording import frame_indices, load_recording, Recording
 from mtv_world_ros.data.recordings import commands_until
 from mtv_world_ros.rollout.options import RolloutOptions
@@ -226,6 +230,51 @@ def table(pipeline: Pipeline, recording: Recording, others: ByteArray | None) ->
     return rows
 
 
+def answer(row: Row, real: Row) -> str:
+    """Return what became of the answer of real frames; one of `ANSWERS`."""
+    if not isfinite(row.success.probability):
+        return 'no verdict'
+    if row.is_surer_than(real):
+        return 'SURER'
+    if row.word == real.word:
+        return 'the same'
+    return 'open' if row.word == 'open' else 'another, wider'
+
+
+#: what becomes of an answer, from best to worst
+ANSWERS = ('no verdict', 'the same', 'open', 'another, wider', 'SURER')
+
+
+def sweep(pipeline: Pipeline, folder: Path) -> int:
+    """Print how often each damage has each answer over all episodes that have a second plan.
+
+    Returns:
+        The number of answers that are surer.
+    """
+    counts: dict[tuple[str, str], Counter[str]] = {}
+    words: Counter[str] = Counter()
+    surer = 0
+    for path in tqdm(list_episodes(folder), desc='episodes', mininterval=30):
+        recording = load_recording(path, pipeline.spec, pipeline.robot)
+        if frame_indices(recording, 0, pipeline.spec, pipeline.spec.num_frames) is None:
+            continue
+        real, *rows = table(pipeline, recording, None)
+        words[real.word] += 1
+        for row in rows:
+            found = answer(row, real)
+            counts.setdefault((row.name, row.views), Counter())[found] += 1
+            if found == 'SURER':
+                surer += 1
+                print(f'{path.name}: {row.line(real)} real: {real.line(None)}', file=sys.stderr)
+    print(f'{sum(words.values())} episodes; real frames: {dict(words)}; commit {commit()}\n')
+    print(f'| pictures | views | {" | ".join(ANSWERS)} |')
+    print(f'|---|---|{"---|" * len(ANSWERS)}')
+    for (name, views), found in counts.items():
+        cells = ' | '.join(str(found[word]) for word in ANSWERS)
+        print(f'| {name} | {views} | {cells} |')
+    return surer
+
+
 def main() -> int:
     """Print the table; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -234,6 +283,8 @@ def main() -> int:
     parser.add_argument('--other', type=Path, help='episode of another scene')
     arguments = parser.parse_args()
     pipeline = Pipeline.load()
+    if not (arguments.episode / 'metadata.yaml').is_file():
+        return int(sweep(pipeline, arguments.episode) > 0)
     recording = load_recording(arguments.episode, pipeline.spec, pipeline.robot)
     others = None
     if arguments.other is not None:

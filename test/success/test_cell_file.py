@@ -2,6 +2,7 @@
 
 import json
 import os
+from threading import Thread
 
 import pytest
 
@@ -32,6 +33,31 @@ def test_evidence_goes_on_over_restarts(tmp_path):
     assert found.trust('stack').is_confirmed
     file.store(found)
     assert file.load()[0].trust('stack').is_confirmed
+
+
+def test_two_nodes_of_a_cell_share_its_evidence(tmp_path):
+    """Each adds ends to what the other wrote meanwhile; none is lost."""
+    file = cell(tmp_path)
+    nodes = [file.load()[0], file.load()[0]]
+
+    def follow(node):
+        for rollout in range(25):
+            file.update(node, lambda found, r=rollout: found.take(seen_end(0.0), r, 'stack'))
+
+    threads = [Thread(target=follow, args=(node,)) for node in nodes]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert file.load()[0].tasks['stack'].num_foreseen == 50
+
+
+def test_evidence_is_changed_in_memory_where_it_cannot_be_written(tmp_path):
+    tmp_path.joinpath('folder').write_text('a file')
+    found = ContactConfirmation()
+    with pytest.raises(OSError):
+        cell(tmp_path / 'folder').update(found, lambda c: c.take(seen_end(0.0), 0, 'stack'))
+    assert found.tasks['stack'].num_foreseen == 1
 
 
 @pytest.mark.parametrize(

@@ -346,14 +346,20 @@ class LiveFidelity:
             return
         cell = self._cell(self._place)
         with self._cells_lock:
-            before = dict(cell.confirmation.tasks)
-            change(cell.confirmation)
-            if cell.file is None or cell.refusal or cell.confirmation.tasks == before:
+            if cell.file is None or cell.refusal:
+                change(cell.confirmation)
                 return
             try:
-                cell.file.store(cell.confirmation)
-            except OSError as error:
+                remark = cell.file.update(cell.confirmation, change)
+            except ConfigError as error:
+                cell.refusal = str(error)
                 self._report(error)
+            except OSError as error:
+                cell.file = None  # from here on it is kept in memory alone, and says so
+                self._report(error)
+            else:
+                if remark:
+                    self._report(ConfigError(remark))
 
     def _cell(self, place: str) -> _Cell:
         """Return the evidence of a robot cell, at first that of its file."""
