@@ -20,6 +20,7 @@ import os  # noqa: E402
 from pathlib import Path  # noqa: E402
 import shlex  # noqa: E402
 import sys  # noqa: E402
+import threading  # noqa: E402
 from types import ModuleType  # noqa: E402
 from typing import Any  # noqa: E402
 import warnings  # noqa: E402
@@ -41,8 +42,8 @@ from mtv_world_ros.core.errors import (  # noqa: E402
 from mtv_world_ros.core.files import check_name, check_output  # noqa: E402
 from mtv_world_ros.core.processes import (  # noqa: E402
     ended_by_signals,
-    escape_unprintable_output,
     is_helper_rank,
+    prepare_output,
     stopped_by_sigterm,
 )
 from mtv_world_ros.core.shown_text import MOST_OF_ERROR, shown  # noqa: E402
@@ -67,6 +68,8 @@ _GROUPS = {
     'export': 'write episodes and results in other formats',
 }
 _OWN = 'mtv_world_ros.'
+#: time after which a command says that it is loading; most mistakes are found before [s]
+_FIRST_LINE_S = 0.5
 #: control characters that messages may hold
 _LINES = '\n\t'
 _DESCRIPTION = 'An online embodied world model for ROS 2.'
@@ -302,7 +305,7 @@ def main(argv: list[str] | None = None) -> int:
 
     That is 1 for an error of the user's or of the disk, and 128 + n where signal n ended it.
     """
-    escape_unprintable_output()
+    prepare_output()
     try:
         with ended_by_signals('mtv-world'):
             arguments = _parsed(sys.argv[1:] if argv is None else argv)
@@ -310,6 +313,7 @@ def main(argv: list[str] | None = None) -> int:
         return _said(str(error), 1)
     try:
         with stopped_by_sigterm(), _own_warnings(), ExitStack() as locks:
+            locks.enter_context(_said_to_load(arguments.command_line))
             for path, option in [] if is_helper_rank() else _outputs(arguments):
                 locks.enter_context(only_writer(path, option))
             return arguments.handler(arguments)
@@ -331,6 +335,22 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt as stopped:
         number = getattr(stopped, 'signum', signal.SIGINT)
         return _said(f'stopped ({signal.Signals(number).name})', 128 + number)
+
+
+@contextmanager
+def _said_to_load(words: Sequence[str]) -> Iterator[None]:
+    """Print a line soon after the start of a command that takes seconds to load."""
+    name = next((n for n in (' '.join(words[:2]), *words[:1]) if n in COMMANDS), '')
+    if not name or not COMMANDS[name].is_long or is_helper_rank():
+        yield
+        return
+    timer = threading.Timer(_FIRST_LINE_S, _said, [f'{name}: loading', 0])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 @contextmanager

@@ -88,10 +88,9 @@ def _episodes_in(path: Path) -> list[Path]:
 
 
 def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
-    from tqdm import tqdm
-
     from mtv_world_ros.core.files import write_json, write_whole
     from mtv_world_ros.core.images import write_png
+    from mtv_world_ros.core.progress import Progress
     from mtv_world_ros.inspection.folder import (
         broken_parts,
         folder_markdown,
@@ -105,7 +104,7 @@ def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
     file, source = robot_file(arguments, paths[0])
     inspector = load_inspector(file)
     found, pictures = inspect_folder(
-        tqdm(paths, unit='ep', disable=None),
+        Progress(paths, unit='episode'),
         inspector,
         lambda path: read_for_checks(
             path,
@@ -137,8 +136,7 @@ def _check_folder(arguments: argparse.Namespace, paths: Sequence[Path]) -> int:
 def _check(arguments: argparse.Namespace, path: Path) -> int:
     from functools import partial
 
-    from tqdm import tqdm
-
+    from mtv_world_ros.core.progress import Progress
     from mtv_world_ros.inspection.inspect import load_inspector
     from mtv_world_ros.inspection.inspection_report import EXIT_STATUS, to_text
 
@@ -148,7 +146,7 @@ def _check(arguments: argparse.Namespace, path: Path) -> int:
     episode = read_for_checks(
         path, arguments.views, source, robot, robot.base_link, with_masks=True
     )
-    bar = partial(tqdm, desc='comparing', unit='view', disable=None)
+    bar = partial(Progress, desc='comparing', unit='view')
     inspection = inspector.inspect(episode, bar)
     out = arguments.out or _default_out(arguments)
     _write_inspection(inspector, episode, inspection, out)

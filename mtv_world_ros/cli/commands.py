@@ -14,12 +14,14 @@ class CommandEntry:
         help: one line for `mtv-world --help`.
         section: heading under which `mtv-world --help` shows it.
         function: name of the function that adds it.
+        is_long: whether it takes seconds to load, and says so.
     """
 
     module: str
     help: str
     section: str
     function: str = 'add'
+    is_long: bool = True
 
 
 #: headings of `mtv-world --help`, in its order
@@ -58,9 +60,11 @@ COMMANDS = {
     ),
     'collect': CommandEntry('collect', 'record episodes of the simulated benchmark', 'Prepare'),
     'robot': CommandEntry(
-        'robot', 'print and draw a robot, and make its YAML from a URDF', 'Prepare'
+        'robot', 'print and draw a robot, and make its YAML from a URDF', 'Prepare', is_long=False
     ),
-    'task': CommandEntry('task', 'draft the YAML of a task from an instruction', 'Prepare'),
+    'task': CommandEntry(
+        'task', 'draft the YAML of a task from an instruction', 'Prepare', is_long=False
+    ),
     'check': CommandEntry(
         'check', 'check calibration, joints, clocks and images of recordings', 'Prepare'
     ),
@@ -78,13 +82,14 @@ COMMANDS = {
         'imports.wan', 'convert public Wan 2.1 weights into a checkpoint', 'Prepare'
     ),
     'recover': CommandEntry(
-        'recover', 'repair bags of recordings that were killed or cut off', 'Prepare'
+        'recover', 'repair bags of recordings that were killed or cut off', 'Prepare',
+        is_long=False,
     ),
     'export lerobot': CommandEntry(
         'export_lerobot', 'convert episodes into a LeRobot data set (v3.0)', 'Prepare'
     ),
     'export report': CommandEntry(
-        'evaluate', 'write the HTML report of evaluations again', 'Prepare', 'add_report'
+        'evaluate', 'write the HTML report of evaluations again', 'Prepare', 'add_report', False
     ),
 }  # fmt: skip
 

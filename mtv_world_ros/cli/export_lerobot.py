@@ -38,9 +38,8 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
     from mtv_world_ros.core.files import bundled
+    from mtv_world_ros.core.progress import Progress
     from mtv_world_ros.data.episode_reader import list_episodes
     from mtv_world_ros.importing.lerobot_writer import export_dataset, MAPPING
     from mtv_world_ros.robot.file import load_robot
@@ -55,7 +54,7 @@ def _export(arguments: argparse.Namespace) -> int:
         load_robot(path),
         named,
         arguments.fps,
-        progress=lambda paths: tqdm(paths, unit='ep', disable=None),
+        progress=lambda paths: Progress(paths, unit='episode'),
         size=_size(arguments.size),
         as_videos=not arguments.images,
     )

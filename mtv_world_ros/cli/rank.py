@@ -132,7 +132,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _rank(arguments: argparse.Namespace) -> int:
     names, truth = _names(arguments), physics_text(arguments.physics)
     opened = open_checkpoints(device_here(arguments), *names)
-    watched = watch_arguments(arguments)
+    watched = watch_arguments(arguments, _recording_name(arguments))
     if watched and not arguments.clips:
         raise ConfigError('--watch shows what --no-video leaves out; give one of them')
     robot = opened[0].load_robot(arguments.robot)
@@ -210,10 +210,16 @@ def _viewer(arguments: argparse.Namespace) -> LiveRanking | None:
     from mtv_world_ros.reports.shown_rankings import LiveRanking
     from mtv_world_ros.viewing import rerun_log
 
-    stream = rerun_log.recording('ranking')
+    stream = rerun_log.recording(_recording_name(arguments))
     watch = arguments.watch
     print(rerun_log.open_viewer(stream, None, watch.address, watch.file, False), flush=True)
     return LiveRanking(stream, arguments.out, watch.file)
+
+
+def _recording_name(arguments: argparse.Namespace) -> str:
+    """Return the name of the viewer's recording: that of the ranking in `--out`."""
+    folder = str(arguments.out.resolve())
+    return f'ranking {sha256(folder.encode(errors="surrogateescape")).hexdigest()[:16]}'
 
 
 def _names(arguments: argparse.Namespace) -> list[str]:

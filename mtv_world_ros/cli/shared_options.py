@@ -206,8 +206,12 @@ def add_watch(parser: argparse.ArgumentParser, what: str) -> None:
     )
 
 
-def watch_arguments(arguments: argparse.Namespace) -> tuple[str, ...] | None:
+def watch_arguments(arguments: argparse.Namespace, continued: str = '') -> tuple[str, ...] | None:
     """Return the viewer's arguments for `--watch`; None = nobody watches.
+
+    Args:
+        arguments: options of the command.
+        continued: name of the recording that the command continues; a file of it is replaced.
 
     Raises:
         ConfigError: the viewer is not installed, its port is taken, or its file exists.
@@ -216,14 +220,15 @@ def watch_arguments(arguments: argparse.Namespace) -> tuple[str, ...] | None:
     if watch is None:
         return None
     from mtv_world_ros.core.files import check_free
-    from mtv_world_ros.viewing.rerun_log import check_installed
+    from mtv_world_ros.viewing.rerun_log import check_installed, is_recording
     from mtv_world_ros.viewing.viewer_process import check_ports
 
     check_installed()
     if watch.file is None:
         check_ports(watch.address, '--watch PORT')
         return '--port', str(watch.address)
-    check_free(watch.file, arguments.overwrite, '--watch FILE.rrd')
+    is_own = bool(continued) and is_recording(watch.file, continued)
+    check_free(watch.file, arguments.overwrite or is_own, '--watch FILE.rrd')
     return '--save', str(watch.file)
 
 

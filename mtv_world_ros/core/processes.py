@@ -121,14 +121,15 @@ def _give_up_tidying() -> None:
     os._exit(128 + signal.SIGTERM)
 
 
-def escape_unprintable_output() -> None:
-    """Let stdout and stderr print every text, with escapes for characters that they lack.
+def prepare_output() -> None:
+    """Let stdout and stderr print every text, and each line at once.
 
+    Characters that they lack are escaped.
     With `LC_ALL=C` and no UTF-8 mode they are ASCII, and names of files may hold any bytes.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors='backslashreplace')
+            stream.reconfigure(errors='backslashreplace', line_buffering=True)
 
 
 def private_domain() -> dict[str, str]:

@@ -14,9 +14,8 @@ import time
 from typing import Any, TYPE_CHECKING, TypeVar
 import uuid
 
-from tqdm import tqdm
-
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.core.worker_pool import made_run, Run
 
 if TYPE_CHECKING:
@@ -250,7 +249,7 @@ class _Actors:
             raise MtvWorldError(
                 f'all Ray workers died ({error}); what is done is kept: run the command again'
             ) from error
-        tqdm.write(f'a Ray worker died; {self._num_left} go on')
+        Progress.write(f'a Ray worker died; {self._num_left} go on')
 
 
 def _is_ray_at_hand() -> bool:

@@ -11,12 +11,12 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.core.executor import score_all
 from mtv_world_ros.core.files import plain, write_json
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.core.workers import IN_PROCESS, Workers
 from mtv_world_ros.data.recordings import described_objects
 from mtv_world_ros.evaluation.episode_scorer import EpisodeScorer, EvaluationJob, Instruments
@@ -99,7 +99,7 @@ def evaluate(
         parallel: workers to score with; None = this process.
         describer: names the objects from each episode's first frame; None = see `EvaluationJob`.
         overwrite: replace results of other settings; only asked where there is a name.
-        show_progress: draw a progress bar, on a terminal.
+        show_progress: show the progress.
 
     Raises:
         ConfigError: weights are missing, `out` holds results of other settings, or two episodes
@@ -113,9 +113,7 @@ def evaluate(
     tasks = {} if pipeline.estimator.is_given else own_tasks(episode_paths)
     jobs = make_jobs(episode_paths, zero_shot, config.seed, tasks)
     results, failed = [], {}
-    bar = tqdm(
-        run.results(jobs), total=len(jobs), unit='ep', disable=None if show_progress else True
-    )
+    bar = Progress(run.results(jobs), total=len(jobs), unit='episode', is_shown=show_progress)
     for job, result in bar:
         if isinstance(result, EpisodeResult):
             results.append(result)

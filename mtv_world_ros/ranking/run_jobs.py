@@ -9,12 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.executor import score_all
 from mtv_world_ros.core.files import plain, write_json, write_whole
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.core.workers import IN_PROCESS, Workers
 from mtv_world_ros.evaluation.result_settings import check_same_settings
 from mtv_world_ros.ranking.rollout_jobs import Job, Result
@@ -62,7 +61,7 @@ def run_jobs(
         config: denoising steps, limits and physics of the episodes.
         workers: where the rollouts run.
         overwrite: replace results of other settings.
-        show_progress: draw a progress bar, on a terminal.
+        show_progress: show the progress.
         watch: called with the first checkpoint's results: at first with those of an earlier run,
             then with each as it comes.
 
@@ -79,7 +78,7 @@ def run_jobs(
         watch(list(stores[0].found.values()))
     make = partial(make_runner, [c.make_pipeline for c in checkpoints], config)
     outcomes = score_all(left, make, workers)
-    bar = tqdm(outcomes, total=len(left), unit='rollout', disable=None if show_progress else True)
+    bar = Progress(outcomes, total=len(left), unit='rollout', is_shown=show_progress)
     for done, outcome in bar:
         if isinstance(outcome, str):
             failed[done.job] = outcome

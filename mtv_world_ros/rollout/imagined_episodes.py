@@ -15,8 +15,6 @@ from threading import Thread
 import time
 from typing import Any
 
-from tqdm import tqdm
-
 from mtv_world_ros.core.data_types import JointTrajectory, Observation
 from mtv_world_ros.core.errors import (
     ConfigError,
@@ -27,6 +25,7 @@ from mtv_world_ros.core.errors import (
 )
 from mtv_world_ros.core.executor import run_all
 from mtv_world_ros.core.files import check_free, check_room, write_whole
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.core.workers import Workers
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.observations import observation_after
@@ -256,7 +255,7 @@ def imagine_episodes(
     first = next(starts)
     clear_episodes(out, overwrite=overwrite)
     chosen = islice(chain([first], starts), options.count)
-    for number, start in enumerate(tqdm(chosen, total=options.count, unit='ep', disable=None)):
+    for number, start in enumerate(Progress(chosen, total=options.count, unit='episode')):
         on_start(start)
         run = _EpisodeRun(pipeline, options, number, start, _bag(out, number))
         try:
@@ -296,7 +295,7 @@ def imagine_recorded(
     make_run = partial(_RecordedRun, make_pipeline, options, source, out)
     results = list[dict[str, Any]]()
     done = run_all(range(options.count), make_run, replace(workers, writes=out))
-    for _, result in tqdm(done, total=options.count, unit='ep', disable=None):
+    for _, result in Progress(done, total=options.count, unit='episode'):
         results.append(result)
         results.sort(key=lambda one: one['episode'])
         write_whole(out / 'episodes.json', json.dumps(results, indent=2) + '\n')

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from mtv_world_ros.core.data_types import Observation, SuccessEstimate
 from mtv_world_ros.core.errors import EpisodeError, MtvWorldError, ObservationError
 from mtv_world_ros.core.estimate_words import estimate_lines
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import read_episode
@@ -100,7 +100,7 @@ def replay_offline(
         seed: seed of the noise; the k-th trajectory uses `seed + 1000 k`.
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
         overwrite: replace an existing folder of predictions.
-        show_progress: draw a progress bar, on a terminal.
+        show_progress: show the progress.
 
     Raises:
         EpisodeError: the episode cannot be read, or none of its trajectories can be imagined.
@@ -121,7 +121,7 @@ def replay_offline(
     summary = ReplaySummary(out=Path(out), warnings=episode.warnings)
     observed = ObservedEpisode(pipeline)
     starts = [stamp for stamp, _ in episode.trajectories]
-    bar = tqdm(total=len(starts), unit='trajectory', disable=None if show_progress else True)
+    bar = Progress(total=len(starts), unit='plan', is_shown=show_progress)
     with bar, PredictionWriter(out, pipeline.robot.joint_names, overwrite=overwrite) as writer:
         for index, (stamp, trajectory) in enumerate(episode.trajectories):
             until = starts[index + 1] if index + 1 < len(starts) else None

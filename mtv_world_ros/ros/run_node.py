@@ -21,8 +21,8 @@ from rclpy.signals import SignalHandlerOptions
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.processes import (
     end_on_signals,
-    escape_unprintable_output,
     PARENT_VARIABLE,
+    prepare_output,
 )
 from mtv_world_ros.ros.guarded_clock import guard_clock
 from mtv_world_ros.ros.messages.request_limits import guard_services
@@ -88,7 +88,7 @@ def run(
         The exit status: 1 after an error of the user's or of the disk, whose text goes to stderr,
         else 0. A signal n that comes while the node is made ends the process with 128 + n.
     """
-    escape_unprintable_output()
+    prepare_output()
     if help_text and '--help' in (sys.argv if args is None else args):
         sys.stdout.write(f'{help_text}\n')
         return 0

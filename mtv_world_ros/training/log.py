@@ -1,4 +1,4 @@
-"""Log of a training: a progress bar, `log.jsonl` and TensorBoard."""
+"""Log of a training: progress, `log.jsonl` and TensorBoard."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import time
 from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 from mtv_world_ros.core.bounded_input import parse_json
 from mtv_world_ros.core.files import write_whole
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.training.trainer import StepReport
 
 #: steps per row of the log
@@ -40,12 +40,8 @@ class TrainingLog:
         ideal_seconds: float | None = None,
     ) -> None:
         self._total, self._active, self._ideal = total, active, ideal_seconds
-        self._bar = tqdm(
-            total=total,
-            initial=step,
-            desc='training',
-            unit='step',
-            disable=None if active else True,  # None: on a terminal only
+        self._bar = Progress(
+            total=total, initial=step, desc='training', unit='step', is_shown=active
         )
         self._started = time.monotonic()
         self._steps, self._seconds, self._waited = 0, 0.0, 0.0

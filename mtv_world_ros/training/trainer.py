@@ -11,12 +11,12 @@ import time
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from mtv_world_ros.control.control import Control
 from mtv_world_ros.control.registry import control_class
 from mtv_world_ros.control.trajectory_video import TrajectoryVideo
 from mtv_world_ros.core.errors import TrainingError
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER, OPTIONAL_KEYS, ROBOT_FOLDER
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import check_history
@@ -184,7 +184,7 @@ class Trainer:
         elif (theirs.robot, len(theirs.spec.views)) == (video.robot, len(video.views)):
             self._object_motion = loaded.object_motion
         elif loaded.object_motion is not None and self.processes.is_main:
-            tqdm.write(
+            Progress.write(
                 f"what foresees objects in '{folder}' is left out: it is of robot "
                 f"'{theirs.robot}' with {len(theirs.spec.views)} views; run fit contact"
             )

@@ -15,7 +15,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from mtv_world_ros.cameras.calibration_file import save_calibration
 from mtv_world_ros.cameras.camera import camera_poses, project
@@ -30,6 +29,8 @@ from mtv_world_ros.core.errors import (
     TrainingInterrupted,
 )
 from mtv_world_ros.core.files import write_whole
+from mtv_world_ros.core.processes import is_helper_rank
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode_reader import list_episodes, read_info
 from mtv_world_ros.data.recording import DEFAULT, Recording
@@ -108,7 +109,9 @@ def load_recordings(
         DiskError: the cache cannot be written.
     """
     recordings, skipped = [], {}
-    for path in tqdm(paths, desc='reading episodes', unit='ep', disable=None):
+    for path in Progress(
+        paths, desc='reading episodes', unit='episode', is_shown=not is_helper_rank()
+    ):
         try:
             if str(path) in broken:
                 raise EpisodeError(broken[str(path)])
@@ -300,7 +303,7 @@ def train(
         trainer.export(trainer.result)  # killed after the state was saved
     if processes.is_main:
         write_whole(out / 'skipped.json', json.dumps(skipped, indent=2))
-        tqdm.write(
+        Progress.write(
             f'{len(recordings)} episodes, {len(skipped)} left out (see {out / "skipped.json"}), '
             f'{source.num_clips} clips, {num_dropped(recordings, config.spec)} dropped for '
             f'gaps; {"resumed at" if resumed else "starting from"} step {trainer.step}; '
@@ -310,7 +313,7 @@ def train(
         left_out += unknown_camera_lines(skipped, len(recordings) + len(skipped))
         told = training_notes(trainer.config, recordings, None if resumed else run.initial)
         for line in [*left_out, *told]:
-            tqdm.write(line)
+            Progress.write(line)
     ideal = None
     if run.peak_tflops is not None and processes.is_main:
         peak = 1e12 * run.peak_tflops or measured_peak(processes.device, dtype)
@@ -492,7 +495,7 @@ class StopSignals:
 
     def _note(self, number: int, _: object) -> None:
         self.number = number
-        tqdm.write('saving after this step; once more to stop at once')
+        Progress.write('saving after this step; once more to stop at once')
         self.__exit__()
 
 

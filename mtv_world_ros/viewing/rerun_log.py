@@ -22,6 +22,8 @@ APPLICATION = 'mtv_world'
 #: RGB of outlines, by number of the object
 _COLOURS = ((230, 60, 60), (60, 140, 240), (60, 190, 90), (240, 180, 40), (180, 90, 220))
 _TIMELINE = 'time'
+#: length of a file's beginning that has the recording's name [bytes]
+_HEAD_BYTES = 1024
 _OPEN_TO_OTHERS = 'Whoever reaches this address can see and copy what is shown, and write to it.'
 
 
@@ -41,6 +43,15 @@ def recording(name: str) -> Any:
     import rerun
 
     return rerun.RecordingStream(APPLICATION, recording_id=name)
+
+
+def is_recording(file: Path, name: str) -> bool:
+    """Return whether a file is the recording of this name, also one that was cut off."""
+    try:
+        with file.open('rb') as stream:
+            return name.encode() in stream.read(_HEAD_BYTES)
+    except OSError:
+        return False
 
 
 def log_any(stream: Any, shown: Streams | ScoredRollout, root: str) -> None:

@@ -214,4 +214,12 @@ def test_an_offline_replay_fails_if_plans_were_rejected_and_says_the_first(
     assert '4 trajectories' in said.out
     if num_rejected:
         first = '2 of 6 plans were not imagined, the first: joints would jump at 0 s'
-        assert said.err == f'mtv-world: {first}\n'
+        assert said.err.endswith(f'mtv-world: {first}\n')
+
+
+def test_a_command_that_takes_seconds_says_that_it_is_loading(tmp_path):
+    code = 'import sys, time, mtv_world_ros.cli.imagine as i; i._replay = lambda _: time.sleep(3);'
+    code += 'from mtv_world_ros.cli import main; main(sys.argv[1:])'
+    words = [sys.executable, '-c', code, 'replay', str(tmp_path), '--offline']
+    run = subprocess.run([*words, '--out', str(tmp_path / 'out')], capture_output=True, text=True)
+    assert run.stderr == 'mtv-world: replay: loading\n'

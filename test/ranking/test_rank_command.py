@@ -1,3 +1,4 @@
+import argparse
 from math import nan
 import socket
 import subprocess
@@ -6,8 +7,12 @@ import sys
 import pytest
 
 from mtv_world_ros.cli import main
+from mtv_world_ros.cli.rank import _recording_name
+from mtv_world_ros.cli.shared_options import Watch, watch_arguments
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.reports.shown_rankings import rates_table
 from mtv_world_ros.simulation.opengl import missing_opengl
+from mtv_world_ros.viewing.viewer_process import PageAddress
 
 
 @pytest.mark.parametrize(
@@ -30,6 +35,26 @@ def test_a_wrong_option_is_refused_before_anything_runs(options, says, tmp_path,
     assert not (tmp_path / 'out').exists()
 
 
+def test_only_the_recording_of_a_ranking_that_goes_on_is_replaced(tmp_path):
+    rerun_log = pytest.importorskip('mtv_world_ros.viewing.rerun_log')
+    pytest.importorskip('rerun')
+    file, out = tmp_path / 'live.rrd', tmp_path / 'out'
+
+    def arguments(folder):
+        watch = Watch(file=file)
+        return argparse.Namespace(watch=watch, overwrite=False, out=folder)
+
+    stream = rerun_log.recording(_recording_name(arguments(out)))
+    rerun_log.open_viewer(stream, None, PageAddress(), file, False)
+    rerun_log.flush(stream, file)
+    assert watch_arguments(arguments(out), _recording_name(arguments(out)))
+    other = arguments(tmp_path / 'other')
+    with pytest.raises(ConfigError, match='live.rrd. exists; give another --watch FILE.rrd'):
+        watch_arguments(other, _recording_name(other))
+    with pytest.raises(ConfigError, match='exists'):
+        watch_arguments(arguments(out))
+
+
 @pytest.mark.slow
 def test_a_ranking_is_watched_while_it_runs(tmp_path, capsys):
     """Rates so far and each rollout as it ends; those of an earlier run are there at once."""
@@ -39,7 +64,8 @@ def test_a_ranking_is_watched_while_it_runs(tmp_path, capsys):
     out = tmp_path / 'out'
     command = ['rank', '--policies', 'expert', '--tasks', 'stack_blocks_two', '--episodes', '1']
     command += ['--max-chunks', '1', '--segmenter', 'colour', '--out', str(out), '--watch']
-    for file in (tmp_path / 'first.rrd', tmp_path / 'again.rrd'):
+    # the same command goes on, and its recording of the ranking is written again
+    for file in (tmp_path / 'first.rrd', tmp_path / 'first.rrd', tmp_path / 'again.rrd'):
         assert main([*command, str(file)]) == 0
         assert f'written: {file}\n' in capsys.readouterr().out
         words = [sys.executable, '-m', 'rerun', 'rrd', 'print', '-vvv', str(file)]

@@ -9,8 +9,6 @@ import subprocess
 import time
 from typing import Any
 
-from tqdm import tqdm
-
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.core.files import check_room
 from mtv_world_ros.core.processes import (
@@ -22,6 +20,7 @@ from mtv_world_ros.core.processes import (
     stop_process,
     StoppedProcesses,
 )
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.rollout.imagined_episodes import ROOM_BYTES
@@ -79,7 +78,7 @@ def record_through_node(
         command += ['--wait-timeout', str(_NODE_START_S), '--answer-timeout', '300']
         player = start_process('player', command, logs, environment)
         plans = sum(1 for _ in BagReader(episode).messages(('/joint_trajectory',)))
-        with tqdm(total=plans, desc='imagining', unit='plan', disable=None) as bar:
+        with Progress(total=plans, desc='imagining', unit='plan') as bar:
             _wait(player, {'node': node, 'recorder': recorder}, logs, bar)
     finally:
         stop_process(recorder)

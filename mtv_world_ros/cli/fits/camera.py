@@ -271,8 +271,8 @@ def _estimate_fixed(
     from functools import partial
 
     import numpy as np
-    from tqdm import tqdm
 
+    from mtv_world_ros.core.progress import Progress
     from mtv_world_ros.core.transforms import inverse
     from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
     from mtv_world_ros.robot.shape import load_shape
@@ -295,7 +295,7 @@ def _estimate_fixed(
     found = fixed.estimate(
         guess=arguments.guess,
         seed=arguments.seed,
-        progress=partial(tqdm, desc='aligning', unit='pose', disable=None),
+        progress=partial(Progress, desc='aligning', unit='pose'),
     )
     pose = inverse(rest(link)) @ found.camera.T_mount_camera
     return replace(found, camera=replace(found.camera, mount_link=link, T_mount_camera=pose))

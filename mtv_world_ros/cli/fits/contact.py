@@ -57,8 +57,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _fit(arguments: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
+    from mtv_world_ros.core.progress import Progress
     from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
     from mtv_world_ros.physics.arms.arms import Arms
@@ -102,8 +101,8 @@ def _fit(arguments: argparse.Namespace) -> int:
         arms,
         first,
         workers=workers_of(arguments),
-        report=tqdm.write,
-        progress=partial(tqdm, desc='foreseeing', unit='ep', disable=None),
+        report=Progress.write,
+        progress=partial(Progress, desc='foreseeing', unit='episode'),
         place=_place_of(paths) if arguments.place is None else arguments.place,
     )
     settings = settings.replace(num_motions=arguments.motions)

@@ -212,8 +212,7 @@ def read_for_checks(
 
 
 def _read_all(arguments: argparse.Namespace) -> tuple[list[Episode], Path]:
-    from tqdm import tqdm
-
+    from mtv_world_ros.core.progress import Progress
     from mtv_world_ros.robot.file import load_robot
 
     paths = recordings(arguments.episodes)
@@ -221,7 +220,7 @@ def _read_all(arguments: argparse.Namespace) -> tuple[list[Episode], Path]:
     robot = load_robot(file)
     episodes = [
         read_for_checks(path, arguments.views, source, robot, robot.base_link)
-        for path in tqdm(paths, desc='reading', unit='ep', disable=None)
+        for path in Progress(paths, desc='reading', unit='episode')
     ]
     return episodes, file
 

@@ -56,7 +56,7 @@ class ImportJob:
     episode: Callable[[Any], str]
     label: Callable[[Any], str] = str
     recording: Callable[[Any], str] | None = None
-    unit: str = 'ep'
+    unit: str = 'episode'
 
 
 def import_parser(
@@ -107,9 +107,8 @@ def add_common_options(
 
 def run_import(arguments: argparse.Namespace, job: ImportJob) -> int:
     """Convert the recordings, or write the page of `--click`; return the exit status."""
-    from tqdm import tqdm
-
     from mtv_world_ros.core.files import ROBOT_YAML
+    from mtv_world_ros.core.progress import Progress
     from mtv_world_ros.importing.bags import summary_line
     from mtv_world_ros.importing.split import parse_split, write_split
 
@@ -118,7 +117,7 @@ def run_import(arguments: argparse.Namespace, job: ImportJob) -> int:
         return _write_boxes_page(arguments, job)
     summary = job.convert(
         lambda: _object_stage(arguments, job.found, job.read),
-        lambda recordings: tqdm(recordings, unit=job.unit, disable=None),
+        lambda recordings: Progress(recordings, unit=job.unit),
     )
     has_objects = bool(arguments.segmenter or arguments.objects)
     for one in summary.made:

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from tqdm import tqdm
 
 from mtv_world_ros.cameras.camera import camera_poses
 from mtv_world_ros.cameras.mask_geometry import centroids, locate_all
 from mtv_world_ros.core.data_types import BoolArray, CameraModel, FloatArray
 from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.data.episode import Episode, JointStates
 from mtv_world_ros.data.recording import stitched_commands
 from mtv_world_ros.physics.arms.arm_response import PERIOD_S
@@ -45,7 +45,7 @@ def read_each(
 ) -> tuple[list[Read], dict[str, str]]:
     """Return what is read of each episode, and why others cannot be used, by path."""
     found, skipped = [], {}
-    for path in tqdm(paths, desc='reading episodes', unit='ep', disable=None):
+    for path in Progress(paths, desc='reading episodes', unit='episode'):
         try:
             found.append(read(path))
         except MtvWorldError as error:

@@ -10,11 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from mtv_world_ros.core.errors import SimulatorError
 from mtv_world_ros.core.executor import run_all
 from mtv_world_ros.core.images import encode_png
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.core.workers import IN_PROCESS, Workers
 from mtv_world_ros.simulation.collect.contact_sheet import contact_sheet, SHEET_FILE
 from mtv_world_ros.simulation.collect.dataset_card import (
@@ -81,7 +80,7 @@ def collect(
         failures_of_ten: number of episodes in ten of a task that miss their grasp; none in
             zero-shot sets.
         sheets: whether a larger contact sheet of every task is written, too.
-        progress: show a progress bar, on a terminal.
+        progress: show the progress.
 
     Returns:
         The entries of the episodes that were asked for.
@@ -183,9 +182,7 @@ class _DataSet:
         done = len(jobs) - len(missing)
         try:
             finished = run_all(missing, partial(_maker, config), workers)
-            with tqdm(
-                total=len(jobs), initial=done, unit='ep', disable=None if progress else True
-            ) as bar:
+            with Progress(total=len(jobs), initial=done, unit='episode', is_shown=progress) as bar:
                 self._show(bar, jobs)
                 for number, (job, _) in enumerate(finished, 1):
                     self.entries[job.path.name] = read_entry(job.path)

@@ -19,12 +19,12 @@ from safetensors import safe_open, SafetensorError
 from safetensors.torch import save
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from mtv_world_ros.core.bounded_input import parse_json, read_json, require_regular
 from mtv_world_ros.core.data_types import WorldModelSpec
 from mtv_world_ros.core.errors import ConfigError, TrainingError
 from mtv_world_ros.core.files import content_digest, write_whole
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.data.recordings import cut_clip
 from mtv_world_ros.model.conditioning import Conditioning, ControlBatch, pad_rows, start_slot
@@ -371,7 +371,7 @@ def cached_batches(
     cache = LatentCache(root, settings)
     clips = list_clips(source.starts)
     for note in [*cache.notes, *_changed(cache, clips)]:
-        tqdm.write(f'latent cache: {note}')
+        Progress.write(f'latent cache: {note}')
     steps = encode_missing_clips(
         cache,
         clips,
@@ -382,9 +382,11 @@ def cached_batches(
     )
     held = sum(clip.key in cache for clip in clips)
     missing = len(clips) - held
-    done = [*tqdm(steps, total=missing, desc='encoding clips', unit='clip', disable=None)]
+    done = [*Progress(steps, total=missing, desc='encoding clips', unit='clip')]
     made = done[-1] if done else 'none to encode'
-    tqdm.write(f"latent cache '{cache.folder}': {held} of {len(clips)} clips were there, {made}")
+    Progress.write(
+        f"latent cache '{cache.folder}': {held} of {len(clips)} clips were there, {made}"
+    )
     return CachedSource(
         cache,
         clips,
