@@ -25,6 +25,8 @@ from mtv_world_ros.success.comparison import ComparedPair, Comparison
 
 #: least probability that a policy is better in most scenes that tell, of an ordered pair
 MIN_CONFIDENCE = 0.95
+#: least number of scenes that order a pair, all for one policy: 1 - 0.5^(4 + 1) > MIN_CONFIDENCE
+MIN_TELLING = 4
 #: prior standard deviation of a strength in the Bradley-Terry model, in log odds
 PRIOR_DEVIATION = 2.0
 

@@ -21,7 +21,7 @@ from mtv_world_ros.ranking.judges import (
     Score,
     true_rate,
 )
-from mtv_world_ros.ranking.policy_order import MIN_CONFIDENCE, PolicyOrder
+from mtv_world_ros.ranking.policy_order import MIN_CONFIDENCE, MIN_TELLING, PolicyOrder
 from mtv_world_ros.ranking.ranking_summary import ALL_TASKS, Optimism, Summary
 from mtv_world_ros.reports.charts import Point, scatter_chart
 from mtv_world_ros.reports.rollout_cards import rollout_cards
@@ -32,6 +32,8 @@ from mtv_world_ros.success.estimator import FAILURE_BELOW, SUCCESS_FROM
 TITLE = 'Policy ranking'
 #: number of hues of the report's style sheet
 _NUM_HUES = 6
+#: maximum number of policies that a sentence names
+_MAX_LISTED = 4
 #: maximum number of characters in the head of a column
 _NAME_LENGTH = 17
 
@@ -78,6 +80,54 @@ def order_table(order: PolicyOrder) -> Table:
         rows=rows,
         num_labels=2,
     )
+
+
+def best_policy(summary: Summary) -> tuple[str, str]:
+    """Return which policy is best and how sure that is, and its class in the style sheet."""
+    order = summary.order
+    best, *rest = order.policies
+    if not rest:
+        rate = _rate(summary.judged_rate(best, None, 'imagined'))
+        return f'One policy, {best}: imagined success rate {rate}.', 'few'
+    if not order.pairs:
+        return _highest_rate(summary), 'few'
+    pairs = [pair for pair in order.pairs if best in (pair.first, pair.second)]
+    below = [pair for pair in pairs if pair.better == best]
+    above = [pair.better for pair in pairs if pair.better not in ('', best)]
+    others = [pair.other(best) for pair in pairs if not pair.better]
+    scenes = f'{order.num_scenes} scene{"s" * (order.num_scenes != 1)}'
+    if not below:
+        text = (
+            f'No policy can be called best after {scenes}: the first, {best}, is not told from '
+            f'{_listed([*others, *above])}. A pair takes {MIN_TELLING} scenes that tell, or more.'
+        )
+        return text, 'few'
+    sure = min(pair.confidence for pair in below)
+    text = f'better than {_listed([pair.other(best) for pair in below])}'
+    text += f', with probability {sure:.2f} or more ({scenes})'
+    if above:
+        return f'{best} comes first: {text}; yet {_listed(above)} beats it in pairs.', 'doubt'
+    if others:
+        return f'{best} comes first: {text}; not told from {_listed(others)}.', ''
+    return f'Best policy: {best}, {text}.', ''
+
+
+def _highest_rate(summary: Summary) -> str:
+    """Return the policy with the highest imagined rate, where no pairs can be compared."""
+    rates = {name: summary.judged_rate(name, None, 'imagined') for name in summary.policies}
+    known = [name for name in rates if rates[name].count]
+    if not known:
+        return 'No policy can be called best: no imagined rollout has an estimate.'
+    best = max(known, key=lambda name: rates[name].value)
+    return (
+        'No policy can be called best: no two rollouts can be compared in pairs. Highest imagined '
+        f'success rate: {best}, {_rate(rates[best])}.'
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown, rest = names[:_MAX_LISTED], len(names) - _MAX_LISTED
+    return f'{", ".join(shown)} and {rest} more' if rest > 0 else ', '.join(shown)
 
 
 def order_remark(order: PolicyOrder) -> str:
@@ -489,6 +539,7 @@ def console(summary: Summary) -> str:
         tables.insert(0, order_table(summary.order))
     parts = [f'{found.caption}\n\n{found.text()}' for found in tables]
     parts.insert(bool(summary.order.num_scenes), order_remark(summary.order))
+    parts.insert(0, best_policy(summary)[0])
     return '\n\n'.join([*parts, *_notes(summary)])
 
 
@@ -562,6 +613,7 @@ def _content(summary: Summary) -> dict[str, Any]:
     """Return the values that the Markdown and the HTML page share."""
     return {
         'title': TITLE,
+        'best': best_policy(summary),
         'order': order_table(summary.order) if summary.order.num_scenes else None,
         'order_remark': order_remark(summary.order),
         'remarks': remarks(summary),

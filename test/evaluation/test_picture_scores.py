@@ -11,6 +11,7 @@ from mtv_world_ros.evaluation.metrics.picture_scores import (
     picture_estimates,
     picture_scores,
     ssim_map,
+    WORSE,
 )
 from mtv_world_ros.evaluation.metrics.statistics import Estimate
 
@@ -133,3 +134,22 @@ def test_one_episode_is_told_how_many_it_takes():
     assert found.line == 'follows the commands: cannot tell (episodes: 1, give at least 3)'
     few = following(picture_estimates(episodes((2.0, 2.5), (3.0, 3.2))))
     assert few.line.endswith('2 episodes, give at least 3)')
+
+
+@pytest.mark.parametrize(
+    ('psnr', 'word'),
+    [
+        ((19.9, 20.1, 19.8, 20.3), WORSE),  # the held frame has 23.9 dB
+        ((19.9,), WORSE),
+        ((23.5,), 'cannot tell'),  # too near for one episode
+        ((19.9, 31.0, 19.8, 30.3), 'cannot tell'),
+    ],
+)
+def test_frames_further_off_than_the_held_frame_are_worse_than_a_still_picture(psnr, word):
+    chunks = [[(8, {'low': {'psnr': value, 'psnr_held': 23.9}})] for value in psnr]
+    found = following(picture_estimates([mean_pictures(chunk) for chunk in chunks]))
+    assert found.word == word
+    if word == WORSE:
+        line = found.line
+        assert line.startswith('the imagined frames are worse than a still picture (PSNR -')
+        assert 'against the first frame held' in line

@@ -10,7 +10,13 @@ from mtv_world_ros.core.data_types import FutureEvidence, SuccessEstimate
 from mtv_world_ros.ranking.policy_order import bradley_terry, PolicyOrder
 from mtv_world_ros.ranking.ranking_summary import Summary
 from mtv_world_ros.ranking.rollout_jobs import Result, StoredEstimate, StoredFutures
-from mtv_world_ros.reports.ranking_report import console, markdown, order_remark, write_ranking
+from mtv_world_ros.reports.ranking_report import (
+    best_policy,
+    console,
+    markdown,
+    order_remark,
+    write_ranking,
+)
 
 #: share of four futures in which each policy succeeds
 SUCCESSES = {'good': 4, 'fair': 2, 'bad': 0, 'as bad': 0}
@@ -62,6 +68,26 @@ def test_rollouts_without_common_futures_are_no_pair(rollout, make_result):
     assert isnan(order.strengths[0])
 
 
+def test_the_answer_names_what_cannot_be_told(results, rollout, make_result):
+    few = [rollout(name, k, num) for k in range(3) for name, num in SUCCESSES.items()]
+    assert best_policy(_summary(few))[0].startswith(
+        'No policy can be called best after 3 scenes: the first, good, is not told from fair'
+    )
+    bad = [result for result in results if result.policy in ('bad', 'as bad')]
+    assert 'is not told from' in best_policy(_summary(bad))[0]
+    better = [rollout('better', k, 4) for k in range(6)]
+    text = best_policy(_summary([*results, *better]))[0]
+    assert 'comes first: better than fair, ' in text and 'not told from ' in text
+    without = [make_result('a', 0, True, 0.9), make_result('b', 0, False, 0.2)]
+    text = best_policy(_summary(without))[0]
+    assert text.startswith('No policy can be called best') and 'a, 0.90' in text
+    assert best_policy(_summary(without[:1]))[0].startswith('One policy, a: imagined')
+
+
+def _summary(results):
+    return Summary(results=results, failed={}, num_true=2, provenance={})
+
+
 def test_strengths_are_those_of_the_shares_of_wins():
     # of 40 scenes the first is better in 30: log odds log 3, halved about the mean, shrunk a bit
     wins = np.zeros((40, 2, 2))
@@ -78,11 +104,15 @@ def test_strengths_are_those_of_the_shares_of_wins():
 def test_the_order_comes_first_and_names_the_prior_and_the_fit(results, tmp_path):
     summary = Summary(results=results, failed={}, num_true=2, provenance={})
     text = console(summary)
-    assert text.startswith('Order of the policies: 5 of 6 pairs are ordered, 6 scenes')
+    answer = 'Best policy: good, better than '
+    assert text.startswith(answer) and ', with probability 0.99 or more (6 scenes).' in text
+    assert '\n\nOrder of the policies: 5 of 6 pairs are ordered, 6 scenes' in text
     said = ' '.join(text.split())
     assert 'wide prior' in said and '`mtv-world fit contact`' in said
     assert markdown(summary).split('\n## ')[1].startswith('Order of the policies')
+    assert markdown(summary).split('\n\n')[1].startswith(f'**{answer}')
     page = write_ranking(summary, tmp_path).read_text()
+    assert page.index('id="best"') < page.index('Best policy: good') < page.index('id="order"')
     assert page.index('id="order"') < page.index('id="answer"')
     stored = json.loads((tmp_path / 'ranking.json').read_text())['order']
     assert [pair['better'] for pair in stored['pairs']].count('good') == 3

@@ -105,7 +105,8 @@ def test_the_first_line_of_the_page_tells_few_scenes_from_a_failure(
     pair = [make_result(p, i, p == 'a', 0.9, rule=p == 'a') for p in 'ab' for i in range(scenes)]
     path = write_ranking(Summary(results=pair, failed={}, num_true=1, provenance={}), tmp_path)
     page = path.read_text()
-    style, text = re.search(r'<p class="verdict (\w*)">([^<]*)<', page).groups()
+    answer = page[page.index('id="answer"') :]
+    style, text = re.search(r'<p class="verdict (\w*)">([^<]*)<', answer).groups()
     assert style == shown[0] and text.startswith(shown[1])
     assert 'Cells: value [95 % interval] count' in page
 

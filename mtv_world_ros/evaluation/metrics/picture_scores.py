@@ -53,6 +53,10 @@ _CHANGED = 20.0
 _LEAST_CHANGED = 0.002
 #: largest margin over shuffled commands of a model that does not follow commands [dB]
 _NO_MARGIN_DB = 0.25
+#: verdict on frames that are further from the recorded ones than the first frame held
+WORSE = 'worse than a still picture'
+#: margin below the held frame from which episodes too few for an interval are `WORSE` [dB]
+_WORSE_DB = 1.0
 #: standard deviation of the window of SSIM [px] (Wang et al. 2004)
 _SSIM_SIGMA_PX = 1.5
 #: constant C1 of SSIM, K1 = 0.01 of the value range 255 (Wang et al. 2004)
@@ -218,7 +222,12 @@ def picture_estimates(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Following:
-    """Verdict whether a model follows the commands (`yes`, `no`, `cannot tell`) and its reason."""
+    """Verdict whether a model follows the commands, and its reason.
+
+    Attributes:
+        word: 'yes', 'no', 'cannot tell' or `WORSE`.
+        why: numbers that the verdict rests on.
+    """
 
     word: str
     why: str
@@ -226,6 +235,8 @@ class Following:
     @property
     def line(self) -> str:
         """The first line of a report."""
+        if self.word == WORSE:
+            return f'the imagined frames are {WORSE} ({self.why})'
         return f'follows the commands: {self.word} ({self.why})'
 
 
@@ -245,6 +256,10 @@ def following(
             known.
     """
     found = _following_by_pictures(estimates, chunks)
+    whole = estimates.get(f'psnr_over_{HELD}')
+    if found.word != 'yes' and whole is not None and _is_worse(whole):
+        why = f'PSNR {_signed(whole)} against the first frame held; {found.why}'
+        return Following(word=WORSE, why=why)
     if objects is None or objects.num_episodes < MIN_EPISODES or found.word == 'no':
         return found
     why = f'{found.why}; J of moving objects {_against_held(objects)}'
@@ -252,6 +267,13 @@ def following(
         return Following(word='no', why=why)
     is_above = objects.value > 0 and not objects.interval[0] <= 0
     return Following(word=found.word if is_above else 'cannot tell', why=why)
+
+
+def _is_worse(margin: Estimate) -> bool:
+    """Return whether whole frames are further from the recorded ones than the held frame is."""
+    if margin.num_episodes < MIN_EPISODES:
+        return margin.value < -_WORSE_DB
+    return margin.interval[1] < 0
 
 
 def _against_held(margin: Estimate) -> str:
