@@ -1,1 +1,1 @@
-"""The scripted expert and its way points."""
+"""The scripted expert."""

@@ -13,9 +13,6 @@ from mtv_world_ros.core.transforms import rotation
 from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.robot.arm_solver import ArmSolver
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.simulation.expert.way_points import WayPoint
-from mtv_world_ros.simulation.faults.edited_move import ring, UP
-from mtv_world_ros.simulation.faults.second_arm import Visit
 from mtv_world_ros.simulation.faults.variant_faults import WayPointFaults
 from mtv_world_ros.simulation.physics import physics_named
 from mtv_world_ros.simulation.scenes.placement import side_of
@@ -23,6 +20,7 @@ from mtv_world_ros.simulation.scenes.scene import Place, Scene, SceneObject
 from mtv_world_ros.simulation.scenes.shapes import Grasp, SHAPES
 from mtv_world_ros.simulation.scenes.tasks import Move, PickPlace, Shake, Task
 from mtv_world_ros.simulation.scenes.workcell import workcell_of
+from mtv_world_ros.simulation.way_points import ring, UP, Visit, WayPoint
 
 #: step in the search for the longest reachable part of a path [fraction of the path]
 _SHORTENING_STEP = 0.05

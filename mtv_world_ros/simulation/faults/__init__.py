@@ -1,1 +1,1 @@
-"""Faults of commands and of the surroundings, as data."""
+"""Faults of scripted policies: functions from a plan to a plan, by name."""

@@ -1,120 +1,43 @@
-"""The fault catalogue: what can be wrong with a scripted policy, and its sizes.
+"""The fault catalogue: what can be wrong with a scripted policy, by name, and policies by theirs.
 
-The kinds are data, in `config/faults`. A policy's name says its faults and their sizes:
-`expert-joint_noise-0.02`, `expert-grasp_height-0.03-gripper_delay-0.3`.
+A policy's name says its faults and their sizes: `expert-joint_noise-0.02`,
+`expert-grasp_height-0.03-gripper_delay-0.3`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from inspect import signature
 from math import isfinite
 import re
-from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator
 
-from mtv_world_ros.core.config import ListOf, Number, read_yaml, Schema, validated
 from mtv_world_ros.core.errors import nearest, PolicyError
-from mtv_world_ros.core.files import share_path
-from mtv_world_ros.simulation.faults.commands import COMMANDS
-from mtv_world_ros.simulation.faults.drawn import drawn_names, DRAWN_SETS, drawn_values, is_drawn
-from mtv_world_ros.simulation.faults.edits import PRIMITIVES, ROW
-from mtv_world_ros.simulation.faults.second_arm import SecondArm
+from mtv_world_ros.simulation.faults.drawn import drawn_kind, drawn_names, DRAWN_SETS, is_drawn
+from mtv_world_ros.simulation.faults.fault import FaultKind
+from mtv_world_ros.simulation.faults.kinds import (
+    collision,
+    height,
+    joints,
+    lateral,
+    objects,
+    opening,
+    regrasp,
+    release,
+    speed,
+    timing,
+    wrist,
+)
 
 EXPERT = 'expert'
 #: of fault kinds; kinds of `test` never enter training, calibration or the choice of anything
 SPLITS = ('train', 'calibrate', 'test')
 #: in the order of the catalogue, which random policies depend on
-_FILES = (
-    *('timing', 'height', 'lateral', 'wrist', 'opening', 'release', 'collision', 'object'),
-    *('speed', 'joint', 'regrasp'),
+_FAMILIES = (
+    *(timing, height, lateral, wrist, opening, release, collision, objects, speed, joints),
+    regrasp,
 )
-Steps = ListOf[dict[str, dict[str, Any]]]
-
-
-def _known_steps(primitives: Mapping[str, Callable[..., Any]], steps: Steps) -> Steps:
-    """Refuse steps whose primitive does not exist, or does not have their options."""
-    for name, options in (item for step in steps for item in step.items()):
-        if name not in primitives:
-            raise ValueError(f"unknown step '{name}'{nearest(name, primitives)}")
-        parameters = signature(primitives[name]).parameters.values()
-        known = {p.name for p in parameters if p.kind is p.KEYWORD_ONLY} | {'scale'}
-        known |= {*ROW} if any(p.kind is p.VAR_KEYWORD for p in parameters) else set()
-        for row, keys in (
-            (options, known),
-            *((r, {*ROW, 'like'}) for r in options.get('rows', ())),
-        ):
-            for key in row.keys() - keys:
-                raise ValueError(f"step '{name}' has no option '{key}'{nearest(key, keys)}")
-    return steps
-
-
-class FaultSize(Schema):
-    """Allowed sizes of a fault.
-
-    Attributes:
-        typical: size at which success and failure are about as frequent.
-        largest: largest size of a policy.
-        unit: unit of all sizes; empty = a share or a number.
-        none: size that means no fault.
-        ranked: sizes in the rankings of the kind's split.
-    """
-
-    typical: Number
-    largest: Number
-    unit: str = ''
-    none: Number = 0.0
-    ranked: ListOf[Number] = ()
-
-
-class FaultKind(Schema):
-    """One way in which a policy fails: an entry of `config/faults`.
-
-    Attributes:
-        alias: another name, which earlier recordings have.
-        family: group of kinds, e.g. `timing` or `release`.
-        split: `train`, `calibrate` or `test`.
-        size: typical, largest and ranked sizes of the fault.
-        text: meaning of the size, in words.
-        contact: whether its failures are failures of contact, which do not show in the arm's path
-            alone.
-        needs: parts that a robot must have for it.
-        keeps_tempo: added way points take time of their own; else they share the move's.
-        edits: steps that change the way points of a move.
-        second_arm: visit of another arm during the move.
-        commands: steps that change the commands of the whole plan.
-    """
-
-    alias: str = ''
-    family: str
-    split: Literal['train', 'calibrate', 'test']
-    size: FaultSize
-    text: str
-    contact: bool = True
-    needs: ListOf[Literal['gripper', 'two_arms']] = ()
-    keeps_tempo: bool = False
-    edits: Annotated[Steps, AfterValidator(partial(_known_steps, PRIMITIVES))] = ()
-    second_arm: SecondArm | None = None
-    commands: Annotated[Steps, AfterValidator(partial(_known_steps, COMMANDS))] = ()
-
-
-def _read() -> dict[str, FaultKind]:
-    """Return all kinds.
-
-    `defaults` of a file hold for its entries where these do not say otherwise.
-    """
-    kinds: dict[str, FaultKind] = {}
-    for name in _FILES:
-        path = share_path('config', 'faults', f'{name}.yaml')
-        entries = read_yaml(path, 'fault file', 'config/faults')
-        defaults = entries.pop('defaults')
-        for kind, values in entries.items():
-            kinds[kind] = validated(FaultKind, {**defaults, **values}, f"{path}: '{kind}'")
-    return kinds
 
 
 class _Catalogue(dict[str, FaultKind]):
@@ -123,11 +46,13 @@ class _Catalogue(dict[str, FaultKind]):
     def __missing__(self, name: str) -> FaultKind:
         if not is_drawn(name):
             raise KeyError(name)
-        return FaultKind(**drawn_values(name))
+        return drawn_kind(name)
 
 
 #: kinds by name
-FAULTS: Mapping[str, FaultKind] = _Catalogue(_read())
+FAULTS: Mapping[str, FaultKind] = _Catalogue(
+    {name: kind for module in _FAMILIES for name, kind in module.fault.kinds.items()}
+)
 _NAMES = {name: kind for kind, fault in FAULTS.items() for name in (kind, fault.alias)}
 _ALL = f"the {len(FAULTS)} kinds that 'mtv-world rank --list-faults' prints"
 
@@ -307,7 +232,7 @@ def refuse_test_kinds(names: Iterable[str], what: str) -> None:
         listed = '; '.join(f"'{name}' has {', '.join(kinds)}" for name, kinds in found.items())
         raise PolicyError(
             f'fault kinds of the split {test} are not for {what}: {listed}; choose kinds of '
-            f'{", ".join(others[::-1])} (config/faults)'
+            f'{", ".join(others[::-1])}, which mtv-world rank --list-faults prints'
         )
 
 

@@ -1,13 +1,13 @@
-"""Primitives that change the commands of a plan, as `config/faults` names them.
+"""Changes of the commands of a plan, of which faults consist.
 
 Shape letters: T commands, J joints, A arms, G grippers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 
 import numpy as np
 
@@ -78,6 +78,8 @@ class CommandFaultSettings:
 _SETTINGS = CommandFaultSettings()
 
 Rng = np.random.Generator
+#: returns changed positions (T, J) by the size of a fault
+CommandChange = Callable[[Commands, float, Rng], FloatArray]
 
 
 def _own(rng: Rng) -> Rng:
@@ -134,20 +136,22 @@ def lag(c: Commands, size: float, rng: Rng, *, joints: str) -> FloatArray:
     return whole
 
 
-def give_way(c: Commands, size: float, rng: Rng, *, by: str) -> FloatArray:
-    """Open grippers to at least a fraction of their range, weighted by one of `GIVE_WAY`."""
+def give_way(
+    c: Commands, size: float, rng: Rng, *, by: Callable[[Commands], FloatArray]
+) -> FloatArray:
+    """Open grippers to at least a fraction of their range, with a weight (T, G or 1)."""
     opens = np.sign(c.travel)
-    least = c.closed + np.minimum(size * GIVE_WAY[by](c), 1.0) * c.travel
+    least = c.closed + np.minimum(size * by(c), 1.0) * c.travel
     return c.grippers_of(np.maximum(c.positions[:, c.grippers] * opens, least * opens) * opens)
 
 
-def _twitches(c: Commands) -> FloatArray:
+def twitches(c: Commands) -> FloatArray:
     """Return jerks (T, 1), 0 to 1; 0 most of the time."""
     knots = _SETTINGS.jump_s * np.arange(4)
     return np.interp(c.times % _SETTINGS.twitch_period_s, knots, [0.0, 1.0, 1.0, 0.0])[:, None]
 
 
-def _haste(c: Commands) -> FloatArray:
+def haste(c: Commands) -> FloatArray:
     """Return the speed (T, G) of the arm of each gripper, as a fraction of its top speed."""
     steps = np.gradient(c.positions, axis=0)
     steps[:, c.grippers] = 0.0
@@ -156,7 +160,7 @@ def _haste(c: Commands) -> FloatArray:
     return (speeds / np.where(top > 0, top, 1.0))[:, _arms_of_grippers(c)]
 
 
-def _reach(c: Commands) -> FloatArray:
+def reach(c: Commands) -> FloatArray:
     """Return the horizontal reach (T, G) of the arm of each gripper [fraction of its maximum]."""
     tools = np.stack([poses[:, :2, 3] for poses in c.robot.tool_poses(c.positions)], axis=1)
     ways = np.linalg.norm(tools - tools[0], axis=2)
@@ -170,19 +174,11 @@ def _arms_of_grippers(c: Commands) -> np.ndarray:
     return np.array(c.grippers) // (c.positions.shape[1] // c.num_arms)
 
 
-def _since_shut(c: Commands) -> FloatArray:
+def time_shut(c: Commands) -> FloatArray:
     """Return the time (T, G) since a gripper was last more than half open [s]."""
     is_open = (c.positions[:, c.grippers] - c.middles) * np.sign(c.travel) > 0
     rows = c.rows[:, None]
     return (rows - np.maximum.accumulate(np.where(is_open, rows, 0))) * c.period
-
-
-GIVE_WAY: Mapping[str, Callable[[Commands], FloatArray]] = {
-    'jerks': _twitches,
-    'speed': _haste,
-    'reach': _reach,
-    'time_shut': _since_shut,
-}
 
 
 def _passes(c: Commands) -> list[tuple[int, float, int]]:
@@ -545,42 +541,46 @@ def glitches(c: Commands, size: float, rng: Rng) -> FloatArray:
     return with_glitches(c, round(size), _own(rng))
 
 
-def error(c: Commands, size: float, rng: Rng, *, of: str) -> FloatArray:
-    """Add one of `ERRORS` to the commands of the arms."""
-    added = ERRORS[of](c, size, rng)
+def error(c: Commands, size: float, rng: Rng, *, of: CommandChange) -> FloatArray:
+    """Add an error (T, J) to the commands of the arms."""
+    added = of(c, size, rng)
     added[:, c.grippers] = 0.0
     return c.positions + added
 
 
-def _offsets(c: Commands, size: float, rng: Rng) -> FloatArray:
+def offsets(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Return a constant error of each joint, after an onset."""
     drawn = _own(rng).normal(0.0, size, c.positions.shape[1])
     return c.ramp(_SETTINGS.onset_s)[:, None] * drawn
 
 
-def _drifts(c: Commands, size: float, rng: Rng) -> FloatArray:
+def drifts(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Return an error of each joint that grows with time, by `size` [rad/s]."""
     return c.times[:, None] * _own(rng).normal(0.0, size, c.positions.shape[1])
 
 
-def _mirrored(c: Commands, size: float, rng: Rng) -> FloatArray:
+def mirrored_arm(c: Commands, size: float, rng: Rng) -> FloatArray:
     """Mirror the motion of an arm in the next arm, in the order of joints, if that one rests."""
     is_still = (c.positions == c.positions[0]).astype(np.float64)
     at_rest = _average(is_still, c.num(_SETTINGS.onset_s))
     return size * at_rest * crossed(c.positions, c.positions.shape[1] // c.num_arms)
 
 
-def _tremors(c: Commands, size: float, rng: Rng) -> FloatArray:
+def tremors(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Return a fast oscillation of each joint, after an onset."""
     phases = _own(rng).uniform(0.0, 2 * np.pi, c.positions.shape[1])
     waves = np.sin(2 * np.pi * _SETTINGS.tremor_hz * c.times[:, None] + phases)
     return size * c.ramp(_SETTINGS.onset_s)[:, None] * waves
 
 
-def _spikes(c: Commands, size: float, rng: Rng) -> FloatArray:
+def spikes(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Return a few short outliers of each joint."""
     own = _own(rng)
     middles = own.uniform(0.1, 0.9, _SETTINGS.num_spikes) * len(c.positions)
     return _triangles(c, middles, c.positions.shape[1], size, own)
 
 
-def _kicks(c: Commands, size: float, rng: Rng) -> FloatArray:
+def kicks(c: Commands, size: float, rng: Rng) -> FloatArray:
     """Jerk the arm of a gripper once, whenever the gripper opens or closes."""
     is_open, own = c.robot.gripper_openings(c.positions) > 0.5, _own(rng)
     arm = c.positions.shape[1] // len(is_open)
@@ -596,30 +596,19 @@ def _triangles(
     return np.maximum(1 - away, 0.0) @ rng.normal(0.0, deviation, (len(middles), num_joints))
 
 
-def _with_grippers(c: Commands, size: float, rng: Rng) -> FloatArray:
+def gripper_errors(c: Commands, size: float, rng: Rng) -> FloatArray:
+    """Return an error of each joint of an arm that grows as its gripper closes."""
     shut = 1 - c.robot.gripper_openings(c.positions).T
     drawn = _own(rng).normal(0.0, size, c.positions.shape[1])
     return np.repeat(shut, c.positions.shape[1] // c.num_arms, axis=1) * drawn
 
 
-def _slow_noise(c: Commands, size: float, rng: Rng) -> FloatArray:
+def slow_noise(c: Commands, size: float, rng: Rng) -> FloatArray:
     """Return a slow error (T, J), zero at first: random every half second, linear in between."""
     knots = np.arange(0.0, c.times[-1] + 2 * _SETTINGS.drift_knot_s, _SETTINGS.drift_knot_s)
     drawn = rng.normal(0.0, size, (len(knots), c.positions.shape[1]))
     drawn[0] = 0.0
     return np.stack([np.interp(c.times, knots, column) for column in drawn.T], axis=1)
-
-
-ERRORS: Mapping[str, Callable[[Commands, float, Rng], FloatArray]] = {
-    'offsets': _offsets,
-    'drifts': _drifts,
-    'mirrored_arm': _mirrored,
-    'tremors': _tremors,
-    'spikes': _spikes,
-    'kicks': _kicks,
-    'grippers': _with_grippers,
-    'slow_noise': _slow_noise,
-}
 
 
 def tempo(c: Commands, size: float, rng: Rng, *, faster: bool) -> FloatArray:
@@ -630,7 +619,7 @@ def tempo(c: Commands, size: float, rng: Rng, *, faster: bool) -> FloatArray:
 
 def opening_noise(c: Commands, size: float, rng: Rng) -> FloatArray:
     """Add a slow error to the openings of the grippers [fraction of their range]."""
-    added = _slow_noise(c, size, rng)[:, c.grippers] * c.travel
+    added = slow_noise(c, size, rng)[:, c.grippers] * c.travel
     return c.grippers_of(c.positions[:, c.grippers] + added)
 
 
@@ -641,14 +630,16 @@ def stop(c: Commands, size: float, rng: Rng) -> FloatArray:
     return whole
 
 
-#: primitives in the order in which a policy's faults are applied
-COMMANDS: Mapping[str, Callable[..., FloatArray]] = {
-    change.__name__: change
-    for change in (
-        *(delay, lead, lag, give_way, flicker, pause_half_way, hurry, pause, jump, flinch, mix),
-        *(restart, shuffle, seams, delay_each, gripper_tempo, hold_all, quantise, play, stick),
-        *(scale_one, stop_one, limit_one, bind_one, slip_one, tow, lose_one_way, average),
-        *(limit_speed, lose_steps, sink_once, heave, fade, warp, swap_arms, swing, freeze),
-        *(glitches, error, tempo, opening_noise, stop),
-    )
-}
+#: changes in the order in which those of a policy with several faults are made
+COMMANDS: tuple[Callable[..., FloatArray], ...] = (
+    *(delay, lead, lag, give_way, flicker, pause_half_way, hurry, pause, jump, flinch, mix),
+    *(restart, shuffle, seams, delay_each, gripper_tempo, hold_all, quantise, play, stick),
+    *(scale_one, stop_one, limit_one, bind_one, slip_one, tow, lose_one_way, average),
+    *(limit_speed, lose_steps, sink_once, heave, fade, warp, swap_arms, swing, freeze),
+    *(glitches, error, tempo, opening_noise, stop),
+)
+
+
+def order_of(change: CommandChange) -> int:
+    """Return the place of a change, with or without given options, in `COMMANDS`."""
+    return COMMANDS.index(change.func if isinstance(change, partial) else change)

@@ -1,14 +1,13 @@
-"""Edits of way points that are programs: runs, visits and actions drawn at random."""
+"""Changes of way points that are drawn at random: runs, visits, actions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mtv_world_ros.simulation.expert.way_points import WayPoint
-from mtv_world_ros.simulation.faults.edited_move import EditedMove, UP
+from mtv_world_ros.simulation.faults.move_plan import MovePlan
+from mtv_world_ros.simulation.way_points import UP, WayPoint
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,11 +73,11 @@ def _above(stop: WayPoint, floor: float) -> WayPoint:
     return replace(stop, position=np.array([x, y, max(z, floor)]))
 
 
-def random_way_points(move: EditedMove) -> None:
+def random_way_points(move: MovePlan, size: float) -> MovePlan:
     """Insert random way points: before the grasp, on the path to the goal, after the release."""
-    rng, floor = move.draws.play, move.floor
+    rng, floor = move.rng, move.floor
     begins = {'grasp': 0.6, 'carry': 0.2, 'retreat': 0.2}
-    for _ in range(round(move.size)):
+    for _ in range(round(size)):
         at = move.index(str(rng.choice(list(begins), p=list(begins.values()))))
         where = move.stops[at if move.stops[at].phase == 'grasp' else at - 1]
         x, y = where.position[:2] + rng.normal(0.0, _EDITS.play_m, 2)
@@ -94,13 +93,14 @@ def random_way_points(move: EditedMove) -> None:
             opening=float(rng.uniform()),
             seconds=None,
         )
-        move.stops = [*move.stops[:at], drawn, *move.stops[at:]]
+        move = move.insert(at, [drawn])
+    return move
 
 
-def random_runs(move: EditedMove) -> None:
+def random_runs(move: MovePlan, size: float) -> MovePlan:
     """Change the opening, position or rotation of random runs of way points, or add a detour."""
-    rng, floor = move.draws.play, move.floor
-    for _ in range(round(move.size)):
+    rng, floor = move.rng, move.floor
+    for _ in range(round(size)):
         first = int(rng.integers(len(move.stops) - 1))
         end = min(first + int(rng.integers(1, _EDITS.max_odd_run + 1)), len(move.stops) - 1)
         way, opening = rng.normal(0.0, _EDITS.odd_m, 3), float(rng.uniform())
@@ -117,13 +117,14 @@ def random_runs(move: EditedMove) -> None:
             case _:
                 detour = replace(move.stops[end - 1], phase='above', seconds=None).moved(way)
                 run = [*move.stops[first:end], _above(detour, floor)]
-        move.stops = [*move.stops[:first], *run, *move.stops[end:]]
+        move = move.insert(first, run, drop=end - first)
+    return move
 
 
-def random_visits(move: EditedMove) -> None:
+def random_visits(move: MovePlan, size: float) -> MovePlan:
     """Insert a visit before a random way point: to an object, and through it or past it."""
-    rng, floor = move.draws.play, move.floor
-    for _ in range(round(move.size)):
+    rng, floor = move.rng, move.floor
+    for _ in range(round(size)):
         at = int(rng.integers(len(move.stops)))
         x, y, z = move.draws.objects[int(rng.integers(len(move.draws.objects)))]
         angle = rng.uniform(0.0, 2 * np.pi)
@@ -145,16 +146,17 @@ def random_visits(move: EditedMove) -> None:
             leaves = replace(leaves, opening=float(rng.uniform()))
         before, after = (rng.uniform(*_EDITS.visit_rise_m) * UP for _ in range(2))
         visit = [arrives.moved(before), arrives, leaves, leaves.moved(after)]
-        move.stops = [*move.stops[:at], *visit, *move.stops[at:]]
+        move = move.insert(at, visit)
+    return move
 
 
-def random_actions_at_object(move: EditedMove) -> None:
+def random_actions_at_object(move: MovePlan, size: float) -> MovePlan:
     """Insert a sequence of random actions at an object: each changes one quantity.
 
     The actions include opening the fingers in place, and raising, leaning and releasing the held
     object.
     """
-    rng, floor = move.draws.play, move.floor
+    rng, floor = move.rng, move.floor
     at = int(rng.integers(len(move.stops)))
     place = move.draws.objects[int(rng.integers(len(move.draws.objects)))]
     here = WayPoint(
@@ -164,11 +166,12 @@ def random_actions_at_object(move: EditedMove) -> None:
         opening=float(rng.choice((0.0, rng.uniform(), 1.0))),
     )
     run = [_above(here, floor)]
-    for _ in range(round(move.size)):
+    for _ in range(round(size)):
         run.append(_varied(run[-1], floor, rng))
     before, after = (rng.uniform(*_EDITS.visit_rise_m) * UP for _ in range(2))
     left = replace(run[-1], seconds=None).moved(after)
-    move.stops = [*move.stops[:at], run[0].moved(before), *run, left, *move.stops[at:]]
+    move = move.insert(at, [run[0].moved(before), *run, left])
+    return move
 
 
 def _varied(stop: WayPoint, floor: float, rng: np.random.Generator) -> WayPoint:
@@ -188,17 +191,17 @@ def _varied(stop: WayPoint, floor: float, rng: np.random.Generator) -> WayPoint:
             return replace(last, yaw=last.yaw + float(rng.normal(0.0, _EDITS.action_angle_rad)))
 
 
-def random_actions_with_object(move: EditedMove) -> None:
+def random_actions_with_object(move: MovePlan, size: float) -> MovePlan:
     """Insert random actions with the held object, on the table and on other objects.
 
     So it is pressed down, dragged, leaned, put on what lies there, let go and taken again.
     """
-    rng, lift = move.draws.play, move.index('lift')
+    rng, lift = move.rng, move.index('lift')
     low = float(move.stops[lift - 1].position[2])
     floor = low - rng.uniform(0.0, _EDITS.max_press_depth_m)
     at = int(rng.integers(lift, move.index('open') + 1))
     run = [replace(move.stops[at - 1], phase='carry', seconds=None)]
-    for _ in range(round(move.size)):
+    for _ in range(round(size)):
         if rng.random() < _EDITS.other_object_fraction:
             place = move.draws.objects[int(rng.integers(len(move.draws.objects)))]
             # what lies on the table is twice as high as its centre
@@ -209,19 +212,20 @@ def random_actions_with_object(move: EditedMove) -> None:
             run += [there.moved(high), there]
         else:
             run.append(_varied(run[-1], floor, rng))
-    move.stops = [*move.stops[:at], *run[1:], *move.stops[at:]]
+    move = move.insert(at, run[1:])
+    return move
 
 
-def random_carried_contacts(move: EditedMove) -> None:
+def random_carried_contacts(move: MovePlan, size: float) -> MovePlan:
     """Carry the held object at a low height through, or past, the position of another object."""
-    rng = move.draws.play
-    grasp = move.stop('close').position
+    rng = move.rng
+    grasp = move.position('close')
     others = [
         place
         for place in move.draws.objects
         if np.linalg.norm((place - grasp)[:2]) > _EDITS.visit_to_m[1]
     ]
-    for _ in range(round(move.size) if others else 0):
+    for _ in range(round(size) if others else 0):
         at = int(rng.integers(move.index('lift') + 1, move.index('open') + 1))
         place = others[int(rng.integers(len(others)))][:2] + rng.normal(
             0.0, _EDITS.meet_offset_m, 2
@@ -241,37 +245,30 @@ def random_carried_contacts(move: EditedMove) -> None:
         leaves = replace(arrives, position=end)
         over, after = (rng.uniform(*_EDITS.visit_rise_m) * UP for _ in range(2))
         meeting = [arrives.moved(over), arrives, leaves, leaves.moved(after)]
-        move.stops = [*move.stops[:at], *meeting, *move.stops[at:]]
+        move = move.insert(at, meeting)
+    return move
 
 
-def way_points_left_out(move: EditedMove) -> None:
+def way_points_left_out(move: MovePlan, size: float) -> MovePlan:
     """Remove random way points, so that the arm moves straight to the next one.
 
     Where it should close or open, it has done so at the next one. Others, drawn anew, where the
     arm does not reach the way between.
     """
-    gone = move.draws.play.permutation(len(move.stops) - 1)[: round(move.size)]
+    gone = move.rng.permutation(len(move.stops) - 1)[: round(size)]
     for number in sorted(map(int, gone), reverse=True):
         left_out, after = move.stops[number : number + 2]
         if left_out.phase in ('close', 'open'):
             after = replace(after, phase=left_out.phase)
-        move.stops = [*move.stops[:number], after, *move.stops[number + 2 :]]
+        move = move.insert(number, [after], drop=2)
+    return move
 
 
-def way_points_swapped(move: EditedMove) -> None:
+def way_points_swapped(move: MovePlan, size: float) -> MovePlan:
     """Exchange random way points with the next one, so that the later action comes first.
 
     Others, drawn anew, where the arm does not reach the way between.
     """
-    for number in map(int, move.draws.play.permutation(len(move.stops) - 2)[: round(move.size)]):
-        move.stops[number : number + 2] = move.stops[number + 1], move.stops[number]
-
-
-RANDOM_EDITS: Mapping[str, Callable[[EditedMove], None]] = {
-    edit.__name__: edit
-    for edit in (
-        *(random_way_points, random_runs, random_visits, random_actions_at_object),
-        *(random_actions_with_object, random_carried_contacts, way_points_left_out),
-        way_points_swapped,
-    )
-}
+    for number in map(int, move.rng.permutation(len(move.stops) - 2)[: round(size)]):
+        move = move.insert(number, move.stops[number : number + 2][::-1], drop=2)
+    return move

@@ -10,11 +10,11 @@ import numpy as np
 from mtv_world_ros.core.data_types import FloatArray, JointTrajectory
 from mtv_world_ros.core.errors import PolicyError
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.simulation.expert.way_points import Draws, Stops, WayPoint
 from mtv_world_ros.simulation.faults.catalogue import FAULTS, PolicyVariant
-from mtv_world_ros.simulation.faults.commands import COMMANDS, Commands
-from mtv_world_ros.simulation.faults.edits import edited
-from mtv_world_ros.simulation.faults.second_arm import Visit, visit_of
+from mtv_world_ros.simulation.faults.fault import OtherArm
+from mtv_world_ros.simulation.faults.move_plan import Draws, MovePlan
+from mtv_world_ros.simulation.faults.signals import Commands
+from mtv_world_ros.simulation.way_points import Stops, Visit, WayPoint
 
 #: way points of a move at most
 _MOST_STOPS = 40
@@ -41,7 +41,7 @@ class WayPointFaults:
             'sign': float(rng.choice((-1.0, 1.0))),
             'errors': rng.normal(size=(_MOST_STOPS, 3)),
             'openings': rng.normal(size=_MOST_STOPS),
-            'play': np.random.default_rng(rng.integers(2**32)),
+            'rng': np.random.default_rng(rng.integers(2**32)),
         }
 
     @property
@@ -67,9 +67,11 @@ class WayPointFaults:
 
     def applied(self, stops: Stops, draws: Draws) -> Stops:
         """Return the way points of a move with all faults, in the catalogue's order."""
+        plan = MovePlan(stops, draws)
         for fault, size in self._faults:
-            stops = edited(fault.edits, stops, size, draws)
-        return stops
+            if fault.way_points:
+                plan = fault.way_points(plan, size)
+        return plan.stops
 
     def visits(
         self, stops: Stops, draws: Draws, home: WayPoint, times: Sequence[float]
@@ -82,10 +84,9 @@ class WayPointFaults:
             home: way point at which the second arm rests.
             times: times of the way points, before scaling [s].
         """
+        plan, other = MovePlan(stops, draws), OtherArm(home, times)
         visits = (
-            visit_of(fault.second_arm, stops, size, draws, home, times)
-            for fault, size in self._faults
-            if fault.second_arm
+            fault.second_arm(plan, size, other) for fault, size in self._faults if fault.second_arm
         )
         return sorted(visits, key=lambda visit: (not visit.waits, not visit.is_timed, visit.meets))
 
@@ -107,16 +108,10 @@ def with_faults(
     """
     refuse_robot(variant, robot)
     commands = Commands(np.array(plan.positions), float(plan.times[1] - plan.times[0]), robot)
-    order = list(COMMANDS)
-    steps = [
-        (order.index(name), size * options.get('scale', 1.0), options)
-        for kind, size in variant.faults
-        for step in FAULTS[kind].commands
-        for name, options in step.items()
-    ]
-    for number, size, options in sorted(steps, key=lambda step: step[0]):
-        given = {key: value for key, value in options.items() if key != 'scale'}
-        commands = commands.at(COMMANDS[order[number]](commands, size, rng, **given))
+    faults = [(FAULTS[kind], size) for kind, size in variant.faults]
+    for fault, size in sorted(faults, key=lambda fault: fault[0].order):
+        if fault.commands:
+            commands = commands.at(fault.commands(commands, size * fault.scale, rng))
     return JointTrajectory(
         joint_names=plan.joint_names,
         times=commands.times,

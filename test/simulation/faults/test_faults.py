@@ -17,7 +17,6 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
-from mtv_world_ros.simulation.expert.way_points import WayPoint
 from mtv_world_ros.simulation.faults.catalogue import (
     draw_variant,
     FAULTS,
@@ -29,6 +28,7 @@ from mtv_world_ros.simulation.faults.catalogue import (
     SPLITS,
 )
 from mtv_world_ros.simulation.faults.variant_faults import WayPointFaults, with_faults
+from mtv_world_ros.simulation.way_points import WayPoint
 from test.support.tables import table
 
 SEED, TASK = 4, 'place_block_a2b_left'
