@@ -11,7 +11,7 @@ def test_the_sheet_has_a_line_of_every_view():
         'reasons_by_chunk': ['4 of 16 foreseen motions succeed; more', "abstains: 'x' is no task"],
         'outcome': 'success',
         'latency_s': [1.5],
-        'lead_s': [0.5],
+        'lead_s': [0.5, -2.48],
         'chunks': 2,
         'frames_received': 32,
         'frames_published': 32,
@@ -27,4 +27,6 @@ def test_the_sheet_has_a_line_of_every_view():
         '  1. 0.25: 4 of 16 foreseen motions succeed',
         "  2. no estimate: 'x' is no task",
     ]
-    assert len(notes) == 8
+    assert notes[6] == 'from a plan to the verdict on each chunk: 1.50 s'
+    assert notes[7].endswith('they are about: 0.50 s before it, 2.48 s after it')
+    assert len(notes) == 9

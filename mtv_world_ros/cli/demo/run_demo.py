@@ -32,6 +32,12 @@ from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.viewing.video import Comparison, contact_sheet, side_by_side, write_video
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
+#: line above the table
+_ABOUT_J = (
+    'J: overlap of an object in imagined and real frames, 0 = none, 1 = the same pixels; still: '
+    'the same of a still picture, the first frame held'
+)
+
 
 def run_demo(episode: Path, out: Path, options: DemoOptions) -> str:
     """Replay an episode through the node and return the printed table.
@@ -152,7 +158,7 @@ def _known(value: float) -> float | None:
 
 
 def _object_rows(report: dict[str, Any]) -> list[str]:
-    lines = [f'{"view":8} {"object":16} {"chunk":>5} {"moves":>5} {"J":>6} {"J held":>6}']
+    lines = [_ABOUT_J, f'{"view":8} {"object":16} {"chunk":>5} {"moves":>5} {"J":>6} {"still":>6}']
     for row in report['objects']:
         lines.append(
             f'{row["view"]:8} {row["object"]:16} {row["chunk"]:5d} '
@@ -168,7 +174,7 @@ def sheet_notes(report: dict[str, Any], views: tuple[str, ...]) -> list[str]:
     for view in views:
         means = report['views'][view]
         lines.append(
-            f'{view:8} moving objects: J {_number(means["j_moving"])}, first frame held '
+            f'{view:8} moving objects: J {_number(means["j_moving"])}, still picture '
             f'{_number(means["j_copy_moving"])}; all objects: J {_number(means["j_object_mean"])}'
         )
     lines += estimate_lines(
@@ -177,14 +183,19 @@ def sheet_notes(report: dict[str, Any], views: tuple[str, ...]) -> list[str]:
         report['reasons_by_chunk'],
     )
     latencies = ', '.join(f'{value:.2f}' for value in report['latency_s'])
-    leads = ', '.join(f'{value:.2f}' for value in report['lead_s'])
-    lines.append(f'from its verdict to the end of a chunk (negative: after it): {leads} s')
+    lines.append(f'from a plan to the verdict on each chunk: {latencies} s')
+    leads = ', '.join(map(_early_or_late, report['lead_s']))
+    lines.append(f'verdicts, against the end of the motion that they are about: {leads}')
     lines.append(
-        f'{report["chunks"]} chunks, {report["frames_received"]} of '
-        f'{report["frames_published"]} frames received; latency {latencies} s; '
-        f'real-time factor {report["real_time_factor"]:.1f}'
+        f'{report["chunks"]} chunks (parts of a plan that are imagined at once), '
+        f'{report["frames_received"]} of {report["frames_published"]} frames received; '
+        f'{report["real_time_factor"]:.1f} s of video for a second of computing'
     )
     return lines
+
+
+def _early_or_late(lead_s: float) -> str:
+    return f'{abs(lead_s):.2f} s {"before" if lead_s >= 0 else "after"} it'
 
 
 def _number(value: float | None) -> str:
