@@ -13,8 +13,8 @@ PAGE = Path(__file__).parent / 'commands.md'
 _HEAD = """\
 # Commands
 
-`mtv-world --help` prints the list, `mtv-world COMMAND --help` the options of one. This page is
-written by `python docs/command_pages.py`.
+`mtv-world --help` prints the list, `mtv-world COMMAND --help` the options of one that most need,
+`--help-all` every one. This page is written by `python docs/command_pages.py`.
 """
 
 

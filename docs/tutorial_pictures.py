@@ -35,7 +35,7 @@ NUM_COLOURS = 128
 FILES = {
     'expert': 'out/judge/expert/episode_00000/contact_sheet.png',
     'mine': 'out/judge/mine/episode_00000/contact_sheet.png',
-    'doctor': 'out/tutorial/doctor/low.png',
+    'check': 'out/tutorial/check/low.png',
     'imagined': 'out/tutorial/imagined/contact_sheet.png',
 }
 PAGES = {'ranking': 'out/judge/ranking/ranking.html', 'scores': 'out/tutorial/scores/report.html'}

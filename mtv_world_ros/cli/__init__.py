@@ -130,7 +130,10 @@ def _group_options(parser: argparse.ArgumentParser) -> None:
         moved = [action for action in common if options & {*action.option_strings}]
         if moved:
             parser._optionals._group_actions = [a for a in common if a not in moved]
-            parser.add_argument_group(heading)._group_actions.extend(moved)
+            group = parser.add_argument_group(heading)
+            group._group_actions.extend(moved)
+            if options is ADVANCED_OPTIONS and isinstance(parser, _Parser):
+                parser.hide(group)
 
 
 def _add_others(commands: argparse._SubParsersAction) -> None:
@@ -183,11 +186,60 @@ def _overview() -> str:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Refuses empty paths, which Python reads as the present folder."""
+    """Refuses empty paths, which Python reads as the present folder.
+
+    `--help` leaves out the options of the group given to `hide`; `--help-all` prints all.
+    """
 
     def __init__(self, **how: Any) -> None:
         super().__init__(**how)
         self.register('type', Path, _path)
+        self._hidden: argparse._ArgumentGroup | None = None
+
+    def hide(self, group: argparse._ArgumentGroup) -> None:
+        """Leave a group out of `--help`, and add `--help-all`, which prints it, too."""
+        self._hidden = group
+        text = f'show {len(group._group_actions)} more options, too'
+        self.add_argument('--help-all', action=_HelpAll, help=text)
+        options = self._optionals._group_actions
+        options.insert(1, options.pop())  # after --help
+
+    def show_all(self) -> None:
+        """Let the help have all options."""
+        self._hidden = None
+
+    def format_usage(self) -> str:
+        """Return the usage, without options that `--help` leaves out."""
+        formatter = self._get_formatter()
+        self._add_usage(formatter)
+        return formatter.format_help()
+
+    def format_help(self) -> str:
+        """Return the help, as argparse does it, without the group that is left out."""
+        formatter = self._get_formatter()
+        self._add_usage(formatter)
+        formatter.add_text(self.description)
+        for group in self._action_groups:
+            if group is not self._hidden:
+                formatter.start_section(group.title)
+                formatter.add_text(group.description)
+                formatter.add_arguments(group._group_actions)
+                formatter.end_section()
+        formatter.add_text(self.epilog)
+        return formatter.format_help()
+
+    def _add_usage(self, formatter: argparse.HelpFormatter) -> None:
+        hidden = self._hidden._group_actions if self._hidden else []
+        shown = [action for action in self._actions if action not in hidden]
+        formatter.add_usage(self.usage, shown, self._mutually_exclusive_groups)
+
+
+class _HelpAll(argparse._HelpAction):
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        if isinstance(parser, _Parser):
+            parser.show_all()
+        parser.print_help()
+        parser.exit()
 
 
 def _path(text: str) -> Path:

@@ -47,17 +47,17 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_options(parser, 'source')
     parser.add_argument('--robot', help=f"{robots()}; default: the episode's")
     parser.add_argument(
-        '--out', type=Path, help='folder of the report; default: out/doctor/<episode>'
+        '--out', type=Path, help='folder of the report; default: out/check/<episode>'
     )
-    parser.set_defaults(handler=_doctor, default_out=_default_out)
+    parser.set_defaults(handler=_run, default_out=_default_out)
 
 
 def _default_out(arguments: argparse.Namespace) -> Path:
     name = 'live' if arguments.episode is None else arguments.episode.resolve().name
-    return Path('out/doctor') / name
+    return Path('out/check') / name
 
 
-def _doctor(arguments: argparse.Namespace) -> int:
+def _run(arguments: argparse.Namespace) -> int:
     if arguments.live == (arguments.episode is not None):
         raise ConfigError('name an EPISODE, or give --live to check the running topics')
     if not arguments.live:
@@ -71,7 +71,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
         raise ConfigError('--live needs the names of the views: --views low,high')
     if arguments.robot is None or arguments.calibration is None:
         raise ConfigError('--live needs --robot and --calibration: topics do not carry them')
-    with tempfile.TemporaryDirectory(prefix='mtv_world_doctor_') as folder:
+    with tempfile.TemporaryDirectory(prefix='mtv_world_check_') as folder:
         print(
             f'recording {", ".join(arguments.views)} for {arguments.seconds:g} s', file=sys.stderr
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from pathlib import Path
+import sys
 
 from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.physics_option import add_physics
@@ -99,6 +100,7 @@ def _collect(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.simulation.scenes.randomize import RandomizationConfig
 
     size = RandomizationConfig(width=arguments.width, height=arguments.height)
+    missing: list[str] = []
     made = collect(
         [name.strip() for name in arguments.task.split(',')],
         arguments.episodes,
@@ -119,11 +121,14 @@ def _collect(arguments: argparse.Namespace) -> int:
             ),
         ),
         sheets=arguments.sheets,
+        on_missing=missing.append,
     )
     outcomes = Counter(entry.outcome for entry in made)
     counted = ', '.join(f'{outcome} {number}' for outcome, number in sorted(outcomes.items()))
     print(f'{len(made)} episodes ({counted}): {arguments.out}')
-    return 0
+    if missing:
+        print(f'{len(missing)} could not be made:', *missing, sep='\n  ', file=sys.stderr)
+    return int(bool(missing))
 
 
 def _period(fps: float) -> float:

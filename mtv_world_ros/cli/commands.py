@@ -121,20 +121,27 @@ MODEL_OPTIONS = frozenset(
     }
 )
 
-#: options that few users need; `--help` shows them last, under a heading of their own
+#: options that few users need; `--help-all` shows them, under a heading of their own
 ADVANCED_OPTIONS = frozenset(
     {
+        '--actions',
         '--adapter',
         '--between',
         '--cache',
+        '--compare',
+        '--cpus-per-worker',
         '--data-workers',
         '--describer',
         '--dtype',
         '--fid-weights',
         '--fvd-weights',
+        '--gpus-per-worker',
         '--held-out-episodes',
+        '--hold',
         '--latent-cache',
+        '--list-faults',
         '--max-chunks',
+        '--mode',
         '--motions',
         '--no-camera-check',
         '--no-ceiling',
@@ -142,11 +149,15 @@ ADVANCED_OPTIONS = frozenset(
         '--no-report',
         '--no-store',
         '--no-video',
+        '--object-mask',
         '--peak-tflops',
         '--physics',
+        '--quality',
+        '--ray',
         '--sample-every',
         '--save-every',
         '--save-minutes',
+        '--seeds',
         '--serving',
         '--sheets',
         '--steps',

@@ -87,6 +87,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--seed', type=int, default=0, help='seed of weights, noise and batches')
     parser.add_argument('--device', default='cpu', help='PyTorch device, e.g. cpu or cuda')
     parser.add_argument(
+        '--checked',
         '--doctor',
         type=Path,
         metavar='DIR',
@@ -185,7 +186,9 @@ def _train(arguments: argparse.Namespace) -> int:
     refuse_test_kinds(paths, 'training')
     same = ('out', 'seed', 'device', 'dtype', 'save_every', 'save_minutes', 'cache')
     same += ('latent_cache', 'data_workers', 'peak_tflops')
-    broken = found_broken(arguments.doctor, paths, config.video.views) if arguments.doctor else {}
+    broken = (
+        found_broken(arguments.checked, paths, config.video.views) if arguments.checked else {}
+    )
     run = TrainingRun(
         config=config,
         dataset=tuple(paths),
@@ -288,13 +291,13 @@ def found_broken(report: Path, paths: Sequence[Path], views: Sequence[str]) -> d
         found = TypeAdapter(dict[str, dict[str, str]]).validate_python(read_json(report / BROKEN))
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"--doctor '{report}': {BROKEN} cannot be read ({error}); mtv-world check FOLDER "
+            f"--checked '{report}': {BROKEN} cannot be read ({error}); mtv-world check FOLDER "
             '--out DIR writes it'
         ) from error
     unchecked = [path.name for path in paths if path.name not in found]
     if unchecked:
         raise ConfigError(
-            f"--doctor '{report}': {len(unchecked)} of the episodes were not checked, e.g. "
+            f"--checked '{report}': {len(unchecked)} of the episodes were not checked, e.g. "
             f"'{unchecked[0]}'; run mtv-world check on the folder again"
         )
     parts = {path: {n: t for n, t in found[path.name].items() if n in (*views, 'recording')}

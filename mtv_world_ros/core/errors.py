@@ -103,6 +103,10 @@ class SimulatorError(MtvWorldError):
     """The simulator cannot render or build a scene."""
 
 
+class NoSceneError(SimulatorError):
+    """No scene of those that were drawn gave the wanted episode."""
+
+
 class PolicyError(MtvWorldError):
     """A policy cannot answer, or its answer cannot be used."""
 

@@ -262,9 +262,11 @@ class _EpisodeReader:
         try:
             self.topics: EpisodeTopics = find_topics(path, found, views, named)
         except EpisodeError as error:
-            if self.bag.truncated:
-                raise EpisodeError(f'{error}; {self.bag.truncated}') from error
-            raise
+            text = f'{error}; {self.bag.truncated}' if self.bag.truncated else str(error)
+            recorded = self.bag.custom_data.get('robot', '')
+            if robot is not None and recorded not in ('', robot.name):
+                text = f"it is of another robot: '{recorded}', not '{robot.name}': {text}"
+            raise EpisodeError(text) from error
         further = self.mapping.state_topics[1:]
         self.state_topics = (self.topics.joint_states, *further)
         self.command_topics = self._find_commands()

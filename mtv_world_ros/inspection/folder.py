@@ -29,6 +29,8 @@ from mtv_world_ros.inspection.inspection_report import (
 )
 from mtv_world_ros.inspection.places import background, CameraPlaces, find_places
 
+#: height of the line with an episode's name [px]
+_NAME_PX = 20
 #: width of one view in the overview picture [px]
 _TILE_WIDTH_PX = 320
 #: maximum number of episodes in the overview picture
@@ -327,7 +329,9 @@ def folder_picture(pictures: dict[str, dict[str, ByteArray]]) -> ByteArray | Non
 def _row(name: str, views: dict[str, ByteArray]) -> ByteArray:
     tiles: Sequence[ByteArray] = [_small(picture) for picture in views.values()]
     height = min(tile.shape[0] for tile in tiles)
-    row = np.ascontiguousarray(np.hstack([tile[:height] for tile in tiles]))
+    row = np.hstack([tile[:height] for tile in tiles])
+    # above the pictures, which have times in their corners
+    row = np.ascontiguousarray(np.pad(row, ((_NAME_PX, 0), (0, 0), (0, 0))))
     cv2.putText(row, name, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 0))
     return row
 

@@ -12,6 +12,7 @@ import yaml
 from mtv_world_ros.core.errors import CalibrationError, EpisodeError, MtvWorldError
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
 from mtv_world_ros.data.episode_writer import EpisodeWriter
+from mtv_world_ros.robot.file import load_robot, robot_path
 from test.support.unknown_cameras import forget_poses
 
 START_NS, PERIOD_NS, FRAMES = 1_700_000_000_000_000_000, 100_000_000, 8
@@ -104,6 +105,9 @@ def test_a_missing_view_is_named_with_those_that_are_there(make_episode):
     assert read_episode(path).views == ('high',)
     with pytest.raises(EpisodeError, match=r"no view 'low'.*its views are high.*`topics`"):
         read_episode(path, views=('low', 'high'))
+    match = r"of another robot: '\w+', not 'franka': .*no view 'low'"
+    with pytest.raises(EpisodeError, match=match):
+        read_episode(path, views=('low',), robot=load_robot(robot_path('franka')))
     with pytest.raises(EpisodeError, match=r"no view 'hihg'.*did you mean 'high'"):
         read_episode(path, views=('hihg',))
 

@@ -1,4 +1,4 @@
-"""The doctor on a robot whose root link is `world`: what moves follows the kinematics."""
+"""`check` on a robot whose root link is `world`: what moves follows the kinematics."""
 
 from dataclasses import replace
 import shutil

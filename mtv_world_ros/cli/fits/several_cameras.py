@@ -226,7 +226,7 @@ def _read_all(arguments: argparse.Namespace) -> tuple[list[Episode], Path]:
 
 
 def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_known: bool) -> str:
-    """Return the table: a line a recording, with its place, the doctor's measures and doubts."""
+    """Return the table: a line a recording, with its place, the measures of `check` and doubts."""
     import numpy as np
 
     view, width = estimate.cameras[0].view, estimate.cameras[0].width
@@ -257,7 +257,7 @@ def describe(estimate: SharedEstimate, episodes: Sequence[Episode], *, focal_kno
             )
         )
     if estimate.kept_guess:
-        lines.append("the guess fits better by the doctor's measure and is kept")
+        lines.append('the guess fits better by the measure of `check` and is kept')
     for number, episode in enumerate(episodes):
         x, y, z = estimate.cameras[number].T_mount_camera[:3, 3]
         measure = estimate.measures[number]

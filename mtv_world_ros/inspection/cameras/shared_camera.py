@@ -366,7 +366,7 @@ def _judged(
     *,
     guess: bool,
 ) -> SharedEstimate:
-    """Return the better of guess and result by the doctor's measure.
+    """Return the better of guess and result by the measure of `check`.
 
     Its error is that of the state that was fitted without the points that were left out.
     """

@@ -620,7 +620,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     add('--duration', type=float, default=float('inf'), help='play this much [s]')
     add('--topics', nargs='+', default=[], metavar='TOPIC', help='play only these')
     add('--wait-for', nargs='+', default=[], metavar='TOPIC', help='default: the trajectory')
-    add('--wait-timeout', type=float, default=30.0, help='wait for a subscriber this long [s]')
+    add('--wait-timeout', type=float, default=300.0, help='wait for a subscriber this long [s]')
     add('--no-wait', action='store_true', help='play whether or not anybody listens')
     add('--lock-step', action='store_true', help='after each trajectory wait for the answer')
     add('--answer-timeout', type=float, default=120.0, help='wait for an answer this long [s]')

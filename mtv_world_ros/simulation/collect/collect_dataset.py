@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mtv_world_ros.core.errors import SimulatorError
+from mtv_world_ros.core.errors import NoSceneError, SimulatorError
 from mtv_world_ros.core.executor import run_all
 from mtv_world_ros.core.images import encode_png
 from mtv_world_ros.core.progress import Progress
@@ -63,6 +63,7 @@ def collect(
     failures_of_ten: int = NUM_MISSED,
     sheets: bool = False,
     progress: bool = True,
+    on_missing: Callable[[str], object] | None = None,
 ) -> list[CardEntry]:
     """Make the missing episodes of a data set, its card and its contact sheet.
 
@@ -81,11 +82,14 @@ def collect(
             zero-shot sets.
         sheets: whether a larger contact sheet of every task is written, too.
         progress: show the progress.
+        on_missing: takes the reason of each episode that could not be made, after the others
+            were made; None = the first reason is raised then.
 
     Returns:
-        The entries of the episodes that were asked for.
+        The entries of the episodes that were asked for and made.
 
     Raises:
+        NoSceneError: see `on_missing`; or no episode at all could be made.
         SimulatorError: unknown task or kind, no OpenGL library, `out` holds another set or
             cannot be written.
     """
@@ -110,19 +114,30 @@ def collect(
     with dataset_lock(out):
         data_set = _DataSet(out, ZERO_SHOT_SET if kinds else TASKS_SET, seed, config, jobs)
         workers = replace(workers, threads=1, writes=out)
-        data_set.make(jobs, workers, config, progress=progress)
+        missing = data_set.make(jobs, workers, config, progress=progress)
         remove_leftovers(out)  # of workers that died
+        if missing and not data_set.entries:
+            raise NoSceneError(missing[0])
         data_set.describe(sheets=sheets)
-    return [data_set.entries[job.path.name] for job in jobs]
+    for reason in missing:
+        if on_missing is None:
+            raise NoSceneError(reason)
+        on_missing(reason)
+    return [data_set.entries[name] for job in jobs if (name := job.path.name) in data_set.entries]
 
 
-def _maker(config: CollectConfig) -> Callable[[CollectJob], None]:
+def _maker(config: CollectConfig) -> Callable[[CollectJob], str]:
+    """Return what makes an episode; it returns why there is none, or an empty text."""
     maker = EpisodeMaker(config)
 
-    def make(job: CollectJob) -> None:
+    def make(job: CollectJob) -> str:
         # a worker that died may have finished it; an episode gets its name when it is whole
-        if not job.path.exists():
-            maker.make(job)
+        try:
+            if not job.path.exists():
+                maker.make(job)
+        except NoSceneError as error:  # the others of the set are made all the same
+            return str(error)
+        return ''
 
     return make
 
@@ -176,15 +191,19 @@ class _DataSet:
         config: CollectConfig,
         *,
         progress: bool,
-    ) -> None:
-        """Make the missing episodes."""
+    ) -> list[str]:
+        """Make the missing episodes; return why some are still missing."""
+        reasons: list[str] = []
         missing = [job for job in jobs if job.path.name not in self.entries]
         done = len(jobs) - len(missing)
         try:
             finished = run_all(missing, partial(_maker, config), workers)
             with Progress(total=len(jobs), initial=done, unit='episode', is_shown=progress) as bar:
                 self._show(bar, jobs)
-                for number, (job, _) in enumerate(finished, 1):
+                for number, (job, reason) in enumerate(finished, 1):
+                    if reason:
+                        reasons.append(reason)
+                        continue
                     self.entries[job.path.name] = read_entry(job.path)
                     bar.update()
                     self._show(bar, jobs)
@@ -195,6 +214,7 @@ class _DataSet:
             with suppress(SimulatorError):
                 self._write_card()
             raise
+        return reasons
 
     def _show(self, bar: Any, jobs: Sequence[CollectJob]) -> None:
         names = [job.path.name for job in jobs]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.core.errors import EpisodeError, PolicyError, SimulatorError
+from mtv_world_ros.core.errors import EpisodeError, NoSceneError, PolicyError, SimulatorError
 from mtv_world_ros.core.files import bundled
 from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.robot.file import load_robot
@@ -91,7 +91,8 @@ class EpisodeMaker:
         """Simulate attempts until one is as wanted, and write it.
 
         Raises:
-            SimulatorError: none of `max_attempts` seeds gave the wanted outcome, or the episode
+            NoSceneError: none of `max_attempts` seeds gave the wanted outcome.
+            SimulatorError: the episode
                 cannot be written.
         """
         attempts = range(self._config.record.max_attempts)
@@ -106,13 +107,13 @@ class EpisodeMaker:
                 sim.close()
         episode = f"episode {job.index} of task '{job.task.name}' (seed {job.seed})"
         if job.policy:
-            raise SimulatorError(
+            raise NoSceneError(
                 f"{episode}: policy '{job.policy}' cannot be carried out in any of "
                 f'{len(attempts)} scenes; leave it, or the task, out (--policies, --task)'
             )
-        raise SimulatorError(
+        raise NoSceneError(
             f'{episode} was {"no clean miss" if job.miss else "no success"} in {len(attempts)} '
-            'attempts; see simulation/expert/expert.py'
+            'scenes; another --seed draws other ones, or leave the task out (--task)'
         )
 
     def _attempt(self, job: CollectJob, seed: int) -> tuple[SimEpisode, Take | None]:

@@ -116,6 +116,21 @@ def test_a_policy_that_no_scene_allows_is_named(tmp_path, opengl):
         collect('collect_toy', 1, SEED, tmp_path, config=config, progress=False)
 
 
+def test_an_episode_that_no_scene_allows_does_not_stop_the_set(tmp_path, opengl):
+    config = replace(
+        SMALL, policies=('expert-drop_high-0.04', 'expert'), record=RecordConfig(max_attempts=2)
+    )
+    said = []
+    made = collect(
+        'collect_toy', 2, SEED, tmp_path, config=config, progress=False, on_missing=said.append
+    )
+    assert [entry.name for entry in made] == ['collect_toy_00001']
+    (reason,) = said
+    assert reason.startswith("episode 0 of task 'collect_toy'") and '--task' in reason
+    card = json.loads((tmp_path / 'dataset.json').read_text())
+    assert len(card['episodes']) == 1
+
+
 def test_the_command_says_what_was_made_and_draws_no_bar_into_a_file(data_set, tmp_path, capsys):
     out = shutil.copytree(data_set, tmp_path / 'set')
     words = list(COMMAND[COMMAND.index('collect') :])
