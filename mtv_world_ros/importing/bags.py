@@ -30,7 +30,14 @@ from mtv_world_ros.data.bag.image_decoding import check_raw
 from mtv_world_ros.data.bag.reader import BagMessage, BagReader
 from mtv_world_ros.data.bag.unused_topics import unused_line
 from mtv_world_ros.data.bag_mapping import BagMapping, key_of
-from mtv_world_ros.data.episode import Episode, MASKS_BY, parse_outcome, PLACE, UNKNOWN_CAMERAS
+from mtv_world_ros.data.episode import (
+    Episode,
+    MASKS_BY,
+    parse_outcome,
+    PHYSICS,
+    PLACE,
+    UNKNOWN_CAMERAS,
+)
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.stream_clocks import ClockBreakError, WHOLE, Window
@@ -548,6 +555,7 @@ def _metadata(episode: Episode, source: str, key: str) -> dict[str, str]:
     values = {'source': source, MAPPING_KEY: key}
     place = episode.info.place  # of simulated episodes the simulator, whose name has the physics
     values |= {PLACE: place} if place else {}
+    values |= {PHYSICS: episode.info.physics} if episode.info.physics else {}
     values |= {UNKNOWN_CAMERAS: ', '.join(episode.unknown)} if episode.unknown else {}
     by = episode.info.metadata.get(MASKS_BY, '')
     return {**values, MASKS_BY: by} if episode.masks and by else values

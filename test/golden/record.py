@@ -260,6 +260,7 @@ def helps() -> dict[str, list[str]]:
     whole = command('--help')
     names = import_module(f'{PACKAGE}.cli.commands').COMMANDS
     shown = {'': whole} | {name: command(*name.split(), '--help') for name in names}
+    shown |= {n: command(*n.split(), '--help-all') for n in names if '--help-all' in shown[n]}
     return {name: text.split('\n') for name, text in shown.items()}
 
 
