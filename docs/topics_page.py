@@ -74,7 +74,7 @@ TOPICS = {
     '~/<view>/mask/camera_info': 'intrinsics at their size',
     '~/predicted/joint_states': 'commanded positions at the predicted times; lets a policy close '
     'the loop on the imagination',
-    '~/success': 'probability of success, NaN where the estimate abstains; the reasons are  of ',
+    '~/success': 'probability of success, NaN where the estimate abstains; reasons: `~/report`',
     '~/jaccard': '[J](glossary.md#frames), view x object; NaN where an object is absent',
     '~/fidelity': 'J of an imagined chunk against the real frames that arrived later for the same '
     'times, view x object; mode `observe` only',

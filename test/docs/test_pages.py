@@ -45,30 +45,32 @@ URDF = """
 """
 
 
-def cells_of(page):
-    """Cells of the table of verdicts: column -> judge -> cell."""
-    found = re.search(
-        r'<!-- unseen-faults: begin -->(.*)<!-- unseen-faults: end -->',
-        (ROOT / page).read_text(),
-        re.S,
+def results_page(name):
+    return (ROOT / 'experiments' / 'results' / f'{name}.md').read_text()
+
+
+def test_the_four_numbers_of_the_readme_are_those_of_the_results_pages():
+    text = ' '.join((ROOT / 'README.md').read_text().split())
+    pictures = results_page('bundled_paper_cpu2_2026-11-28').partition('## Both checkpoints')[2]
+    imagined = re.search(r'\| bundled \| (\.\d+)', pictures)[1]
+    held = re.search(r'\| first frame held \| (\.\d+)', pictures)[1]
+    assert f'overlap with the real ones by {float(imagined):.2f} (J;' in text
+    assert f'those of a still picture by {float(held):.2f},' in text
+    faults = results_page('unseen_faults_cpu2_2026-11-29')
+    row = re.search(r'\| \*\*both\*\* \| (\d+) of (\d+) \| (\d+) of \d+.*?; (\d+) of \d+', faults)
+    given, plans, successes, failures = map(int, row.groups())
+    assert (
+        f'in {successes + failures} of {given} cases; it gives one for {given} of {plans}' in text
     )
-    assert found is not None
-    rows = [
-        [cell.strip() for cell in line.strip('|').split('|')]
-        for line in found[1].splitlines()
-        if line.startswith('| ')
-    ]
-    return {
-        (row[0], column): cell
-        for row in rows[2:]
-        for column, cell in zip(rows[0], row, strict=True)
-    }
-
-
-def test_the_table_of_the_readme_is_part_of_that_of_the_results_page():
-    short, whole = cells_of('README.md'), cells_of('docs/results.md')
-    assert len(short) == 15 < len(whole)
-    assert short.items() <= whole.items()
+    row = re.search(r'\| foreseen motions alone \|.*?\| (\d+) of (1\d+) \|', faults)
+    given, plans = map(int, row.groups())
+    assert f'{plans - given} of {plans} plans get no verdict' in text
+    speed = results_page('foresight_cpu2_2026-11-27')
+    row = re.search(
+        r'\| this \| realtime \| 1 \| 3.2 \|.*?\| 10 \| 10 \| ([\d.]+) \| ([\d.]+)', speed
+    )
+    delay, lead = map(float, row.groups())
+    assert f'comes {delay:.1f} s after a plan**, {lead:.1f} s before the motion ends' in text
 
 
 #: a visitor reads the README in two minutes

@@ -1,4 +1,4 @@
-"""Table of fresh seeds: coverage of intervals, the estimate of before, the block of README.md."""
+"""Table of fresh seeds: coverage of intervals, the estimate of before, the table of results."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_the_estimate_of_before_counts_frames_beside_the_motion_and_is_that_of_l
     assert isnan(script.before(OLD, rows, 'bundled')['bold', script.BEFORE][1][0].probability)
 
 
-def test_the_block_of_the_readme_has_a_row_for_each_judge(script, monkeypatch):
+def test_the_block_of_the_results_page_has_a_row_for_each_judge(script, monkeypatch):
     rows = [{'final': k % 2 == 0, 'job': ['nominal', 'stack', 0, k // 4]} for k in range(16)]
     sure = [ShareEstimate(0.95 if r['final'] else 0.05, nan, nan) for r in rows]
     made = [
@@ -117,11 +117,6 @@ def test_the_block_of_the_readme_has_a_row_for_each_judge(script, monkeypatch):
         '16 of 16', '8 of 8; 8 of 8', '1.00 (1.00, `bold`)', '1.00 (1.00, `bold`)',
     ]  # fmt: skip
     assert '2 seeds (1,2)' in text and '`bold`' in text
-    short = script.readme_block(made, 4, 16).splitlines()
-    cells = [line.strip('| ').split(' | ') for line in short if line.startswith('| ')][2:]
-    assert [row[0] for row in cells] == [f'**{script.BOTH}**', script.FORESEEN, script.RULE]
-    assert cells[1] == [body[1][k].strip('| ') for k in script.README_COLUMNS]
-    assert '4 scenes, n = 16 in the nominal physics and in each of 1 others' in short[-1]
     assert script.of_seed(
         Namespace(logs=Path('logs'), seed=0, faults='', log=None), 5
     ).log == Path('logs/5.jsonl')
