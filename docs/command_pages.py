@@ -24,13 +24,14 @@ def page() -> str:
     for section in SECTIONS:
         lines += [f'## {section}', '']
         for name in (name for name, entry in COMMANDS.items() if entry.section == section):
-            lines += [f'### mtv-world {name}', '', *_described(_parser(name)), '']
+            lines += [f'### mtv-world {name}', '', *_described(parser_of(name)), '']
     lines += ['## Names before 0.2', '', '| before | now |', '|---|---|']
     lines += [f'| `{old}` | `{" ".join(words)}` |' for old, words in RENAMED.items()]
     return '\n'.join([*lines, ''])
 
 
-def _parser(name: str) -> argparse.ArgumentParser:
+def parser_of(name: str) -> argparse.ArgumentParser:
+    """Return the parser of a command of one or two words."""
     parser = make_parser(name)
     for word in name.split():
         choices = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))

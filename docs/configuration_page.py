@@ -195,10 +195,16 @@ FILES = (
 _HEAD = """\
 # Configuration files
 
-Keys of all YAML files that a user writes. An unknown key is an error that names the nearest known
-one. Numbers have the units that stand in brackets. This page is written by
+Keys of all YAML files that a user writes, in two tiers: the [basic](#basic) keys are those that
+most users set, and the [advanced](#advanced) part has all keys. An unknown key is an error that
+names the nearest known one. Numbers have the units that stand in brackets. This page is written by
 `python docs/configuration_page.py`; the node's parameters are on [a page of their
 own](parameters.md).
+
+## Basic
+
+| file | key | value | default | |
+|---|---|---|---|---|
 """
 _ATTRIBUTE = re.compile(r'^ {4}(\w+): (.*(?:\n {8}.*)*)', re.M)
 #: spelling of names in headings
@@ -215,19 +221,37 @@ _PLAIN = {
 
 def page() -> str:
     """Return the text of the page: a table of keys for each file and each of its sections."""
-    lines = [_HEAD]
+    lines = [_HEAD + '\n'.join(_basic_rows()), '', '## Advanced', '', 'All keys of all files.', '']
+    for file, parts in sections():
+        lines += [f'### {file.heading}', '', file.introduction(), '', *_table(file.schema), '']
+        for part in parts:
+            lines += [f'#### {_title(part)}', '', _first_line(part), '', *_table(part), '']
+    return '\n'.join(lines)
+
+
+def sections() -> Iterator[tuple[ConfigFile, list[type]]]:
+    """Yield the kinds of files, each with the sections that no earlier kind has."""
     shown: set[type] = set()
     for file in FILES:
-        lines += [f'## {file.heading}', '', file.introduction(), '', *_table(file.schema), '']
         shown.add(file.schema)
+        parts: list[type] = []
         waiting = _parts(file.schema)
         while waiting:
             part = waiting.pop(0)
             if part not in shown:
                 shown.add(part)
-                lines += [f'### {_title(part)}', '', _first_line(part), '', *_table(part), '']
+                parts.append(part)
                 waiting += _parts(part)
-    return '\n'.join(lines)
+        yield file, parts
+
+
+def keys(kind: type) -> dict[str, FieldInfo]:
+    """Return the keys of a schema or dataclass by the names that a file writes."""
+    return {field.alias or name: field for name, field in _fields(kind).items()}
+
+
+def _anchor(heading: str) -> str:
+    return re.sub(r'[^\w -]', '', heading.lower()).replace(' ', '-')
 
 
 def _title(kind: type) -> str:
@@ -244,10 +268,24 @@ def _first_line(kind: type) -> str:
     return (inspect.getdoc(kind) or '').split('\n\n')[0].replace('\n', ' ')
 
 
+def _basic_rows() -> Iterator[str]:
+    for file, parts in sections():
+        for kind in (file.schema, *parts):
+            link = f'[{file.heading}](#{_anchor(file.heading)})'
+            if kind is not file.schema:
+                link += f': [{_title(kind)}](#{_anchor(_title(kind))})'
+            rows = dict(zip(keys(kind), _rows(kind), strict=True))
+            yield from (f'| {link} {rows[key]}' for key in getattr(kind, 'basic', ()))
+
+
 def _table(kind: type) -> Iterator[str]:
-    meanings = _attributes(kind)
     yield '| key | value | default | |'
     yield '|---|---|---|---|'
+    yield from _rows(kind)
+
+
+def _rows(kind: type) -> Iterator[str]:
+    meanings = _attributes(kind)
     for name, field in _fields(kind).items():
         meaning = ' '.join((field.description or meanings.get(name, '')).split())
         if not meaning and len(get_args(field.annotation)) == 1:
@@ -320,7 +358,7 @@ def _type(kind: Any) -> str:
     if kind is RobotModel:
         return _PLAIN[Path]
     if kind is not RobotModel and _is_part(kind):
-        return f'[{_title(kind)}](#{_title(kind).lower().replace(" ", "-")})'
+        return f'[{_title(kind)}](#{_anchor(_title(kind))})'
     return _PLAIN.get(kind, 'see the guide')
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, Strict
@@ -69,6 +69,8 @@ _Pixels = Annotated[
 
 class CalibratedView(Schema):
     """Camera of a calibration file; see `load_calibration`."""
+
+    basic: ClassVar = ('width', 'height', 'K', 'mount_link', 'T_mount_camera')
 
     section = ''
 

@@ -30,6 +30,7 @@ from mtv_world_ros.cli.commands import (  # noqa: E402
     COMMANDS,
     MODEL_OPTIONS,
     REMOVED,
+    REMOVED_OPTIONS,
     RENAMED,
     SECTIONS,
 )
@@ -327,6 +328,7 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
     for word in words[:2]:
         leaf = _choices(leaf).get(word, leaf)
     if more and not getattr(arguments, 'takes_more', lambda *_: False)(arguments, more):
+        _refuse_removed(parser, leaf, more)
         hints = [f'{word}{nearest(word, leaf._option_string_actions)}' for word in more]
         parser.error(f'unrecognized arguments: {" ".join(hints)}')
     _check_texts(leaf, arguments)
@@ -337,6 +339,17 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
 
         check_needs(words, arguments)
     return arguments
+
+
+def _refuse_removed(
+    parser: argparse.ArgumentParser, leaf: argparse.ArgumentParser, more: Sequence[str]
+) -> None:
+    """End with what to use now if one of the words is an option of an earlier version."""
+    command = leaf.prog.removeprefix('mtv-world ')
+    for word in more:
+        option = word.partition('=')[0]
+        if now := REMOVED_OPTIONS.get(f'{command} {option}'):
+            parser.error(f"'{option}' is no longer an option of '{command}': {now}")
 
 
 def _outputs(arguments: argparse.Namespace) -> list[tuple[Path, str]]:

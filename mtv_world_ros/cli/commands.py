@@ -167,5 +167,24 @@ ADVANCED_OPTIONS = frozenset(
     }
 )
 
+#: options that left, with their command -> what to use now
+REMOVED_OPTIONS = {
+    'demo --robot': 'the demo takes the robot of its checkpoint',
+    'demo --seed': 'the demo has the seed 0; mtv-world replay --offline --seed sets another',
+    'demo --no-foresight': 'it had no effect here; mtv-world replay --offline --no-foresight has',
+    'demo --no-camera-check': 'it had no effect here; mtv-world replay --offline '
+    '--no-camera-check has',
+    'fit success --l2': 'the prior has the strength 1',
+    'imagine --start': 'mtv-world replay --offline imagines every recorded plan from the frames '
+    'at its time; to begin a policy later, cut the recording there (ros2 bag convert)',
+    'imagine --max-seconds': 'an episode ends after an hour; --max-chunks ends it earlier',
+    'import wan --guidance-scale': 'set sampling.guidance_scale in a copy of the preset, and give '
+    'the copy as --preset',
+    'import wan --negative-prompt': 'set sampling.negative_prompt in a copy of the preset, and '
+    'give the copy as --preset',
+    'train --held-out-episodes': 'four episodes are scored during training; mtv-world evaluate '
+    '--episodes scores another number of them afterwards',
+}
+
 #: commands that left -> the last version that has them
 REMOVED = {'distill': '0.1.0', 'train-motion': '0.1.0'}

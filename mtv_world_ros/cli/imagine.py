@@ -140,16 +140,10 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
         '--count', type=int, default=0, help='number of episodes; default: each once'
     )
     parser.add_argument(
-        '--start', type=float, default=0.0, help='time in the recording to start at [s]'
-    )
-    parser.add_argument(
         '--max-chunks',
         type=int,
         default=0,
         help='largest number of chunks an episode; 0 = no limit',
-    )
-    parser.add_argument(
-        '--max-seconds', type=float, default=3600.0, help='wall-clock limit of an episode [s]'
     )
     parser.add_argument(
         '--candidates',
@@ -235,7 +229,7 @@ def _in_world_model(
     from mtv_world_ros.core.errors import MtvWorldError
     from mtv_world_ros.rollout.assembly import asked_describer
     from mtv_world_ros.rollout.imagined_episodes import (
-        check_start,
+        check_recording,
         EpisodeOptions,
         imagine_episodes,
         imagine_recorded,
@@ -245,7 +239,7 @@ def _in_world_model(
 
     # a wrong name is an error here, before anything is loaded or removed
     robot = arguments.checkpoint.load_robot(arguments.robot)
-    check_start(arguments.policy, robot, arguments.start, is_recorded=not arguments.live)
+    check_recording(arguments.policy, robot, is_recorded=not arguments.live)
     for bag in sorted(arguments.out.glob('episode_*')):
         check_free(bag, arguments.overwrite)
     arguments.task = named_here(arguments.task, episodes)
@@ -253,13 +247,12 @@ def _in_world_model(
         policy=arguments.policy,
         count=arguments.count or len(episodes) or 1,
         max_chunks=arguments.max_chunks,
-        max_seconds=arguments.max_seconds,
         instruction=arguments.instruction,
         seed=arguments.seed,
         num_inference_steps=arguments.steps,
         num_candidates=arguments.candidates,
     )
-    source = RecordedSource(paths=episodes, start_s=arguments.start, place=arguments.place)
+    source = RecordedSource(paths=episodes, place=arguments.place)
     if not workers.are_here:
         make = partial(_described_pipeline, arguments.checkpoint, workers.num_threads,
                        arguments.describer, pipeline_choices(arguments))  # fmt: skip

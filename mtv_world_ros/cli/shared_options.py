@@ -57,14 +57,20 @@ def _count(text: str) -> int:
 #: options by the word that `add_options` knows them by; a help text that names what is bundled is
 #: a function, as its folder is read when a parser is made
 _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
-    'model': {
+    'robot': {
         '--robot': {'help': lambda: f'{bundled_help.robots()}; default: that of the checkpoint'},
+    },
+    'device': {
         '--device': {'default': 'cpu', 'help': 'PyTorch device, e.g. cpu (default) or cuda'},
+    },
+    'threads': {
         '--threads': {
             'type': number_or_0,
             'default': 0,
             'help': 'CPU threads; 0 = all cores but one (of two cores: both)',
         },
+    },
+    'foresight': {
         '--no-foresight': {
             'dest': 'foresight',
             'action': 'store_false',
@@ -77,11 +83,15 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
             'help': "skip the comparison of the first frames with the arm's outline, and the "
             'correction of the cameras',
         },
+    },
+    'steps': {
         '--steps': {
             'type': number_or_0,
             'default': 0,
             'help': 'denoising steps; 0 = as many as the checkpoint says',
         },
+    },
+    'seed': {
         '--seed': {'type': int, 'default': 0, 'help': 'seed of the noise (default: 0)'},
     },
     'serving': {
@@ -178,10 +188,13 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     'dtype': {'--dtype': {'default': 'auto', 'help': 'number format: auto, float32 or bfloat16'}},
 }
 
+#: the options of a command that runs a model
+_MODEL = 'robot device threads foresight steps seed'
+
 
 def add_options(parser: argparse.ArgumentParser, words: str) -> None:
     """Add options that several commands share, e.g. those of `overwrite model task`."""
-    for word in words.split():
+    for word in words.replace('model', _MODEL).split():
         for flag, how in _OPTIONS[word].items():
             text = how['help']
             parser.add_argument(flag, **{**how, 'help': text() if callable(text) else text})

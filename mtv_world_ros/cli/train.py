@@ -137,13 +137,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="data set of held-out episodes (its split 'val', else 'test'), for --sample-every "
         'and the evaluation afterwards; default: DATASET',
     )
-    parser.add_argument(
-        '--held-out-episodes',
-        type=int,
-        default=4,
-        metavar='N',
-        help='number of held-out episodes',
-    )
     parser.set_defaults(handler=_train)
 
 
@@ -230,6 +223,8 @@ def _print_result(
     print('\n'.join(_evaluation_advice(arguments, model, paths, out)))
 
 
+#: number of held-out episodes that are scored during training
+NUM_HELD_OUT = 4
 #: stands for a folder that the user has to name
 UNSEEN = 'EPISODES'
 
@@ -394,7 +389,7 @@ def _held_out(
         return None
     from mtv_world_ros.training.training_run import HeldOut, spread
 
-    paths = spread(_paths(arguments), arguments.held_out_episodes)
+    paths = spread(_paths(arguments), NUM_HELD_OUT)
     both = {path.resolve() for path in paths} & {path.resolve() for path in trained_on}
     if both:
         raise ConfigError(

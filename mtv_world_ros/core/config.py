@@ -103,10 +103,14 @@ class Schema(BaseModel):
     Attributes:
         section: way in which errors name a value: None = by its quoted key; a text = by its dotted
             path, which begins with this text if the model is made by itself.
+        basic: keys that most users set; pages and help texts show them first.
+        removed: keys of earlier versions, with what holds now, for the error that names them.
     """
 
     model_config = ConfigDict(frozen=True, extra='forbid', strict=True, allow_inf_nan=False)
     section: ClassVar[str | None] = None
+    basic: ClassVar[tuple[str, ...]] = ()
+    removed: ClassVar[Mapping[str, str]] = {}
 
     if not TYPE_CHECKING:
 
@@ -128,6 +132,8 @@ class Schema(BaseModel):
             raise ValueError(f'expected keys and values, got {values!r}')
         known = [field.alias or name for name, field in cls.model_fields.items()]
         for key in values:
+            if key in cls.removed:
+                raise ValueError(f"key '{key}' is gone: {cls.removed[key]}; delete the key")
             if key not in known:
                 raise ValueError(
                     f"unknown key '{key}'{nearest(str(key), known)}; known are {', '.join(known)}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -83,6 +83,8 @@ class Written(Schema):
 
 class BagMapping(Written):
     """A mapping file of bags; topics without a leading slash are in the namespace."""
+
+    basic: ClassVar = ('robot', 'views', 'joint_states', 'action')
 
     robot: str = Field(
         default='',

@@ -431,7 +431,7 @@ def fit_logistic(
     if left > 1e-4 * max(1.0, l2, float(np.abs(features).sum(0).max(initial=0))):
         raise MtvWorldError(
             f'the logistic fit to {len(features)} episodes did not reach its minimum (gradient '
-            f'{left:.2g}); set another --l2, now {l2:g}'
+            f'{left:.2g}, l2 {l2:g}); leave out episodes with extreme margins'
         )
     return Logistic(weights=theta[:-1], bias=float(theta[-1]))
 

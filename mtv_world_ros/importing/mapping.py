@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import hashlib
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import (
     AfterValidator,
@@ -174,6 +174,8 @@ def _named(views: dict[str, CameraSource]) -> dict[str, CameraSource]:
 
 class DatasetMapping(Written):
     """A mapping file."""
+
+    basic: ClassVar = ('robot', 'views', 'state', 'action')
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
 

@@ -44,6 +44,8 @@ def _address(server: str) -> str:
 class OpenPiConfig(ServerMapping, PolicySettings):
     """A policy behind the websocket server of [openpi](https://github.com/Physical-Intelligence/openpi)."""
 
+    basic: ClassVar = ('kind', 'server', 'state', 'actions')
+
     server_address: ClassVar[str] = 'ws://127.0.0.1:{port}'
 
     kind: Literal['openpi'] = 'openpi'

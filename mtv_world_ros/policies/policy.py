@@ -83,7 +83,6 @@ class PolicySettings(Schema):
         is_made_for_episode: the policy depends on the origin of its episode, so that one is made
             for each; else one serves all episodes.
         needs_recording: an episode must begin from a recorded one.
-        needs_first_frame: an episode must begin from the first frame of the recorded one.
         server_address: address of a server that a ranking starts, with `{port}`; such settings
             have a field `server`. Empty = there is no server.
         serves_one_client: the server serves one client at a time.
@@ -91,7 +90,6 @@ class PolicySettings(Schema):
 
     is_made_for_episode: ClassVar[bool] = False
     needs_recording: ClassVar[bool] = False
-    needs_first_frame: ClassVar[bool] = False
     server_address: ClassVar[str] = ''
     serves_one_client: ClassVar[bool] = False
 

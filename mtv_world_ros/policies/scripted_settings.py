@@ -16,7 +16,6 @@ class ScriptedPolicySettings(PolicySettings):
     """A scripted policy of the simulator, with its name under `variant`."""
 
     is_made_for_episode: ClassVar[bool] = True
-    needs_first_frame: ClassVar[bool] = True
 
     kind: Literal['scripted'] = 'scripted'
     variant: str = Field(

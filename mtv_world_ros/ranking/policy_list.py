@@ -8,7 +8,7 @@ import hashlib
 import json
 from os.path import isfile
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, model_validator
 
@@ -64,6 +64,8 @@ class PolicyEntry(Schema):
 
 class PolicyList(Schema):
     """A file of policies."""
+
+    basic: ClassVar = ('policies',)
 
     policies: ListOf[PolicyEntry] = Field(min_length=1, description='policies that are ranked')
 

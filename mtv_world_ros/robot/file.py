@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import os
 from pathlib import Path
 import re
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 from xml.etree import ElementTree
 
 import numpy as np
@@ -224,6 +224,8 @@ class MimicEntry(Schema):
 class ToolEntry(PoseEntry):
     """The tool of an arm; its pose is that of the tool in its link."""
 
+    basic: ClassVar = ('arm', 'link', 'gripper_joint', 'gripper_closed', 'gripper_open')
+
     arm: str = Field(description='name of the arm')
     link: str = Field(description='link that carries the tool')
     gripper_joint: str | None = Field(
@@ -242,6 +244,8 @@ class ToolEntry(PoseEntry):
 
 class RobotFile(Schema):
     """A robot file: `urdf` or `dh`, and the tools."""
+
+    basic: ClassVar = ('name', 'urdf', 'tools')
 
     name: str = Field(description='name of the robot; episodes and checkpoints name it')
     urdf: str | None = Field(default=None, description='file, relative to the YAML')

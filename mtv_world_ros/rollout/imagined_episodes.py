@@ -49,6 +49,8 @@ from mtv_world_ros.success.task import TaskSpec
 
 #: free space that the bags and reports need before anything is computed [bytes]
 ROOM_BYTES = 8 * 2**20
+#: longest time of an episode on the wall, a hanging policy included [s]
+LONGEST_EPISODE_S = 3600.0
 #: distance between the seeds of two episodes
 SEED_STEP = 1000
 #: limits of the answers of a policy, as those of the node by default
@@ -65,7 +67,6 @@ class EpisodeOptions:
             `expert-miss-0.5`.
         count: number of episodes.
         max_chunks: number of answers after which an episode ends; 0 = the policy ends it.
-        max_seconds: longest time of an episode on the wall [s].
         instruction: text for the robot; empty = the start's.
         seed: episode k uses seed + 1000 k.
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
@@ -76,7 +77,6 @@ class EpisodeOptions:
     policy: str
     count: int = 1
     max_chunks: int = 0
-    max_seconds: float = 3600.0
     instruction: str = ''
     seed: int = 0
     num_inference_steps: int = 0
@@ -114,22 +114,21 @@ class EpisodeStart:
         return replace(self, observation=replace(self.observation, place=place))
 
 
-def recorded_start(path: Path, pipeline: Pipeline, start_s: float = 0.0) -> EpisodeStart:
-    """Return a moment of a recorded episode.
+def recorded_start(path: Path, pipeline: Pipeline) -> EpisodeStart:
+    """Return the first moment of a recorded episode.
 
     Args:
         path: folder of the rosbag2 episode.
         pipeline: names the views and the joints.
-        start_s: time since the first frame of the first view [s].
 
     Raises:
-        EpisodeError: the episode cannot be read, or ends before.
+        EpisodeError: the episode cannot be read.
         CalibrationError: a view is not calibrated.
         ConfigError: the task that the episode defines cannot be used.
     """
     views, robot = pipeline.spec.views, pipeline.robot
     episode = read_episode(path, views=views, with_masks=False, robot=robot)
-    observation = observation_after(episode, views, robot, start_s)
+    observation = observation_after(episode, views, robot, 0.0)
     info = episode.info
     return EpisodeStart(
         source=str(path),
@@ -152,18 +151,16 @@ class RecordedSource:
 
     Attributes:
         paths: folders of the recorded episodes.
-        start_s: time since the first frame of the first view [s].
         place: name of the robot cell; None = what the recording states.
     """
 
     paths: Sequence[Path]
-    start_s: float = 0.0
     place: str | None = None
 
     def start(self, number: int, pipeline: Pipeline) -> EpisodeStart:
         """Return the start of the imagined episode of a number; see `recorded_start`."""
         path = self.paths[number % len(self.paths)]
-        start = recorded_start(path, pipeline, self.start_s)
+        start = recorded_start(path, pipeline)
         return start if self.place is None else start.at_place(self.place)
 
     def starts(self, pipeline: Pipeline) -> Iterator[EpisodeStart]:
@@ -171,29 +168,22 @@ class RecordedSource:
         return (self.start(number, pipeline) for number in count())
 
 
-def check_start(policy: str, robot: RobotModel, start_s: float, *, is_recorded: bool) -> None:
-    """Check that a policy can start where it is to.
+def check_recording(policy: str, robot: RobotModel, *, is_recorded: bool) -> None:
+    """Check that a policy which repeats a recording has one.
 
     Args:
         policy: name or file of the policy.
         robot: the robot that it moves.
-        start_s: time of the recorded frame to start from [s].
         is_recorded: whether the episodes start from recorded ones.
 
     Raises:
-        ConfigError: it repeats a recording and there is none, or plans for its first frame.
+        ConfigError: it repeats a recording, and there is none.
         PolicyError: there is no such policy.
     """
     settings = policy_settings(policy, robot)
     if settings.needs_recording and not is_recorded:
         raise ConfigError(
             f"policy '{policy}' repeats what was commanded in a recorded episode: give --episodes"
-        )
-    if settings.needs_first_frame and start_s > 0:
-        raise ConfigError(
-            f"policy '{policy}' plans for the scene as it is in the recording's first frame, "
-            f'--start is {start_s:g} s: leave --start out, or take --policy recorded or one that '
-            'looks at the pictures'
         )
 
 
@@ -428,11 +418,11 @@ class _EpisodeRun:
                 )
             self._how, self._text = _HOW[run.end], ''
         except _NoAnswerError:
-            limit = self._options.max_seconds
+            limit = LONGEST_EPISODE_S
             self._how = 'max_seconds'
             self._text = f'the policy had not answered when {limit:g} s were over'
         except RolloutPreempted:
-            limit = self._options.max_seconds
+            limit = LONGEST_EPISODE_S
             self._how, self._text = 'max_seconds', f'it took longer than {limit:g} s'
         except PolicyError as error:
             self._how, self._text = 'policy_failed', str(error)
@@ -449,7 +439,7 @@ class _EpisodeRun:
 
     def _left_s(self) -> float:
         """Time that is left of the episode's longest time on the wall [s]."""
-        return self._begun_s + self._options.max_seconds - time.monotonic()
+        return self._begun_s + LONGEST_EPISODE_S - time.monotonic()
 
     def _is_late(self) -> bool:
         return self._left_s() < 0

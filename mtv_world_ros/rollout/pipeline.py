@@ -9,8 +9,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol
 
-import numpy as np
-
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.control.control import Control, ControlInputs, ControlScene
 from mtv_world_ros.control.registry import create_control
@@ -559,13 +557,7 @@ class Pipeline:
             stamp_ns,
             self.spec.num_history,
             memory,
-            state.objects.watched(
-                motion,
-                masks.names,
-                np.concatenate([start_masks.masks, masks.masks], axis=2),
-                1 / self.spec.fps,
-                commands,
-            ),
+            state.objects.watched(positions, 1 / self.spec.fps, commands),
             background,
             masks,
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from textwrap import wrap
-from typing import Annotated, Any, get_args, get_origin, Literal
+from typing import Annotated, Any, ClassVar, get_args, get_origin, Literal
 
 from pydantic import AfterValidator, Field
 from pydantic.fields import FieldInfo
@@ -51,6 +51,15 @@ def at_start(default: Any, text: str, within: Span | None = None) -> Any:
 
 
 _SECONDS = (0.001, 86400.0)
+#: parameters of earlier versions -> what holds now
+REMOVED = {
+    'publish_compressed': 'predictions are always offered as JPEG too',
+    'jpeg_quality': 'the quality is 90',
+    'publish_trajectory_video': 'the trajectory video is always offered',
+    'publish_masks': 'masks are always offered',
+    'rollout_timeout_s': 'a rollout that takes longer than 300 s ends the episode',
+    'frames_timeout_s': 'frames are lost that arrive later than 10 s after their rollout',
+}
 #: services that change parameters
 _SET_SERVICES = ('set_parameters', 'set_parameters_atomically')
 
@@ -127,6 +136,22 @@ class LiveSettings(ObservationSettings):
 
 class Settings(LiveSettings, NodeSettings):
     """Parameters of the node `world_model`."""
+
+    basic: ClassVar = (
+        'checkpoint',
+        'robot_file',
+        'calibration_file',
+        'joint_state_topics',
+        'compressed_input',
+        'device',
+        'task',
+        'segmenter',
+        'instruction',
+        'objects',
+        'place',
+        'mode',
+        'foresight',
+    )
 
     device: str = at_start('cpu', 'Device of the model: cpu, cuda, cuda:1.')
     num_threads: int = at_start(
@@ -225,14 +250,6 @@ class Settings(LiveSettings, NodeSettings):
     pace: Literal['realtime', 'burst'] = parameter(
         'realtime', 'When images go out: one period before their stamps, or each chunk at once.'
     )
-    publish_compressed: bool = parameter(
-        True, 'Offer predictions as JPEG too (made when subscribed).'
-    )
-    jpeg_quality: int = parameter(90, 'Quality of those.', (1, 100))
-    publish_trajectory_video: bool = parameter(
-        True, 'Publish the control video (when subscribed).'
-    )
-    publish_masks: bool = parameter(True, 'Publish the object masks (when subscribed).')
 
     @property
     def plan_limits(self) -> PlanLimits:
@@ -248,7 +265,11 @@ class Settings(LiveSettings, NodeSettings):
 def help_text(name: str, kind: type[Schema]) -> str:
     """Return what a node prints on `--help`."""
     lines = [f'usage: {name} [--ros-args [-p PARAMETER:=VALUE] [--params-file FILE]]', '']
-    for parameter_name, field in kind.model_fields.items():
+    fields = kind.model_fields
+    for parameter_name in sorted(fields, key=lambda one: one not in kind.basic):
+        if parameter_name not in kind.basic and 'advanced:' not in lines and kind.basic:
+            lines += ['', 'advanced:', '']
+        field = fields[parameter_name]
         lines += [f'  {parameter_name}  {shown_default(field)}  {valid_values(field)}'.rstrip()]
         lines += [f'      {line}' for line in wrap(field.description or '', 90)]
     return '\n'.join(lines)
@@ -370,6 +391,12 @@ def refuse_unknown(node: Node) -> None:
     known = node.list_parameters([], 0).names
     # rclpy has no public way to ask for what was given
     unknown = [name for name in node._parameter_overrides if not node.has_parameter(name)]
+    gone = [f"'{name}': {REMOVED[name]}" for name in unknown if name in REMOVED]
+    if gone:
+        raise ConfigError(
+            f"'{node.get_name()}' no longer has the parameter {', '.join(gone)}; images are made "
+            'for subscribers alone. Delete it from the parameter file'
+        )
     if unknown:
         names = ', '.join(f"'{name}'{nearest(name, known)}" for name in unknown)
         raise ConfigError(f"'{node.get_name()}' has no parameter {names}; --help lists them")

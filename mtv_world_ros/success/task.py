@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 import re
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import BeforeValidator, model_validator, PlainValidator
@@ -85,6 +85,8 @@ class TaskSpec(Schema):
         scene: objects on the table and moves of the expert, for the simulator; None = the task can
             be judged, but not simulated. `simulation/scenes/tasks.py` reads it.
     """
+
+    basic: ClassVar = ('name', 'instruction', 'relations')
 
     name: str
     instruction: str

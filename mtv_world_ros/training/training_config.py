@@ -39,6 +39,7 @@ class VideoConfig(Schema):
     """Video that the model sees and predicts: views, size, rate, robot."""
 
     section: ClassVar = 'video'
+    basic: ClassVar = ('views', 'fps', 'num_frames', 'width', 'height', 'robot', 'control')
 
     views: ListOf[str] = Field(default=('low', 'high'), description='names of the views')
     fps: float = Field(default=5.0, gt=0, le=1000, description='frames a second')
@@ -89,13 +90,12 @@ class AugmentConfig(Schema):
     """Disturbances of the start frame and of colours, and which episodes are seen how often."""
 
     section: ClassVar = 'augment'
+    removed: ClassVar = {
+        'start_noise_std': 'it is 0.04 in every training; `start_noise` is its probability'
+    }
 
     start_noise: Share = Field(
         default=0.5, description='probability of a start frame that is blurred and noisy'
-    )
-    start_noise_std: Share = Field(
-        default=0.04,
-        description='largest standard deviation of that noise, as a share of full range',
     )
     colour_permutation: Share = Field(
         default=0.3, description='probability of exchanged colour channels'
@@ -169,6 +169,7 @@ class SamplingConfig(Schema):
     """Default sampling settings of the checkpoint."""
 
     section: ClassVar = 'sampling'
+    basic: ClassVar = ('num_inference_steps',)
 
     num_inference_steps: Count = Field(default=4, description='denoising steps')
     guidance_scale: float = Field(
@@ -190,6 +191,7 @@ class OptimizerConfig(Schema):
     """AdamW with warm-up, a constant stretch and a linear decay to zero."""
 
     section: ClassVar = 'optimizer'
+    basic: ClassVar = ('steps', 'batch_size', 'learning_rate')
 
     learning_rate: float = Field(default=6e-4, ge=0, le=100, description='after the warm-up')
     weight_decay: Weight = Field(default=0.01, description='weight decay of AdamW')

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.cli import imagine, main
+from mtv_world_ros.cli.commands import REMOVED_OPTIONS
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.rollout import offline
 from mtv_world_ros.rollout.offline import ReplaySummary
@@ -56,6 +57,21 @@ def test_a_command_that_left_says_where_it_is(capsys):
     said = capsys.readouterr().err
     assert end.value.code == 2
     assert "'distill' is no longer a command" in said and 'version 0.1.0 has it' in said
+
+
+def test_an_option_that_left_says_what_to_use_now(capsys):
+    required = {
+        'fit success': ['bundled', 'data', '--out', 'x'],
+        'import wan': ['x', '--out', 'y'],
+    }
+    for name, now in REMOVED_OPTIONS.items():
+        command, _, option = name.rpartition(' ')
+        for words in ([option, '1'], [f'{option}=1']):
+            with pytest.raises(SystemExit) as end:
+                main([*command.split(), *required.get(command, []), *words])
+            said = ' '.join(capsys.readouterr().err.split())
+            assert end.value.code == 2
+            assert f"'{option}' is no longer an option of '{command}': {now}" in said
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibr
 from mtv_world_ros.cli import main
 from mtv_world_ros.cli.imagine import episode_table
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.rollout import imagined_episodes
 from mtv_world_ros.success.estimator import NOT_FITTED_HERE
 from mtv_world_ros.viewing.streams import read_streams
 
@@ -126,8 +127,9 @@ def test_each_episode_has_cameras_of_its_own(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_episode_ends_after_its_longest_time_and_keeps_its_chunks(tmp_path):
-    assert run(tmp_path, 'recorded', '--steps', '1', '--max-seconds', '0.001', '--no-video') == 0
+def test_an_episode_ends_after_its_longest_time_and_keeps_its_chunks(tmp_path, monkeypatch):
+    monkeypatch.setattr(imagined_episodes, 'LONGEST_EPISODE_S', 0.001)
+    assert run(tmp_path, 'recorded', '--steps', '1', '--no-video') == 0
     (episode,) = json.loads((tmp_path / 'episodes.json').read_text())
     assert episode['how'] == 'max_seconds' and (tmp_path / 'episode_00000').is_dir()
 

@@ -12,7 +12,7 @@ from mtv_world_ros.ranking.policy_list import load_policy_list
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.resample import resample
 from mtv_world_ros.rollout.assembly import assemble_policy
-from mtv_world_ros.rollout.imagined_episodes import check_start
+from mtv_world_ros.rollout.imagined_episodes import check_recording
 
 ROBOT = load_robot(robot_path('yam_bimanual'))
 COMMANDS = JointTrajectory(
@@ -77,7 +77,7 @@ def test_without_a_recording_it_says_where_one_is_given():
     with pytest.raises(PolicyError, match="give --episodes .* the parameter 'recording'"):
         assemble_policy('recorded', ROBOT)(EpisodeOrigin())
     with pytest.raises(ConfigError, match="policy 'recorded' repeats .* give --episodes"):
-        check_start('recorded', ROBOT, 0.0, is_recorded=False)
+        check_recording('recorded', ROBOT, is_recorded=False)
 
 
 def test_a_ranking_refuses_it(tmp_path):
@@ -85,8 +85,3 @@ def test_a_ranking_refuses_it(tmp_path):
     file.write_text('policies: [{name: again, policy: {kind: recorded}}]')
     with pytest.raises(ConfigError, match="'again' is of kind 'recorded': .* scenes of its own"):
         load_policy_list(file, ROBOT)
-
-
-def test_a_scripted_policy_begins_where_its_plan_does():
-    with pytest.raises(ConfigError, match=r"'expert-miss-0.5' plans .* --start is 1.5 s: leave"):
-        check_start('expert-miss-0.5', ROBOT, 1.5, is_recorded=True)

@@ -165,6 +165,7 @@ def test_a_folder_without_episodes_says_how_to_get_some(tmp_path):
     [
         ({'optimizer.step': 5}, r"unknown key 'step' \(did you mean 'steps'\?\)"),
         ({'optimiser.steps': 5}, r"unknown key 'optimiser' \(did you mean 'optimizer'\?\)"),
+        ({'augment.start_noise_std': 0.1}, "'start_noise_std' is gone: it is 0.04 in every"),
         ({'steps': 5}, 'must look like section.key'),
         ({'rendering.half_life_s': -1.0}, 'half_life_s'),
         ({'sampling.num_inference_steps': 0}, 'num_inference_steps is 0; it must be at least 1'),

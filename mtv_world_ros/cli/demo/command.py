@@ -15,7 +15,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--episode', type=Path, help='episode folder; default: the bundled one')
     parser.add_argument('--out', type=Path, default=Path('out/demo'), help='default: out/demo')
-    add_options(parser, 'overwrite checkpoint model')
+    add_options(parser, 'overwrite checkpoint device threads steps')
     parser.set_defaults(handler=_demo)
 
 
@@ -30,11 +30,9 @@ def _demo(arguments: argparse.Namespace) -> int:
     options = DemoOptions(
         checkpoint=arguments.checkpoint,
         calibration=episode / 'calibration.yaml',
-        robot=arguments.robot,
         device=arguments.device,
         num_threads=arguments.threads,
         num_inference_steps=arguments.steps,
-        seed=arguments.seed,
     )
     print(run_demo(episode, arguments.out, options))
     return 0

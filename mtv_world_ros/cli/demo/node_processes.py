@@ -37,11 +37,9 @@ class DemoOptions:
 
     checkpoint: str
     calibration: Path
-    robot: str | None
     device: str
     num_threads: int
     num_inference_steps: int
-    seed: int
 
 
 def record_through_node(
@@ -93,12 +91,10 @@ def _node_command(episode: Path, options: DemoOptions) -> list[str]:
         'compressed_input': True,
         'pace': 'burst',
         'checkpoint': options.checkpoint,
-        'robot_file': options.robot or '',
         'calibration_file': options.calibration,
         'device': options.device,
         'num_threads': options.num_threads,
         'num_inference_steps': options.num_inference_steps,
-        'seed': options.seed,
         'place': read_info(episode).place,
         # the same numbers whatever weights are at hand
         'segmenter': 'colour',

@@ -48,7 +48,7 @@ def run_demo(episode: Path, out: Path, options: DemoOptions) -> str:
         EpisodeError: the episode cannot be used or a process failed.
     """
     checkpoint = Checkpoint.open(options.checkpoint)
-    spec, robot = checkpoint.spec, checkpoint.load_robot(options.robot)
+    spec, robot = checkpoint.spec, checkpoint.load_robot()
     recording = load_recording(episode, spec, robot)
     record_through_node(episode, spec.views, out, options)
     predictions = read_predictions(out / 'predictions', spec.views)

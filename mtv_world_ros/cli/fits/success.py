@@ -53,9 +53,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument('--episodes', type=int, help='use only the first N episodes')
     add_options(parser, 'workers seeds')
     parser.add_argument(
-        '--l2', type=float, default=1.0, help='strength of the prior on the weights'
-    )
-    parser.add_argument(
         '--no-store',
         dest='store',
         action='store_false',
@@ -103,7 +100,7 @@ def _fit_and_store(
         result_kinds(selection.paths),
         result_physics(selection.paths),
     )
-    found = calibrate(samples, segmenter=segmenter, l2=arguments.l2, made=made)
+    found = calibrate(samples, segmenter=segmenter, made=made)
     horizon = _horizon([run.results for run in runs], runs[0], made)
     text = write_calibration_report(arguments.out, found, horizon)
     if arguments.store:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 import shlex
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.bundled_help import presets
 from mtv_world_ros.core.errors import CheckpointError
@@ -35,12 +35,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--prompt', default=PROMPT, help="the instruction; default: the paper's for all tasks"
     )
-    parser.add_argument(
-        '--guidance-scale', type=float, help="text guidance, 1 = none; default: the preset's"
-    )
-    parser.add_argument(
-        '--negative-prompt', help="text that guidance leads away from; default: the preset's"
-    )
     for part in _ELSEWHERE:
         option = '--' + part.replace('_', '-')
         parser.add_argument(option, type=Path, help='file or folder; default: in PATH')
@@ -56,7 +50,6 @@ def _import_weights(arguments: argparse.Namespace) -> int:
             f"'{arguments.path}' does not exist; name a checkpoint's folder or file"
         )
     config = load_training_config(arguments.preset)
-    sampling = config.sampling
     from mtv_world_ros.model.wan_weights import import_weights
 
     robot = load_robot(robot_path(config.video.robot))
@@ -64,8 +57,8 @@ def _import_weights(arguments: argparse.Namespace) -> int:
 
     text = {
         'prompt': arguments.prompt,
-        'negative_prompt': _given(arguments.negative_prompt, sampling.negative_prompt),
-        'guidance_scale': _given(arguments.guidance_scale, sampling.guidance_scale),
+        'negative_prompt': config.sampling.negative_prompt,
+        'guidance_scale': config.sampling.guidance_scale,
     }
     reports = import_weights(
         arguments.path,
@@ -85,10 +78,6 @@ def _import_weights(arguments: argparse.Namespace) -> int:
         f'--init {out} --out DIR'
     )
     return 0
-
-
-def _given(value: Any, default: Any) -> Any:
-    return default if value is None else value
 
 
 def _line(report: PartReport) -> str:

@@ -22,6 +22,10 @@ from mtv_world_ros.ros.parameters import at_start, Mode, NodeSettings, parameter
 from mtv_world_ros.ros.policy.policy_thread import Actor, PolicyAnswer
 
 _SECONDS = (0.001, 86400.0)
+#: a rollout that ends later ends the episode [s]
+ROLLOUT_TIMEOUT_S = 300.0
+#: frames that arrive later after the end of their rollout are lost [s]
+FRAMES_TIMEOUT_S = 10.0
 
 
 class PolicySettings(NodeSettings):
@@ -56,12 +60,6 @@ class PolicySettings(NodeSettings):
         (0.0, 3600.0),
     )
     answer_timeout_s: float = parameter(60.0, 'A later answer ends the episode [s].', _SECONDS)
-    rollout_timeout_s: float = parameter(
-        300.0, 'A later end of a rollout ends the episode [s].', _SECONDS
-    )
-    frames_timeout_s: float = parameter(
-        10.0, 'Frames that arrive later after their rollout are lost [s].', _SECONDS
-    )
     observation_timeout_s: float = parameter(
         30.0, 'An episode ends without an observation for this time [s].', _SECONDS
     )
@@ -267,7 +265,7 @@ class PolicyLoop:
             if state == 'chunk':
                 self._chunk.report = values
             elif state == 'done':
-                self._wait('collecting', self._settings.frames_timeout_s)
+                self._wait('collecting', FRAMES_TIMEOUT_S)
                 self.tick()
             elif state in ENDS:
                 reason = values.get('reason', '')
@@ -322,7 +320,7 @@ class PolicyLoop:
         self._chunk.sent_s = time.monotonic()
         self._frames.clear()
         self._sent.add(str(stamp_ns))
-        self._wait('imagining', self._settings.rollout_timeout_s)
+        self._wait('imagining', ROLLOUT_TIMEOUT_S)
         self._out.send(first_part(answer.trajectory, start, seconds), stamp_ns)
 
     def _start_of(self, trajectory: JointTrajectory, observation: Observation) -> FloatArray:

@@ -28,6 +28,9 @@ from mtv_world_ros.ros.status_publisher import create_publisher
 from mtv_world_ros.ros.world_model.chunk_outcomes import Sent
 from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Result
 
+#: quality of predictions as JPEG, of 100
+JPEG_QUALITY = 90
+
 
 class ImageStream:
     """Publishes an image, its JPEG and its CameraInfo; what nobody subscribes to is not made.
@@ -160,19 +163,15 @@ class PredictionPublisher:
             frames.drop_others(None)
 
     def _offer(self, view: str, depth: int) -> dict[str, ImageStream]:
-        """Return the streams of a view that the parameters ask for, by name."""
-        settings = self._settings()
-        names = ['predicted']
-        names += ['trajectory'] if settings.publish_trajectory_video else []
-        names += ['mask'] if settings.publish_masks else []
+        """Return the streams of a view by name; pictures are made for subscribers alone."""
         return {
             name: ImageStream(
                 self._node,
                 f'~/{view}/{name}',
                 depth,
-                has_jpeg=name == 'predicted' and settings.publish_compressed,
+                has_jpeg=name == 'predicted',
             )
-            for name in names
+            for name in ('predicted', 'trajectory', 'mask')
         }
 
     def _wait_s(self, chunk: Chunk, index: int, last: Last) -> float:
@@ -204,14 +203,13 @@ class PredictionPublisher:
     def _publish(self, chunk: Chunk, streams: Sequence[str], index: int) -> int:
         """Publish a frame of streams that somebody subscribes to; return its stamp [ns]."""
         stamp_ns = stamp_of(chunk, index, self._settings().stamp_mode)
-        quality = self._settings().jpeg_quality
         for view, offered in enumerate(self._streams):
             info = chunk.scene.camera_infos[view]
             for name in streams:
                 if name in offered and offered[name].is_wanted:
                     pixels = _pixels(chunk, name, view, index)
                     header = make_header(stamp_ns, info.header.frame_id)
-                    offered[name].publish(pixels, header, info, quality)
+                    offered[name].publish(pixels, header, info, JPEG_QUALITY)
         return stamp_ns
 
     def _publish_estimate(self, chunk: Chunk) -> None:

@@ -96,6 +96,10 @@ class ExpertConfig:
         retreat: rise after opening [m].
         close_s: time to close the gripper [s].
         open_s: time to open the gripper [s].
+        shake_lift: height at which an object is shaken, over where it stood, range [m].
+        shake_lean: angles that it leans by in turn, positive towards the table's middle [rad]; the
+            wrist has less room the other way.
+        num_swings: number of swings of a shake from one side to the other.
         swing_s: time of one swing of a shake [s].
         speed: mean speed of the tool between way points [m/s], before scaling.
         least_s: shortest move between way points, before scaling [s].
@@ -115,6 +119,9 @@ class ExpertConfig:
     retreat: float = 0.07
     close_s: float = 0.4
     open_s: float = 0.3
+    shake_lift: tuple[float, float] = (0.074, 0.082)
+    shake_lean: tuple[float, float] = (0.45, -0.1)
+    num_swings: int = 4
     swing_s: float = 0.45
     speed: float = 0.22
     least_s: float = 0.4
@@ -317,7 +324,7 @@ class Expert:
         rng: np.random.Generator,
     ) -> list[WayPoint]:
         config, place, yaw, wide = self._config, pick.position, pick.yaw, pick.opening
-        heights = config.lift if isinstance(move, PickPlace) else move.lift
+        heights = config.lift if isinstance(move, PickPlace) else config.shake_lift
         above, lift = (rng.uniform(*r) * UP for r in (config.above_grasp, heights))
         start = [
             WayPoint('above', place + above, yaw, wide),
@@ -325,7 +332,7 @@ class Expert:
             WayPoint('close', place, yaw, 0.0, config.close_s),
         ]
         if isinstance(move, Shake):
-            middle = self._swings(move, pick, place + lift, -side_of(now[move.subject]))
+            middle = self._swings(pick, place + lift, -side_of(now[move.subject]))
             down, turned = place + 0.002 * UP, yaw
         else:
             down, turned = self._place(pick, move, now, goal)
@@ -346,18 +353,16 @@ class Expert:
             WayPoint('home', home, 0.0, 1.0),
         ]
 
-    def _swings(
-        self, move: Shake, pick: Pick, lifted: FloatArray, inwards: float
-    ) -> list[WayPoint]:
+    def _swings(self, pick: Pick, lifted: FloatArray, inwards: float) -> list[WayPoint]:
         upright = WayPoint('lift', lifted, pick.yaw, 0.0)
         swings = [
             replace(
                 upright,
                 phase='carry',
-                lean=inwards * move.lean[k % 2],
+                lean=inwards * self._config.shake_lean[k % 2],
                 seconds=self._config.swing_s,
             )
-            for k in range(move.num_swings)
+            for k in range(self._config.num_swings)
         ]
         return [upright, *swings, replace(upright, phase='carry')]
 

@@ -12,13 +12,12 @@ from dataclasses import dataclass, field
 import json
 from pathlib import Path
 import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, PlainValidator, Strict
 
 from mtv_world_ros.core.config import (
-    Count,
     expected,
     ListOf,
     Number,
@@ -132,16 +131,13 @@ class Shake(Schema):
 
     Attributes:
         subject: role that is shaken.
-        lean: angles that it leans by in turn, positive towards the table's middle [rad]; the wrist
-            has less room the other way.
-        lift: height it is shaken at, over where it stood [m].
-        num_swings: number of swings from one side to the other.
     """
 
+    removed: ClassVar = dict.fromkeys(
+        ('lean', 'lift', 'num_swings'), 'the expert shakes all objects in the same way'
+    )
+
     subject: str
-    lean: Two = (0.45, -0.1)
-    lift: Range = (0.074, 0.082)
-    num_swings: Count = 4
 
 
 Move = PickPlace | Shake
@@ -152,7 +148,8 @@ def _move(data: Any) -> Move:
     if isinstance(data, PickPlace | Shake):
         return data
     if isinstance(data, Mapping) and 'reference' not in data:
-        strange = next((key for key in data if key not in Shake.model_fields), None)
+        known = {*Shake.model_fields, *Shake.removed}
+        strange = next((key for key in data if key not in known), None)
         if strange is not None:
             known = dict.fromkeys([*PickPlace.model_fields, *Shake.model_fields])
             raise ValueError(

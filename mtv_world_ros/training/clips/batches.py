@@ -37,6 +37,9 @@ from mtv_world_ros.training.clips.clip_controls import (
 from mtv_world_ros.training.training_config import TrainingConfig
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
+#: largest standard deviation of the noise of a disturbed start frame, as a share of full range
+START_NOISE_STD = 0.04
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClipBatch:
@@ -205,7 +208,7 @@ class BatchSource:
             lead_in = lead_in and replace(lead_in, colours=tuple(colours.tolist()))
         start = frames[:, 0]
         if rng.random() < self._augment.start_noise:
-            start = _disturb(start, self._augment.start_noise_std, rng)
+            start = _disturb(start, rng)
         whole = np.ascontiguousarray(frames)
         lead_in = lead_in and replace(lead_in, names=names, foresees=foresees)
         return _Sample(whole, start.copy(), inputs, clip.object_ids, past, lead_in)
@@ -262,12 +265,12 @@ def _stacked(ids: Sequence[ByteArray | None]) -> Tensor | None:
     )
 
 
-def _disturb(frames: ByteArray, noise_std: float, rng: np.random.Generator) -> ByteArray:
+def _disturb(frames: ByteArray, rng: np.random.Generator) -> ByteArray:
     """Blur and noise of random strength, like a frame the model predicted itself."""
     blurred = np.stack([cv2.blur(frame, (3, 3)) for frame in frames]).astype(np.float32)
     share = rng.random() * 0.7
     mixed = (1 - share) * frames + share * blurred
-    mixed = mixed + rng.normal(0, 255 * noise_std * rng.random(), mixed.shape)
+    mixed = mixed + rng.normal(0, 255 * START_NOISE_STD * rng.random(), mixed.shape)
     return mixed.round().clip(0, 255).astype(np.uint8)
 
 

@@ -221,6 +221,11 @@ def test_a_parameter_that_is_unknown_is_refused(observe):
         observe('-p', 'max_image_ages_s:=2.0', timeout_s=0.1)
 
 
+def test_a_parameter_that_left_says_what_holds_now(observe):
+    with pytest.raises(ConfigError, match=r"'publish_masks': masks are always offered.*Delete it"):
+        observe('-p', 'publish_masks:=false', timeout_s=0.1)
+
+
 def test_arguments_that_ros_refuses_are_named(observe):
     with pytest.raises(ConfigError, match='cannot be used'):
         observe('-r', 'low')

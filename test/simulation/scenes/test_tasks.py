@@ -197,7 +197,10 @@ A_BOWL = {'role': 'a', 'shapes': ['bowl', 'tray']}
         ({'moves': []}, "scene.moves has none of 'a', which the relations want to be moved"),
         ({'moves': [3]}, 'moves[0]: expected keys and values, got 3'),
         ({'moves': [{'subject': 'a', 'refrence': 'b'}]}, "'refrence' (did you mean 'reference'?)"),
-        ({'moves': [{'subject': 'a', 'num_swings': 0}]}, "'num_swings' is 0, must be at least 1"),
+        (
+            {'moves': [{'subject': 'a', 'num_swings': 2}]},
+            "'num_swings' is gone: the expert shakes all",
+        ),
         ({'moves': [{'subject': 'c', 'reference': 'b'}]}, "moves[0].subject is 'c'; it must be"),
         ({'moves': [{'subject': 'a', 'reference': 'tabel'}]}, "'tabel' (did you mean 'table'?)"),
         ({'moves': [{'subject': 'a', 'reference': 'b', 'rest': 'up'}]}, 'valid are table, on, in'),
