@@ -66,28 +66,28 @@ $(INTERFACES): test/support/interfaces.py $(DEV)
 
 fuzz: $(DEV)  ## damage everything that is read from outside (minutes); prints seed and table
 	@mkdir -p out
-	$(BIN)/python -m test.robustness.fuzz --json out/fuzz.json
+	$(BIN)/python -m robustness.fuzz --json out/fuzz.json
 
 kills: $(DEV)  ## kill nodes, recorder and player at random moments (an hour); prints a table
-	$(BIN)/python -m test.robustness.kills
+	$(BIN)/python -m robustness.kills
 
 soak: $(DEV)  ## 10,000 rollouts with faults (an hour); memory, threads, latency under out/soak/
-	$(BIN)/python -m test.robustness.soak
+	$(BIN)/python -m robustness.soak
 
 attacks: $(DEV)  ## plans at 10 Hz, clients in default settings, lifecycle cycles, odd worlds, wild policy servers, stopped children, interrupted commands, open ports, hostile peers and paths, damaged pictures (three hours)
 	@mkdir -p out
-	$(BIN)/python -m test.robustness.rate
-	$(BIN)/python -m test.robustness.node_inputs
-	$(BIN)/python -m test.robustness.default_client
-	$(BIN)/python -m test.robustness.default_client --cameras 3 --transports UDPv4
-	$(BIN)/python -m test.robustness.cycles --bundled
-	$(BIN)/python -m test.robustness.pictures
-	$(BIN)/python -m test.robustness.odd_worlds
-	$(BIN)/python -m test.robustness.policy_servers --json out/servers.json
-	$(BIN)/python -m test.robustness.children
-	$(BIN)/python -m test.robustness.interrupts
-	$(BIN)/python -m test.robustness.listeners
-	$(BIN)/python -m test.robustness.hostile_peer
+	$(BIN)/python -m robustness.rate
+	$(BIN)/python -m robustness.node_inputs
+	$(BIN)/python -m robustness.default_client
+	$(BIN)/python -m robustness.default_client --cameras 3 --transports UDPv4
+	$(BIN)/python -m robustness.cycles --bundled
+	$(BIN)/python -m robustness.pictures
+	$(BIN)/python -m robustness.odd_worlds
+	$(BIN)/python -m robustness.policy_servers --json out/servers.json
+	$(BIN)/python -m robustness.children
+	$(BIN)/python -m robustness.interrupts
+	$(BIN)/python -m robustness.listeners
+	$(BIN)/python -m robustness.hostile_peer
 	MTV_WORLD_ATTACKS=all $(BIN)/python -m pytest -q test/robustness/test_commands.py test/robustness/test_examples.py
 
 # LeRobot needs older versions of some packages: an environment that has them first, then those of .venv
@@ -124,7 +124,7 @@ docs: $(DEV)  ## build the documentation; open out/docs/index.html
 
 clean:  ## remove what the demo, the tests and colcon left behind; data/ and runs/ stay
 	rm -rf out build install log *.egg-info .pytest_cache .ruff_cache .import_linter_cache
-	find mtv_world_ros test experiments launch -name __pycache__ -type d -prune -exec rm -rf {} +
+	find mtv_world_ros test robustness experiments launch -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean  ## remove .venv, too
 	rm -rf .venv

@@ -16,7 +16,7 @@ from mtv_world_ros.core.processes import stop_process, STOPPED_S, StoppedProcess
 from mtv_world_ros.core.worker_pool import run_job, WorkerPool
 from mtv_world_ros.core.workers import Workers
 from mtv_world_ros.training.clips.batches import ClipWorkers
-from test.robustness.worker_jobs import LongJobs, make_held_back, make_stopping
+from test.support.worker_jobs import LongJobs, make_held_back, make_stopping
 
 
 @pytest.fixture

@@ -65,6 +65,7 @@ FOLDERS = (
     'launch',
     'requirements',
     'resource',
+    'robustness',
     'test',
 )
 #: options of other programs that the texts mention

@@ -1,6 +1,6 @@
 """URDFs and COLLADA files that would end or stop a recursive parser are refused before it.
 
-Deep, long, circular and laughing ones are among the accidents of `test/robustness`.
+Deep, long, circular and laughing ones are among the accidents of `robustness`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mtv_world_ros.importing.robot_guess import guess_robot
 from mtv_world_ros.robot.file import parse_urdf
 from mtv_world_ros.robot.mesh_pieces import load_mesh, MissingMeshError
 from mtv_world_ros.robot.xml_file import check_xml, parse_xml, root_link
-from test.robustness.accidents import chain, entity_bomb, joint, star, urdf_of
+from robustness.accidents import chain, entity_bomb, joint, star, urdf_of
 
 MOST_S, MOST_MB = 1.0, 100
 

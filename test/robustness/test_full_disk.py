@@ -17,7 +17,7 @@ from mtv_world_ros.inspection import inspect
 from mtv_world_ros.inspection.camera_pose import CameraEstimate
 from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
 from mtv_world_ros.inspection.motion_residual import ResidualSearch
-from test.robustness.interrupts import ONE_STEP, settings
+from robustness.interrupts import ONE_STEP, settings
 from test.support.tiers import rest_slow
 from test.support.wan_files import AUTOENCODER, SCHEDULER, TRANSFORMER, write_videox
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.core.errors import MtvWorldError
-from test.robustness import bad_input_table, fuzz, node_messages, parameter_calls
-from test.robustness.accidents import ACCIDENTS
-from test.robustness.file_kinds import Kind, KINDS
+from robustness import bad_input_table, fuzz, node_messages, parameter_calls
+from robustness.accidents import ACCIDENTS
+from robustness.file_kinds import Kind, KINDS
 from test.support.tiers import rest_slow
 
 SEED = 20261122
@@ -66,7 +66,7 @@ def test_what_once_was_an_accident_is_refused_in_time(name, tmp_path) -> None:
     # the node limits an instruction's length; matching one takes as long as it is
     assert outcome == ('survived' if kind == 'instruction' else 'rejected')
     assert more_mb < MOST_MB
-    # the page says what is answered: `python -m test.robustness.bad_input_table` writes it
+    # the page says what is answered: `python -m robustness.bad_input_table` writes it
     shown = bad_input_table.answer(KINDS[kind], make(), tmp_path)
     assert bad_input_table.row(name, shown) in bad_input_table.written_rows()
 

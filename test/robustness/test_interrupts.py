@@ -9,7 +9,7 @@ import signal
 import pytest
 
 from mtv_world_ros.core.files import share_path
-from test.robustness.interrupts import Attack, halves, WAYS
+from robustness.interrupts import Attack, halves, WAYS
 
 
 @pytest.fixture(scope='module')

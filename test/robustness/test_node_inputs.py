@@ -1,4 +1,4 @@
-"""The short part of `python -m test.robustness.node_inputs`."""
+"""The short part of `python -m robustness.node_inputs`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed (pip install .[ros])
 def test_no_input_of_a_peer_ends_blinds_or_silences_the_node():
     """In a process of its own: Fast DDS reads settings once, and tests have the package's."""
     done = subprocess.run(
-        [sys.executable, '-m', 'test.robustness.node_inputs', '--cases', '60'],
+        [sys.executable, '-m', 'robustness.node_inputs', '--cases', '60'],
         cwd=Path(__file__).parents[2],
         capture_output=True,
         text=True,

@@ -12,7 +12,7 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import frame_indices, load_recording
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
-from test.robustness.pictures import damages, Row, run
+from robustness.pictures import damages, Row, run
 from test.support.tiers import rest_slow
 
 _FAST = ('black', 'delayed by 1 s', 'shifted by a tenth')

@@ -12,7 +12,7 @@ import pytest
 from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.core.files import copy_folder
 from mtv_world_ros.data.episode_reader import LinkWarning, list_episodes
-from test.robustness.folder_kinds import clean_up, FOLDERS, new_folder
+from robustness.folder_kinds import clean_up, FOLDERS, new_folder
 
 #: errors that the readers raise for a user; others are defects
 SLOW = ('latent cache', 'LoRA')

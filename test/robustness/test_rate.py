@@ -6,11 +6,11 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed (pip install .[ros])')
 
-from test.robustness.rate import answer_times, BUFFERS_FULL, BURST, Ended, growth, overlap_s, Rate
+from robustness.rate import answer_times, BUFFERS_FULL, BURST, Ended, growth, overlap_s, Rate
 
 
 def test_each_plan_of_bursts_gets_one_end(tmp_path, monkeypatch):
-    monkeypatch.setattr('test.robustness.rate.STOP_EVERY', 100)
+    monkeypatch.setattr('robustness.rate.STOP_EVERY', 100)
     rate = Rate(tmp_path, bundled=False)
     try:
         rate.run(2 * BURST + 80, 20.0)

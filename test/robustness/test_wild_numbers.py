@@ -20,7 +20,7 @@ from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.physics.checkpoint_files import load_contact
 from mtv_world_ros.robot.file import load_robot
-from test.robustness.folder_kinds import FOLDERS
+from robustness.folder_kinds import FOLDERS
 from test.support.wan_files import AUTOENCODER, SCHEDULER, TRANSFORMER, write_videox
 
 

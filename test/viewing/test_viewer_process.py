@@ -13,7 +13,7 @@ import pytest
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.viewing import viewer_process
 from mtv_world_ros.viewing.viewer_process import check_ports, PageAddress
-from test.robustness import listeners
+from robustness import listeners
 
 PACKAGE = Path(viewer_process.__file__).parents[1]
 

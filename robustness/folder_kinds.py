@@ -26,7 +26,7 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.robot.file import load_robot
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @cache

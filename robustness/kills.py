@@ -31,9 +31,9 @@ from rosbags.highlevel import AnyReader
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.importing.recover import find_damaged, recover
 from mtv_world_ros.ros.messages.conversions import read_stamp
-from test.robustness.children import make_episode
-from test.robustness.node_messages import commit, ROOT, ros
-from test.robustness.usage import starved_s
+from robustness.children import make_episode
+from robustness.node_messages import commit, ROOT, ros
+from robustness.usage import starved_s
 
 #: a busy machine takes long to start a node
 START_S = 180.0
@@ -129,7 +129,7 @@ class Kills:
         self._seed = seed
         os.environ['PYTHONPATH'] = str(ROOT)  # the fork server looks for its modules there
         self._context = multiprocessing.get_context('forkserver')
-        self._context.set_forkserver_preload(['test.robustness.kills_preload'])
+        self._context.set_forkserver_preload(['robustness.kills_preload'])
         self._sent: list[int] = []
         self._heard = 0
         #: longest that a thread of the process waited for a processor, while it was at work

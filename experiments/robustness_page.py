@@ -1,9 +1,9 @@
 """What became of damaged input, kills and rollouts with faults: a page of what the harness wrote.
 
     make fuzz kills soak attacks
-    python experiments/robustness.py out/fuzz.json out/kills/kills.json --soak out/soak --out DIR
-        --rate out/rate --cycles out/cycles --worlds out/odd_worlds --servers out/servers.json
-        --interrupts out/interrupts/interrupts.json
+    python experiments/robustness_page.py out/fuzz.json out/kills/kills.json --out DIR
+        --soak out/soak --rate out/rate --cycles out/cycles --worlds out/odd_worlds
+        --servers out/servers.json --interrupts out/interrupts/interrupts.json
 
 Rows of one kind in several files are added up. Beside the page stand the plots of soak and cycles.
 `--before` and the like take the same of an earlier commit, for a table beside.
@@ -251,7 +251,7 @@ def main() -> None:
     body += attacks_text(options)
     publish(
         'robustness', 'Damaged input, kills and rollouts with faults',
-        'python experiments/robustness.py', '\n\n'.join(body), options, 'rclpy over Fast DDS',
+        'python experiments/robustness_page.py', '\n\n'.join(body), options, 'rclpy over Fast DDS',
     )  # fmt: skip
 
 

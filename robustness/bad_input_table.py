@@ -1,6 +1,6 @@
 """Table of bad input in docs/mistakes.md: what was once an accident, and what is answered now.
 
-    python -m test.robustness.bad_input_table
+    python -m robustness.bad_input_table
 
 writes it anew from `ACCIDENTS`; `test_fuzz.py` compares each row with what is answered.
 """
@@ -13,11 +13,11 @@ import tempfile
 import textwrap
 
 from mtv_world_ros.core.errors import MtvWorldError
-from test.robustness import fuzz
-from test.robustness.accidents import ACCIDENTS
-from test.robustness.file_kinds import Kind, KINDS
+from robustness import fuzz
+from robustness.accidents import ACCIDENTS
+from robustness.file_kinds import Kind, KINDS
 
-PAGE = Path(__file__).parents[2] / 'docs/mistakes.md'
+PAGE = Path(__file__).parents[1] / 'docs/mistakes.md'
 BEGIN, END = '<!-- bad input: begin -->\n', '<!-- bad input: end -->\n'
 HEAD = '| input | read as | answer | at most [s] |\n|---|---|---|---|\n'
 #: characters of an answer in the table

@@ -22,9 +22,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from mtv_world_ros.ros.messages.conversions import NANO, to_stamp
-from test.robustness.default_client import SETTINGS
-from test.robustness.node_messages import commit, DAMAGE, damaged
-from test.robustness.usage import usage
+from robustness.default_client import SETTINGS
+from robustness.node_messages import commit, DAMAGE, damaged
+from robustness.usage import usage
 from test.support import ros_nodes as ros
 from test.support.large_messages import empty_points
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from test.robustness import wild_plans
+from robustness import wild_plans
 
 #: time that is foreseen, and how long it may take [s of the processor]
 SECONDS, MOST_S = 2.0, 12.0

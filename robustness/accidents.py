@@ -22,8 +22,8 @@ import yaml
 import zstandard
 
 from mtv_world_ros.core.files import share_path
-from test.robustness.file_kinds import KINDS, timed_actions
-from test.robustness.node_messages import ros, whole
+from robustness.file_kinds import KINDS, timed_actions
+from robustness.node_messages import ros, whole
 
 
 def calibration(text: str, instead: str) -> bytes:

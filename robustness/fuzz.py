@@ -28,8 +28,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mtv_world_ros.core.errors import MtvWorldError
-from test.robustness.file_kinds import Kind, KINDS, MOST_S
-from test.robustness.node_messages import commit
+from robustness.file_kinds import Kind, KINDS, MOST_S
+from robustness.node_messages import commit
 
 #: a process that takes more memory ends
 MOST_BYTES = 2 * 2**30

@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 FLOATS = (
     float('nan'), float('inf'), -float('inf'), 1e300, -1e300, 1e30, 1e9, 1e-320, 0.0, -0.0, -1.0,
     7.0, 100.0, 3.2, 0.031, -0.001,

@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mtv_world_ros.ros.messages.conversions import NANO, to_ns, values_of
-from test.robustness.node_messages import commit, ROOT, ros
-from test.robustness.usage import starved_s, usage
+from robustness.node_messages import commit, ROOT, ros
+from robustness.usage import starved_s, usage
 
 #: an end that comes later than this after its plan is late, on a machine that is not busy [s]
 LATE_S = 2.0

@@ -1,5 +1,5 @@
 """Loaded by the fork server of `kills`: everything that is started, so that starting is cheap."""
 
-from test.robustness import kills
+from robustness import kills
 
 kills.imported()

@@ -59,7 +59,7 @@ from mtv_world_ros.ros.parameters import Settings  # noqa: E402
 from mtv_world_ros.ros.world_model.loading import load_named_pipeline  # noqa: E402
 from test.support.ros_domain import claim_domain  # noqa: E402
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 EPISODE = share_path('resource', 'demo_episode')
 #: length of a plan [s], of the cameras' joint states [Hz]
 PLAN_S = 3.2
@@ -363,7 +363,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         roles = ['cameras'] * options.apart + ['viewer'] * (options.cameras > 2)
         for role in roles:
             start(
-                [sys.executable, '-m', 'test.robustness.default_client', *words, '--role', role],
+                [sys.executable, '-m', 'robustness.default_client', *words, '--role', role],
                 os.environ,
                 ROOT,
             )

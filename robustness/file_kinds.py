@@ -34,10 +34,10 @@ from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.simulation.scenes.tasks import Task
 from mtv_world_ros.success.task import load_task, load_tasks, match_task
 from mtv_world_ros.vision.describers.describer import objects_from_instruction
-from test.robustness import parameter_calls, wild_numbers, wild_plans, wild_scenes
-from test.robustness.folder_kinds import answers, FOLDERS, make_checkpoint, parts, with_part
-from test.robustness.node_messages import DAMAGE, damaged, send
-from test.robustness.wild_numbers import judged, with_wild_number
+from robustness import parameter_calls, wild_numbers, wild_plans, wild_scenes
+from robustness.folder_kinds import answers, FOLDERS, make_checkpoint, parts, with_part
+from robustness.node_messages import DAMAGE, damaged, send
+from robustness.wild_numbers import judged, with_wild_number
 
 #: a case that takes longer is a hang [s of the process]
 MOST_S = 2.0

@@ -15,8 +15,8 @@ import sys
 import time
 from typing import Any
 
-from test.robustness.node_messages import commit, ROOT, ros
-from test.robustness.usage import LABELS, plot, slope, usage
+from robustness.node_messages import commit, ROOT, ros
+from robustness.usage import LABELS, plot, slope, usage
 
 #: growth that is allowed, once caches are filled [MB a cycle, descriptors a cycle]
 MOST_MB, MOST_DESCRIPTORS = 0.3, 0.02

@@ -29,9 +29,9 @@ import yaml
 from mtv_world_ros.core.data_types import JointTrajectory
 from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.policies.openpi_client import pack
-from test.robustness.node_messages import commit, ROOT, ros
-from test.robustness.policy_servers import _observation, fine, TIMEOUT_S
-from test.robustness.usage import descendants
+from robustness.node_messages import commit, ROOT, ros
+from robustness.policy_servers import _observation, fine, TIMEOUT_S
+from robustness.usage import descendants
 
 #: an end that comes later than this after the signal is late; a case that takes longer froze [s]
 LATE_S, FROZEN_S = 20.0, 90
@@ -144,7 +144,8 @@ def policy_server(folder: Path, one: Signal) -> None:
     from mtv_world_ros.ranking.policy_list import GuardedPolicy, load_policy_list
     from mtv_world_ros.robot.file import load_robot, robot_path
 
-    command = [sys.executable, str(Path(__file__).resolve()), '--serve', '{port}']
+    module = [sys.executable, '-m', 'robustness.children']
+    command = ['env', f'PYTHONPATH={ROOT}', *module, '--serve', '{port}']
     entry = {'name': 'fine', 'policy': 'openpi', 'command': command}
     entry['change'] = {'timeout_s': TIMEOUT_S}
     (folder / 'list.yaml').write_text(yaml.safe_dump({'policies': [entry]}))

@@ -29,7 +29,7 @@ import numpy as np
 from mtv_world_ros.core.errors import MtvWorldError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.bag.reader import BagReader
-from test.robustness.node_messages import commit, ROOT
+from robustness.node_messages import commit, ROOT
 
 #: an end that comes later than this after the signal is late; what is not over then is killed [s]
 LATE_S, FROZEN_S = 15.0, 120.0

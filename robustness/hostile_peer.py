@@ -1,6 +1,6 @@
 """A peer that sends what no client sends: every node of the package outlives it and answers.
 
-    python -m test.robustness.hostile_peer [NODE ...]
+    python -m robustness.hostile_peer [NODE ...]
 
 starts each node as a process of its own, sends requests and messages that once ended one, and
 prints a table: which node lived, and how long the next ordinary request took. The exit status is 1
@@ -22,7 +22,7 @@ import time
 from typing import Any
 
 from mtv_world_ros.core.files import share_path
-from test.robustness.accidents import chain, diamonds, entity_bomb, nested, star, urdf_of
+from robustness.accidents import chain, diamonds, entity_bomb, nested, star, urdf_of
 
 #: longest time until an ordinary request is answered after an attack [s]
 MOST_S = 2.0

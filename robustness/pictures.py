@@ -1,6 +1,6 @@
 """Damaged pictures from a later plan on: estimate, interval, word and reason beside real frames.
 
-    python -m test.robustness.pictures [EPISODE | FOLDER]
+    python -m robustness.pictures [EPISODE | FOLDER]
 
 The first plan of an episode starts from real frames. From the second one on all frames of one
 view, or of all, are damaged. What must hold: no damaged row has the opposite verdict, or a
@@ -30,7 +30,7 @@ from mtv_world_ros.data.recordings import commands_until
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.success.estimator import verdict_word
-from test.robustness.node_messages import commit
+from robustness.node_messages import commit
 
 #: damages frames (V, T, H, W, 3) of all views; the second argument is the recorded index of each
 Damage = Callable[[ByteArray, np.ndarray], ByteArray]

@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from test.robustness.children import make_episode
-from test.robustness.node_messages import commit, ROOT, ros
+from robustness.children import make_episode
+from robustness.node_messages import commit, ROOT, ros
 
 #: this seed's chunks take 0.3 s
 SLOW = 1400

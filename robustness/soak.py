@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from test.robustness.node_messages import commit, ROOT, ros
-from test.robustness.usage import LABELS, plot, slope, usage
+from robustness.node_messages import commit, ROOT, ros
+from robustness.usage import LABELS, plot, slope, usage
 
 ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
 OUT_OF_MEMORY, CRASHES = 1100, 1300

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from test.robustness import wild_plans
-from test.robustness.folder_kinds import clean_up, new_folder
-from test.robustness.node_messages import FLOATS, WORDS
+from robustness import wild_plans
+from robustness.folder_kinds import clean_up, new_folder
+from robustness.node_messages import FLOATS, WORDS
 
 #: beyond those of tests that start nodes as processes of their own (1 to 100)
 _DOMAIN = 101

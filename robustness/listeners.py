@@ -1,6 +1,6 @@
 """Sockets that processes listen on: none is reachable from another machine unless asked for.
 
-    python -m test.robustness.listeners
+    python -m robustness.listeners
 
 starts every command that opens a TCP port, prints where it listens, and fails on an address that
 is not the machine's own.
@@ -24,7 +24,7 @@ import time
 _LISTEN = '0A'
 _START_S = 90.0
 _ENVIRONMENT = {'ROS_DOMAIN_ID': '86', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def process_tree(pid: int) -> set[int]:

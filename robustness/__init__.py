@@ -1,0 +1,1 @@
+"""Programs that damage, kill, flood and interrupt: `make fuzz`, `kills`, `soak`, `attacks`."""
