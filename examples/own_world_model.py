@@ -56,5 +56,5 @@ options = parser.parse_args()
 
 bundled = Pipeline.load('bundled')
 recording = load_recording(options.episode, bundled.spec, bundled.robot)
-held = replace(bundled, world_model=HeldFrame(bundled.spec), object_motion=None)
+held = replace(bundled.without_foresight(), world_model=HeldFrame(bundled.spec))
 print(f'bundled model: success {imagined(bundled):.2f}; held frame: {imagined(held):.2f}')

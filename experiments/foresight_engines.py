@@ -99,11 +99,10 @@ futures = int(sys.argv[1])
 pipeline = Pipeline.load('bundled', num_threads=1)
 if futures:
     from mtv_world_ros.physics.solid_foresight import SolidForesight
-    known = pipeline.object_motion
+    known = pipeline.judge.object_motion
     settings = known.settings.model_copy(update={'num_motions': futures})
-    pipeline = replace(
-        pipeline, object_motion=SolidForesight(known.robot, known.response, settings)
-    )
+    foresight = SolidForesight(known.robot, known.response, settings)
+    pipeline = replace(pipeline, judge=replace(pipeline.judge, object_motion=foresight))
 recording = load_recording(
     share_path('resource', 'demo_episode'), pipeline.spec, pipeline.robot
 )

@@ -67,6 +67,7 @@ from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.success.estimator import SuccessEstimator, verdict_word
 from mtv_world_ros.success.rollout_memory import footage_of
 from mtv_world_ros.success.task import load_task, load_tasks
@@ -320,7 +321,8 @@ def imagine_whole(arguments: argparse.Namespace) -> None:
     if arguments.memory == 'off':
         pipeline = replace(pipeline, scene_keeper=None)
     if arguments.foresight == 'off':
-        pipeline = replace(pipeline, object_motion=None)
+        assert isinstance(pipeline.judge, SuccessJudge)
+        pipeline = replace(pipeline, judge=replace(pipeline.judge, object_motion=None))
     made_with = {
         'checkpoint': Checkpoint.open(arguments.checkpoint).digest(),
         'code': code_version(),

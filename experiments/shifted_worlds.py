@@ -74,6 +74,7 @@ from mtv_world_ros.robot.resample import resample
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.rollout import Rollout
+from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.simulation.collect.episode_jobs import episode_seed
 from mtv_world_ros.simulation.collect.record import carry_out, RecordConfig, Take
 from mtv_world_ros.simulation.expert.expert import Expert
@@ -210,7 +211,7 @@ def foreseen_by(
     pipeline: Pipeline, episode: Rollout, observation: Observation, commands: FloatArray
 ) -> Ahead:
     """Return what is foreseen of commands (C, J)."""
-    model, names = pipeline.object_motion, episode.names
+    model, names = pipeline.judge.object_motion, episode.names
     assert model is not None  # `Scenes._ask` asks only pipelines that foresee
     masks = pipeline.segmenter.segment(observation.frames[:, None], names).masks[:, :, 0]
     poses = np.stack(
@@ -224,7 +225,7 @@ def foreseen_by(
     (ahead,) = objects.foresee([commands])
     num_rows = len(ahead.motions[0].points)
     motions = foreseen_of(pipeline.robot, ahead, num_rows)
-    ends = pipeline.estimator.foresee(motions, episode.options.instruction)
+    ends = pipeline.judge.estimator.foresee(motions, episode.options.instruction)
     each = round(pipeline.spec.num_frames / pipeline.spec.fps / motions.step_s)
     rows = np.array([*range(0, num_rows - 1, each), num_rows - 1])
     return Ahead(
@@ -307,7 +308,8 @@ class Scenes:
         self._fitted = dict[str, ObjectMotionModel]()
         #: foresight of a robot cell in which nothing was fitted, by checkpoint
         self._unfitted = {
-            name: pipeline.object_motion and pipeline.object_motion.at_place(_ELSEWHERE)
+            name: pipeline.judge.object_motion
+            and pipeline.judge.object_motion.at_place(_ELSEWHERE)
             for name, pipeline in pipelines.items()
         }
         for physics in options.physics.split(',') if options.contact else ():
@@ -389,7 +391,7 @@ class Scenes:
         if judge == FITTED:
             return self._fitted[physics]
         if judge == AS_FITTED or physics == NOMINAL:
-            return self._pipelines[name].object_motion
+            return self._pipelines[name].judge.object_motion
         return self._unfitted[name]
 
     def _once(
@@ -414,16 +416,17 @@ class Scenes:
             check = self._check(whole, (name, *same), first)
             if check.refusal and judge != RULE:
                 return {'refused': True}
-            pipeline = replace(
-                whole,
+            assert isinstance(whole.judge, SuccessJudge)
+            judging = replace(
+                whole.judge,
                 camera_checker=None,
-                object_motion=motion or whole.object_motion,
+                object_motion=motion or whole.judge.object_motion,
                 checks_place=False,
             )
             if judge == PICTURES:
-                pipeline = pipeline.without_foresight()
+                judging = judging.without_foresight()
             # features are logged whether or not weights were ever fitted to them
-            pipeline = replace(pipeline, grounds=Grounds())
+            pipeline = replace(whole, judge=replace(judging, grounds=Grounds()))
             first = check.corrected_observation(first)
             begun = pipeline.begin(
                 first, RolloutOptions(instruction=instruction, seed=seed, num_inference_steps=1)
@@ -433,7 +436,8 @@ class Scenes:
 
     def _check(self, pipeline: Pipeline, key: tuple, first: Observation) -> CameraCheck:
         """What the first picture says about the cameras."""
-        checker = pipeline.camera_checker
+        assert isinstance(pipeline.judge, SuccessJudge)
+        checker = pipeline.judge.camera_checker
         if checker is None:
             return CameraCheck()
         if key not in self._known:
@@ -455,7 +459,7 @@ class Scenes:
                 return {'value': None}
         if judge in IMAGINED:
             return imagined(pipeline, episode, commands)
-        if pipeline.object_motion is None:  # of a checkpoint that foresees nothing: no verdict
+        if pipeline.judge.object_motion is None:  # nothing is foreseen: no verdict
             return {'value': None}
         return foreseen_by(pipeline, episode, first, commands)
 
@@ -525,7 +529,7 @@ def estimated(pipeline: Pipeline, judge: str, said: Said, physics: str) -> Share
     features = {key: nan if value is None else value for key, value in features.items()}
     if judge == PICTURES:
         judging = pipeline.without_foresight()
-    calibration = judging.estimator.calibration
+    calibration = judging.judge.estimator.calibration
     if isfinite(features.get('foreseen', nan)):
         is_fitted = physics == NOMINAL or judge in (AS_FITTED, FITTED)
         fit = None if calibration is None else calibration.futures

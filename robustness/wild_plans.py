@@ -145,7 +145,7 @@ def check_plausible(episode: Any, prediction: Any) -> None:
     if len(prediction.positions) > 1:
         steps = np.linalg.norm(np.diff(poses, axis=1), axis=-1)
         assert steps.max() < REACH_M, f'a tool went {steps.max():.1f} m in a frame'
-    objects = episode._states[0].objects
+    objects = episode._states[0].evidence.objects
     found = None if objects is None else objects.found
     if found is None or np.isnan(success):
         return

@@ -57,7 +57,7 @@ def foresee(solids: Any, _: Any) -> None:
     from mtv_world_ros.physics.solid_foresight import TrackedSolids
 
     observation, _instruction = wild_plans.first_scene()
-    foresight = wild_plans.bundled().object_motion
+    foresight = wild_plans.bundled().judge.object_motion
     assert foresight is not None
     names = tuple(f'block {number}' for number in range(len(solids)))
     tracked = TrackedSolids(foresight=foresight, names=names, solids=tuple(solids))

@@ -11,9 +11,9 @@ from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.rollout.options import RolloutOptions
-from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.rollout import SEED_STEP
 from mtv_world_ros.success.calibration import HorizonCurve
+from test.support.pipelines import assembled
 from test.support.small_episodes import PersistenceWorldModel
 
 SPEC = WorldModelSpec(
@@ -54,7 +54,7 @@ def imagine(recording, num_seeds, horizon=None):
     trajectory = JointTrajectory(
         joint_names=whole.joint_names, times=whole.times[kept], positions=whole.positions[kept]
     )
-    episode = Pipeline.assemble(CARD, model, robot=YAM, horizon=horizon).begin(
+    episode = assembled(CARD, model, YAM, horizon=horizon).begin(
         observation, RolloutOptions(instruction=recording.instruction, seed=3, num_seeds=num_seeds)
     )
     return model, list(episode.extend(trajectory))

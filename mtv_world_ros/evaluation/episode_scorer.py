@@ -205,8 +205,8 @@ class EpisodeScorer:
 
     def _pipeline_for(self, names: tuple[str, ...], task: TaskSpec | None) -> Pipeline:
         """Return the pipeline for the objects and the own task of an episode."""
-        estimator = self.pipeline.estimator.for_task(task)
-        return replace(self.pipeline, objects=names, estimator=estimator)
+        judge = self.pipeline.judge.for_task(task)
+        return replace(self.pipeline, objects=names, judge=judge)
 
     def _donor(self, job: EvaluationJob) -> Recording | None:
         """Return the episode that lends its actions; None if there is none that can be read."""

@@ -110,7 +110,7 @@ def evaluate(
         config = config.replace(num_inference_steps=pipeline.spec.num_inference_steps)
     run = _Run(pipeline, out, name, config, parallel, describer)
     check_same_settings(out / 'episodes', run.settings, overwrite or not name)
-    tasks = {} if pipeline.estimator.is_given else own_tasks(episode_paths)
+    tasks = {} if pipeline.judge.estimator.is_given else own_tasks(episode_paths)
     jobs = make_jobs(episode_paths, zero_shot, config.seed, tasks)
     results, failed = [], {}
     bar = Progress(run.results(jobs), total=len(jobs), unit='episode', is_shown=show_progress)

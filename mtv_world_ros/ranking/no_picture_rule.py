@@ -88,7 +88,7 @@ def judge_without_pictures(pipeline: Pipeline, episode: Rollout, commands: Float
             relation asks for what poses do not tell.
     """
     instruction = episode.options.instruction
-    estimator = pipeline.estimator.for_task(episode.options.task)
+    estimator = pipeline.judge.estimator.for_task(episode.options.task)
     found = match_task(estimator.tasks, instruction)
     if found is None:
         raise CannotTell(f"'{instruction}' is no known task")

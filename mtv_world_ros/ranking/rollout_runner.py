@@ -169,7 +169,7 @@ class RolloutRunner:
 
         None = none ever is.
         """
-        if self.pipeline.object_motion is None:
+        if self.pipeline.judge.object_motion is None:
             return None
         pipeline, options = self.pipeline.without_foresight(), self._options(real, job, objects)
         world = ImaginedWorld(pipeline, real.world.start, options)

@@ -20,7 +20,9 @@ from mtv_world_ros.rollout.assembly import policy_settings
 from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.plan_comparison import held_until
+from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.vision.camera_check import CameraChecker
+from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
 
 class CandidatePolicy:
@@ -164,12 +166,17 @@ def comparing_pipeline(checkpoint: Checkpoint, robot: RobotModel) -> Pipeline:
             'compared: set candidates to 1, or take a checkpoint with object_motion '
             '(mtv-world fit contact)'
         )
-    pipeline = Pipeline.assemble(
-        checkpoint.card,
-        _NoDenoiser(checkpoint.spec),
-        robot=robot,
-        control=control,
+    segmenter = choose_segmenter()
+    judge = replace(
+        SuccessJudge.of(robot, segmenter),
         object_motion=motion,
         camera_checker=CameraChecker(robot, load_shape(robot)),
+        checks_place=True,
     )
-    return replace(pipeline, checks_place=True)
+    return Pipeline(
+        robot=robot,
+        world_model=_NoDenoiser(checkpoint.spec),
+        segmenter=segmenter,
+        judge=judge,
+        control=control,
+    )

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite, nan
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any, Protocol, TYPE_CHECKING
 
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.control.control import Control, ControlInputs, ControlScene
-from mtv_world_ros.control.registry import create_control
 from mtv_world_ros.control.trajectory_video import TrajectoryVideo, TrajectoryVideoConfig
 from mtv_world_ros.core.data_types import (
-    BoolArray,
     ByteArray,
     FloatArray,
     History,
@@ -25,40 +22,35 @@ from mtv_world_ros.core.data_types import (
     WorldModelSpec,
 )
 from mtv_world_ros.core.errors import CheckpointError, ConfigError
-from mtv_world_ros.core.processes import threads_each
-from mtv_world_ros.model.card import CheckpointCard
-from mtv_world_ros.model.checkpoint import BUNDLED, Checkpoint, control_options
-from mtv_world_ros.physics.episode_objects import Majority, ObjectForesight
-from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
-from mtv_world_ros.physics.object_motion import ObjectMotionModel
+from mtv_world_ros.model.checkpoint import BUNDLED, Checkpoint
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import ChunkPlan, Plan
-from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.assembly import asked_describer
+from mtv_world_ros.rollout.judge import ChunkStart, ImaginedChunk, Judge, SeenChunk
 from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions, with_keywords
-from mtv_world_ros.rollout.plan_comparison import foreseen_outcomes, plans_to_compare
+from mtv_world_ros.rollout.plan_comparison import plans_to_compare
 from mtv_world_ros.rollout.prediction import Prediction, StageClock
 from mtv_world_ros.rollout.rollout import ObservedChunk, Rollout
 from mtv_world_ros.rollout.scene_memory import SceneKeeper, SceneMemory
 from mtv_world_ros.rollout.state import RolloutState
-from mtv_world_ros.success.calibration import Calibration, Fits, HorizonCurve, load_fits
+from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.success.comparison import Comparison
-from mtv_world_ros.success.doubts import doubted, Grounds, widened
-from mtv_world_ros.success.estimator import JudgedChunk, SuccessEstimator, verdict_word
-from mtv_world_ros.success.fitted_to import Setting
-from mtv_world_ros.success.own_tasks import bundled_tasks, chosen_task
-from mtv_world_ros.success.rollout_memory import footage_of
 from mtv_world_ros.success.task import TaskSpec
-from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
-from mtv_world_ros.vision.frame_check import check_frames, check_stretch, frame_doubt, lost_objects
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
-#: reason against an estimate if the plan is drawn outside of all views
-_UNSEEN = 'no view shows a tool at any time'
-#: reason against an estimate of imagined frames in place of foreseen motions
-_UNPLACED = 'no motion is foreseen from the frames that this plan starts from'
+#: names that `Pipeline` had until the judge became a part of its own -> where they are
+_MOVED = {
+    'estimator': 'judge.estimator',
+    'object_motion': 'judge.object_motion',
+    'horizon': 'judge.horizon',
+    'camera_checker': 'judge.camera_checker',
+    'grounds': 'judge.grounds',
+    'checks_place': 'judge.checks_place',
+    'picture_fits': 'judge.picture_fits',
+    'is_fitted_at': 'judge.is_fitted_at',
+}
 
 
 class WorldModel(Protocol):
@@ -101,26 +93,19 @@ class WorldModel(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pipeline:
-    """The main path around a world model; it has no state: `begin` returns a rollout, which has.
+    """Draws a plan, predicts frames and segments them; a judge says how the task ends.
+
+    It has no state: `begin` returns a rollout, which has.
 
     Attributes:
         robot: joints, limits and tools.
         world_model: predicts chunks.
         segmenter: finds the objects' masks.
-        estimator: judges the outcome.
+        judge: simulates object motion, and turns it and masks into a verdict.
         control: way in which the plan enters the model; must be that of the model's training.
         objects: names of the objects; empty = the describer's.
         describer: names the objects of an episode's first frame; None = the instruction's words.
-        horizon: measured J by horizon; None = not measured.
-        object_motion: foresees object motions, for controls that show them; None = the imagined
-            frames alone decide.
-        camera_checker: compares the first frames with the arm's outline; None = no check.
-        grounds: reasons for which estimates that are not calibrated abstain.
         drawing: draws the plan for people where the control itself is no video.
-        checks_place: futures are drawn from a wide prior where contact parameters were not fitted
-            in the robot cell of the observation; False for fits, which state a bare estimate.
-        picture_fits: fits to rollouts without foreseen object motion, for `without_foresight`;
-            None = the estimate stays as it is, e.g. bare.
         scene_keeper: keeps the background of rollouts as real frames showed it; None = the model
             draws it anew in each chunk.
         checkpoint: checkpoint that the model was loaded from; None = made otherwise.
@@ -129,19 +114,32 @@ class Pipeline:
     robot: RobotModel
     world_model: WorldModel
     segmenter: Segmenter
-    estimator: SuccessEstimator
+    judge: Judge
     control: Control
     objects: tuple[str, ...] = ()
     describer: Describer | None = None
-    horizon: HorizonCurve | None = None
-    object_motion: ObjectMotionModel | None = None
-    camera_checker: CameraChecker | None = None
-    grounds: Grounds = Grounds()
     drawing: TrajectoryVideo = TrajectoryVideo(config=TrajectoryVideoConfig())
-    checks_place: bool = False
-    picture_fits: Fits | None = None
     scene_keeper: SceneKeeper | None = None
     checkpoint: Checkpoint | None = None
+
+    if not TYPE_CHECKING:
+
+        def __new__(cls, **values: Any) -> Pipeline:
+            """Raise for a field that is no longer of the pipeline, with its place."""
+            moved = next((name for name in values if name in _MOVED), None)
+            if moved is not None:
+                raise TypeError(
+                    f"a pipeline has no field '{moved}': it is {_MOVED[moved]} now; give "
+                    f'judge=replace(pipeline.judge, {moved}=...)'
+                )
+            return object.__new__(cls)
+
+        def __getattr__(self, name: str) -> Any:
+            """Raise for a name that is no longer of the pipeline, with its place."""
+            text = f"'Pipeline' object has no attribute '{name}'"
+            if name in _MOVED:
+                text += f': it is {_MOVED[name]} now'
+            raise AttributeError(text)
 
     @classmethod
     def load(
@@ -190,10 +188,9 @@ class Pipeline:
             CheckpointError, ConfigError, RobotError: see their messages.
         """
         from mtv_world_ros.model.loading import load_world_model
-        from mtv_world_ros.physics.checkpoint_files import load_foresight
 
         opened = Checkpoint.open(checkpoint).with_adapter(adapter)
-        model, motion = opened.load_robot(robot), None
+        model = opened.load_robot(robot)
         control = opened.load_control(model)
         world_model = load_world_model(
             opened,
@@ -204,80 +201,28 @@ class Pipeline:
             layout=control.layout,
         )
         _check_inputs(opened.card.control, control, world_model.transformer.config)
-        foresees = control.shows_objects and opened.object_motion is not None
-        if foresight and foresees and opened.object_motion is not None:
-            threads = num_threads or threads_each(1)
-            motion = load_foresight(opened.object_motion, model, threads)
-        fits = load_fits(opened.folder, of_pictures=foresees and not foresight)
-        calibration = fits.calibration if calibrated else None
-        pipeline = cls.assemble(
-            opened.card,
-            world_model,
-            robot=model,
-            control=control,
-            objects=objects,
+        finds = choose_segmenter(segmenter, device=device)
+        judge = SuccessJudge.load(
+            opened,
+            model,
+            finds,
             task=task,
-            segmenter=choose_segmenter(segmenter, device=device),
-            describer=asked_describer(describer),
-            calibration=calibration,
-            horizon=fits.horizon,
-            object_motion=motion,
-            camera_checker=CameraChecker(model, load_shape(model)) if camera_check else None,
-            setting=Setting.of(model, opened.object_motion_digest),
+            foresees=control.shows_objects,
+            foresight=foresight,
+            calibrated=calibrated,
+            camera_check=camera_check,
+            num_threads=num_threads,
         )
-        pipeline = replace(pipeline, checkpoint=opened)
-        if not calibrated:  # to be fitted, or compared: the bare estimate
-            return pipeline
-        doubt = motion.settings.doubt if motion else ''
-        return replace(
-            pipeline,
-            grounds=Grounds.of(doubt, calibration is not None),
-            checks_place=True,
-            picture_fits=load_fits(opened.folder, of_pictures=True) if motion else None,
-        )
-
-    @classmethod
-    def assemble(
-        cls,
-        card: CheckpointCard,
-        world_model: WorldModel,
-        *,
-        robot: RobotModel,
-        control: Control | None = None,
-        objects: tuple[str, ...] = (),
-        task: str | TaskSpec | None = None,
-        segmenter: Segmenter | None = None,
-        describer: Describer | None = None,
-        calibration: Calibration | None = None,
-        horizon: HorizonCurve | None = None,
-        object_motion: ObjectMotionModel | None = None,
-        camera_checker: CameraChecker | None = None,
-        setting: Setting | None = None,
-    ) -> Pipeline:
-        """Return the pipeline around a world model trained as the card says.
-
-        The control is that of the card; one that is fitted to a training set has to be given.
-        """
-        segmenter = segmenter or choose_segmenter()
-        if control is None:
-            control = create_control(card.control, control_options(card, robot))
         return cls(
-            robot=robot,
+            robot=model,
             world_model=world_model,
-            segmenter=segmenter,
-            estimator=SuccessEstimator(
-                *_tasks(task),
-                calibration=calibration,
-                segmenter=segmenter,
-                setting=setting,
-            ),
+            segmenter=finds,
+            judge=judge,
             control=control,
             objects=objects,
-            describer=describer,
-            horizon=horizon,
-            object_motion=object_motion,
-            camera_checker=camera_checker,
-            scene_keeper=SceneKeeper.of(robot) if card.scene_memory else None,
+            describer=asked_describer(describer),
+            scene_keeper=SceneKeeper.of(model) if opened.card.scene_memory else None,
+            checkpoint=opened,
         )
 
     @property
@@ -287,12 +232,10 @@ class Pipeline:
 
     def with_robot(self, robot: RobotModel) -> Pipeline:
         """Return the pipeline for a robot of the same joints and tools, e.g. a calibrated one."""
-        motion, checker = self.object_motion, self.camera_checker
         return replace(
             self,
             robot=robot,
-            camera_checker=None if checker is None else checker.with_robot(robot),
-            object_motion=None if motion is None else motion.with_robot(robot),
+            judge=self.judge.with_robot(robot),
             scene_keeper=self.scene_keeper and self.scene_keeper.with_robot(robot),
         )
 
@@ -303,27 +246,8 @@ class Pipeline:
         the masks of the first frame gets them, which is the paper's method; one that was trained
         with foreseen objects (`rendering.object_motion`) gets no objects.
         """
-        if self.object_motion is None:
-            return self
-        fits = self.picture_fits
-        if fits is None:
-            return replace(self, object_motion=None)
-        return replace(
-            self,
-            object_motion=None,
-            estimator=self.estimator.with_calibration(fits.calibration),
-            horizon=fits.horizon,
-            grounds=Grounds.of('', fits.calibration is not None),
-        )
-
-    def is_fitted_at(self, place: str) -> bool:
-        """Return True if futures are drawn as they were fitted, in a robot cell.
-
-        Args:
-            place: name of the robot cell; empty = not stated.
-        """
-        model = self.object_motion
-        return model is None or not self.checks_place or model.at_place(place) is model
+        judge = self.judge.without_foresight()
+        return self if judge is self.judge else replace(self, judge=judge)
 
     def begin(
         self,
@@ -371,36 +295,23 @@ class Pipeline:
             RolloutPreempted: `should_stop` of the options said so.
         """
         state = self._state_at(observation)
-        if state.objects.model is None:
+        evidence = state.evidence
+        if evidence.objects.model is None:
             raise ConfigError(
                 'plans are compared in simulated object motion, and this pipeline foresees none: '
                 'use a checkpoint with object_motion (mtv-world fit contact) and foresight=True'
             )
         start = state.observation
         checked = plans_to_compare(plans, self.robot, start, options.limits, self.spec.fps)
-        first_frame = state.objects.first.frames[0]
+        first_frame = evidence.objects.first.frames[0]
         options = replace(options, objects=self.name_objects(options, lambda: first_frame))
-        masks, estimator = self.find(state, options), self.estimator.for_task(options.task)
-        objects = state.objects.as_fitted() if options.contact.is_confirmed else state.objects
-        found = [
-            foreseen_outcomes(objects, plan, start, masks, self.spec, estimator, options)
-            for plan in checked
-        ]
-        reason = state.camera_check.refusal
-        if len({key for _, key, _ in found}) > 1:
-            reason = reason or 'the futures of the plans are not common'
-        return Comparison.of(
-            [outcomes for outcomes, _, _ in found],
-            reason=reason,
-            is_fitted=all(is_fitted for _, _, is_fitted in found),
-        )
+        masks = self.find(state, options)
+        return self.judge.compare(evidence, checked, start, masks, self.spec, options)
 
     def _state_at(self, observation: Observation) -> RolloutState:
         """Return the state of an episode that begins at an observation, with checked cameras."""
-        checker = self.camera_checker
-        check = CameraCheck() if checker is None else checker.check(observation)
-        observation = check.corrected_observation(observation)
-        return RolloutState.at(observation, self.spec, self._objects_in(observation), check)
+        evidence = self.judge.begin(observation, foresees=self.control.shows_objects)
+        return RolloutState.at(evidence.objects.first, self.spec, evidence)
 
     def name_objects(
         self, options: RolloutOptions, first_frame: Callable[[], ByteArray]
@@ -432,28 +343,17 @@ class Pipeline:
         motion = Motion.of(self.robot, start.cameras, plan.positions, self._links)
         in_view = motion.tools_in_view()
         start_masks = self.find(state, options)
-        if state.starts_later:
-            state = replace(state, frame_doubt=self._frame_doubt(state, start_masks))
         clock.lap('start masks')
-        objects = state.objects
-        if options.contact.is_confirmed:
-            objects = objects.as_fitted()
-        objects = objects.foresee(
-            plan,
-            start,
-            options.objects,
-            start_masks,
-            self._majority(state, options),
-            state.is_begun,
-            options.should_stop,
+        chunk_start = ChunkStart(
+            plan=plan, observation=start, masks=start_masks, num_imagined=state.num_imagined
         )
-        pictures = objects.pictures(plan, motion)
+        evidence = self.judge.foresee(state.evidence, chunk_start, options)
         scene = ControlScene(
             motion=motion,
             times=plan.times,
             start_frames=start.frames,
             masks=start_masks.masks[:, :, 0],
-            objects=pictures,
+            objects=evidence.objects.pictures(plan, motion),
             seen=state.scene.last if state.scene and state.num_imagined else None,
         )
         clock.lap('object motion')
@@ -480,13 +380,10 @@ class Pipeline:
             frames, background = self._kept(state, scene, motion, drawn, frames, options)
         masks = self.follow(state, start_masks, frames, options)
         clock.lap('masks')
-        foreseen = objects.motions(plan, state.is_begun)
-        success, memory = self.judge(state, motion, start_masks, masks, options, foreseen)
-        unseen = () if control.video is None or in_view.any() else (_UNSEEN,)
-        success = doubted(success, (*objects.reasons, *unseen))
-        is_foreseen = isfinite(success.features.get('foreseen', nan))
-        unplaced = _UNPLACED if objects.starts_later and not is_foreseen else ''
-        success = doubted(success, refusal=state.frame_doubt or objects.refusal or unplaced)
+        imagined = ImaginedChunk(
+            motion=motion, masks=masks, is_in_view=control.video is None or bool(in_view.any())
+        )
+        success, foreseen, evidence = self.judge.judge(evidence, chunk_start, imagined, options)
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
@@ -495,8 +392,7 @@ class Pipeline:
             motion.positions[-1],
             stamp_ns,
             self.spec.num_history,
-            memory,
-            objects,
+            evidence,
             background,
             masks,
         )
@@ -513,11 +409,11 @@ class Pipeline:
             chunk=plan.chunk,
             num_chunks=plan.num_chunks,
             imagined_seconds=state.num_imagined / self.spec.fps,
-            horizon=self.horizon,
+            horizon=self.judge.horizon,
             segmenter=self.segmenter.name,
             num_inference_steps=num_steps,
             foreseen=None if foreseen is None else foreseen.at_frames(plan),
-            objects=objects,
+            objects=evidence.objects,
             in_view=in_view,
             seconds=MappingProxyType(clock.seconds),
         )
@@ -547,21 +443,25 @@ class Pipeline:
         background = state.scene
         if self.scene_keeper is not None and options.objects:
             background = self.scene_keeper.seen(background, motion.after_first(), frames, masks)
-        success, memory = self.judge(state, motion, start_masks, masks, options, is_real=True)
-        doubts = check_stretch(frames, positions[1:], state.observation.views)
-        success = doubted(success, refusal='; '.join(doubts))
+        seen = SeenChunk(
+            motion=motion,
+            start_masks=start_masks,
+            masks=masks,
+            frames=frames,
+            period_s=1 / self.spec.fps,
+            commands=commands,
+        )
+        success, _, evidence = self.judge.see(state.evidence, seen, options)
         stamp_ns = state.observation.stamp_ns + round(frames.shape[1] / self.spec.fps * 1e9)
         after = state.after(
             frames,
             positions[-1],
             stamp_ns,
             self.spec.num_history,
-            memory,
-            state.objects.watched(positions, 1 / self.spec.fps, commands),
+            evidence,
             background,
             masks,
         )
-        after = replace(after, observed_doubts=doubts)
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success), after
 
     def _kept(
@@ -629,64 +529,6 @@ class Pipeline:
             first_frames=state.observation.frames,
         )
 
-    def judge(
-        self,
-        state: RolloutState,
-        motion: Motion,
-        start_masks: ObjectMasks,
-        masks: ObjectMasks,
-        options: RolloutOptions,
-        foreseen: ForeseenMotions | None = None,
-        *,
-        is_real: bool = False,
-    ) -> JudgedChunk:
-        """Return the estimate after a chunk of 1 + T states, and what it remembers."""
-        check, footage = state.camera_check, footage_of(motion, start_masks, masks)
-        judged = self.estimator.for_task(options.task).estimate(
-            footage, options.instruction, state.memory, foreseen, is_real=is_real
-        )
-        estimate = judged.estimate if is_real else self.grounds.bear(judged.estimate)
-        estimate = doubted(estimate, check.notes, check.refusal)
-        if options.doubt:
-            estimate = widened(estimate, options.doubt)
-        if foreseen is not None and options.contact.text:
-            is_open = verdict_word(estimate.probability, estimate.interval) == 'open'
-            word = 'open: ' if is_open and not options.contact.is_confirmed else ''
-            estimate = doubted(estimate, (f'{word}{options.contact.text}',))
-        return judged._replace(estimate=estimate)
-
-    def _frame_doubt(self, state: RolloutState, start_masks: ObjectMasks) -> str:
-        """Return why the real frames that a later plan starts from allow no verdict."""
-        objects = state.objects
-        reasons = check_frames(
-            objects.source, objects.first, state.camera_check, self.camera_checker
-        )
-        reasons = tuple(dict.fromkeys([*reasons, *state.observed_doubts]))
-        return frame_doubt(reasons, lost_objects(start_masks))
-
-    def _majority(self, state: RolloutState, options: RolloutOptions) -> Majority:
-        """Return the rule that selects futures of majority outcome, for pictures and estimate."""
-
-        def majority(motions: ForeseenMotions) -> BoolArray | None:
-            estimator = self.estimator.for_task(options.task)
-            ends = estimator.foresee(motions, options.instruction, state.memory)
-            return None if ends is None else ends.is_majority
-
-        return majority
-
-    def _objects_in(self, observation: Observation) -> ObjectForesight:
-        """Return the objects of an episode that begins at an observation."""
-        model = self.object_motion if self.control.shows_objects else None
-        if model is not None and self.checks_place:
-            model = model.at_place(observation.place)
-        return ObjectForesight(
-            model=model,
-            segmenter=self.segmenter,
-            robot=self.robot,
-            first=observation,
-            source=observation,
-        )
-
 
 def _check_inputs(name: str, control: Control, transformer: Mapping[str, Any]) -> None:
     """Raise if the transformer was not built for the inputs that a control feeds."""
@@ -701,15 +543,3 @@ def _check_inputs(name: str, control: Control, transformer: Mapping[str, Any]) -
                 f"control '{name}' {fed}, the checkpoint's transformer {taken}; the control that "
                 'it was trained with stands in world_model.json, as `control`'
             )
-
-
-def _tasks(task: str | TaskSpec | None) -> tuple[tuple[TaskSpec, ...], str | None]:
-    """Return the known tasks, and the name of the one to judge; None = each that matches.
-
-    A task of the user's own is one more.
-    """
-    known = bundled_tasks()
-    given = task if isinstance(task, TaskSpec) else chosen_task(task, ())
-    if given is None:
-        return known, None
-    return (*(spec for spec in known if spec.name != given.name), given), given.name

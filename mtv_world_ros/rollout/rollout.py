@@ -108,12 +108,12 @@ class Rollout:
     @property
     def camera_check(self) -> CameraCheck:
         """Calibration check on the first frames; its corrections are applied."""
-        return self._states[0].camera_check
+        return self._states[0].evidence.camera_check
 
     @property
     def objects(self) -> FoundObjects | None:
         """Objects that are foreseen, and how they moved; None = nothing is foreseen."""
-        return self._states[0].objects.found
+        return self._states[0].evidence.objects.found
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -127,7 +127,7 @@ class Rollout:
         instruction = self.options.instruction
         if instruction not in self._described:
             self._described[instruction] = self.pipeline.name_objects(
-                self.options, lambda: self._states[0].objects.first.frames[0]
+                self.options, lambda: self._states[0].evidence.objects.first.frames[0]
             )
         return self._described[instruction]
 
@@ -191,7 +191,7 @@ class Rollout:
 
     def seen_points(self, num_frames: int) -> FloatArray:
         """Return (1 + T, O, 3) where masks showed the objects in the last frames [m]."""
-        memory = self._states[0].memory
+        memory = self._states[0].evidence.memory
         assert memory is not None
         return memory.points[:, -1 - num_frames :].swapaxes(0, 1)
 
@@ -205,22 +205,11 @@ class Rollout:
             ObservationError: the views are not the model's.
         """
         before = self._states[0]
-        observation = before.camera_check.corrected_observation(observation)
-        state = RolloutState.at(
-            observation,
-            self.pipeline.spec,
-            before.objects.branch(observation),
-            before.camera_check,
-        )
+        observation = before.evidence.camera_check.corrected_observation(observation)
+        state = RolloutState.at(observation, self.pipeline.spec, before.evidence.at(observation))
         passed_s = 1e-9 * abs(observation.stamp_ns - before.observation.stamp_ns)
         is_next = passed_s <= _NEXT_FRAMES / self.pipeline.spec.fps
-        state = replace(
-            state,
-            memory=before.memory,
-            scene=before.scene,
-            followed=before.followed if is_next else None,
-            observed_doubts=before.observed_doubts,
-        )
+        state = replace(state, scene=before.scene, followed=before.followed if is_next else None)
         return replace(self, _states=(state,))
 
     def _plan(self, trajectory: JointTrajectory | Plan) -> Plan:

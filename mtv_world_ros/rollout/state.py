@@ -16,10 +16,8 @@ from mtv_world_ros.core.data_types import (
 )
 from mtv_world_ros.core.errors import ObservationError
 from mtv_world_ros.core.images import resize_frames
-from mtv_world_ros.physics.episode_objects import ObjectForesight
+from mtv_world_ros.rollout.judge import JudgeState
 from mtv_world_ros.rollout.scene_memory import SceneMemory
-from mtv_world_ros.success.rollout_memory import RolloutMemory
-from mtv_world_ros.vision.camera_check import CameraCheck
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,36 +40,22 @@ class RolloutState:
     Attributes:
         observation: last frame of the episode, at the model's size.
         history: the frames before that one.
-        objects: foreseen poses of the named objects.
-        memory: memory of the success estimate; None before the first chunk.
+        evidence: what the judge has seen and foreseen so far.
         num_imagined: frames since the last real one.
-        camera_check: calibration check on the episode's first frames; its corrections are
-            applied.
         scene: memory of the background; None = nothing is held.
         followed: objects in the last frame, as they were followed there; None = nothing was.
-        frame_doubt: reason why the real frames that the plan starts from allow no verdict; empty =
-            none.
-        observed_doubts: reasons why the real frames before that one are no evidence.
     """
 
     observation: Observation
     history: History
-    objects: ObjectForesight
-    memory: RolloutMemory | None = None
+    evidence: JudgeState
     num_imagined: int = 0
-    camera_check: CameraCheck = CameraCheck()
     scene: SceneMemory | None = None
     followed: Followed | None = None
-    frame_doubt: str = ''
-    observed_doubts: tuple[str, ...] = ()
 
     @classmethod
     def at(
-        cls,
-        observation: Observation,
-        spec: WorldModelSpec,
-        objects: ObjectForesight,
-        camera_check: CameraCheck,
+        cls, observation: Observation, spec: WorldModelSpec, evidence: JudgeState
     ) -> RolloutState:
         """Return the state of an episode that begins at a real observation.
 
@@ -79,22 +63,7 @@ class RolloutState:
             ObservationError: the views are not the model's.
         """
         start = fit_observation(observation, spec)
-        return cls(
-            observation=start,
-            history=History.begin(start.frames),
-            objects=objects,
-            camera_check=camera_check,
-        )
-
-    @property
-    def starts_later(self) -> bool:
-        """True if a plan starts here from real frames later than the episode's first ones."""
-        return not self.num_imagined and self.objects.source is not self.objects.first
-
-    @property
-    def is_begun(self) -> bool:
-        """True if no real frame was observed since the episode began."""
-        return self.memory is None or self.memory.num_frames == 1 + self.num_imagined
+        return cls(observation=start, history=History.begin(start.frames), evidence=evidence)
 
     def after(
         self,
@@ -102,8 +71,7 @@ class RolloutState:
         positions: FloatArray,
         stamp_ns: int,
         num_history: int,
-        memory: RolloutMemory,
-        objects: ObjectForesight,
+        evidence: JudgeState,
         scene: SceneMemory | None = None,
         followed: ObjectMasks | None = None,
     ) -> RolloutState:
@@ -114,8 +82,7 @@ class RolloutState:
             positions: (J,) commanded at the last one [rad or m].
             stamp_ns: stamp of the last one [ns].
             num_history: most frames to keep before it.
-            memory: memory of the success estimate after the chunk.
-            objects: foreseen poses after the chunk.
+            evidence: evidence of the judge after the chunk.
             scene: memory of the background after the chunk.
             followed: masks of the objects in these frames.
         """
@@ -126,8 +93,7 @@ class RolloutState:
                 start, frames=frames[:, -1], positions=positions, stamp_ns=stamp_ns
             ),
             history=self.history.after(start.frames, frames, num_history),
-            objects=objects,
-            memory=memory,
+            evidence=evidence,
             num_imagined=self.num_imagined + frames.shape[1],
             scene=scene,
             followed=followed and Followed(masks=followed.last(), frames=frames[:, -1]),
@@ -141,11 +107,13 @@ class RolloutState:
         """
         observation = self.observation
         if cameras is not None:
-            corrected = self.camera_check.corrected(cameras)
+            corrected = self.evidence.camera_check.corrected(cameras)
             observation = replace(observation, cameras=corrected)
-        objects = self.objects.branch(observation)
         return replace(
-            self, observation=observation, num_imagined=0, objects=objects, frame_doubt=''
+            self,
+            observation=observation,
+            num_imagined=0,
+            evidence=self.evidence.at(observation),
         )
 
 

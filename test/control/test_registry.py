@@ -210,7 +210,7 @@ def test_any_control_trains_and_predicts(control, outside, tmp_path, robot):
     card = json.loads((run / 'checkpoint' / 'world_model.json').read_text())
     assert card['control'] == control
     pipeline = Pipeline.load(run / 'checkpoint', dtype='float32', num_threads=1)
-    assert pipeline.object_motion is None
+    assert pipeline.judge.object_motion is None
     recording = load_recording(episodes / 'demo', pipeline.spec, robot)
     rest = recording.positions[0]
     goal = rest + 0.32 * np.eye(len(rest))[0]

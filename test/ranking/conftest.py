@@ -12,6 +12,7 @@ from mtv_world_ros.core.images import resize_frames
 from mtv_world_ros.ranking.rollout_jobs import Result, StoredEstimate
 from mtv_world_ros.ranking.rollout_runner import RolloutConfig, RolloutRunner
 from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
 from mtv_world_ros.simulation.opengl import missing_opengl
@@ -53,11 +54,13 @@ def runner(robot, expert):
     if reason:
         pytest.skip(reason)
     world_model = PerfectWorldModel(robot, expert.home)
+    segmenter = ColourSegmenter()
+    estimator = SuccessEstimator(load_tasks(share_path('config', 'tasks')))
     pipeline = Pipeline(
         robot=robot,
         world_model=world_model,
-        segmenter=ColourSegmenter(),
-        estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks'))),
+        segmenter=segmenter,
+        judge=SuccessJudge(robot=robot, segmenter=segmenter, estimator=estimator),
         control=TrajectoryVideo(config=TrajectoryVideoConfig()),
     )
 

@@ -86,7 +86,7 @@ def test_executed_plans_are_compared_with_futures_of_the_fitted_parameters(pipel
     """Futures of the prior would foresee nearly everything."""
     fitted = imagined(pipeline, recording, 'simulator/nominal', ContactTrust())
     elsewhere = imagined(pipeline, recording, 'cell 3', ContactTrust())
-    model = pipeline.object_motion.with_robot(pipeline.robot)
+    model = pipeline.judge.object_motion.with_robot(pipeline.robot)
     start = replace(elsewhere[0].start, stamp_ns=1)
     chunks = Plan.of(plan(recording), pipeline.robot, start).chunks(pipeline.spec)
     for number, (one, other) in enumerate(zip(elsewhere, fitted, strict=True), start=1):

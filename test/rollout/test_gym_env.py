@@ -16,8 +16,8 @@ from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.rollout.gym_env import WorldEnv
 from mtv_world_ros.rollout.options import RolloutOptions
-from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.world import ImaginedWorld
+from test.support.pipelines import assembled
 from test.support.small_episodes import PersistenceWorldModel
 
 SPEC = WorldModelSpec(
@@ -39,7 +39,7 @@ class SeededWorldModel(PersistenceWorldModel):
 def env() -> WorldEnv:
     recording = load_recording(share_path('resource', 'demo_episode'), SPEC, YAM)
     card = Checkpoint.open().card.replace(rendering={})
-    pipeline = Pipeline.assemble(card, SeededWorldModel(SPEC), robot=YAM)
+    pipeline = assembled(card, SeededWorldModel(SPEC), YAM)
     options = RolloutOptions(instruction=recording.instruction)
     world = ImaginedWorld(pipeline, recording.observation(0), options)
     return WorldEnv(world, YAM, max_steps=3, render_mode='rgb_array')

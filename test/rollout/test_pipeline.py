@@ -53,6 +53,7 @@ from mtv_world_ros.success.calibration import Fits, load_fits
 from mtv_world_ros.success.doubts import Grounds
 from mtv_world_ros.vision.describers.describer import DescribedObject
 from mtv_world_ros.vision.jaccard import jaccard
+from test.support.pipelines import assembled
 from test.support.small_episodes import PersistenceWorldModel
 
 SPEC = WorldModelSpec(
@@ -94,7 +95,7 @@ def world_model() -> CountingWorldModel:
 
 @pytest.fixture
 def pipeline(world_model) -> Pipeline:
-    return Pipeline.assemble(CARD, world_model, robot=YAM)
+    return assembled(CARD, world_model, YAM)
 
 
 def observe(recording: Recording) -> Observation:
@@ -129,7 +130,7 @@ def draw(pipeline: Pipeline, motion: Motion, times: np.ndarray, masks: ObjectMas
 def with_motion(world_model: CountingWorldModel, object_motion) -> Pipeline:
     """A pipeline that shows the model where objects go."""
     card = CARD.replace(rendering={'object_motion': True})
-    return replace(Pipeline.assemble(card, world_model, robot=YAM), object_motion=object_motion)
+    return assembled(card, world_model, YAM, object_motion=object_motion)
 
 
 def imagine(pipeline: Pipeline, recording: Recording, seconds: float, **options):
@@ -169,7 +170,7 @@ def test_denoises_in_the_steps_that_the_model_is_made_for_unless_told_otherwise(
 ):
     world_model = CountingWorldModel(replace(SPEC, num_inference_steps=made_for))
     options = {'num_inference_steps': asked} if asked else {}
-    (chunk,) = imagine(Pipeline.assemble(CARD, world_model, robot=YAM), recording, 1.6, **options)
+    (chunk,) = imagine(assembled(CARD, world_model, YAM), recording, 1.6, **options)
     assert world_model.num_steps == [expected]
     assert chunk.num_inference_steps == expected
 
@@ -184,7 +185,7 @@ def test_history_is_the_frames_before_the_start_and_the_first_one_stays_the_anch
     recording, num_history
 ):
     model = CountingWorldModel(replace(SPEC, num_history=num_history))
-    chunks = imagine(Pipeline.assemble(CARD, model, robot=YAM), recording, 4.8)
+    chunks = imagine(assembled(CARD, model, YAM), recording, 4.8)
     first = recording.frames[:, 0]
     shown = np.concatenate([first[:, None], *(c.video.frames for c in chunks)], axis=1)
     assert len(model.histories) == 3
@@ -207,7 +208,7 @@ def part_of(asked: JointTrajectory, begin_s: float, end_s: float) -> JointTrajec
 def test_chained_extends_are_one_long_extend(recording, num_seeds):
     """The clock, seeds, history, anchor and memory are those of an episode without stops."""
     model = CountingWorldModel(replace(SPEC, num_history=5))
-    pipeline = Pipeline.assemble(CARD, model, robot=YAM)
+    pipeline = assembled(CARD, model, YAM)
     whole = imagine(pipeline, recording, 4.8, seed=3, num_seeds=num_seeds)
     asked = commands(recording, 4.8)
     episode = pipeline.begin(
@@ -261,7 +262,7 @@ def test_keywords_of_version_0_1_work_and_say_what_replaced_them(pipeline, recor
 @pytest.mark.parametrize('num_seeds', [1, 2])
 def test_a_stop_in_mid_chunk_leaves_the_episode_where_it_was(recording, num_seeds):
     model = StoppingWorldModel(SPEC)
-    episode = Pipeline.assemble(CARD, model, robot=YAM).begin(
+    episode = assembled(CARD, model, YAM).begin(
         observe(recording), RolloutOptions(num_seeds=num_seeds)
     )
     done = []
@@ -297,7 +298,7 @@ class NoisyWorldModel(CountingWorldModel):
 
 
 def test_the_same_seed_twice_gives_the_same_frames(recording):
-    pipeline = Pipeline.assemble(CARD, NoisyWorldModel(SPEC), robot=YAM)
+    pipeline = assembled(CARD, NoisyWorldModel(SPEC), YAM)
     first, again, other = (
         np.concatenate([c.video.frames for c in imagine(pipeline, recording, 3.2, seed=seed)], 1)
         for seed in (5, 5, 6)
@@ -322,7 +323,7 @@ def test_real_frames_are_judged_as_imagined_ones_are(pipeline, recording):
 
 def test_imagining_goes_on_from_what_was_observed(recording):
     model = CountingWorldModel(replace(SPEC, num_history=5))
-    episode = Pipeline.assemble(CARD, model, robot=YAM).begin(
+    episode = assembled(CARD, model, YAM).begin(
         observe(recording), RolloutOptions(instruction=recording.instruction)
     )
     real = recording.frames[:, :9]
@@ -509,9 +510,9 @@ def test_objects_are_foreseen_with_how_the_fingers_moved_in_the_real_frames(
     shut[:, column] = ends.gripper_closed
     positions[:, column] = half
     again.observe(recording.frames[:, 1:9], positions, commands=positions)
-    assert not again._states[0].objects.fingers.are_stopped().any()
+    assert not again._states[0].evidence.objects.fingers.are_stopped().any()
     again.observe(recording.frames[:, 1:9], positions, commands=shut)
-    assert again._states[0].objects.fingers.are_stopped().tolist() == [True, False]
+    assert again._states[0].evidence.objects.fingers.are_stopped().tolist() == [True, False]
 
 
 @pytest.mark.parametrize('found_again', [True, False])
@@ -530,7 +531,7 @@ def test_what_is_hidden_by_now_is_shown_and_foreseen_as_it_was_when_it_was_whole
     episode = begun.branch(now)
     (chunk,) = episode.extend(part_of(commands(recording, 3.2), 1.6, 3.2))
     first = pipeline.segmenter.segment(recording.frames[:, :1], begun.names).masks[:, :, 0]
-    objects = episode._states[0].objects.found
+    objects = episode._states[0].evidence.objects.found
     # nothing of it is seen now; of the other one neither, which does not count as hidden
     np.testing.assert_array_equal(objects.cuts[:, 0, ..., 3] > 0, first[:, 0])
     assert first[:, 1].any() and not objects.cuts[:, 1, ..., 3].any()
@@ -619,7 +620,7 @@ def test_arms_are_drawn_as_the_frame_that_each_chunk_starts_from_shows_them(
     world_model, recording
 ):
     card = CARD.replace(rendering={'arm_pictures': True})
-    chunks = imagine(Pipeline.assemble(card, world_model, robot=YAM), recording, 3.2)
+    chunks = imagine(assembled(card, world_model, YAM), recording, 3.2)
     parts = load_shape(YAM).parts
     for chunk, control in zip(chunks, world_model.trajectories, strict=True):
         start = chunk.start.frames
@@ -643,7 +644,7 @@ def test_forward_kinematics_run_once_for_the_frames_of_a_chunk_and_once_for_its_
 
     monkeypatch.setattr(RobotModel, '_placements', counted)
     card = CARD.replace(rendering={'link_width_m': 0.02, 'finger_width_m': 0.01})
-    pipeline = Pipeline.assemble(card, world_model, robot=YAM)
+    pipeline = assembled(card, world_model, YAM)
     start = observe(recording)
     wrist = replace(start.cameras[1], mount_link=YAM.tools[0].link)
     rollout = pipeline.begin(replace(start, cameras=(start.cameras[0], wrist)))
@@ -659,10 +660,8 @@ def test_the_objects_are_those_of_the_instruction(pipeline, recording):
 
 
 def test_without_object_masks_the_control_is_dark_but_for_the_trails(world_model, recording):
-    imagine(
-        Pipeline.assemble(CARD.replace(object_mask=False), world_model, robot=YAM), recording, 1.6
-    )
-    imagine(Pipeline.assemble(CARD, world_model, robot=YAM), recording, 1.6)
+    imagine(assembled(CARD.replace(object_mask=False), world_model, YAM), recording, 1.6)
+    imagine(assembled(CARD, world_model, YAM), recording, 1.6)
     without, with_masks = (np.count_nonzero(t) for t in world_model.trajectories)
     assert 0 < without < with_masks
 
@@ -693,7 +692,7 @@ def test_views_in_another_order_are_refused(pipeline, recording):
 def test_two_views_for_a_model_of_one_are_refused(recording):
     card = CARD.replace(views=('low',))
     model = CountingWorldModel(replace(SPEC, views=('low',)))
-    pipeline = Pipeline.assemble(card, model, robot=YAM)
+    pipeline = assembled(card, model, YAM)
     said = r"views \['low', 'high'\], the model was trained on \['low'\].*train --views"
     with pytest.raises(ObservationError, match=said):
         pipeline.begin(observe(recording))
@@ -800,7 +799,7 @@ def large_recording() -> Recording:
 
 @pytest.fixture
 def observed() -> ObservedEpisode:
-    return ObservedEpisode(Pipeline.assemble(CARD, PersistenceWorldModel(LARGE), robot=YAM))
+    return ObservedEpisode(assembled(CARD, PersistenceWorldModel(LARGE), YAM))
 
 
 def seen_at(recording: Recording, frame: int) -> Observation:
@@ -936,8 +935,8 @@ def test_without_foresight_a_model_is_drawn_what_it_was_trained_with(recording, 
     """Fills of the first masks are drawn for models that were trained with them alone."""
     foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
     trained = with_motion(world_model, foresight)
-    blind = Pipeline.assemble(CARD.replace(object_mask=False), world_model, robot=YAM)
-    paper = Pipeline.assemble(CARD, world_model, robot=YAM)
+    blind = assembled(CARD.replace(object_mask=False), world_model, YAM)
+    paper = assembled(CARD, world_model, YAM)
     drawn = []
     for pipeline in (trained.without_foresight(), blind, paper.without_foresight(), paper):
         imagine(pipeline, recording, 1.6)
@@ -950,24 +949,35 @@ def test_without_foresight_a_model_is_drawn_what_it_was_trained_with(recording, 
 def test_without_foresight_the_fits_to_such_rollouts_are_used(recording, world_model):
     foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
     bare = with_motion(world_model, foresight)
-    assert bare.without_foresight().estimator is bare.estimator
-    assert bare.without_foresight().grounds == Grounds()
+    assert bare.without_foresight().judge.estimator is bare.judge.estimator
+    assert bare.without_foresight().judge.grounds == Grounds()
     usual = load_fits(share_path('resource', 'checkpoint'))
     own = usual.calibration.replace(bias=3.0, fitted_to=None)
-    whole = replace(
-        bare,
-        estimator=bare.estimator.with_calibration(usual.calibration),
+    judge = replace(
+        bare.judge,
+        estimator=bare.judge.estimator.with_calibration(usual.calibration),
         horizon=usual.horizon,
         picture_fits=Fits(own, None),
     )
+    whole = replace(bare, judge=judge)
     alone = whole.without_foresight()
-    assert alone.object_motion is None and alone.horizon is None
-    assert alone.estimator.calibration is own
-    assert whole.estimator.calibration is usual.calibration
+    assert alone.judge.object_motion is None and alone.judge.horizon is None
+    assert alone.judge.estimator.calibration is own
+    assert whole.judge.estimator.calibration is usual.calibration
     assert alone.without_foresight() is alone
-    (chunk,) = imagine(replace(whole, picture_fits=Fits()).without_foresight(), recording, 1.6)
+    unfitted = replace(bare, judge=replace(judge, picture_fits=Fits()))
+    (chunk,) = imagine(unfitted.without_foresight(), recording, 1.6)
     assert np.isnan(chunk.success.probability)
     assert 'never calibrated' in chunk.success.reasons[0]
+
+
+def test_what_went_to_the_judge_is_named_with_its_place(pipeline):
+    with pytest.raises(AttributeError, match=r"'estimator': it is judge\.estimator now"):
+        _ = pipeline.estimator
+    with pytest.raises(TypeError, match=r'judge=replace\(pipeline\.judge, object_motion=\.\.\.\)'):
+        replace(pipeline, object_motion=None)
+    with pytest.raises(AttributeError, match="no attribute 'estimate'$"):
+        _ = pipeline.estimate
 
 
 def test_the_bundled_checkpoint_has_a_fit_to_rollouts_without_foresight():
@@ -985,7 +995,7 @@ def test_every_switch_that_takes_foresight_away_uses_the_fit_of_its_own_kind():
     switched = whole.without_foresight()
     loaded = Pipeline.load(segmenter='colour', num_threads=1, foresight=False)
     own = load_fits(share_path('resource', 'checkpoint'), of_pictures=True)
-    for alone in (switched, loaded):
+    for alone in (switched.judge, loaded.judge):
         assert alone.estimator.calibration == own.calibration
         assert alone.horizon == own.horizon
         assert alone.grounds == Grounds.of('', True)

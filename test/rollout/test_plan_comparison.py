@@ -105,7 +105,7 @@ def test_plans_that_cannot_be_compared_are_named(silent, start, options, good, i
     assert 'stamped 2 ns, not 1 ns' in refused([later, good])
     renamed = replace(good, joint_names=[f'x_{name}' for name in good.joint_names])
     assert 'joint' in refused([good, renamed], PlanError)
-    blind = replace(silent, object_motion=None)
+    blind = replace(silent, judge=replace(silent.judge, object_motion=None))
     assert 'foresees none' in refused([good, idle], pipeline=blind)
 
 

@@ -96,12 +96,12 @@ def test_a_checkpoint_says_what_its_numbers_of_contact_rest_on(own, origin, doub
     contact = load_contact(folder)
     assert contact is not None
     save_contact(contact.replace(fitted=origin), folder)
-    grounds = Pipeline.load(own, num_threads=1, segmenter='colour').grounds
+    grounds = Pipeline.load(own, num_threads=1, segmenter='colour').judge.grounds
     assert grounds.foreseen.startswith(doubt) and bool(grounds.foreseen) == bool(doubt)
     assert grounds.pictures.startswith('the estimate was never calibrated for this checkpoint')
     # what `calibrate` fits has to be the bare estimate
     bare = Pipeline.load(own, num_threads=1, segmenter='colour', calibrated=False)
-    assert bare.grounds == Grounds()
+    assert bare.judge.grounds == Grounds()
 
 
 def test_files_of_before_count_as_never_fitted(own):
@@ -118,7 +118,7 @@ def test_files_of_before_count_as_never_fitted(own):
 
 
 def test_the_bundled_model_has_grounds():
-    assert Pipeline.load(num_threads=1, segmenter='colour').grounds == Grounds()
+    assert Pipeline.load(num_threads=1, segmenter='colour').judge.grounds == Grounds()
 
 
 @pytest.mark.parametrize(('foresight', 'mends'), [(True, 'fit contact'), (False, 'fit success')])

@@ -15,6 +15,7 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.rollout.assembly import asked_describer
 from mtv_world_ros.rollout.pipeline import Pipeline, WorldModelSpec
+from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.ros.world_model.node import main
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
@@ -75,11 +76,13 @@ class FakeWorldModel:
 
 
 def load(settings):
+    robot, segmenter = load_robot(robot_path('yam_bimanual')), ColourSegmenter()
+    estimator = SuccessEstimator(load_tasks(share_path('config', 'tasks')))
     return Pipeline(
-        robot=load_robot(robot_path('yam_bimanual')),
+        robot=robot,
         world_model=FakeWorldModel(),
-        segmenter=ColourSegmenter(),
-        estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks'))),
+        segmenter=segmenter,
+        judge=SuccessJudge(robot=robot, segmenter=segmenter, estimator=estimator),
         control=TrajectoryVideo(config=TrajectoryVideoConfig()),
         objects=settings.objects,
         describer=asked_describer(settings.describer),

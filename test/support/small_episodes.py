@@ -17,8 +17,10 @@ from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.rollout.pipeline import Pipeline, WorldModel
+from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter, PALETTE
+from test.support.pipelines import assembled
 
 HEIGHT, WIDTH, NUM_FRAMES = 48, 64, 19
 START_NS, PERIOD_NS = 1_700_000_000_000_000_000, 100_000_000
@@ -150,11 +152,13 @@ def make_pipeline(robot) -> Callable[..., Pipeline]:
     """A pipeline around a world model; by default the one that repeats the start frame."""
 
     def make(world_model: WorldModel | None = None, **options: object) -> Pipeline:
+        segmenter = ColourSegmenter()
+        estimator = SuccessEstimator(load_tasks(share_path('config', 'tasks')))
         return Pipeline(
             robot=robot,
             world_model=world_model or PersistenceWorldModel(SPEC),
-            segmenter=ColourSegmenter(),
-            estimator=SuccessEstimator(load_tasks(share_path('config', 'tasks'))),
+            segmenter=segmenter,
+            judge=SuccessJudge(robot=robot, segmenter=segmenter, estimator=estimator),
             control=TrajectoryVideo(config=TrajectoryVideoConfig()),
             **options,  # type: ignore[arg-type]
         )
@@ -211,4 +215,4 @@ def persistence(spec: WorldModelSpec) -> Pipeline:
     """A pipeline whose world model holds the first frame; a worker process can make it, too."""
     card = read_card(share_path('resource', 'checkpoint')).replace(rendering={})
     yam = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
-    return Pipeline.assemble(card, PersistenceWorldModel(spec), robot=yam)
+    return assembled(card, PersistenceWorldModel(spec), yam)

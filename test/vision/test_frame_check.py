@@ -26,7 +26,7 @@ def recording(pipeline):
 
 def _checked(pipeline, recording, frames=None, row=40):
     first, later = recording.observation(0), recording.observation(row)
-    checker = pipeline.camera_checker
+    checker = pipeline.judge.camera_checker
     later = later if frames is None else replace(later, frames=frames)
     return check_frames(later, first, checker.check(first), checker)
 
@@ -46,24 +46,24 @@ def test_a_blank_picture_is_named_with_its_camera(pipeline, recording):
 def test_a_frozen_picture_is_named_without_the_arms_outline(pipeline, recording):
     first, later = recording.observation(0), recording.observation(40)
     frozen = replace(later, frames=first.frames)
-    begun = pipeline.camera_checker.check(first)
+    begun = pipeline.judge.camera_checker.check(first)
     reasons = check_frames(frozen, first, begun, None)
     assert len(reasons) == 2 and all('although the arm has moved' in text for text in reasons)
 
 
 def test_a_picture_of_an_arm_that_rests_may_stay_the_same(pipeline, recording):
     first = recording.observation(0)
-    begun = pipeline.camera_checker.check(first)
-    assert check_frames(first, first, begun, pipeline.camera_checker) == ()
+    begun = pipeline.judge.camera_checker.check(first)
+    assert check_frames(first, first, begun, pipeline.judge.camera_checker) == ()
 
 
 def test_a_camera_that_could_not_be_checked_at_first_is_not_doubted_later(pipeline, recording):
     later = recording.observation(40)
     mirrored = replace(later, frames=later.frames[:, :, ::-1])
     first = recording.observation(0)
-    blind = pipeline.camera_checker.check(replace(first, frames=np.zeros_like(first.frames)))
+    blind = pipeline.judge.camera_checker.check(replace(first, frames=np.zeros_like(first.frames)))
     assert {fit.status for fit in blind.fits} == {'unchecked'}
-    assert check_frames(mirrored, first, blind, pipeline.camera_checker) == ()
+    assert check_frames(mirrored, first, blind, pipeline.judge.camera_checker) == ()
 
 
 def test_an_object_in_no_view_is_lost_and_one_in_a_single_view_is_not():

@@ -129,7 +129,8 @@ class LiveFidelity:
         self._given_up: list[Chunk] = []
         self._fitted: ObjectMotionModel | None = None
         # imagined frames begin chunks, too, and cameras were checked before
-        self._pipeline, self._spec = replace(pipeline, camera_checker=None), pipeline.spec
+        judge = pipeline.judge.without_camera_check()
+        self._pipeline, self._spec = replace(pipeline, judge=judge), pipeline.spec
         self._events = events
         self._tolerance_ns = round(MAX_OFFSET / self._spec.fps * NANO)
         self._changed = Condition()
@@ -172,7 +173,7 @@ class LiveFidelity:
 
     def is_fitted_at(self, place: str) -> bool:
         """Return True if contact parameters were fitted in a robot cell."""
-        return self._pipeline.is_fitted_at(place)
+        return self._pipeline.judge.is_fitted_at(place)
 
     def use_robot(self, robot: RobotModel) -> None:
         """Observe with another description of the same robot from the next chunk on."""
@@ -393,13 +394,13 @@ class LiveFidelity:
         return self._task_named(request.instruction)
 
     def _task_named(self, instruction: str) -> str:
-        matched = match_task(self._pipeline.estimator.tasks, instruction)
+        matched = match_task(self._pipeline.judge.estimator.tasks, instruction)
         return instruction if matched is None else matched[0].name
 
     def _fitted_model(self) -> ObjectMotionModel:
         """Return foresight with the fitted parameters; its simulator is this thread's own."""
         if self._fitted is None:
-            model = self._pipeline.object_motion
+            model = self._pipeline.judge.object_motion
             assert model is not None  # something was foreseen
             self._fitted = model.with_robot(self._pipeline.robot)
         return self._fitted

@@ -18,6 +18,7 @@ from mtv_world_ros.model.world_model import DiffusionWorldModel
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.training.clips import self_rollout
 from mtv_world_ros.training.clips.batches import BatchSource
@@ -104,11 +105,12 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
     assert rolled
     model = DiffusionWorldModel(load_trained_model(Checkpoint.open(tmp_path / 'checkpoint')))
     spec = rolling.spec
+    segmenter, estimator = ColourSegmenter(), SuccessEstimator({})
     pipeline = Pipeline(
         robot=robot,
         world_model=model,
-        segmenter=ColourSegmenter(),
-        estimator=SuccessEstimator({}),
+        segmenter=segmenter,
+        judge=SuccessJudge(robot=robot, segmenter=segmenter, estimator=estimator),
         control=trainer.control,
     )
     for index in rolled:
