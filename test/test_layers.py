@@ -65,7 +65,7 @@ def test_the_overview_imports_no_command():
         "print([n for n in sys.modules if n.startswith('mtv_world_ros.cli.')])"
     )
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "['mtv_world_ros.cli.commands']"
+    assert done.stdout.strip() == "['mtv_world_ros.cli.commands', 'mtv_world_ros.cli.parser']"
 
 
 @pytest.mark.parametrize(('old', 'words'), RENAMED.items())

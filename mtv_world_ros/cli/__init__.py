@@ -26,14 +26,13 @@ from typing import Any  # noqa: E402
 import warnings  # noqa: E402
 
 from mtv_world_ros.cli.commands import (  # noqa: E402
-    ADVANCED_OPTIONS,
     COMMANDS,
-    MODEL_OPTIONS,
     REMOVED,
     REMOVED_OPTIONS,
     RENAMED,
     SECTIONS,
 )
+from mtv_world_ros.cli.parser import CommandParser, EMPTY  # noqa: E402
 from mtv_world_ros.core import entry_points  # noqa: E402
 from mtv_world_ros.core.errors import (  # noqa: E402
     MtvWorldError,
@@ -77,7 +76,6 @@ _DESCRIPTION = 'An online embodied world model for ROS 2.'
 #: second line of `mtv-world --help`
 _BEGIN = 'Begin with `mtv-world demo`. `mtv-world COMMAND --help` has the options of a command.'
 _USAGE = 'mtv-world [-h] [--version] COMMAND ...'
-_EMPTY = "it is empty; leave it out, or give a path or a name ('.' is the present folder)"
 _ADVICE = {
     errno.ENOSPC: _FULL,
     errno.EDQUOT: _FULL,
@@ -97,7 +95,7 @@ def make_parser(*wanted: str) -> argparse.ArgumentParser:
     Raises:
         ConfigError: a command of another package cannot be loaded.
     """
-    parser = _Parser(prog='mtv-world', description=_DESCRIPTION)
+    parser = CommandParser(prog='mtv-world', description=_DESCRIPTION)
     parser.add_argument('--version', action=_Version, nargs=0, help='print the version, then exit')
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
     groups: dict[str, argparse._SubParsersAction] = {}
@@ -111,7 +109,6 @@ def make_parser(*wanted: str) -> argparse.ArgumentParser:
         getattr(module, COMMANDS[name].function)(place)
         command = place.choices[last]
         command.description = command.description or _sentence(COMMANDS[name].help)
-        _group_options(command)
     if not wanted:
         _add_others(commands)
     return parser
@@ -119,22 +116,6 @@ def make_parser(*wanted: str) -> argparse.ArgumentParser:
 
 def _sentence(text: str) -> str:
     return f'{text[:1].upper()}{text[1:]}.'
-
-
-def _group_options(parser: argparse.ArgumentParser) -> None:
-    """Show options of the model, and those that few users need, under their own headings."""
-    groups = {'advanced options': ADVANCED_OPTIONS}
-    if '--no-foresight' in parser._option_string_actions:  # it runs a model
-        groups = {'model options': MODEL_OPTIONS, **groups}
-    for heading, options in groups.items():
-        common = parser._optionals._group_actions
-        moved = [action for action in common if options & {*action.option_strings}]
-        if moved:
-            parser._optionals._group_actions = [a for a in common if a not in moved]
-            group = parser.add_argument_group(heading)
-            group._group_actions.extend(moved)
-            if options is ADVANCED_OPTIONS and isinstance(parser, _Parser):
-                parser.hide(group)
 
 
 def _add_others(commands: argparse._SubParsersAction) -> None:
@@ -156,7 +137,7 @@ def _add_others(commands: argparse._SubParsersAction) -> None:
 
 def _others_parser() -> argparse.ArgumentParser:
     """Return a parser of the commands of other packages; the names of the table are taken."""
-    parser = _Parser(prog='mtv-world', description=_DESCRIPTION)
+    parser = CommandParser(prog='mtv-world', description=_DESCRIPTION)
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
     for name in _first_words():
         commands.add_parser(name)
@@ -186,76 +167,13 @@ def _overview() -> str:
     return '\n'.join(lines)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Refuses empty paths, which Python reads as the present folder.
-
-    `--help` leaves out the options of the group given to `hide`; `--help-all` prints all.
-    """
-
-    def __init__(self, **how: Any) -> None:
-        super().__init__(**how)
-        self.register('type', Path, _path)
-        self._hidden: argparse._ArgumentGroup | None = None
-
-    def hide(self, group: argparse._ArgumentGroup) -> None:
-        """Leave a group out of `--help`, and add `--help-all`, which prints it, too."""
-        self._hidden = group
-        text = f'show {len(group._group_actions)} more options, too'
-        self.add_argument('--help-all', action=_HelpAll, help=text)
-        options = self._optionals._group_actions
-        options.insert(1, options.pop())  # after --help
-
-    def show_all(self) -> None:
-        """Let the help have all options."""
-        self._hidden = None
-
-    def format_usage(self) -> str:
-        """Return the usage, without options that `--help` leaves out."""
-        formatter = self._get_formatter()
-        self._add_usage(formatter)
-        return formatter.format_help()
-
-    def format_help(self) -> str:
-        """Return the help, as argparse does it, without the group that is left out."""
-        formatter = self._get_formatter()
-        self._add_usage(formatter)
-        formatter.add_text(self.description)
-        for group in self._action_groups:
-            if group is not self._hidden:
-                formatter.start_section(group.title)
-                formatter.add_text(group.description)
-                formatter.add_arguments(group._group_actions)
-                formatter.end_section()
-        formatter.add_text(self.epilog)
-        return formatter.format_help()
-
-    def _add_usage(self, formatter: argparse.HelpFormatter) -> None:
-        hidden = self._hidden._group_actions if self._hidden else []
-        shown = [action for action in self._actions if action not in hidden]
-        formatter.add_usage(self.usage, shown, self._mutually_exclusive_groups)
-
-
-class _HelpAll(argparse._HelpAction):
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        if isinstance(parser, _Parser):
-            parser.show_all()
-        parser.print_help()
-        parser.exit()
-
-
-def _path(text: str) -> Path:
-    if not text:
-        raise argparse.ArgumentTypeError(_EMPTY)
-    return Path(text)
-
-
 def _check_texts(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """Refuse an empty text that is not the option's default."""
     for action in parser._actions:
         given = getattr(arguments, action.dest, None)
         is_empty = '' in given if isinstance(given, list) else given == ''
         if is_empty and action.type is None and '' not in (action.default, action.const):
-            parser.error(str(argparse.ArgumentError(action, _EMPTY)))
+            parser.error(str(argparse.ArgumentError(action, EMPTY)))
 
 
 class _Version(argparse.Action):
@@ -281,9 +199,9 @@ def _parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
 
     Ends the process with a message where there is no such command.
     """
-    plain = _Parser(prog='mtv-world', usage=_USAGE)
+    plain = CommandParser(prog='mtv-world', usage=_USAGE)
     first, second = [*words, '', ''][:2]
-    if first in ('-h', '--help'):
+    if first in ('-h', '--help', '--help-all'):
         print(_overview())
         plain.exit()
     if first in COMMANDS:

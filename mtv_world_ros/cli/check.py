@@ -19,12 +19,13 @@ from mtv_world_ros.cli.shared_options import add_options, names
 from mtv_world_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.data.episode import Episode
     from mtv_world_ros.inspection.inspect import Inspector
     from mtv_world_ros.inspection.inspection_report import Inspection
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'check',

@@ -6,13 +6,17 @@ import argparse
 from collections import Counter
 from pathlib import Path
 import sys
+from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.physics_option import add_physics
 from mtv_world_ros.cli.shared_options import add_options, names, workers_of
 
+if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
 
-def add(commands: argparse._SubParsersAction) -> None:
+
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'collect',
@@ -86,7 +90,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--fps', type=float, default=10.0, help='frames a second, at most 50; 16 for Wan'
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--sheets', action='store_true', help='also write a larger contact sheet of every task'
     )
     parser.set_defaults(handler=_collect)

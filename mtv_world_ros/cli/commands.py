@@ -108,65 +108,6 @@ RENAMED = {
     'faults': ('rank', '--list-faults'),
 }
 
-#: options of commands that run a model; `--help` shows them under a heading of their own
-MODEL_OPTIONS = frozenset(
-    {
-        '--checkpoint',
-        '--device',
-        '--no-foresight',
-        '--robot',
-        '--seed',
-        '--seeds',
-        '--segmenter',
-    }
-)
-
-#: options that few users need; `--help-all` shows them, under a heading of their own
-ADVANCED_OPTIONS = frozenset(
-    {
-        '--actions',
-        '--adapter',
-        '--between',
-        '--cache',
-        '--compare',
-        '--cpus-per-worker',
-        '--data-workers',
-        '--describer',
-        '--dtype',
-        '--fid-weights',
-        '--fvd-weights',
-        '--gpus-per-worker',
-        '--held-out-episodes',
-        '--hold',
-        '--latent-cache',
-        '--list-faults',
-        '--max-chunks',
-        '--mode',
-        '--motions',
-        '--no-camera-check',
-        '--no-ceiling',
-        '--no-clips',
-        '--no-report',
-        '--no-store',
-        '--no-video',
-        '--object-mask',
-        '--peak-tflops',
-        '--physics',
-        '--quality',
-        '--ray',
-        '--sample-every',
-        '--save-every',
-        '--save-minutes',
-        '--seeds',
-        '--serving',
-        '--sheets',
-        '--steps',
-        '--threads',
-        '--true-episodes',
-        '--truth',
-    }
-)
-
 #: options that left, with their command -> what to use now
 REMOVED_OPTIONS = {
     'demo --robot': 'the demo takes the robot of its checkpoint',

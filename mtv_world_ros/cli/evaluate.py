@@ -24,6 +24,7 @@ from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import check_free
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.data.splits import Selection
     from mtv_world_ros.evaluation.evaluate_episodes import Parallel
     from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary
@@ -38,7 +39,7 @@ again continues an interrupted run. Exit status: 1 if an episode could not be sc
 """
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command `evaluate`."""
     parser = commands.add_parser(
         'evaluate', help='score checkpoints on recorded episodes', epilog=_EPILOG
@@ -53,7 +54,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--out', type=Path, required=True, metavar='DIR', help='folder of the results'
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--mode',
         choices=('observe', 'imagine'),
         default='observe',
@@ -63,44 +64,44 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--split', help="split of dataset.json, or 'all'; default: test where there is one"
     )
     parser.add_argument('--episodes', type=int, help='use only the first N episodes')
-    parser.add_argument(
+    parser.add_advanced(
         '--physics',
         metavar='NAME',
         help='only the episodes that were collected with this physics; default: all, counted',
     )
     add_options(parser, 'workers')
-    parser.add_argument(
+    parser.add_advanced(
         '--actions',
         type=names,
         default=('true', 'shuffled'),
         metavar='LIST',
         help='what is imagined, of true,shuffled,zero; default: true,shuffled',
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--no-ceiling',
         dest='ceiling',
         action='store_false',
         help='do not score the recorded frames themselves and through the autoencoder',
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--truth',
         choices=('simulator', 'segmenter'),
         default='simulator',
         help="ground truth: the simulator's masks, where an episode has them, or the segmenter's "
         'masks of the recorded frames',
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--quality',
         type=names,
         default=(),
         metavar='LIST',
         help='picture quality, any of psnr,ssim,lpips',
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--fid-weights', type=Path, help='for FID: state dict of Inception-v3 of 2015-12-05'
     )
-    parser.add_argument('--fvd-weights', type=Path, help='for FVD: state dict of I3D')
-    parser.add_argument(
+    parser.add_advanced('--fvd-weights', type=Path, help='for FVD: state dict of I3D')
+    parser.add_advanced(
         '--no-report', dest='report', action='store_false', help='write no report.html'
     )
     add_options(parser, 'overwrite dtype model serving seeds describer segmenter source task')
@@ -300,7 +301,7 @@ def _score(
     )
 
 
-def add_report(commands: argparse._SubParsersAction) -> None:
+def add_report(commands: Commands) -> None:
     """Add the command `export report`."""
     parser = commands.add_parser(
         'report', help='write the HTML report of one or several evaluations again'

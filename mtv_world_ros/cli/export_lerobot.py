@@ -10,10 +10,12 @@ from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
+
     pass
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'lerobot',

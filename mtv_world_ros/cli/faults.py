@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import CommandParser
 
 
 class ListFaults(argparse.Action):
@@ -13,9 +16,7 @@ class ListFaults(argparse.Action):
     says what the size means. A policy is called expert-NAME-SIZE.
     """
 
-    def __call__(
-        self, parser: argparse.ArgumentParser, namespace: object, values: Any, *_: object
-    ) -> None:
+    def __call__(self, parser: CommandParser, namespace: object, values: Any, *_: object) -> None:
         """Print the kinds that were asked for."""
         print_faults(values or '')
         parser.exit()

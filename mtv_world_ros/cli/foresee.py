@@ -11,6 +11,7 @@ from mtv_world_ros.cli.shared_options import add_options, names
 from mtv_world_ros.core.files import check_free
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.core.data_types import FloatArray
     from mtv_world_ros.physics.solid_foresight import SolidForesight, TrackedSolids
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 _FILES = ('.yaml', '.yml')
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'foresee',

@@ -30,6 +30,7 @@ from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.core.files import check_free
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.core.workers import Workers
     from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.rollout.episode_viewer import EpisodeViewer
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 GOOD_ENDS = ('done', 'max_chunks', 'max_seconds')
 
 
-def add_replay(commands: argparse._SubParsersAction) -> None:
+def add_replay(commands: Commands) -> None:
     """Add the command `replay`."""
     parser = commands.add_parser(
         'replay',
@@ -114,7 +115,7 @@ def _play(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def add_imagine(commands: argparse._SubParsersAction) -> None:
+def add_imagine(commands: Commands) -> None:
     """Add the command `imagine`."""
     parser = commands.add_parser(
         'imagine',
@@ -139,7 +140,7 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--count', type=int, default=0, help='number of episodes; default: each once'
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--max-chunks',
         type=int,
         default=0,
@@ -167,7 +168,7 @@ def add_imagine(commands: argparse._SubParsersAction) -> None:
         default=Path('out/imagine'),
         help='folder of the results; default: out/imagine',
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--no-video', dest='video', action='store_false', help='write no comparison.mp4'
     )
     add_options_of_tables(parser)

@@ -12,13 +12,14 @@ from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.files import check_free
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import CommandParser
     from mtv_world_ros.core.data_types import ByteArray
 
 #: video where `--out` names none
 DEFAULT_OUT = Path('out/imagined.mp4')
 
 
-def add_options_of_tables(parser: argparse.ArgumentParser) -> None:
+def add_options_of_tables(parser: CommandParser) -> None:
     """Add the options for a start that is no recording."""
     parser.add_argument(
         '--image',

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
+from typing import TYPE_CHECKING
 
 from mtv_world_ros.simulation.physics import physics_named
 
+if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import CommandParser
 
-def add_physics(parser: argparse.ArgumentParser) -> None:
+
+def add_physics(parser: CommandParser) -> None:
     """Add `--physics`."""
-    parser.add_argument(
+    parser.add_advanced(
         '--physics',
         default='nominal',
         metavar='NAME',

@@ -26,6 +26,7 @@ from mtv_world_ros.cli.shared_options import (
 from mtv_world_ros.core.errors import ConfigError, PolicyError
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.ranking.policy_list import ListedPolicy
     from mtv_world_ros.ranking.rollout_jobs import Job
@@ -46,7 +47,7 @@ default one denoising step. Logs of the policy servers that a file starts go to 
 """
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'rank',
@@ -54,7 +55,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         description=_DESCRIPTION,
         epilog=_EPILOG,
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--list-faults',
         action=ListFaults,
         nargs='?',
@@ -87,14 +88,14 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--out', type=Path, required=True, metavar='DIR', help='folder of the results'
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--compare',
         metavar='CHECKPOINT',
         help='a second checkpoint that is ranked, too; every rollout is simulated once. Its own '
         'ranking goes to DIR/compared',
     )
     add_options(parser, 'workers')
-    parser.add_argument(
+    parser.add_advanced(
         '--true-episodes',
         type=int,
         default=5,
@@ -102,13 +103,13 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='number of episodes of each task whose true outcomes the prediction-powered rates '
         'use; default: 5',
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--max-chunks',
         type=int,
         default=8,
         help='largest number of answers of a policy in an episode',
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--hold',
         type=int,
         default=0,
@@ -116,7 +117,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='end an episode also when the task is done, or the estimate abstains, after N '
         'answers in a row; default: only the policy and --max-chunks end it',
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--no-video',
         '--no-clips',
         dest='clips',

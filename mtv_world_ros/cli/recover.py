@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 from mtv_world_ros.core.errors import EpisodeError
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.importing.recover import Recovered
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'recover', help='make whole bags of recordings that were killed or cut off'

@@ -10,10 +10,11 @@ from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.robot.model import RobotModel
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'robot',

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from importlib import metadata
@@ -16,6 +17,7 @@ from mtv_world_ros.cli import bundled_help
 from mtv_world_ros.viewing.viewer_process import PageAddress
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import CommandParser
     from mtv_world_ros.core.workers import Workers
     from mtv_world_ros.model.checkpoint import Checkpoint
     from mtv_world_ros.rollout.pipeline import Pipeline
@@ -54,17 +56,26 @@ def _count(text: str) -> int:
     return number
 
 
-#: options by the word that `add_options` knows them by; a help text that names what is bundled is
+#: options by the word that `add_options` knows them by, with the group (`model`, `advanced`) that
+#: `--help` shows them in; a help text that names what is bundled is
 #: a function, as its folder is read when a parser is made
 _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     'robot': {
-        '--robot': {'help': lambda: f'{bundled_help.robots()}; default: that of the checkpoint'},
+        '--robot': {
+            'group': 'model',
+            'help': lambda: f'{bundled_help.robots()}; default: that of the checkpoint',
+        },
     },
     'device': {
-        '--device': {'default': 'cpu', 'help': 'PyTorch device, e.g. cpu (default) or cuda'},
+        '--device': {
+            'group': 'model',
+            'default': 'cpu',
+            'help': 'PyTorch device, e.g. cpu (default) or cuda',
+        },
     },
     'threads': {
         '--threads': {
+            'group': 'advanced',
             'type': number_or_0,
             'default': 0,
             'help': 'CPU threads; 0 = all cores but one (of two cores: both)',
@@ -72,12 +83,14 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     },
     'foresight': {
         '--no-foresight': {
+            'group': 'model',
             'dest': 'foresight',
             'action': 'store_false',
             'help': 'simulate no object motion: the imagined frames alone decide. For the '
             "paper's method use it with --checkpoint bundled-paper",
         },
         '--no-camera-check': {
+            'group': 'advanced',
             'dest': 'camera_check',
             'action': 'store_false',
             'help': "skip the comparison of the first frames with the arm's outline, and the "
@@ -86,21 +99,29 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     },
     'steps': {
         '--steps': {
+            'group': 'advanced',
             'type': number_or_0,
             'default': 0,
             'help': 'denoising steps; 0 = as many as the checkpoint says',
         },
     },
     'seed': {
-        '--seed': {'type': int, 'default': 0, 'help': 'seed of the noise (default: 0)'},
+        '--seed': {
+            'group': 'model',
+            'type': int,
+            'default': 0,
+            'help': 'seed of the noise (default: 0)',
+        },
     },
     'serving': {
         '--serving': {
+            'group': 'advanced',
             'default': '',
             'metavar': '"NAME=VALUE ..."',
             'help': 'options that make the model faster or smaller, e.g. "compile=true"',
         },
         '--adapter': {
+            'group': 'advanced',
             'type': Path,
             'help': "LoRA folder or file, instead of the checkpoint's own",
         },
@@ -127,6 +148,7 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     },
     'seeds': {
         '--seeds': {
+            'group': 'model',
             'type': _count,
             'default': 1,
             'help': 'rollouts of each episode with different noise, for the success estimate',
@@ -134,6 +156,7 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     },
     'segmenter': {
         '--segmenter': {
+            'group': 'model',
             'default': 'auto',
             'help': lambda: (
                 f'finds objects: {bundled_help.segmenters()}, module:Class of your own, or the '
@@ -144,6 +167,7 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     },
     'describer': {
         '--describer': {
+            'group': 'advanced',
             'type': Path,
             'metavar': 'YAML',
             'help': 'file of what names the objects (see config/describer.yaml); default: the '
@@ -158,6 +182,7 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
             'machines',
         },
         '--ray': {
+            'group': 'advanced',
             'nargs': '?',
             'const': '',
             'metavar': 'ADDRESS',
@@ -165,12 +190,14 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
             'this machine. DIR has to be on a file system that all machines share',
         },
         '--gpus-per-worker': {
+            'group': 'advanced',
             'type': float,
             'metavar': 'N',
             'help': 'GPUs that Ray reserves for a worker, e.g. 0.5; default: 1 with --device '
             'cuda, else 0',
         },
         '--cpus-per-worker': {
+            'group': 'advanced',
             'type': int,
             'metavar': 'N',
             'help': 'CPU cores that Ray reserves for a worker, and its threads; default: 1',
@@ -178,6 +205,7 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     },
     'checkpoint': {
         '--checkpoint': {
+            'group': 'model',
             'default': 'bundled',
             'help': "folder of the model, 'bundled' (default) or 'bundled-paper'",
         }
@@ -192,15 +220,23 @@ _OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
 _MODEL = 'robot device threads foresight steps seed'
 
 
-def add_options(parser: argparse.ArgumentParser, words: str) -> None:
-    """Add options that several commands share, e.g. those of `overwrite model task`."""
+def add_options(parser: CommandParser, words: str) -> None:
+    """Add options that several commands share, e.g. those of `overwrite model task`.
+
+    Options of the group `model` stand under its heading where the words have `model`.
+    """
+    adds: dict[str, Callable[..., object]] = {'advanced': parser.add_advanced}
+    if 'model' in words.split():
+        adds['model'] = parser.model.add_argument
     for word in words.replace('model', _MODEL).split():
         for flag, how in _OPTIONS[word].items():
-            text = how['help']
-            parser.add_argument(flag, **{**how, 'help': text() if callable(text) else text})
+            text, group = how['help'], how.get('group', '')
+            rest = {name: value for name, value in how.items() if name != 'group'}
+            rest['help'] = text() if callable(text) else text
+            adds.get(group, parser.add_argument)(flag, **rest)
 
 
-def add_watch(parser: argparse.ArgumentParser, what: str) -> None:
+def add_watch(parser: CommandParser, what: str) -> None:
     """Add `--watch`.
 
     Args:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import add_options, names
 from mtv_world_ros.core.files import check_free
 
+if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
 
-def add(commands: argparse._SubParsersAction) -> None:
+
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'task',

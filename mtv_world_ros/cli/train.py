@@ -19,13 +19,14 @@ from mtv_world_ros.core.processes import is_helper_rank
 if TYPE_CHECKING:
     import torch
 
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.data.bag_mapping import EpisodeSource
     from mtv_world_ros.training.training_config import TrainingConfig
     from mtv_world_ros.training.training_run import HeldOut, Judge
     from mtv_world_ros.viewing.scored_rollout import StoredRollout
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'train',
@@ -43,7 +44,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--preset', default='small', help=f'training preset: {presets()}')
     parser.add_argument('--views', help="names of the views, e.g. low,high; default: the preset's")
-    parser.add_argument(
+    parser.add_advanced(
         '--object-mask',
         choices=('on', 'off'),
         help="draw object masks into the trajectory video; default: the preset's",
@@ -56,7 +57,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--init', help="checkpoint to start from: a folder, 'bundled' or 'bundled-paper'"
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--latent-cache',
         type=Path,
         metavar='DIR',
@@ -78,7 +79,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--split', help="split of dataset.json, or 'all'; default: train where there is one"
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--cache',
         type=Path,
         metavar='DIR',
@@ -94,20 +95,20 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='report folder of mtv-world check about these episodes; broken ones are left out',
     )
     add_options(parser, 'describer segmenter dtype')
-    parser.add_argument(
+    parser.add_advanced(
         '--threads',
         type=number_or_0,
         default=0,
         help='CPU threads per process; 0 = its share of all cores',
     )
-    parser.add_argument('--save-every', type=int, default=250, help='steps between saved states')
-    parser.add_argument(
+    parser.add_advanced('--save-every', type=int, default=250, help='steps between saved states')
+    parser.add_advanced(
         '--save-minutes',
         type=float,
         default=10.0,
         help='longest time between saved states [min]; Ctrl-C and SIGTERM save, too',
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--data-workers',
         type=int,
         default=0,
@@ -115,7 +116,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='processes that prepare clips, with segmenters on the CPU; 0 = a thread. The log '
         'says how long training waited for clips',
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--peak-tflops',
         type=float,
         default=0.0,
@@ -123,7 +124,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help='peak of a device, for the model-FLOP utilisation in the log; 0 = measured at the '
         'start with a product of large matrices',
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--sample-every',
         type=int,
         default=0,

@@ -12,6 +12,7 @@ from mtv_world_ros.core.files import check_free
 from mtv_world_ros.viewing.viewer_process import PageAddress
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.viewing.scored_rollout import ScoredRollout
     from mtv_world_ros.viewing.streams import Streams
 
@@ -25,7 +26,7 @@ now. Needs the extra `view`.
 """
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'view',

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.shared_options import add_options
 
+if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
 
-def add(commands: argparse._SubParsersAction) -> None:
+
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'demo', help='replay the bundled episode through the ROS node and score its predictions'

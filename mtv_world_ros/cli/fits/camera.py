@@ -19,6 +19,7 @@ from mtv_world_ros.cli.shared_options import add_options, names
 from mtv_world_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.core.data_types import CameraModel, FloatArray
     from mtv_world_ros.data.episode import Episode, JointStates, Track
     from mtv_world_ros.inspection.camera_pose import CameraEstimate
@@ -35,7 +36,7 @@ _ROUGH_MM = 50.0
 GOOD_MATCH = 0.85
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'camera',
@@ -106,7 +107,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument('--robot', help=f"{robots()}; default: the episode's")
     add_options(parser, 'source')
-    parser.add_argument(
+    parser.add_advanced(
         '--between',
         type=_interval,
         metavar='FROM,TO',

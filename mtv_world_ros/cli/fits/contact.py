@@ -6,13 +6,17 @@ import argparse
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.shared_options import add_options, names, number_or_0, workers_of
 from mtv_world_ros.core.files import check_free
 
+if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
 
-def add(commands: argparse._SubParsersAction) -> None:
+
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'contact',
@@ -41,7 +45,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         '--episodes', type=int, default=50, help='largest number of episodes; 20 to 50 will do'
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--motions', type=int, default=16, help='number of futures that the checkpoint simulates'
     )
     parser.add_argument(
@@ -49,7 +53,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="name of the robot cell of the recordings; the node's `place` must be the same. "
         'Default: what the recordings state, or none',
     )
-    parser.add_argument(
+    parser.add_advanced(
         '--threads', type=number_or_0, default=0, help='CPU threads; 0 = all but one'
     )
     add_options(parser, 'overwrite workers')

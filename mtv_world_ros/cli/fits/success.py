@@ -16,6 +16,7 @@ from mtv_world_ros.core.files import check_free
 from mtv_world_ros.core.writer_lock import only_writer
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.data.splits import Selection
     from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary
     from mtv_world_ros.evaluation.results import EpisodeResult
@@ -35,7 +36,7 @@ not be scored; it is not in the fit.
 """
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'success',
@@ -51,14 +52,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         '--split', help="split of dataset.json, or 'all'; default: test where there is one"
     )
     parser.add_argument('--episodes', type=int, help='use only the first N episodes')
-    add_options(parser, 'workers seeds')
-    parser.add_argument(
+    add_options(parser, 'workers')
+    parser.add_advanced(
         '--no-store',
         dest='store',
         action='store_false',
         help='write the report only; do not change the checkpoint',
     )
-    add_options(parser, 'overwrite dtype model serving segmenter task')
+    add_options(parser, 'overwrite dtype seeds model serving segmenter task')
     parser.set_defaults(handler=_calibrate)
 
 

@@ -27,6 +27,7 @@ Progress = Callable[[Iterable[Any]], Iterable[Any]]
 MakeStage = Callable[[], 'ObjectStage']
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import CommandParser, Commands
     from mtv_world_ros.data.episode import Episode
     from mtv_world_ros.importing.convert import ImportSummary
     from mtv_world_ros.importing.stored_objects import ObjectStage
@@ -60,8 +61,8 @@ class ImportJob:
 
 
 def import_parser(
-    commands: argparse._SubParsersAction, name: str, purpose: str, mapping: str, one: str
-) -> argparse.ArgumentParser:
+    commands: Commands, name: str, purpose: str, mapping: str, one: str
+) -> CommandParser:
     """Return the parser of an import.
 
     Args:
@@ -80,7 +81,7 @@ def import_parser(
 
 
 def add_common_options(
-    parser: argparse.ArgumentParser,
+    parser: CommandParser,
     run: Callable[[argparse.Namespace], int],
     *,
     calibration: str,
@@ -136,7 +137,7 @@ def run_import(arguments: argparse.Namespace, job: ImportJob) -> int:
     return status
 
 
-def _add_masks(parser: argparse.ArgumentParser) -> None:
+def _add_masks(parser: CommandParser) -> None:
     add_options(parser, 'describer')
     parser.add_argument(
         '--segmenter',
@@ -147,7 +148,7 @@ def _add_masks(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--device', default='cpu', help='PyTorch device of the segmenter')
 
 
-def _add_boxes(parser: argparse.ArgumentParser) -> None:
+def _add_boxes(parser: CommandParser) -> None:
     parser.add_argument(
         '--objects',
         type=Path,

@@ -18,12 +18,13 @@ from mtv_world_ros.cli.imports.common import (
 from mtv_world_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.data.episode import Episode
     from mtv_world_ros.importing.convert import ImportSummary
     from mtv_world_ros.importing.lerobot import EpisodeEntry
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = import_parser(
         commands,

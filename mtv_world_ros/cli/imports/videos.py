@@ -16,10 +16,11 @@ from mtv_world_ros.cli.imports.common import (
 )
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.importing.convert import ImportSummary
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = import_parser(
         commands,

@@ -11,6 +11,7 @@ from mtv_world_ros.cli.bundled_help import presets
 from mtv_world_ros.core.errors import CheckpointError
 
 if TYPE_CHECKING:
+    from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.model.wan_weights import PartReport
 
 #: of the paper, Implementation Details
@@ -19,7 +20,7 @@ PROMPT = 'The robotic arm picks up objects from the table and places them'
 _ELSEWHERE = ('autoencoder', 'text_encoder', 'image_encoder', 'tokenizer')
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         'wan',
