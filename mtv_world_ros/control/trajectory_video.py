@@ -140,7 +140,7 @@ _LINK_SHARE = 0.5
 _NEAREST_SIZE_M = 0.05
 _WHITE = np.ones(3)
 #: colours of an arm's two fingers
-_FINGER_COLOURS = (_WHITE, np.array([1.0, 0.0, 1.0]))
+FINGER_COLOURS = (_WHITE, np.array([1.0, 0.0, 1.0]))
 
 
 def render_trajectory_video(
@@ -294,7 +294,7 @@ def _cover(image: ByteArray, pictures: ByteArray | None, frame: int) -> None:
 
 
 def _draw_fingers(fingers: ArmLinks, image: ByteArray, arm: int, frame: int) -> None:
-    for side, colour in enumerate(_FINGER_COLOURS):
+    for side, colour in enumerate(FINGER_COLOURS):
         fingers.draw(image, 2 * arm + side, frame, colour)
 
 

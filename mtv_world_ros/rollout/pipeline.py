@@ -10,6 +10,7 @@ from typing import Any, Protocol, TYPE_CHECKING
 
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.control.control import Control, ControlInputs, ControlScene
+from mtv_world_ros.control.mark_leaks import find_leaks, leak_remarks, without_leaks
 from mtv_world_ros.control.trajectory_video import TrajectoryVideo, TrajectoryVideoConfig
 from mtv_world_ros.core.data_types import (
     ByteArray,
@@ -35,6 +36,7 @@ from mtv_world_ros.rollout.scene_memory import SceneKeeper, SceneMemory
 from mtv_world_ros.rollout.state import RolloutState
 from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.success.comparison import Comparison
+from mtv_world_ros.success.doubts import doubted
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
@@ -374,6 +376,7 @@ class Pipeline:
             history=state.history,
         )[:, : plan.num_frames]
         clock.lap('model')
+        frames, leak_notes = self._without_marks(frames, control, scene)
         motion = motion.first(plan.num_frames + 1)
         background = state.scene
         if self.scene_keeper is not None and options.objects:
@@ -384,6 +387,7 @@ class Pipeline:
             motion=motion, masks=masks, is_in_view=control.video is None or bool(in_view.any())
         )
         success, foreseen, evidence = self.judge.judge(evidence, chunk_start, imagined, options)
+        success = doubted(success, leak_notes)
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)
@@ -463,6 +467,22 @@ class Pipeline:
             masks,
         )
         return ObservedChunk(start_masks=start_masks, masks=masks, success=success), after
+
+    def _without_marks(
+        self, frames: ByteArray, control: ControlInputs, scene: ControlScene
+    ) -> tuple[ByteArray, tuple[str, ...]]:
+        """Return imagined frames without colours of the drawn marks, and a remark on them."""
+        if control.video is None or not isinstance(self.control, TrajectoryVideo):
+            return frames, ()
+        last = 1 + frames.shape[1]
+        leaks = find_leaks(
+            frames,
+            control.video[:, 1:last],
+            scene.start_frames,
+            None if scene.objects is None else scene.objects[:, :last],
+            len(self.robot.tools),
+        )
+        return without_leaks(frames, leaks), leak_remarks(leaks)
 
     def _kept(
         self,
