@@ -213,7 +213,7 @@ def send(key: str, message: Any) -> None:
     from mtv_world_ros.core.bounded_input import check_limit
     from mtv_world_ros.ros.messages.rejection import Reason, rejected_as
     from mtv_world_ros.ros.sensing.observations import ObservationBuffer
-    from mtv_world_ros.ros.world_model.rollouts import RequestMaker
+    from mtv_world_ros.ros.world_model.request_maker import RequestMaker
 
     robot, cameras, settings = _fixed()
     if key == 'instruction':

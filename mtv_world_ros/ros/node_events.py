@@ -33,7 +33,7 @@ class SensingEvents(Protocol):
 
 
 class NodeEvents(SensingEvents, Protocol):
-    """Events of a configured node; see `Rollouts`. All but `on_results` come from the executor."""
+    """Events of a node; see `ConfiguredNode`. All but `on_results` come from the executor."""
 
     def settings(self) -> Settings:
         """Return the present parameters."""

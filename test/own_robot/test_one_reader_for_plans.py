@@ -16,7 +16,7 @@ from mtv_world_ros.importing.bags import BagPart, convert_bag
 from mtv_world_ros.ros.messages.rejection import Rejection
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer, SensedScene
-from mtv_world_ros.ros.world_model.rollouts import RequestMaker
+from mtv_world_ros.ros.world_model.request_maker import RequestMaker
 from test.support.bags import bag_cameras, grey_frames, record
 from test.support.crane import FPS, JOINTS, make_positions, render, START_NS
 

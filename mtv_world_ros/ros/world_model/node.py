@@ -18,10 +18,10 @@ from mtv_world_ros.ros import parameters
 from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.run_node import run
 from mtv_world_ros.ros.sensing.subscriptions import OWN_PATHS
+from mtv_world_ros.ros.world_model.configured_node import ConfiguredNode
 from mtv_world_ros.ros.world_model.loading import load_named_pipeline
 from mtv_world_ros.ros.world_model.loading_watch import LoadingWatch, WaitingLog
 from mtv_world_ros.ros.world_model.reporter import Reporter
-from mtv_world_ros.ros.world_model.rollouts import Rollouts
 
 Load = Callable[[Settings], Pipeline]
 
@@ -44,7 +44,7 @@ class WorldModelNode(LifecycleNode):
         self.add_post_set_parameters_callback(self._on_parameters)
         self._change_state: Any = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state  # type: ignore[assignment]
-        self._rollouts: Rollouts | None = None
+        self._configured: ConfiguredNode | None = None
         self._error: Exception | None = None
         self._is_starting = False
         self._loading = ''
@@ -88,9 +88,9 @@ class WorldModelNode(LifecycleNode):
             with LoadingWatch(self, f"'{self._settings.checkpoint}'", self._on_loading) as watch:
                 pipeline = self._load(self._settings)
                 self._reporter.name_robot(pipeline.robot.name)
-                self._rollouts = Rollouts(self, pipeline, self.settings, self._reporter)
+                self._configured = ConfiguredNode(self, pipeline, self.settings, self._reporter)
                 parameters.refuse_unknown(self)
-                self._rollouts.take_early(watch.take())
+                self._configured.take_early(watch.take())
         except Exception as error:
             self._release()
             self._error = error
@@ -104,15 +104,15 @@ class WorldModelNode(LifecycleNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take plans from now on."""
-        assert self._rollouts is not None
-        self._rollouts.activate()
-        self.get_logger().info(f'ready: {self._rollouts.description}')
+        assert self._configured is not None
+        self._configured.activate()
+        self.get_logger().info(f'ready: {self._configured.description}')
         return TransitionCallbackReturn.SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Pre-empt the plan that runs and refuse others."""
-        assert self._rollouts is not None
-        self._rollouts.deactivate()
+        assert self._configured is not None
+        self._configured.deactivate()
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -123,8 +123,8 @@ class WorldModelNode(LifecycleNode):
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Pre-empt the plan that runs; the model is freed once its end was reported."""
-        if self._rollouts is not None:
-            self._rollouts.deactivate()
+        if self._configured is not None:
+            self._configured.deactivate()
         return TransitionCallbackReturn.SUCCESS
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -158,9 +158,9 @@ class WorldModelNode(LifecycleNode):
         self._reporter.publish_diagnostics()
 
     def _release(self) -> None:
-        if self._rollouts is not None:
-            self._rollouts.close()
-            self._rollouts = None
+        if self._configured is not None:
+            self._configured.close()
+            self._configured = None
 
     def _on_parameters(self, _: object) -> None:
         self._settings = parameters.read(self, Settings)
@@ -168,10 +168,10 @@ class WorldModelNode(LifecycleNode):
     def _on_period(self) -> None:
         if self._lifecycle() == 'finalized':
             self._release()
-        if self._rollouts is not None:
-            self._rollouts.refresh()
-        if self._rollouts is not None and self._lifecycle() == 'active':
-            self._waits.update(self._rollouts.missing(), self._rollouts.has_begun)
+        if self._configured is not None:
+            self._configured.refresh()
+        if self._configured is not None and self._lifecycle() == 'active':
+            self._waits.update(self._configured.missing(), self._configured.has_begun)
         self._reporter.publish_diagnostics()
 
     def _lifecycle(self) -> str:
@@ -184,12 +184,12 @@ class WorldModelNode(LifecycleNode):
             return [f'not configured: {self._error}']
         if self._loading:
             return [self._loading]
-        if self._rollouts is None or self._lifecycle() != 'active':
+        if self._configured is None or self._lifecycle() != 'active':
             return [f'the node is {self._lifecycle()}']
-        return self._rollouts.missing()
+        return self._configured.missing()
 
     def _state(self) -> Mapping[str, object]:
-        state = self._rollouts.state() if self._rollouts is not None else {'policies': 0}
+        state = self._configured.state() if self._configured is not None else {'policies': 0}
         return {'lifecycle': self._lifecycle(), **state}
 
 

@@ -156,7 +156,7 @@ def test_a_stale_plan_that_was_sent_again_says_so(node, client, ros, transport_s
     client.send_scene()
     client.spin_for(0.1)
     since, late_ns = len(client.report_values()), client.now_ns() - 3_000_000_000
-    node.node._rollouts.on_plan(ros.make_trajectory(stamp_ns=late_ns), transport_s)
+    node.node._configured.on_plan(ros.make_trajectory(stamp_ns=late_ns), transport_s)
     ended = client.next_end(since)
     assert ended['reason'] == 'trajectory_stale'
     assert ('2.900 s after it was published: lost and sent again' in ended['text']) == is_said
