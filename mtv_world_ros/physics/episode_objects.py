@@ -23,6 +23,7 @@ from mtv_world_ros.core.images import resize_frames, resize_labels
 from mtv_world_ros.physics.foreseen_motions import foreseen_of, ForeseenMotions
 from mtv_world_ros.physics.grips import FingerState, watch_fingers
 from mtv_world_ros.physics.object_motion import FoundObjects, ObjectMotionModel
+from mtv_world_ros.physics.sights import KeptPose, Sights
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import ChunkPlan
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
@@ -43,6 +44,7 @@ class ObjectForesight:
         source: newest real observation, at the cameras' size.
         found: the objects in `source` and their motion since; None = not looked for yet.
         fingers: motion of the fingers until `source`, as measured; None = not known.
+        sights: last frames until `source` that showed the objects free; None = none were watched.
     """
 
     model: ObjectMotionModel | None
@@ -52,6 +54,7 @@ class ObjectForesight:
     source: Observation
     found: FoundObjects | None = None
     fingers: FingerState | None = None
+    sights: Sights | None = None
     _whole: dict[tuple[str, ...], FoundObjects] = field(default_factory=dict)
 
     def branch(self, source: Observation) -> ObjectForesight:
@@ -98,19 +101,34 @@ class ObjectForesight:
         return None if motions is None else motions.at_frames(plans[-1])
 
     def watched(
-        self, positions: FloatArray, period_s: float, commands: FloatArray | None = None
+        self,
+        motion: Motion,
+        names: Sequence[str],
+        masks: BoolArray,
+        period_s: float,
+        commands: FloatArray | None = None,
     ) -> ObjectForesight:
-        """Return the objects after measured joint positions.
+        """Return the objects after real frames.
 
         Args:
-            positions: (1 + T, J) measured [rad or m]; row 0 where the robot stood before.
+            motion: measured motion of the robot at 1 + T states; row 0 where it stood before.
+            names: names of the O objects.
+            masks: (V, O, 1 + T, H, W) their masks.
             period_s: time between two rows [s].
             commands: (1 + T, J) commanded at the same times [rad or m]; None = not known.
         """
-        openings = self.robot.gripper_openings(positions)
         commanded = None if commands is None else self.robot.gripper_openings(commands)
-        _, fingers = watch_fingers(openings, period_s, self.fingers, commanded)
-        return replace(self, fingers=fingers)
+        before = self.fingers
+        if before is not None:  # what masks say is judged anew
+            before = replace(before, is_refuted=np.zeros(len(before.rest), np.bool_))
+        stopped, fingers = watch_fingers(motion.openings, period_s, before, commanded)
+        sights = self.sights
+        if sights is None or sights.names != tuple(names):
+            sights = Sights.begin(names, motion.first(1))
+            sights = sights.after(motion.first(1), masks[:, :, :1], stopped[:, :1], period_s)
+        sights = sights.after(motion.after_first(), masks[:, :, 1:], stopped[:, 1:], period_s)
+        fingers = replace(fingers, is_refuted=sights.refuted)
+        return replace(self, fingers=fingers, sights=sights)
 
     def foresee(
         self,
@@ -276,10 +294,14 @@ class ObjectForesight:
         """
         assert self.model is not None
         sharp = self._sharp(source, names, masks)
-        poses = Motion.of(self.robot, source.cameras, source.positions[None]).camera_poses[:, 0]
+        motion = Motion.of(self.robot, source.cameras, source.positions[None])
+        poses = motion.camera_poses[:, 0]
         given = names, sharp, source.cameras, list(poses)
         if whole is None:
             return FoundObjects.at(names, frames, masks, poses, self.model.find(*given))
-        tracked, same, hidden = self.model.find_again(whole.tracked, *given)
+        kept: tuple[KeptPose | None, ...] = ()
+        if self.sights is not None and self.sights.names == names:
+            kept = self.sights.kept(motion.tools[:, 0])
+        tracked, same, hidden = self.model.find_again(whole.tracked, *given, kept)
         found = FoundObjects.at(names, frames, masks, poses, tracked).shown_as(whole, hidden)
         return replace(found, is_whole=bool(same.all()))

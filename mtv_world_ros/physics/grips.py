@@ -68,6 +68,7 @@ class FingerState:
         rest: (A,) opening that the fingers have stayed near [fraction of the range].
         rest_s: (A,) time for which they have stayed near that opening [s].
         is_refused: (A,) whether they rest although they are commanded to close further.
+        is_refuted: (A,) whether masks have shown since they stopped that they hold nothing.
     """
 
     widest: FloatArray
@@ -75,6 +76,7 @@ class FingerState:
     rest: FloatArray
     rest_s: FloatArray
     is_refused: BoolArray
+    is_refuted: BoolArray
 
     @classmethod
     def at(cls, openings: FloatArray) -> FingerState:
@@ -85,6 +87,7 @@ class FingerState:
             rest=openings,
             rest_s=np.zeros(len(openings)),
             is_refused=np.zeros(len(openings), np.bool_),
+            is_refuted=np.zeros(len(openings), np.bool_),
         )
 
     def after(
@@ -115,13 +118,15 @@ class FingerState:
             rest=np.where(is_moving, openings, self.rest),
             rest_s=rest_s,
             is_refused=is_refused,
+            is_refuted=self.is_refuted & ~has_opened,
         )
 
     def are_stopped(self, settings: GripSettings = _SETTINGS) -> BoolArray:
-        """Return whether something stops the fingers short of shut (A,)."""
+        """Return whether something stops the fingers short of shut, and may be held (A,)."""
         is_between = (self.rest > settings.min_opening) & (self.rest < settings.max_opening)
         has_closed = self.widest - self.rest >= settings.closes_by
-        return is_between & (has_closed | self.is_refused) & _rests(self.rest_s, settings)
+        is_stopped = is_between & (has_closed | self.is_refused) & _rests(self.rest_s, settings)
+        return is_stopped & ~self.is_refuted
 
 
 def _rests(rest_s: FloatArray, settings: GripSettings) -> BoolArray:

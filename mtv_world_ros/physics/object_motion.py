@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, CameraModel, FloatArray
 from mtv_world_ros.physics.grips import FingerState
+from mtv_world_ros.physics.sights import KeptPose
 from mtv_world_ros.robot.model import RobotModel
 
 #: displacement below which an object stands still [m]
@@ -194,6 +195,7 @@ class ObjectMotionModel(Protocol):
         masks: BoolArray,
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
+        kept: Sequence[KeptPose | None] = (),
     ) -> tuple[TrackedObjects, BoolArray, BoolArray]:
         """Return the objects in a frame in which they may be partly hidden.
 
@@ -203,6 +205,8 @@ class ObjectMotionModel(Protocol):
             masks: visible parts of the objects, see `find`.
             cameras: cameras of the V views.
             poses: T_base_camera of each view, (4, 4) [m].
+            kept: pose of each object by the last frame that showed it free; None, or an empty
+                sequence: the masks alone say where it is.
 
         Returns:
             The objects; mask (O,) of the objects found with certainty, at their former size; mask

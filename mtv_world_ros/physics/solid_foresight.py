@@ -20,6 +20,7 @@ from mtv_world_ros.physics.engine.engine import Batch, BatchState, Engine
 from mtv_world_ros.physics.engine.futures import draw_futures, Future, STANDS_M
 from mtv_world_ros.physics.grips import FingerState
 from mtv_world_ros.physics.object_motion import ObjectMotion
+from mtv_world_ros.physics.sights import KeptPose
 from mtv_world_ros.physics.solids import bottom_of, find_solid, fit_solid, is_box, is_vessel, Solid
 from mtv_world_ros.robot.model import RobotModel
 
@@ -153,6 +154,7 @@ class SolidForesight:
         masks: BoolArray,
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
+        kept: Sequence[KeptPose | None] = (),
     ) -> tuple[TrackedSolids, BoolArray, BoolArray]:
         """Return objects that something may hide in part by now; see `ObjectMotionModel`."""
         points = locate_all(cameras, poses, centroids(masks))
@@ -161,6 +163,12 @@ class SolidForesight:
             solid and find_solid(solid, masks[:, item], points[item], cameras, poses, floor)
             for item, solid in enumerate(whole.solids)
         ]
+        is_kept = np.zeros(len(solids), np.bool_)
+        for item, one in enumerate(kept):
+            solid = one and whole.solids[item]
+            before = one and solid and _solid_then(one, solid, floor)
+            if before is not None:
+                solids[item], is_kept[item] = before, True
         anew = whole.foresight._found(names, masks, cameras, poses, solids)
         same = np.array([solid is not None for solid in solids], np.bool_)
         hidden = np.array([solid is not None and solid.is_hidden for solid in solids], np.bool_)
@@ -171,7 +179,7 @@ class SolidForesight:
             assert was is not None and now is not None
             turned[item], reference[item] = was.turn_to(now), was.centre
         # one view alone tells how far away it is by its size, which is not to be relied on
-        by_two = np.asarray(masks.any((-2, -1)).sum(0) > 1)
+        by_two = np.asarray(masks.any((-2, -1)).sum(0) > 1) | is_kept
         anew = replace(anew, reference=reference, turned=turned, note=whole.note)
         return anew, same & by_two, hidden
 
@@ -365,7 +373,8 @@ class TrackedSolids:
         return {
             number: f"'{self.names[number]}' seems to float {1e3 * height:.0f} mm above the table"
             for number, solid in zip(known, solids, strict=True)
-            if (height := _floats(solid, [s for s in solids if s is not solid], table)) > 0
+            if not solid.is_held
+            and (height := _floats(solid, [s for s in solids if s is not solid], table)) > 0
         }
 
     def futures(self) -> tuple[Future, ...]:
@@ -375,6 +384,17 @@ class TrackedSolids:
         solids = [solid for solid in self.solids if solid is not None]
         drives = self.foresight.engine.arms.drives
         return draw_futures(self.foresight.settings, solids, drives)
+
+
+def _solid_then(kept: KeptPose, solid: Solid, floor: float) -> Solid | None:
+    """Return a solid where a kept pose has it by now; None = it did not look so then."""
+    poses = list(kept.poses)
+    (point,) = locate_all(kept.cameras, poses, centroids(kept.masks)[:, None])
+    found = find_solid(solid, kept.masks, point, kept.cameras, poses, floor)
+    if found is None:
+        return None
+    found = found.moved_by(kept.moved)
+    return replace(found, is_hidden=True, is_held=kept.is_held, error_m=kept.error_m)
 
 
 def table_in(

@@ -77,6 +77,9 @@ class Solid:
         is_hidden: whether something hid a part of it when it was found again.
         fills: (V,) fraction of the outline that the mask fills in each view; 0 = not seen.
         error_px: root mean square distance of its outline from those of the masks.
+        error_m: standard deviation of where it is, beyond that of the fit: what was seen of it
+            last is old [m].
+        is_held: whether fingers hold it.
     """
 
     centre: FloatArray
@@ -87,11 +90,18 @@ class Solid:
     is_hidden: bool = False
     fills: FloatArray = field(default_factory=lambda: np.zeros(0))
     error_px: float = 0.0
+    error_m: float = 0.0
+    is_held: bool = False
 
     @property
     def bottom(self) -> float:
         """Height of its lower face [m]."""
         return float(self.centre[2] - self.size[2] / 2)
+
+    def moved_by(self, T: FloatArray) -> Solid:
+        """Return the solid after a rigid motion (4, 4) in the base frame; it stays upright."""
+        yaw = self.yaw + float(np.arctan2(T[1, 0], T[0, 0]))
+        return replace(self, centre=T[:3, :3] @ self.centre + T[:3, 3], yaw=yaw)
 
     def turn_to(self, now: Solid) -> FloatArray:
         """Return (3, 3) how it has turned."""

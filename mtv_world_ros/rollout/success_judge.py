@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isfinite, nan
 
+import numpy as np
+
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.core.data_types import (
     BoolArray,
@@ -262,7 +264,13 @@ class SuccessJudge:
         estimate = doubted(estimate, refusal='; '.join(doubts))
         state = replace(
             state,
-            objects=state.objects.watched(positions, chunk.period_s, chunk.commands),
+            objects=state.objects.watched(
+                chunk.motion,
+                chunk.masks.names,
+                np.concatenate([chunk.start_masks.masks, chunk.masks.masks], axis=2),
+                chunk.period_s,
+                chunk.commands,
+            ),
             memory=memory,
             observed_doubts=doubts,
         )

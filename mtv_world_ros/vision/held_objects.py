@@ -12,11 +12,12 @@ Shape letters: V views, N frames, O objects, A arms, H W pixels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.cameras.motion import Motion
@@ -38,7 +39,8 @@ class HoldSettings:
         travel: distance from where it closed at which the tool has carried an object away
             [fraction of image width].
         margin: tolerance of an object's place [fraction of image width].
-        min_area: share of the object's area that has to be seen along with the tool.
+        min_area: share of the object's area that has to be seen where the tool would have carried
+            it, or where it was, outside of what both have in common.
         min_frames: frames in which it has to be seen there, in one view.
     """
 
@@ -53,6 +55,8 @@ class HoldSettings:
 
 
 SETTINGS = HoldSettings()
+#: definition for stops of fingers: hands may move a little before they open again
+STOP_SETTINGS = HoldSettings(travel=0.04, margin=0.012, min_area=0.2)
 
 
 class Hold(Enum):
@@ -89,7 +93,7 @@ def judge_stops(
     motion: Motion,
     masks: BoolArray,
     stops: Sequence[tuple[int, int, int]],
-    settings: HoldSettings = SETTINGS,
+    settings: HoldSettings = STOP_SETTINGS,
 ) -> tuple[Stop, ...]:
     """Return stops of fingers with the evidence of masks.
 
@@ -177,6 +181,70 @@ def nearest_object(
     return chosen
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HoldEvidence:
+    """Evidence of frames since fingers closed at an object, of one arm.
+
+    Attributes:
+        start: (V, H, W) masks of the object when they closed.
+        closed_at: (V, 2) pixels of the tool then; NaN = behind a camera.
+        num_far: (V,) frames in which the tool was away from there.
+        num_along: (V,) of these, frames that show the object where the tool would carry it.
+        num_left: (V,) of these, frames that show it where it was, and not at the hand.
+    """
+
+    start: BoolArray
+    closed_at: FloatArray
+    num_far: NDArray[np.int64]
+    num_along: NDArray[np.int64]
+    num_left: NDArray[np.int64]
+
+    @classmethod
+    def begin(cls, start: BoolArray, closed_at: FloatArray) -> HoldEvidence:
+        """Return the evidence before the hand has moved."""
+        none = np.zeros(len(start), np.int64)
+        return cls(start=start, closed_at=closed_at, num_far=none, num_along=none, num_left=none)
+
+    def after(
+        self, masks: BoolArray, tools: FloatArray, settings: HoldSettings = SETTINGS
+    ) -> HoldEvidence:
+        """Return the evidence after one more frame.
+
+        Args:
+            masks: (V, H, W) masks of the object.
+            tools: (V, 2) pixels of the tool.
+            settings: definition of held.
+        """
+        width, ways = masks.shape[-1], tools - self.closed_at
+        margin = round(settings.margin * width)
+        far = np.linalg.norm(ways, axis=-1) >= settings.travel * width
+        far &= self.start.any((-2, -1))
+        along, left = np.zeros(len(masks), np.bool_), np.zeros(len(masks), np.bool_)
+        for view in map(int, np.flatnonzero(far)):
+            start, mask, way = self.start[view], masks[view], ways[view]
+            stays, goes = grown(start, margin), grown(_shifted(start, way), margin)
+            enough = settings.min_area * start.sum()
+            along[view] = (mask & goes & ~stays).sum() >= enough
+            # of a towel that fingers hold by its edge most stays, and the hand stays at it
+            is_beside = mask.any() and _distance(mask, tools[view]) >= np.linalg.norm(way) / 2
+            left[view] = is_beside and (mask & stays & ~goes).sum() >= enough
+        return replace(
+            self,
+            num_far=self.num_far + far,
+            num_along=self.num_along + along,
+            num_left=self.num_left + left,
+        )
+
+    def hold(self, settings: HoldSettings = SETTINGS) -> Hold:
+        """Return what the frames say together; one view that shows it along decides."""
+        if (self.num_along >= settings.min_frames).any():
+            return Hold.HELD
+        if (self.num_left >= settings.min_frames).any():
+            return Hold.NOT_HELD
+        is_far = (self.num_far >= settings.min_frames).any()
+        return Hold.NOT_SEEN if is_far else Hold.NOT_TOLD
+
+
 def goes_along(
     masks: BoolArray,
     tools: FloatArray,
@@ -193,32 +261,11 @@ def goes_along(
         opened: first row at which they open again.
         settings: definition of held.
     """
-    width, hold = masks.shape[-1], Hold.NOT_TOLD
-    for view, way in enumerate(tools - tools[:, closed : closed + 1]):
-        start = _last_shown(masks[view, : closed + 1])
-        if not start.any():
-            continue
-        lengths = np.linalg.norm(way[closed:opened], axis=-1)
-        rows = closed + np.flatnonzero(lengths >= settings.travel * width)
-        if len(rows) < settings.min_frames:
-            continue
-        stays = _grown(start, round(settings.margin * width))
-        along = [
-            _area_along(masks[view, row], start, stays, way[row], settings.margin * width)
-            for row in rows
-        ]
-        if _enough(along, settings):
-            return Hold.HELD
-        left = [(masks[view, row] & stays).sum() / start.sum() for row in rows]
-        if _enough(left, settings):
-            hold = Hold.NOT_HELD
-        elif hold is Hold.NOT_TOLD:
-            hold = Hold.NOT_SEEN
-    return hold
-
-
-def _enough(shares: Sequence[float], settings: HoldSettings) -> bool:
-    return sum(share >= settings.min_area for share in shares) >= settings.min_frames
+    start = np.stack([_last_shown(of_view[: closed + 1]) for of_view in masks])
+    evidence = HoldEvidence.begin(start, tools[:, closed])
+    for row in range(closed, opened):
+        evidence = evidence.after(masks[:, row], tools[:, row], settings)
+    return evidence.hold(settings)
 
 
 def _last_shown(masks: BoolArray) -> BoolArray:
@@ -232,17 +279,14 @@ def _distance(mask: BoolArray, pixel: FloatArray) -> float:
     return float(np.hypot(columns - pixel[0], rows - pixel[1]).min())
 
 
-def _area_along(
-    mask: BoolArray, start: BoolArray, stays: BoolArray, way: FloatArray, margin: float
-) -> float:
-    """Return the area of a mask where a tool carried it, in areas of the start mask."""
+def _shifted(mask: BoolArray, way: FloatArray) -> BoolArray:
+    """Return a mask (H, W) shifted by (2,) pixels."""
     shift = np.array([[1, 0, round(way[0])], [0, 1, round(way[1])]], np.float32)
-    carried = cv2.warpAffine(start.astype(np.uint8), shift, start.shape[::-1]) > 0
-    there = _grown(carried, round(margin)) & ~stays
-    return float((mask & there).sum() / start.sum())
+    return cv2.warpAffine(mask.astype(np.uint8), shift, mask.shape[::-1]) > 0
 
 
-def _grown(mask: BoolArray, pixels: int) -> BoolArray:
+def grown(mask: BoolArray, pixels: int) -> BoolArray:
+    """Return a mask (H, W) that reaches further by some pixels."""
     size = 2 * pixels + 1
     shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     return cv2.dilate(mask.astype(np.uint8), shape) > 0

@@ -112,7 +112,7 @@ def _disturbed(
     """
     noise, spread = share * rng.normal(size=5), settings.spread
     wide, long, high = solid.size * np.exp(spread.size * noise[[0, 0, 1]])
-    x, y = solid.centre[:2] + spread.place_m * noise[2:4]
+    x, y = solid.centre[:2] + np.hypot(spread.place_m, solid.error_m) * noise[2:4]
     bottom = solid.bottom
     if abs(bottom - settings.table_m) < STANDS_M:
         bottom = settings.table_m
