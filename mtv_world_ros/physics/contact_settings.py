@@ -55,8 +55,12 @@ PRIOR_LOG_STD = 1.0
 PRIOR_CAMERA_M = 0.002
 #: largest number of futures of a plan
 MAX_MOTIONS = 64
-#: recordings that must tell whether things slip before verdicts rest on numbers of contact
+#: recordings that must tell whether things slip before verdicts rest on numbers of contact, of
+#: files that do not say within which factor it is known
 ENOUGH_TELLING = 3
+#: factor between the ends of the 90 % interval of what decides whether things slip, above which no
+#: verdict rests on it: that of the prior of a single parameter
+MAX_HOLD_FACTOR = float(np.exp(2 * ndtri(0.95) * PRIOR_LOG_STD))
 
 
 class ContactOrigin(Schema):
@@ -68,6 +72,30 @@ class ContactOrigin(Schema):
     place: str | None = Field(
         default=None,
         description='robot cell of the recordings; null = older file, which holds everywhere',
+    )
+    hold: tuple[float, float] | None = Field(
+        default=None,
+        description='90 % interval of friction x stiffness of fingers / density, which decides '
+        'whether things slip [N m^2/kg]; null = older file',
+    )
+
+
+def hold_line(low: float, high: float) -> str:
+    """Return within which factor it is known whether things slip, and what that is enough for.
+
+    Args:
+        low: lower end of the 90 % interval of friction x stiffness of fingers / density.
+        high: upper end of that interval.
+    """
+    known = (
+        f'whether things slip between fingers is known within a factor of {high / low:.3g} '
+        f'({low:.3g} to {high:.3g} N m^2/kg, 90 %)'
+    )
+    if high <= MAX_HOLD_FACTOR * low:
+        return f'{known}: within {MAX_HOLD_FACTOR:.0f}, so that verdicts may rest on it'
+    return (
+        f'{known}, not within {MAX_HOLD_FACTOR:.0f} as verdicts need it: more recordings in which '
+        'fingers stop at objects, some of which slip, tell it'
     )
 
 
@@ -127,6 +155,13 @@ class ContactSettings(Schema):
         description='what stops measured fingers short of shut is held until they open, whatever '
         'contact would do: of recordings whose commands are measured positions',
     )
+    stop_holds: float = Field(
+        default=1.0,
+        ge=0,
+        le=1,
+        description='with grips_hold: share of the stops of measured fingers at an object that '
+        'hold it; in the other futures contact alone decides',
+    )
     delay_s: float = Field(
         default=0.0, ge=0, le=1, description='by which commands take effect later [s]'
     )
@@ -170,6 +205,9 @@ class ContactSettings(Schema):
         if self.fitted is None:
             return 'numbers of contact (contact.json) were never fitted on recordings'
         telling, count = self.fitted.telling, self.fitted.recordings
+        if self.fitted.hold is not None:
+            low, high = self.fitted.hold
+            return '' if high <= MAX_HOLD_FACTOR * low else hold_line(low, high)
         if telling >= ENOUGH_TELLING:
             return ''
         return (

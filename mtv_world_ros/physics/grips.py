@@ -11,7 +11,7 @@ Shape letters: S rows, A arms, O solids.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,10 @@ class GripSettings:
         max_width_ratio: largest narrow side of what fits between the fingers [widest opening].
         max_gap_m: largest distance of the fingers from each other beyond the longest side of what
             they hold: the error of its size [m].
+        beside_m: distance of the tool point from every solid beyond which stopped fingers
+            contradict a future: something is between them, and no solid is [m].
+        contradiction: factor by which such a stop makes a future less likely; fingers may also
+            stop at something that has no name.
     """
 
     max_opening: float = 0.8
@@ -51,6 +55,8 @@ class GripSettings:
     reach_m: float = 0.025
     max_width_ratio: float = 1.1
     max_gap_m: float = 0.015
+    beside_m: float = 0.04
+    contradiction: float = 0.1
 
 
 _SETTINGS = GripSettings()
@@ -234,6 +240,7 @@ class GripCourse:
         grips: dict[int, Grip],
         poses: FloatArray,
         solids: Sequence[Solid],
+        holds: Callable[[int], bool] = lambda arm: True,
     ) -> tuple[dict[int, Grip], FloatArray]:
         """Return the grips at a row, and where the solids are then.
 
@@ -242,6 +249,7 @@ class GripCourse:
             grips: grip at the row before, by number of the solid.
             poses: (O, 4, 4) T_base_solid where nothing but contact holds the solids [m].
             solids: the O solids as found.
+            holds: whether the stopped fingers of an arm hold what is between them.
         """
         kept = {item: grip for item, grip in grips.items() if not self._lets_go(grip, row)}
         poses = poses.copy()
@@ -249,13 +257,39 @@ class GripCourse:
             poses[item] = self.tools[grip.arm, row] @ grip.T_tool_solid
         busy = {grip.arm for grip in kept.values()}
         for arm in map(int, np.flatnonzero(self.stopped[:, row])):
-            item = None if arm in busy else self._nearest(arm, row, poses, solids, kept)
+            if arm in busy or not holds(arm):
+                continue
+            item = self._nearest(arm, row, poses, solids, kept)
             if item is not None:
                 inside = np.linalg.inv(self.tools[arm, row]) @ poses[item]
                 kept[item] = Grip(
                     arm=arm, T_tool_solid=inside, opening=float(self.openings[arm, row])
                 )
         return kept, poses
+
+    def begins(self, arm: int, row: int, was_stopped: BoolArray) -> bool:
+        """Return whether something begins to stop the fingers of an arm at a row.
+
+        Args:
+            arm: number of the arm.
+            row: number of the row.
+            was_stopped: (A,) whether something stopped the fingers before row 0.
+        """
+        before = self.stopped[arm, row - 1] if row else was_stopped[arm]
+        return bool(self.stopped[arm, row] and not before)
+
+    def is_beside(self, arm: int, row: int, poses: FloatArray, solids: Sequence[Solid]) -> bool:
+        """Return whether no solid is where the fingers of an arm are at a row.
+
+        Args:
+            arm: number of the arm.
+            row: number of the row.
+            poses: (O, 4, 4) T_base_solid [m].
+            solids: the O solids as found.
+        """
+        tool = self.tools[arm, row]
+        away = [_outside(solid, pose, tool)[0] for solid, pose in zip(solids, poses, strict=True)]
+        return min(away, default=np.inf) > self.settings.beside_m
 
     def _lets_go(self, grip: Grip, row: int) -> bool:
         return bool(self.openings[grip.arm, row] > grip.opening + self.settings.opens_by)
@@ -276,12 +310,17 @@ class GripCourse:
             is_too_wide = min(solid.size[:2]) > settings.max_width_ratio * self.widths[arm]
             if item in kept or is_too_wide or gap > max(solid.size) + settings.max_gap_m:
                 continue
-            local = np.linalg.inv(poses[item]) @ tool[:, 3]
-            outside = np.maximum(np.abs(local[:3]) - np.asarray(solid.size) / 2, 0.0)
-            distance = float(np.linalg.norm(outside))
-            if distance < settings.reach_m:
-                near.append((float(np.linalg.norm(local[:3])), item))
+            outside_m, from_centre_m = _outside(solid, poses[item], tool)
+            if outside_m < settings.reach_m + solid.error_m:
+                near.append((from_centre_m, item))
         return min(near)[1] if near else None
+
+
+def _outside(solid: Solid, pose: FloatArray, tool: FloatArray) -> tuple[float, float]:
+    """Return how far a tool point is from the outline of a solid, and from its centre [m]."""
+    local = np.linalg.inv(pose) @ tool[:, 3]
+    outside = np.maximum(np.abs(local[:3]) - np.asarray(solid.size) / 2, 0.0)
+    return float(np.linalg.norm(outside)), float(np.linalg.norm(local[:3]))
 
 
 def _wide_open(robot: RobotModel) -> FloatArray:

@@ -62,7 +62,8 @@ class KeptPose:
         cameras: cameras of the V views at the masks' size.
         poses: (V, 4, 4) T_base_camera then.
         moved: (4, 4) its motion since, in the base frame: that of the gripper that holds it.
-        is_held: whether a gripper holds it.
+        is_held: whether fingers stopped at it, and no mask says that it stayed.
+        is_told: whether the hand has moved since, so that masks would say so.
         age_s: time since that frame [s].
         error_m: standard deviation of where it is now, beyond that of the fit [m].
     """
@@ -72,6 +73,7 @@ class KeptPose:
     poses: FloatArray
     moved: FloatArray
     is_held: bool
+    is_told: bool
     age_s: float
     error_m: float
 
@@ -216,6 +218,7 @@ class Sights:
             poses=sight.poses,
             moved=moved,
             is_held=sight.is_held,
+            is_told=sight.hold is not Hold.NOT_TOLD,
             age_s=sight.age_s,
             error_m=sight.error_m(settings),
         )

@@ -348,13 +348,14 @@ class TrackedSolids:
             points[:] = np.nan
         reference = self.centres if self.reference is None else self.reference
         openings = self.foresight.robot.gripper_openings
+        weights = _weights(state, num)
         motions = tuple(
             ObjectMotion(
                 reference=reference,
                 points=points[k],
                 rotations=turns[k],
                 openings=openings(motion.joints[k]).T,
-                weight=float(k not in state.lost),
+                weight=float(weights[k]),
             )
             for k in range(num)
         )
@@ -394,7 +395,8 @@ def _solid_then(kept: KeptPose, solid: Solid, floor: float) -> Solid | None:
     if found is None:
         return None
     found = found.moved_by(kept.moved)
-    return replace(found, is_hidden=True, is_held=kept.is_held, error_m=kept.error_m)
+    is_held = kept.is_held and kept.is_told
+    return replace(found, is_hidden=True, is_held=is_held, error_m=kept.error_m)
 
 
 def table_in(
@@ -427,6 +429,13 @@ def table_in(
 def _too_many(state: BatchState, count: int) -> bool:
     """Return True if too few futures remain for a verdict."""
     return len(state.lost) > (1 - _ENOUGH) * count
+
+
+def _weights(state: BatchState, count: int) -> FloatArray:
+    """Return (K,) weights of futures, 1 for the likeliest: lost ones do not count."""
+    weights = np.ones(count) if state.stops is None else state.stops.weights.copy()
+    weights[list(state.lost)] = 0.0
+    return weights / max(weights.max(initial=0.0), 1e-12)
 
 
 def _upright(solid: Solid) -> FloatArray:

@@ -140,3 +140,50 @@ def test_the_state_of_fingers_does_not_depend_on_how_rows_are_cut():
     assert whole[0].tolist() == [*[False] * 4, *[True] * 5, False, False]
     for name in FingerState.__slots__:
         np.testing.assert_array_equal(getattr(then, name), getattr(end, name))
+
+
+def _retry():
+    """Positions of a grip, a lift, fingers that open up there, and a second grip at the table."""
+    once = picking()[:141]  # ends with the fingers open, up there
+    down = np.stack([np.linspace(0.12, 0.02, 20), np.full(20, 0.04)], -1)
+    return np.concatenate([once, down, picking()])
+
+
+@pytest.mark.parametrize(('share', 'first'), [(1.0, True), (0.5, True), (0.3, False)])
+def test_stops_hold_in_their_share_of_the_futures(lift, share, first):
+    batch = small_scene.batch_of(
+        lift, BLOCK, num_motions=8, grips_hold=True, squeeze=0.0, stop_holds=share,
+        grip_friction=0.03,
+    )  # fmt: skip
+    motion, state = batch.advance(picking()[:101], 5)
+    held = motion.points[:, :, 0, 2].max(1) > 0.1
+    assert held[0] == first
+    np.testing.assert_array_equal(held, state.stops.holds[:, 0])
+    assert held.all() == (share == 1.0)
+    again, _ = small_scene.batch_of(
+        lift, BLOCK, num_motions=8, grips_hold=True, squeeze=0.0, stop_holds=share,
+        grip_friction=0.03,
+    ).advance(picking()[:101], 5)  # fmt: skip
+    np.testing.assert_array_equal(again.points, motion.points)
+
+
+def test_fingers_that_stop_where_no_solid_is_make_a_future_less_likely(lift):
+    """A block that is carried away by the first grip cannot stop the fingers of the second."""
+    lift_away = _retry()
+    far = replace(BLOCK, centre=np.array([0.2, 0.0, 0.02]))
+    given = {'num_motions': 2, 'grips_hold': True, 'squeeze': 0.1}
+    _, near_state = small_scene.batch_of(lift, BLOCK, **given).advance(lift_away, 5)
+    _, far_state = small_scene.batch_of(lift, far, **given).advance(lift_away, 5)
+    assert near_state.stops.count.tolist() == far_state.stops.count.tolist() == [2]
+    np.testing.assert_allclose(near_state.stops.weights, 1.0)
+    np.testing.assert_allclose(far_state.stops.weights, 0.01)
+
+
+def test_masks_that_refute_a_stop_let_it_hold_nothing(lift):
+    _, fingers = watch_fingers(lift.gripper_openings(picking()[:51]), 0.02)
+    refuted = replace(fingers, is_refuted=np.array([True]))
+    positions = np.tile([0.02, HELD_AT], (5, 1))
+    assert not any(held for held, _ in held_in(lift, positions, fingers=refuted))
+    # the next stop, after the fingers opened, may hold again
+    _, opened = watch_fingers(np.array([[0.625, 1.0]]), 0.2, refuted)
+    assert not opened.is_refuted.any()

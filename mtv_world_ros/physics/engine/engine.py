@@ -98,6 +98,7 @@ class BatchState:
         grips: grip of each solid that measured fingers hold (`ContactSettings.grips_hold`), by
             number of the solid, for each future.
         fingers: measured motion of the fingers until now; None = not known.
+        stops: stops of the measured fingers until now; None = none were looked for.
     """
 
     physics: FloatArray
@@ -107,6 +108,43 @@ class BatchState:
     lost: dict[int, str] = field(default_factory=dict)
     grips: tuple[dict[int, Grip], ...] = ()
     fingers: FingerState | None = None
+    stops: StopState | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StopState:
+    """Stops of measured fingers in K futures until now.
+
+    Attributes:
+        is_stopped: (A,) whether something stops the fingers now.
+        count: (A,) number of stops until now.
+        holds: (K, A) whether the fingers hold what is between them, in the last stop.
+        weights: (K,) likelihood of the stops where the solids of a future are.
+    """
+
+    is_stopped: np.ndarray
+    count: np.ndarray
+    holds: np.ndarray
+    weights: FloatArray
+
+    @classmethod
+    def begin(cls, num_futures: int, num_arms: int) -> StopState:
+        """Return the state before the first stop."""
+        return cls(
+            is_stopped=np.zeros(num_arms, np.bool_),
+            count=np.zeros(num_arms, np.int64),
+            holds=np.ones((num_futures, num_arms), np.bool_),
+            weights=np.ones(num_futures),
+        )
+
+    def copy(self) -> StopState:
+        """Return a state that can be changed."""
+        return StopState(
+            is_stopped=self.is_stopped.copy(),
+            count=self.count.copy(),
+            holds=self.holds.copy(),
+            weights=self.weights.copy(),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -285,6 +323,7 @@ class Batch:
             lost=run.lost,
             grips=tuple(run.grips),
             fingers=fingers,
+            stops=run.stops,
         )
 
     def _advance_row(self, run: _Run, row: int, check: Callable[[], None]) -> None:
@@ -378,11 +417,16 @@ class _Run:
         self._spent = np.zeros(len(futures), np.int64)
         self.grips = list(state.grips) or [{} for _ in futures]
         self._grip_course: GripCourse | None = None
+        self.stops = None if state.stops is None else state.stops.copy()
+        self._was_stopped = np.zeros(0, np.bool_)
         self._rows = [self._read()]
 
     def grip(self, course: GripCourse) -> None:
         """Hold the solids that the measured fingers of a course hold from its first row on."""
         self._grip_course = course
+        if self.stops is None:
+            self.stops = StopState.begin(len(self._futures), len(course.openings))
+        self._was_stopped = self.stops.is_stopped.copy()
         self._hold(0)
         self._rows = [self._read()]
 
@@ -393,18 +437,47 @@ class _Run:
             return
         nq = scene.model.nq
         at = scene.solid_qpos[:, None] + np.arange(7)
+        assert self.stops is not None
+        begun = [
+            arm
+            for arm in range(len(course.openings))
+            if course.begins(arm, row, self._was_stopped)
+        ]
+        self.stops.count[begun] += 1
+        self.stops.is_stopped[:] = course.stopped[:, row]
         for number, future in enumerate(self._futures):
             if number in self.lost or not len(scene.solid_qpos):
                 continue
             qpos, poses = self.qpos(number), np.tile(np.eye(4), (len(scene.solid_qpos), 1, 1))
             poses[:, :3, 3] = qpos[at[:, :3]]
             poses[:, :3, :3] = _matrices(qpos[at[:, 3:]])
-            held, poses = course.after(row, self.grips[number], poses, future.solids)
+            self._begin_stops(begun, number, row, poses)
+            held, poses = course.after(
+                row, self.grips[number], poses, future.solids, self._holds(number)
+            )
             self.grips[number] = held
             for item in held:
                 qpos[at[item]] = [*poses[item, :3, 3], *_quaternion(poses[item, :3, :3])]
                 speeds = self.physics[number, 1 + nq :]
                 speeds[scene.solid_dofs[item] + np.arange(6)] = 0.0
+
+    def _begin_stops(self, arms: Sequence[int], number: int, row: int, poses: FloatArray) -> None:
+        """Say whether stops that begin hold something, and how likely they are in a future."""
+        course, stops, future = self._grip_course, self.stops, self._futures[number]
+        assert course is not None and stops is not None
+        for arm in arms:
+            drawn = np.random.default_rng((5, number, arm, int(stops.count[arm]))).random()
+            share = future.settings.stop_holds
+            is_seen = row == 0 and any(solid.is_held for solid in future.solids)
+            # in the first future all is as it is most likely
+            stops.holds[number, arm] = is_seen or (drawn < share if number else share >= 0.5)
+            if course.is_beside(arm, row, poses, future.solids):
+                stops.weights[number] *= course.settings.contradiction
+
+    def _holds(self, number: int) -> Callable[[int], bool]:
+        assert self.stops is not None
+        of_arms = self.stops.holds[number]
+        return lambda arm: bool(of_arms[arm])
 
     def first_step(self, row: int) -> int:
         return row * self._steps

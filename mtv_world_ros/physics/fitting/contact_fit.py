@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import multivariate_normal, qmc
+from scipy.stats import beta, multivariate_normal, qmc
 
 from mtv_world_ros.cameras.mask_geometry import block_size, CENTROID_NOISE_PX, centroids, locate
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
@@ -33,6 +33,7 @@ from mtv_world_ros.physics.contact_settings import (
     ContactOrigin,
     ContactSettings,
     FACTORS,
+    hold_line,
     MAX_MOTIONS,
     PRIOR_LOG_STD,
     RANGES,
@@ -41,6 +42,7 @@ from mtv_world_ros.physics.engine.contact_scene import CompiledScene
 from mtv_world_ros.physics.engine.drive_inputs import CoursePlanner, SUBSTEPS
 from mtv_world_ros.physics.engine.engine import Engine
 from mtv_world_ros.physics.engine.futures import Future, shifted
+from mtv_world_ros.physics.fitting.stop_trials import observed_stops, ObservedStop, StopTrial
 from mtv_world_ros.physics.fitting.tracks import (
     fine_commands,
     first_frame,
@@ -184,6 +186,7 @@ _WORDS = {
     'delay_s': 'commands arrive late by [s]',
     'table_m': 'height of the table [m]',
     'camera_m': 'cameras see objects elsewhere by [m]',
+    'stop_holds': 'share of stops of fingers that hold something',
     'hold': 'friction x stiffness of fingers / density: whether things slip [N m^2/kg]',
 }
 #: exponents of the product that decides whether an object slips
@@ -268,6 +271,8 @@ class ContactRecording:
         displacements: (1 + T, O, 3) displacements of the objects since the first step, by their
             masks; NaN = not known [m].
         grippers: motion of the grippers before they close.
+        stops: stops of fingers that masks call held or not held; of recordings whose commands are
+            measured positions.
     """
 
     names: tuple[str, ...]
@@ -276,6 +281,12 @@ class ContactRecording:
     recorded: FloatArray
     displacements: FloatArray
     grippers: FreeGrippers
+    stops: tuple[ObservedStop, ...] = ()
+
+    @property
+    def is_measured(self) -> bool:
+        """True if the commands are the measured positions."""
+        return np.allclose(self.positions, self.recorded, atol=_FIT.same_command_tolerance)
 
     def table(self) -> float:
         """Return the height of its own table [m]; NaN = no object tells."""
@@ -312,7 +323,9 @@ class FittedNumber:
 
     def __str__(self) -> str:
         rests = f'rests on {self.count} of {self.of} {self.counted}'
-        if not self.count:
+        if self.name == 'stop_holds':
+            rests = f'{self.count} of {self.of} stops that masks call held or not held are held'
+        elif not self.count:
             rests = f'none of {self.of} {self.counted} tells: this is what was thought before'
         elif not self.apart:
             rests += '; not told apart from the other numbers by these'
@@ -333,7 +346,7 @@ def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> Contact
     stamps_ns = episode.masks[views[0]].stamps_ns[0] + times * 1e9
     shown = _unhidden(episode, views, len(displacements))
     recorded = recorded_positions(episode.joint_states, robot, stamps_ns)
-    return ContactRecording(
+    found = ContactRecording(
         names=tuple(episode.info.objects),
         frame=first_frame(episode, robot, views),
         positions=positions,
@@ -341,6 +354,9 @@ def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> Contact
         displacements=np.where(shown[..., None], displacements, np.nan),
         grippers=FreeGrippers.of(robot, positions, recorded),
     )
+    if not found.is_measured:
+        return found
+    return replace(found, stops=observed_stops(episode, robot, views))
 
 
 def _unhidden(episode: Episode, views: Sequence[str], num_rows: int) -> BoolArray:
@@ -438,7 +454,16 @@ def fit_contact(
         }
     )
     first = settings_of_place(first, recordings, report)
-    trials = [_Trial.of(one, first) for one in recordings]
+    trials = [_Trial.of(one, first, arms.robot) for one in recordings]
+    stops = [stop for one in recordings for stop in one.stops]
+    holds = find_holds(stops)
+    if first.squeeze:
+        told = [len(trial.stops) for trial in trials]
+        report(str(holds))
+        report(
+            f'{sum(told)} of these stops, in {np.count_nonzero(told)} of {len(trials)} '
+            'recordings, are simulated one by one'
+        )
     make_run = partial(_TrialRunner, arms, trials, workers.num_threads)
     with started(make_run, workers, len(trials)) as run:
         factors, likelihoods, weights = _populations(run, len(trials), first, report, progress)
@@ -464,6 +489,7 @@ def fit_contact(
     spread = first.spread.model_copy(update=spreads)
     for one in (*found, hold):
         report(str(one))
+    report(hold_line(hold.low, hold.high))
     deciding = _effective_draws(weights)
     if deciding < _FIT.min_effective_draws:
         report(
@@ -475,11 +501,13 @@ def fit_contact(
         recordings=len(recordings),
         telling=hold.count,
         place=place,
+        hold=(hold.low, hold.high),
     )
     draws = _joint_draws(first, factors, weights)
     update = {**values, 'spread': spread, 'fitted': origin, 'draws': draws}
     # measured fingers show what they hold; slipping was fitted without that, as only slips tell it
     update['grips_hold'] = first.squeeze > 0
+    update['stop_holds'] = holds.value if stops else 1.0
     return first.model_copy(update=update), [table, delay, cameras, *found, hold]
 
 
@@ -505,9 +533,7 @@ def settings_of_place(
             f'tables are between {heights.min():.3f} and {heights.max():.3f} m high: each is '
             'looked for in the first frame'
         )
-    if all(
-        np.allclose(r.positions, r.recorded, atol=_FIT.same_command_tolerance) for r in recordings
-    ):
+    if all(recording.is_measured for recording in recordings):
         changed['squeeze'] = _FIT.squeeze_fraction
         report(
             'commands are measured positions, which stop at what is held: grippers close further '
@@ -695,16 +721,29 @@ class _Trial:
         positions: (1 + T * n, J) commanded.
         displacements: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
         table_m: height of its table.
+        stops: stops of fingers that are simulated one by one.
     """
 
     solids: tuple[Solid, ...]
     positions: FloatArray
     displacements: FloatArray
     table_m: float
+    stops: tuple[StopTrial, ...] = ()
 
     @classmethod
-    def of(cls, recording: ContactRecording, settings: ContactSettings) -> _Trial:
-        """Return the trial of a recording on a table as high as the settings say."""
+    def of(
+        cls,
+        recording: ContactRecording,
+        settings: ContactSettings,
+        robot: RobotModel | None = None,
+    ) -> _Trial:
+        """Return the trial of a recording on a table as high as the settings say.
+
+        Args:
+            recording: the recording.
+            settings: settings that say how high the table is.
+            robot: robot whose stops of fingers are simulated one by one; None = none are.
+        """
         frame, points, table = recording.frame, recording.frame.points(), settings.table_m
         if settings.table_varies and np.isfinite(own := recording.table()):
             table = own
@@ -722,6 +761,7 @@ class _Trial:
             # one memory layout: sums of a pickled copy, in a worker, round alike
             displacements=np.ascontiguousarray(recording.displacements[:, known]),
             table_m=table,
+            stops=() if robot is None else _stop_trials(recording, found, robot, table),
         )
 
     def likelihoods(self, engine: Engine, settings: Sequence[ContactSettings]) -> FloatArray:
@@ -751,7 +791,28 @@ class _Trial:
         found[list(state.lost)] = -np.log1p(
             (_FIT.lost_distance_m / _FIT.position_scale_m) ** 2
         ) * len(self.solids)
+        shifts = np.stack(
+            [one.spread.camera_m * draw for one, draw in zip(settings, drawn, strict=True)]
+        )
+        for stop in self.stops:
+            found = found + stop.likelihoods(engine, settings, shifts)
         return found
+
+
+def _stop_trials(
+    recording: ContactRecording,
+    solids: Sequence[Solid | None],
+    robot: RobotModel,
+    table_m: float,
+) -> tuple[StopTrial, ...]:
+    """Return the stops of a recording that can be simulated."""
+    found = []
+    for stop in recording.stops:
+        solid = solids[stop.item]
+        if solid is not None:
+            ways = recording.displacements[:, stop.item]
+            found.append(StopTrial.of(stop, robot, recording.recorded, ways, solid, table_m))
+    return tuple(trial for trial in found if trial is not None)
 
 
 class _TrialRunner:
@@ -828,6 +889,22 @@ def _ray_gaps(frame: FirstFrame) -> list[float]:
         gap = 2 * place.pixel_m * beyond_px
         gaps.append(gap if edge < _FIT.max_small_size_m else np.nan)
     return gaps
+
+
+def find_holds(stops: Sequence[ObservedStop]) -> FittedNumber:
+    """Return the share of stops of fingers that hold what they stop at; Laplace's rule."""
+    held = sum(stop.is_held for stop in stops)
+    posterior = beta(1 + held, 1 + len(stops) - held)
+    return FittedNumber(
+        name='stop_holds',
+        value=float(posterior.mean()),
+        low=float(posterior.ppf(0.05)),
+        high=float(posterior.ppf(0.95)),
+        spread=float(posterior.std()),
+        count=held,
+        of=len(stops),
+        counted='stops',
+    )
 
 
 def find_table(recordings: Sequence[ContactRecording]) -> FittedNumber:
