@@ -73,10 +73,11 @@ class ContactOrigin(Schema):
         default=None,
         description='robot cell of the recordings; null = older file, which holds everywhere',
     )
-    hold: tuple[float, float] | None = Field(
-        default=None,
+    hold: ListOf[float] = Field(
+        default=(),
+        max_length=2,
         description='90 % interval of friction x stiffness of fingers / density, which decides '
-        'whether things slip [N m^2/kg]; null = older file',
+        'whether things slip [N m^2/kg]; empty = older file',
     )
 
 
@@ -93,10 +94,7 @@ def hold_line(low: float, high: float) -> str:
     )
     if high <= MAX_HOLD_FACTOR * low:
         return f'{known}: within {MAX_HOLD_FACTOR:.0f}, so that verdicts may rest on it'
-    return (
-        f'{known}, not within {MAX_HOLD_FACTOR:.0f} as verdicts need it: more recordings in which '
-        'fingers stop at objects, some of which slip, tell it'
-    )
+    return f'{known}, not within {MAX_HOLD_FACTOR:.0f} as verdicts need it'
 
 
 class ContactDraw(Schema):
@@ -183,7 +181,10 @@ class ContactSettings(Schema):
         Args:
             place: name of the robot cell, see `EpisodeInfo.place`; empty = not stated.
         """
-        return self.fitted is not None and not self.doubt and self.fitted.place in (None, place)
+        if self.fitted is None or self.fitted.place not in (None, place):
+            return False
+        # draws of a fit hold how little it tells; files of before have a count alone
+        return bool(self.fitted.hold) or not self.doubt
 
     def as_prior(self) -> ContactSettings:
         """Return the settings with the wide prior of the parameters in place of their fit.
@@ -205,7 +206,7 @@ class ContactSettings(Schema):
         if self.fitted is None:
             return 'numbers of contact (contact.json) were never fitted on recordings'
         telling, count = self.fitted.telling, self.fitted.recordings
-        if self.fitted.hold is not None:
+        if self.fitted.hold:
             low, high = self.fitted.hold
             return '' if high <= MAX_HOLD_FACTOR * low else hold_line(low, high)
         if telling >= ENOUGH_TELLING:

@@ -218,7 +218,10 @@ def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
 
 #: commands that calibrate an estimate
 _CALIBRATE = 'mtv-world fit success CHECKPOINT EPISODES on episodes of known outcome'
-_FIT = 'mtv-world fit contact RECORDINGS --checkpoint CHECKPOINT on recordings of this robot'
+_FIT = (
+    'mtv-world fit contact RECORDINGS --checkpoint CHECKPOINT on recordings of this robot in '
+    'which fingers stop at objects, held and not held'
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

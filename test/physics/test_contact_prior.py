@@ -44,6 +44,9 @@ def settings():
         (FITTED.replace(place=''), '', True),  # nor do the recordings
         (FITTED.replace(place=None), 'cell 3', True),  # older files hold everywhere
         (FITTED.replace(telling=ENOUGH_TELLING - 1), 'cell 2', False),
+        # a fit that tells little was made here all the same: its draws are as wide as that
+        (FITTED.replace(telling=0, hold=(1.0, 500.0)), 'cell 2', True),
+        (FITTED.replace(telling=0, hold=(1.0, 500.0)), 'cell 3', False),
         (None, '', False),
     ],
 )

@@ -89,6 +89,8 @@ def own(tmp_path):
         (FOUND.replace(telling=0), '0 of the 8 recordings that'),
         (FOUND.replace(telling=2), '2 of the 8 recordings that'),
         (FOUND, ''),
+        (FOUND.replace(hold=(2.2, 235.0)), 'whether things slip between fingers is known within'),
+        (FOUND.replace(telling=1, hold=(2.2, 22.0)), ''),
     ],
 )
 def test_a_checkpoint_says_what_its_numbers_of_contact_rest_on(own, origin, doubt):
