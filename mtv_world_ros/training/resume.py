@@ -1,28 +1,35 @@
-"""The saved state of a training: everything that a resumed run needs, written atomically."""
+"""The saved state of a training: everything that a resumed run needs, written atomically.
+
+It is a distributed checkpoint of torch in safetensors: each process writes a file, and any number
+of processes reads them. Earlier versions wrote one file of the same tensors, which is read, too.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, ExitStack
 import json
 from pathlib import Path
 from typing import Any
+import warnings
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 import torch
 from torch import Tensor
+from torch.distributed import checkpoint
+from torch.distributed.checkpoint import HuggingFaceStorageReader, HuggingFaceStorageWriter
+from torch.distributed.checkpoint.api import CheckpointException
+from torch.distributed.tensor import DTensor
 
 from mtv_world_ros.core.bounded_input import check_finite, read_json, require_regular
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.core.files import recover_folder, whole_folder
 from mtv_world_ros.training.averaged_weights import AveragedWeights
+from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.training_config import TrainingConfig
 
 #: folder of the training state, in the folder of the training
 STATE = 'state'
-#: file of the tensors of weights and optimizer, in that folder
-_TENSORS_FILE = 'state.safetensors'
 #: file of the other values of the state, such as the step, in that folder
 _CARD_FILE = 'state.json'
 
@@ -52,21 +59,57 @@ def save_state(
     weights: AveragedWeights,
     optimizer: torch.optim.Optimizer,
     card: Mapping[str, Any],
+    processes: Processes,
 ) -> None:
-    """Replace the state in `folder/state` atomically.
+    """Replace the state in `folder/state` atomically; every process writes a part of it.
 
     Raises:
         DiskError: the state could not be written; the old one stays.
+        TrainingError: another process is gone.
     """
+    tensors = _tensors_of(weights, optimizer)
+    whole = {**card, 'ema_step': weights.ema.optimization_step}
+    with disk_errors_named(folder), ExitStack() as stack:
+        new = stack.enter_context(whole_folder(folder / STATE)) if processes.is_main else None
+        partial = processes.of_main(new)
+        assert partial is not None
+        writer = HuggingFaceStorageWriter(str(partial), save_distributed=True)
+        try:
+            with processes.losses_named(), _one_process_is_meant():
+                checkpoint.save(tensors, storage_writer=writer)
+        except CheckpointException as error:
+            raise OSError(_of_processes(error)) from error
+        if processes.is_main:
+            (partial / _CARD_FILE).write_text(json.dumps(whole))
+
+
+def _tensors_of(weights: AveragedWeights, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Return copies of the tensors of weights and optimizer on the CPU by the state's names."""
+    for parameter in weights.parameters:
+        if not optimizer.state[parameter]:  # no step was made: as AdamW begins
+            zeros = torch.zeros_like(parameter, requires_grad=False)
+            begin = {'step': torch.tensor(0.0), 'exp_avg': zeros, 'exp_avg_sq': zeros.clone()}
+            optimizer.state[parameter] = begin
     tensors = {f'master.{k}': v.detach() for k, v in weights.master.items()}
     tensors |= {f'ema.{i}': p for i, p in enumerate(weights.ema.shadow_params)}
     for index, state in optimizer.state_dict()['state'].items():
         tensors |= {f'adam.{index}.{k}': v for k, v in state.items()}
-    tensors = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
-    whole = {**card, 'ema_step': weights.ema.optimization_step}
-    with disk_errors_named(folder), whole_folder(folder / STATE) as partial:
-        save_file(tensors, partial / _TENSORS_FILE)
-        (partial / _CARD_FILE).write_text(json.dumps(whole))
+    # copies: a part of the file that is mapped by a reader must not change
+    return {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
+
+
+@contextmanager
+def _one_process_is_meant() -> Iterator[None]:
+    """Silence torch's warning that it saves or loads in a single process."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings('ignore', message='torch.distributed is disabled')
+        yield
+
+
+def _of_processes(error: CheckpointException) -> str:
+    """Return what torch's error says of each process."""
+    reasons = [f'process {n}: {failure[0]}' for n, failure in sorted(error.failures.items())]
+    return '; '.join(reasons)
 
 
 def read_card(folder: Path) -> dict[str, Any] | None:
@@ -133,34 +176,41 @@ def check_card(folder: Path, card: Mapping[str, Any], mine: Mapping[str, Any]) -
         )
 
 
-def load_state(folder: Path, weights: AveragedWeights, optimizer: torch.optim.Optimizer) -> None:
-    """Load the tensors of the saved state.
+def load_state(
+    folder: Path,
+    weights: AveragedWeights,
+    optimizer: torch.optim.Optimizer,
+    processes: Processes,
+) -> None:
+    """Load the tensors of the saved state, whatever number of processes wrote them.
 
     Raises:
         TrainingError: the state is damaged, or of another model.
     """
-    card, file = read_card(folder), folder / STATE / _TENSORS_FILE
+    card, held = read_card(folder), folder / STATE
     assert card is not None
+    tensors = _tensors_of(weights, optimizer)
     try:
-        require_regular(file)
-        tensors = load_file(file)
+        require_regular(*sorted(held.glob('*.safetensors')))
+        reader = HuggingFaceStorageReader(str(held))
+        with processes.losses_named(), _one_process_is_meant():
+            checkpoint.load(tensors, storage_reader=reader)
         for name, tensor in tensors.items():
-            check_finite(tensor, name, file)
-        weights.load({k[7:]: v for k, v in tensors.items() if k.startswith('master.')})
-        shadow = weights.ema.shadow_params
-        weights.ema.shadow_params = [
-            tensors[f'ema.{i}'].to(p.device) for i, p in enumerate(shadow)
-        ]
-    except (OSError, SafetensorError, KeyError, RuntimeError) as error:
+            check_finite(tensor.to_local() if isinstance(tensor, DTensor) else tensor, name, held)
+    except (CheckpointException, OSError, SafetensorError, KeyError, RuntimeError) as error:
+        said = _of_processes(error) if isinstance(error, CheckpointException) else error
         raise TrainingError(
-            f"'{file}' is damaged or of another model: {error}; give the preset it was trained "
+            f"'{held}' is damaged or of another model: {said}; give the preset it was trained "
             'with, or another --out'
         ) from error
+    with torch.no_grad():
+        for name, master in weights.master.items():
+            master.copy_(tensors[f'master.{name}'])
+        weights.share()
+        for index, (parameter, average) in enumerate(
+            zip(weights.parameters, weights.ema.shadow_params, strict=True)
+        ):
+            average.copy_(tensors[f'ema.{index}'])
+            for name, value in optimizer.state[parameter].items():
+                value.copy_(tensors[f'adam.{index}.{name}'])
     weights.ema.optimization_step = card['ema_step']
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, value in tensors.items():
-        if key.startswith('adam.'):
-            _, index, name = key.split('.')
-            state.setdefault(int(index), {})[name] = value
-    groups = optimizer.state_dict()['param_groups']
-    optimizer.load_state_dict({'state': state, 'param_groups': groups})

@@ -11,6 +11,8 @@ import time
 from typing import Any
 
 import torch
+from torch import nn
+from torch.distributed.tensor import DTensor
 
 from mtv_world_ros.control.control import Control
 from mtv_world_ros.control.registry import control_class
@@ -26,7 +28,7 @@ from mtv_world_ros.model.serving import compile_blocks
 from mtv_world_ros.model.trained_model import load_trained_model, save_trained_model, TrainedModel
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.training.adapter import save_adapter
-from mtv_world_ros.training.averaged_weights import AveragedWeights
+from mtv_world_ros.training.averaged_weights import AveragedWeights, ShardedWeights
 from mtv_world_ros.training.base_checkpoint import Base
 from mtv_world_ros.training.clips.batches import BatchSource, ClipBatch
 from mtv_world_ros.training.clips.encoding import (
@@ -94,8 +96,8 @@ def learning_rate(step: int, config: OptimizerConfig) -> float:
 class Trainer:
     """Trainer of the transformer of a preset.
 
-    Every process computes the clips of `clips`, a share of each step's; errors, weights and
-    float32 gradients are summed over the processes, so that all make the same step.
+    Every process computes the clips of `clips`, a share of each step's; torch averages gradients
+    over the processes during the backward pass, so that all make the same step.
 
     Args:
         config: the preset.
@@ -109,7 +111,8 @@ class Trainer:
         control: control of the model; None = the paper's.
 
     Raises:
-        TrainingError: fewer clips per step than processes times accumulated parts.
+        TrainingError: fewer clips per step than processes times accumulated parts, or weights
+            that are shared out in one process or with self-rollouts.
     """
 
     def __init__(
@@ -145,7 +148,8 @@ class Trainer:
         check_history(config.history, self.encoders.autoencoder, transformer.config)
         if settings.gradient_checkpointing:
             transformer.enable_gradient_checkpointing()
-        self.weights = AveragedWeights(transformer, self.device, dtype, settings.ema_decay)
+        kind = ShardedWeights if settings.fully_shard else AveragedWeights
+        self.weights = kind(transformer, self.processes, dtype, settings.ema_decay)
         if settings.compile:
             compile_blocks(self.weights.worker, self.device)
         self.optimizer = torch.optim.AdamW(
@@ -164,6 +168,11 @@ class Trainer:
             raise TrainingError(
                 f'optimizer.batch_size is {settings.batch_size}, less than {count} processes x '
                 f'{parts} accumulated parts; raise it, or start fewer processes'
+            )
+        if settings.fully_shard and count == 1:
+            raise TrainingError(
+                'optimizer.fully_shard shares weights out over several processes, this is one; '
+                'start it with torchrun, or set it to false'
             )
         return self.processes.share(settings.batch_size)
 
@@ -189,22 +198,27 @@ class Trainer:
                 f"'{theirs.robot}' with {len(theirs.spec.views)} views; run fit contact"
             )
         given = loaded.transformer.state_dict()
-        try:
-            self.weights.worker.load_state_dict(given)
-        except RuntimeError as error:
+        shapes = [
+            {name: tuple(tensor.shape) for name, tensor in held.items()}
+            for held in (given, self.weights.worker.state_dict())
+        ]
+        if shapes[0] != shapes[1]:
             there, here = dict(loaded.transformer.config), dict(self.weights.worker.config)
             differ = [
                 f'{name} is {there.get(name)} there and {value} here'
                 for name, value in here.items()
                 if not name.startswith('_') and there.get(name) != value
             ]
+            names = sorted(
+                n for n in {*shapes[0], *shapes[1]} if shapes[0].get(n) != shapes[1].get(n)
+            )
             raise TrainingError(
-                f"'{folder}' does not fit the preset's transformer: {'; '.join(differ) or error}. "
+                f"'{folder}' does not fit the preset's transformer: "
+                f'{"; ".join(differ) or f"weights such as {names[0]}"}. '
                 'Give --preset the one it was trained with, set what differs '
                 '(--set transformer.NAME=VALUE), or leave --init out'
-            ) from error
-        self.weights.load(given)
-        self.weights.ema.shadow_params = [p.detach().clone() for p in self.weights.parameters]
+            )
+        self.weights.start_from(given)
 
     def run(
         self,
@@ -223,7 +237,7 @@ class Trainer:
         Args:
             source: source of the batches of `clips`.
             save_every: steps between saved states.
-            on_save: called with the step after each save, in the main process only.
+            on_save: called with the step after each save, in all processes.
             save_seconds: longest time between saved states [s].
             should_stop: asked after each step.
 
@@ -242,14 +256,14 @@ class Trainer:
             if rollout is not None and isinstance(batch, ClipBatch) and any(batch.lead_ins):
                 with self.weights.averaged_worker() as transformer:
                     batch = rollout.apply(batch, transformer)
-            with memory_errors_named(self.device):
+            with memory_errors_named(self.device), self.processes.losses_named():
                 report = self.train_step(batch)
             self.step += 1
             yield replace(report, seconds=time.perf_counter() - started, waited=waited)
-            stops = self.processes.any(should_stop())
+            is_late = time.monotonic() - saved >= save_seconds
+            stops, is_late = self.processes.any(should_stop(), is_late)
             due = self.step % save_every == 0 or self.step == self.config.optimizer.steps
-            due |= stops or time.monotonic() - saved >= save_seconds
-            if due and self.processes.is_main:
+            if due or stops or is_late:
                 self.save_state()
                 on_save(self.step)
                 saved = time.monotonic()
@@ -270,8 +284,17 @@ class Trainer:
     def loss(self, batch: ClipBatch | EncodedBatch) -> Loss:
         """Return the loss of a batch, or of a part of one."""
         draws = NoiseDraws(self.seed, batch.step, batch.numbers)
-        worker = self.weights.worker
-        return batch_loss(worker, self.encoders, batch, self.config, draws, self.device)
+        weights = self.weights
+        return batch_loss(
+            weights.worker,
+            self.encoders,
+            batch,
+            self.config,
+            draws,
+            self.device,
+            model=weights.model,
+            dtype=weights.dtype,
+        )
 
     def gradients(self, batch: ClipBatch | EncodedBatch) -> float:
         """Leave the gradients of a step in the float32 weights and return the step's loss.
@@ -294,8 +317,8 @@ class Trainer:
                 f"'{self.folder / STATE}'; lower optimizer.learning_rate"
             )
         found = [p.grad for p in self.weights.parameters if p.grad is not None]
-        self.processes.sum_into(found)
-        torch._foreach_div_(found, weight)
+        # torch averages over the processes, whose shares may differ: back to sums over all clips
+        torch._foreach_mul_(found, self.processes.count / weight)
         return total / weight
 
     def train_step(self, batch: ClipBatch | EncodedBatch) -> StepReport:
@@ -315,13 +338,13 @@ class Trainer:
             loss=loss,
             average=math.fsum(self._recent) / len(self._recent),
             learning_rate=rate,
-            grad_norm=norm.item(),
+            grad_norm=(norm.full_tensor() if isinstance(norm, DTensor) else norm).item(),
         )
 
     def save_state(self) -> None:
-        """Write everything a resumed run needs, atomically."""
+        """Write everything a resumed run needs, atomically; all processes have to call this."""
         card = {'step': self.step, 'recent': list(self._recent), **self._identity()}
-        save_state(self.folder, self.weights, self.optimizer, card)
+        save_state(self.folder, self.weights, self.optimizer, card, self.processes)
 
     def _identity(self) -> dict[str, Any]:
         """Return the values that must be the same in a resumed run."""
@@ -334,14 +357,17 @@ class Trainer:
     def load_state(self) -> bool:
         """Continue from the saved state; return whether there was one.
 
+        All processes have to call this; their number may be another than that which saved.
+
         Raises:
             TrainingError: the state is damaged, or of another model, seed or base.
         """
-        card = read_card(self.folder)
+        with self.processes.main_first():
+            card = read_card(self.folder)
         if card is None:
             return False
         check_card(self.folder, card, self._identity())
-        load_state(self.folder, self.weights, self.optimizer)
+        load_state(self.folder, self.weights, self.optimizer, self.processes)
         self._recent.extend(card.get('recent', []))
         self.step = card['step']
         return True
@@ -354,8 +380,8 @@ class Trainer:
     def export(self, folder: Path, *, dtype: torch.dtype = torch.float16) -> None:
         """Write a checkpoint with the averaged weights and all its other parts.
 
-        For an adapter, write its factors (float32), the weights that are trained whole, and the
-        card.
+        The main process writes; all have to call this. An adapter's folder has its factors
+        (float32), the weights that are trained whole, and the card.
         """
         base = self.base
         theirs = base.checkpoint.card.plain() if base else {}  # prompt and guidance
@@ -363,13 +389,17 @@ class Trainer:
         card = card.replace(**{name: theirs[name] for name in OPTIONAL_KEYS if name in theirs})
         if self.config.lora.rank:
             averages = self.weights.averages()
+            if not self.processes.is_main:
+                return
             return save_adapter(
                 self.weights.worker, folder, weights=averages, card=card, control=self.control
             )
         # what `fit contact` put there stays
-        mine = folder / OBJECT_MOTION_FOLDER
+        mine, transformer = folder / OBJECT_MOTION_FOLDER, self.weights.averaged()
+        if transformer is None:
+            return
         parts = TrainedModel(
-            transformer=self.weights.averaged(),
+            transformer=transformer,
             autoencoder=self.encoders.autoencoder,
             scheduler=build_scheduler(self.config.scheduler),
             card=card,
@@ -395,13 +425,26 @@ def batch_loss(
     config: TrainingConfig,
     draws: NoiseDraws,
     device: torch.device,
+    *,
+    model: nn.Module | None = None,
+    dtype: torch.dtype | None = None,
 ) -> Loss:
     """Return the loss of a batch, or of what a latent cache holds of one, as sums over its clips.
 
     Transformer and encoders are on the device; noise levels, noise and what is dropped are drawn
     for each clip.
+
+    Args:
+        transformer: the transformer.
+        encoders: frozen encoders.
+        batch: clips, or what a latent cache holds of them.
+        config: the preset.
+        draws: random numbers of the clips.
+        device: device of the computation.
+        model: what is called in place of the transformer, such as torch's wrapper; None = itself.
+        dtype: number format of its inputs; None = the transformer's.
     """
-    objective, dtype = config.objective, transformer.dtype
+    objective, dtype = config.objective, dtype or transformer.dtype
     if isinstance(batch, ClipBatch):
         batch = encode_batch(encoders, batch, objective, device)
     clean = batch.clean
@@ -416,7 +459,7 @@ def batch_loss(
     if cond.history is not None:
         cond = cond.with_noisy_history(draws.normal(*cond.history.shape[1:]).to(device))
     cond = cond.in_dtype(dtype)
-    predicted = transformer(
+    predicted = (model or transformer)(
         noisy.to(dtype),
         (sigmas * 1000).to(device),
         control=cond.control,

@@ -217,6 +217,11 @@ class OptimizerConfig(Schema):
     gradient_checkpointing: bool = Field(
         default=False, description='recompute blocks in the backward pass instead of keeping them'
     )
+    fully_shard: bool = Field(
+        default=False,
+        description='every process holds a share of weights, gradients and averages (FSDP2), for '
+        'models that are too large for one device; several processes, no self-rollout',
+    )
     compile: bool = Field(
         default=False, description="compile the transformer's repeated block; minutes on a CPU"
     )
@@ -279,6 +284,15 @@ class TrainingConfig(Schema):
     )
     lora: LoraSettings = Field(default=LoraSettings(), description='LoRA adapter')
     optimizer: OptimizerConfig = Field(default=OptimizerConfig(), description='optimiser')
+
+    @model_validator(mode='after')
+    def _shared_weights_do_not_imagine(self) -> Self:
+        if self.optimizer.fully_shard and self.self_rollout.share:
+            raise ValueError(
+                f'optimizer.fully_shard is true and self_rollout.share {self.self_rollout.share}; '
+                'only whole weights imagine clips: set one of them to false or 0'
+            )
+        return self
 
     @property
     def spec(self) -> WorldModelSpec:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import json
 import math
 from pathlib import Path
+import shutil
 import signal
 import threading
 from types import MappingProxyType
@@ -28,7 +29,7 @@ from mtv_world_ros.core.errors import (
     TrainingError,
     TrainingInterrupted,
 )
-from mtv_world_ros.core.files import write_whole
+from mtv_world_ros.core.files import whole_folder, write_whole
 from mtv_world_ros.core.processes import is_helper_rank
 from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.data.bag_mapping import EpisodeSource
@@ -233,8 +234,9 @@ def train(
     config = run.config.replace(video=run.config.video.replace(robot=robot.name))  # not a path
     out, dtype = run.out, choose_dtype(run.dtype, run.device)
     check_device(run.device)
-    check_architecture(out, config)
     processes = Processes(run.device)
+    with processes.main_first():
+        check_architecture(out, config)
     out.mkdir(parents=True, exist_ok=True)
     paths = find_episodes(run.dataset) if isinstance(run.dataset, Path) else run.dataset
     with processes.main_first():
@@ -292,14 +294,13 @@ def train(
         base=base,
         control=control,
     )
-    with processes.main_first():
-        resumed = trainer.load_state()
+    resumed = trainer.load_state()
     trainer.trained_on |= _trained_episodes(
         recordings, run.initial, trainer.result if resumed else None
     ).as_card()
     if run.initial is not None and base is None and not resumed:
         trainer.start_from(run.initial)
-    if resumed and processes.is_main and _steps_of(trainer.result) != trainer.step:
+    if resumed and processes.of_main(_steps_of(trainer.result)) != trainer.step:
         trainer.export(trainer.result)  # killed after the state was saved
     if processes.is_main:
         write_whole(out / 'skipped.json', json.dumps(skipped, indent=2))
@@ -323,6 +324,7 @@ def train(
             _loop(trainer, source, run, held_out, ideal)
     finally:
         source.close()
+    processes.close()
     return trainer.result
 
 
@@ -456,7 +458,7 @@ def _loop(
         )
         for report in reports:
             log.add(report)
-            if held_out is not None and is_main:
+            if held_out is not None:
                 held_out.after(report.step, trainer, log)
     if trainer.step < total:
         raise TrainingInterrupted(
@@ -580,14 +582,20 @@ class HeldOut:
         self._judge, self._every = judge, every
 
     def after(self, step: int, trainer: Trainer, log: TrainingLog) -> None:
-        """Score the averaged weights if due; the best go to the result's folder with `-best`."""
+        """Score the averaged weights if due; the best go to the result's folder with `-best`.
+
+        All processes have to call this; the main one scores.
+        """
         if step % self._every and step != trainer.config.optimizer.steps:
             return
         folder = trainer.folder
         trainer.export(trainer.result)
+        if not trainer.processes.is_main:
+            return
         judged = self._judge(trainer.result, step)
         log.write(step, dict(judged.numbers))
         best = folder / _BEST
         if judged.score > _best_score(best):
-            trainer.export(folder / f'{trainer.result.name}-best')
+            with whole_folder(folder / f'{trainer.result.name}-best') as copy:
+                shutil.copytree(trainer.result, copy, dirs_exist_ok=True)
             write_whole(best, json.dumps({'step': step, 'score': judged.score}))

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from typing import Any
 
+from safetensors.torch import load_file
 import torch
 import yaml
 
@@ -83,6 +84,12 @@ def run_training(out: Path, episodes: Path, preset: Path, **options: Any) -> Non
     run = TrainingRun(config=load_training_config(preset), dataset=episodes, out=out, **options)
     robot = load_robot(share_path('config', 'robots', 'yam_bimanual', 'robot.yaml'))
     train(run, robot=robot, segmenter=ColourSegmenter())
+
+
+def state_tensors(out: Path) -> dict[str, torch.Tensor]:
+    """The tensors of a training's saved state, whichever of its processes wrote them."""
+    files = sorted((out / 'state').glob('*.safetensors'))
+    return {name: tensor for file in files for name, tensor in load_file(file).items()}
 
 
 def write_preset(folder: Path, config: TrainingConfig, **optimizer: Any) -> Path:

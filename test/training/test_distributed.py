@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 import runpy
 import sys
-from types import SimpleNamespace
 
 import pytest
 from safetensors.torch import load_file
@@ -17,7 +16,7 @@ from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import TrainingConfig
-from test.support.sources import make_trainer, run_script, write_preset
+from test.support.sources import make_trainer, run_script, state_tensors, write_preset
 
 SCRIPT = Path(__file__).parents[1] / 'support' / 'train_recorded.py'
 #: of two processes one gets two of the clips of a step
@@ -45,7 +44,8 @@ def test_two_processes_make_the_steps_of_one(tiny, episode, tmp_path, monkeypatc
             continue
         assert torch.equal(parts[0][name], parts[1][name])
         torch.testing.assert_close(parts[0][name], expected, rtol=1e-4, atol=1e-6)
-    states = [load_file(folder / 'state' / 'state.safetensors') for folder in (one, two)]
+    states = [state_tensors(folder) for folder in (one, two)]
+    assert states[0].keys() == states[1].keys()
     for name, expected in states[0].items():
         torch.testing.assert_close(states[1][name], expected, rtol=1e-3, atol=1e-5)
     logs = [json.loads((f / 'log.jsonl').read_text().splitlines()[-1]) for f in (one, two)]
@@ -85,14 +85,14 @@ def test_shares_are_even_and_leave_nothing_out():
 
 def test_processes_wait_for_the_main_one_longer_than_nccl_does(monkeypatch):
     given = {}
-
-    def state(**options: object) -> SimpleNamespace:
-        given.update(options)
-        return SimpleNamespace(process_index=0, num_processes=1)
-
-    monkeypatch.setattr('mtv_world_ros.training.distributed.PartialState', state)
-    Processes('cuda')
-    assert given['timeout'] > 10 * timedelta(minutes=10) and given['cpu'] is False
+    monkeypatch.setattr(
+        'torch.distributed.init_process_group', lambda name, **more: given.update(more, name=name)
+    )
+    monkeypatch.setenv('WORLD_SIZE', '3')
+    monkeypatch.setenv('RANK', '2')
+    found = Processes('cpu')
+    assert (found.number, found.count, given['name']) == (2, 3, 'gloo')
+    assert given['timeout'] > 10 * timedelta(minutes=10)
 
 
 def test_fewer_clips_than_processes_are_refused(tiny, tmp_path):
@@ -107,8 +107,8 @@ def test_a_process_whose_sister_was_killed_says_so_and_the_state_is_whole(tiny, 
     preset = write_preset(tmp_path, tiny, steps=10**6, **THREE_CLIPS)
     run_script('train_lost.py', tmp_path, episode.parent, preset)
     said = (tmp_path / 'said').read_text()
-    assert said.startswith('TrainingError: process 0 of 2 lost another one')
+    assert said.startswith('TrainingError: process 0 of 2 lost process 1: ')
     assert 'run the same command again' in said
     state = json.loads((tmp_path / 'state' / 'state.json').read_text())
     assert state['step'] > 0 and state['step'] % 5 == 0
-    assert load_file(tmp_path / 'state' / 'state.safetensors')
+    assert state_tensors(tmp_path)

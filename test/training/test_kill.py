@@ -9,7 +9,7 @@ import pytest
 from safetensors.torch import load_file
 import torch
 
-from test.support.sources import make_trainer, run_script, write_preset
+from test.support.sources import make_trainer, run_script, state_tensors, write_preset
 
 
 @pytest.mark.slow
@@ -23,7 +23,7 @@ def test_kill_9_changes_neither_curve_nor_weights(tiny, episode, tmp_path):
         rows = [json.loads(line) for line in (tmp_path / name / 'log.jsonl').open()]
         curves.append([(row['step'], row['loss'], row['grad_norm']) for row in rows])
         weights = tmp_path / name / 'checkpoint' / 'transformer'
-        tensors.append(load_file(tmp_path / name / 'state' / 'state.safetensors'))
+        tensors.append(state_tensors(tmp_path / name))
         tensors[-1] |= load_file(weights / 'diffusion_pytorch_model.safetensors')
     assert curves[0] == curves[1]
     assert [step for step, *_ in curves[0]] == [10, 20, 30, 40]
