@@ -58,12 +58,12 @@ setup(
         'safetensors>=0.8',
         'scipy>=1.11',
         'simplejpeg>=1.8',
-        'torch>=2.6',
+        'torch>=2.9',
         'tqdm>=4.66',
         'zstandard>=0.22',
     ],
     extras_require={
-        'train': ['accelerate>=1.15', 'tensorboard>=2.21'],
+        'train': ['tensorboard>=2.21'],
         # Control fast_tokens: byte-pair encoding of actions, one of the paper's baselines.
         'fast-tokens': ['tokenizers>=0.22'],
         # Vision-language models that name objects: behind a server, or here.

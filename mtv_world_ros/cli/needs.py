@@ -12,7 +12,7 @@ from mtv_world_ros.core.errors import ConfigError
 
 #: packages that each command always needs
 _ALWAYS = {
-    'train': ('accelerate', 'tensorboard'),
+    'train': ('tensorboard',),
     'rank': ('matplotlib',),
     'fit success': ('matplotlib',),
     'export report': ('matplotlib',),

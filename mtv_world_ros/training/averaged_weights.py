@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+import warnings
 
 from diffusers.training_utils import EMAModel
 import torch
@@ -159,6 +160,8 @@ class ShardedWeights(AveragedWeights):
             whole.set_force_sum_reduction_for_comms(True)
         for buffer in whole.buffers():
             buffer.data = buffer.data.to(processes.device)
+        # no output of a block is changed in place
+        warnings.filterwarnings('ignore', message='FSDP2-wrapped module .* returned a view')
         self.worker = self.model = whole
         self.master = {n: p for n, p in whole.named_parameters() if p.requires_grad}
         self._pairs = []

@@ -93,6 +93,26 @@ def learning_rate(step: int, config: OptimizerConfig) -> float:
     return config.learning_rate * min(warm, max(0.0, min(1.0, left)))
 
 
+def check_processes(settings: OptimizerConfig, processes: Processes) -> None:
+    """Check that the settings fit the number of processes.
+
+    Raises:
+        TrainingError: fewer clips per step than processes times accumulated parts, or weights
+            that are shared out in one process.
+    """
+    count, parts = processes.count, settings.accumulation
+    if settings.batch_size < count * parts:
+        raise TrainingError(
+            f'optimizer.batch_size is {settings.batch_size}, less than {count} processes x '
+            f'{parts} accumulated parts; raise it, or start fewer processes'
+        )
+    if settings.fully_shard and count == 1:
+        raise TrainingError(
+            'optimizer.fully_shard shares weights out over several processes, this is one; '
+            'start it with torchrun, or set it to false'
+        )
+
+
 class Trainer:
     """Trainer of the transformer of a preset.
 
@@ -111,8 +131,7 @@ class Trainer:
         control: control of the model; None = the paper's.
 
     Raises:
-        TrainingError: fewer clips per step than processes times accumulated parts, or weights
-            that are shared out in one process or with self-rollouts.
+        TrainingError: see `check_processes`.
     """
 
     def __init__(
@@ -133,7 +152,8 @@ class Trainer:
         self.control = control or drawn
         settings = config.optimizer
         self.processes = processes or Processes(device)
-        self.clips = self._clips(settings)
+        check_processes(settings, self.processes)
+        self.clips = self.processes.share(settings.batch_size)
         self.config, self.folder, self.seed = config, Path(folder), seed
         self.device = self.processes.device
         self.trained_on, self.base = trained_on, base
@@ -161,20 +181,6 @@ class Trainer:
         self.step = 0
         self._object_motion: Path | None = None
         self._recent: deque[float] = deque(maxlen=_WINDOW)
-
-    def _clips(self, settings: OptimizerConfig) -> range:
-        count, parts = self.processes.count, settings.accumulation
-        if settings.batch_size < count * parts:
-            raise TrainingError(
-                f'optimizer.batch_size is {settings.batch_size}, less than {count} processes x '
-                f'{parts} accumulated parts; raise it, or start fewer processes'
-            )
-        if settings.fully_shard and count == 1:
-            raise TrainingError(
-                'optimizer.fully_shard shares weights out over several processes, this is one; '
-                'start it with torchrun, or set it to false'
-            )
-        return self.processes.share(settings.batch_size)
 
     def start_from(self, checkpoint: Checkpoint) -> None:
         """Load the weights of a checkpoint of the same architecture; the optimizer state is new.
@@ -256,7 +262,7 @@ class Trainer:
             if rollout is not None and isinstance(batch, ClipBatch) and any(batch.lead_ins):
                 with self.weights.averaged_worker() as transformer:
                     batch = rollout.apply(batch, transformer)
-            with memory_errors_named(self.device), self.processes.losses_named():
+            with memory_errors_named(self.device):
                 report = self.train_step(batch)
             self.step += 1
             yield replace(report, seconds=time.perf_counter() - started, waited=waited)

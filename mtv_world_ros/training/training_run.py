@@ -52,7 +52,7 @@ from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.log import TrainingLog
 from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
-from mtv_world_ros.training.trainer import Trainer
+from mtv_world_ros.training.trainer import check_processes, Trainer
 from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
 from mtv_world_ros.training.unknown_cameras import unknown_camera_lines
 from mtv_world_ros.vision.describers.describer import Describer
@@ -235,6 +235,7 @@ def train(
     out, dtype = run.out, choose_dtype(run.dtype, run.device)
     check_device(run.device)
     processes = Processes(run.device)
+    check_processes(config.optimizer, processes)
     with processes.main_first():
         check_architecture(out, config)
     out.mkdir(parents=True, exist_ok=True)
@@ -320,7 +321,7 @@ def train(
         peak = 1e12 * run.peak_tflops or measured_peak(processes.device, dtype)
         ideal = ideal_seconds(config, dtype, peak * processes.count, control.layout)
     try:
-        with disk_errors_named(out):
+        with disk_errors_named(out), processes.losses_named():
             _loop(trainer, source, run, held_out, ideal)
     finally:
         source.close()

@@ -104,7 +104,7 @@ needs_checkpoint = pytest.mark.skipif(
 
 @needs_checkpoint
 @pytest.mark.parametrize(
-    ('package', 'extra'), [('accelerate', 'train'), ('torchmetrics.image', 'evaluate')]
+    ('package', 'extra'), [('tensorboard', 'train'), ('torchmetrics.image', 'evaluate')]
 )
 def test_a_package_of_an_extra_that_is_missing_is_named(package, extra, capsys, monkeypatch):
     """As after `make demo`, which installs what the demo needs."""
