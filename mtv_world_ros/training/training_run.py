@@ -321,7 +321,7 @@ def train(
         peak = 1e12 * run.peak_tflops or measured_peak(processes.device, dtype)
         ideal = ideal_seconds(config, dtype, peak * processes.count, control.layout)
     try:
-        with disk_errors_named(out), processes.losses_named():
+        with disk_errors_named(out):
             _loop(trainer, source, run, held_out, ideal)
     finally:
         source.close()
@@ -449,7 +449,7 @@ def _loop(
     folder, is_main = trainer.folder, trainer.processes.is_main
     total = trainer.config.optimizer.steps
     log = TrainingLog(folder, step=trainer.step, total=total, active=is_main, ideal_seconds=ideal)
-    with StopSignals() as signals, log:
+    with StopSignals() as signals, log, trainer.processes.losses_named():
         reports = trainer.run(
             source,
             save_every=run.save_every,
