@@ -286,7 +286,10 @@ def read_recording(
     others = {}
     for view, pattern in mapping.views.items():
         frames = _frames(recording, pattern, mapping)
-        images[view], said = _track(frames, times, mapping)
+        try:
+            images[view], said = _track(frames, times, mapping)
+        except EpisodeError as error:
+            raise EpisodeError(f"recording '{recording.name}', view '{view}': {error}") from error
         notes += [f"view '{view}': {text}" for text in said]
         height, width = frames[0].shape[:2]
         if view in given.cameras:

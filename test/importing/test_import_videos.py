@@ -210,6 +210,17 @@ def test_a_video_that_is_shorter_is_told(tmp_path, franka, positions, capsys):
     assert len(episode.images['front'].stamps_ns) == 9
 
 
+def test_frames_that_belong_to_no_rows_name_their_recording(tmp_path, franka, positions, capsys):
+    write_raw(tmp_path / 'raw', 'a', positions, frames=ROWS - 3)
+    words = ['import', 'videos', str(tmp_path / 'raw'), '--out', str(tmp_path / 'data')]
+    file = mapping(tmp_path / 'm.yaml', franka, range(7), 7, fps=2.3 * FPS)
+    assert main([*words, '--mapping', str(file)]) != 0
+    error = capsys.readouterr().err
+    assert "recording 'a', view 'front': 9 frames" in error and "'rows' = frame k" in error
+    file = mapping(tmp_path / 'm.yaml', franka, range(7), 7, fps=2.3 * FPS, frame_times='rows')
+    assert main([*words, '--mapping', str(file)]) == 0
+
+
 def test_the_described_mapping_is_valid(tmp_path):
     from mtv_world_ros.core.files import share_path
     from mtv_world_ros.importing.videos import load_video_mapping

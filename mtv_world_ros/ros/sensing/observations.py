@@ -79,6 +79,10 @@ class ObservationBuffer:
         pose: asked with view, frame and stamp [ns] of an image for what carries the camera; None
             = the calibrated pose.
         time: time of the node; None = samples are not compared with a clock when they arrive.
+
+    Attributes:
+        image_hint: returns for a view of which no image came where its images may be; empty = it
+            is not known.
     """
 
     def __init__(
@@ -93,6 +97,7 @@ class ObservationBuffer:
         pose: Callable[[str, str, int], Mount | None] | None = None,
         time: NodeTime | None = None,
     ) -> None:
+        self.image_hint: Callable[[str], str] = lambda view: ''
         self._intrinsics = Intrinsics(cameras, lambda: bool(limits().calibration_file))
         self._pose = pose
         self._size = (width, height)
@@ -344,6 +349,12 @@ class ObservationBuffer:
             return camera
         return replace(camera, mount_link=mount.link, T_mount_camera=mount.T_link_frame)
 
+    def _why(self, view: str) -> str:
+        """Return why no image of a view may have come."""
+        return self.image_hint(view) or (
+            f"is its camera running, and does the parameter 'camera_topics.{view}' name it?"
+        )
+
     def _pick_images(self, now_ns: int, limits: ObservationSettings) -> list[tuple[int, AnyImage]]:
         """Return per view the image nearest to the newest moment that every view has seen.
 
@@ -353,9 +364,7 @@ class ObservationBuffer:
             if not images:
                 raise Rejection(
                     Reason.IMAGE_STALE if images.refusal else Reason.IMAGE_MISSING,
-                    images.refusal
-                    or f"no image of view '{view}' was received; is its camera "
-                    f"running, and does the parameter 'camera_topics.{view}' name it?",
+                    images.refusal or f"no image of view '{view}' was received; {self._why(view)}",
                 )
         newest = {view: images.newest[0] for view, images in self._images.items()}
         for view, stamp in newest.items():

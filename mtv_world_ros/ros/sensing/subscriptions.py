@@ -181,12 +181,27 @@ def subscribe_observations(
             (CameraInfo, f'{topic}/camera_info', add_info, 1),
             (kind, f'{topic}/image_raw{suffix}', partial(buffer.add_image, view), 1),
         ]
+    buffer.image_hint = partial(_other_image_topic, node, topics, compressed)
     measured = states or ('joint_states',)
     newest += [(JointState, topic, buffer.add_joint_state, 10) for topic in measured]
     return [
         MatchedSubscription(node, kind, topic, guarded(bounded(kind, handle)), depth=depth)
         for kind, topic, handle, depth in newest
     ]
+
+
+def _other_image_topic(
+    node: Node, topics: Mapping[str, str], compressed: Collection[str], view: str
+) -> str:
+    """Return that a view's images are published in the other form; empty = they are not."""
+    is_compressed = view in compressed
+    other = node.resolve_topic_name(
+        f'{topics[view]}/image_raw' + ('' if is_compressed else '/compressed')
+    )
+    if not node.count_publishers(other):
+        return ''
+    form, value = ('raw', 'false') if is_compressed else ('compressed', 'true')
+    return f"'{other}' publishes {form} images: set the parameter 'compressed_input' to {value}"
 
 
 class MatchedSubscription:

@@ -1,6 +1,8 @@
 """Which images and joint states make up an observation."""
 
 from contextlib import suppress
+from functools import partial
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +15,7 @@ from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.ros.messages.conversions import make_header, NANO
 from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 from mtv_world_ros.ros.parameters import NodeSettings
+from mtv_world_ros.ros.sensing import subscriptions
 from mtv_world_ros.ros.sensing.observations import ObservationBuffer
 from mtv_world_ros.ros.sensing.samples import NodeTime, Samples
 
@@ -188,6 +191,31 @@ def test_clearing_forgets_images_and_joints_but_not_the_cameras(make_buffer, ros
         assert refused.value.reason == reason
         add()
     assert buffer.observe(NOW).observation.stamp_ns == NOW
+
+
+@pytest.mark.parametrize(
+    ('compressed', 'published', 'said'),
+    [
+        ((), '/cell/low/image_raw/compressed', "set the parameter 'compressed_input' to true"),
+        (('low',), '/cell/low/image_raw', "set the parameter 'compressed_input' to false"),
+        ((), '/cell/other', "does the parameter 'camera_topics.low' name it?"),
+    ],
+)
+def test_images_of_the_other_form_are_named(make_buffer, compressed, published, said):
+    class Node:
+        def resolve_topic_name(self, topic):
+            return f'/cell/{topic}'
+
+        def count_publishers(self, topic):
+            return int(topic == published)
+
+    buffer = make_buffer()
+    buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
+    topics = {'low': 'low', 'high': 'high'}
+    buffer.image_hint = partial(subscriptions._other_image_topic, Node(), topics, compressed)
+    with pytest.raises(Rejection, match=re.escape(said)) as refused:
+        buffer.observe(NOW)
+    assert refused.value.reason == Reason.IMAGE_MISSING
 
 
 def test_cameras_that_swap_their_views_are_refused_until_a_reset(make_buffer, ros):
