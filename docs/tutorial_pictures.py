@@ -1,10 +1,10 @@
-"""Makes the pictures of the tutorials from what their commands wrote.
+"""Makes the pictures of README and tutorials from what their commands wrote.
 
     python docs/tutorial_pictures.py FOLDER
 
-FOLDER is where the lines of the tutorials were run, for example the folder `docs0` that
-`pytest test/docs/test_shell_lines.py --basetemp FOLDER` leaves. Pages and viewers are opened in a
-headless Chromium.
+FOLDER is where their lines were run: a clone of the repository, or the folder `docs0` that
+`pytest test/docs/test_shell_lines.py --basetemp FOLDER` leaves (without `demo`). Pages and viewers
+are opened in a headless Chromium.
 """
 
 from __future__ import annotations
@@ -29,33 +29,40 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 from test.support.browser import Browser  # noqa: E402
 
+#: largest width of a picture [px]
 WIDTH = 900
+#: pictures whose words would be too small then
+WIDE = ('demo', 'viewer')
 #: colours of a picture: it is to be small
 NUM_COLOURS = 128
 FILES = {
-    'expert': 'out/judge/expert/episode_00000/contact_sheet.png',
-    'mine': 'out/judge/mine/episode_00000/contact_sheet.png',
-    'check': 'out/tutorial/check/low.png',
-    'imagined': 'out/tutorial/imagined/contact_sheet.png',
+    'demo': 'out/demo/contact_sheet.png',
+    'tutorial_expert': 'out/judge/expert/episode_00000/contact_sheet.png',
+    'tutorial_mine': 'out/judge/mine/episode_00000/contact_sheet.png',
+    'tutorial_check': 'out/tutorial/check/low.png',
+    'tutorial_imagined': 'out/tutorial/imagined/contact_sheet.png',
 }
-PAGES = {'ranking': 'out/judge/ranking/ranking.html', 'scores': 'out/tutorial/scores/report.html'}
+PAGES = {
+    'tutorial_ranking': 'out/judge/ranking/ranking.html',
+    'tutorial_scores': 'out/tutorial/scores/report.html',
+}
 VIEWS = {
-    'live': 'out/judge/live.rrd',
-    'view': 'out/tutorial/view.rrd',
-    'watched': 'out/tutorial/live.rrd',
+    'tutorial_live': 'out/judge/live.rrd',
+    'viewer': 'out/tutorial/view.rrd',
+    'tutorial_watched': 'out/tutorial/live.rrd',
 }
 
 
 def save(picture: Path, name: str) -> None:
-    """Write a picture at most `WIDTH` wide, in few colours, as docs/tutorial_NAME.png."""
+    """Write a picture in few colours as docs/NAME.png."""
     from PIL import Image
 
     shown = cv2.imread(str(picture))
     assert shown is not None, f'{picture} is no picture'
-    factor = min(1.0, WIDTH / shown.shape[1])
+    factor = 1.0 if name in WIDE else min(1.0, WIDTH / shown.shape[1])
     small = cv2.resize(shown, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     image = Image.fromarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB))
-    out = ROOT / 'docs' / f'tutorial_{name}.png'
+    out = ROOT / 'docs' / f'{name}.png'
     image.quantize(NUM_COLOURS).save(out, optimize=True)
     sys.stdout.write(f'{out}: {out.stat().st_size // 1024} kB\n')
 
