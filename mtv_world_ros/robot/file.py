@@ -49,7 +49,9 @@ def robot_path(name: str | Path) -> Path:
     path = bundled('robots', name, 'robot_file')
     if not is_file(path):
         problem = 'is no regular file' if os.path.exists(path) else 'does not exist'
-        raise ConfigError(f"robot file '{path}' {problem}; set 'robot_file' to one")
+        raise ConfigError(
+            f"robot file '{path}' {problem}; give another one (--robot, or robot_file of the node)"
+        )
     return path
 
 
