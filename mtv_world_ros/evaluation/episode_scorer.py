@@ -61,12 +61,12 @@ STAGES = ('reading', 'imagining', 'segmenting', 'scoring', 'features', 'storing'
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationJob:
-    """One episode to score.
+    """Episode to be scored, with its names and options.
 
     Attributes:
         path: folder of the episode.
         name: name of its results, unique in the evaluation.
-        donors: episodes that may lend their actions; the first one that can be read does.
+        donors: episodes whose actions may replace its own; the first readable one is used.
         zero_shot: property that the model was not trained for: `view`, `task` or `object`; empty =
             none.
         objects: names of its objects; empty = the pipeline's, or recorded, or named by the task.
@@ -416,7 +416,7 @@ _CLEAR_FAILURE = 0.25
 
 
 def contradiction(outcome: str, probability: float) -> str:
-    """Return what recorded frames show against the label of an episode; empty = nothing clear.
+    """Return how the recorded frames contradict the label of an episode; empty = they do not.
 
     Args:
         outcome: the label, `success`, `failure` or `unknown`.

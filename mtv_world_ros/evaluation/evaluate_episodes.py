@@ -143,7 +143,7 @@ def evaluate(
 
 
 def result_names(paths: Sequence[Path]) -> dict[Path, str]:
-    """Return what results are called: as the folder, or by the whole path if two are alike."""
+    """Return the names of results: the folder's, or its whole path where two are equal."""
     count = Counter(Path(path).name for path in paths)
     return {
         path: path.name if count[path.name] == 1 else '__'.join(path.parts).strip('/')
@@ -157,9 +157,9 @@ def make_jobs(
     seed: int,
     tasks: Mapping[Path, TaskSpec] = MappingProxyType({}),
 ) -> list[EvaluationJob]:
-    """Return the episodes in an order in which each lends its actions to the next.
+    """Return jobs in shuffled order; each episode is the donor of actions for the next.
 
-    Where it cannot be read, the ones before it are asked.
+    Where it cannot be read, the ones before it are donors.
 
     Args:
         paths: folders of the episodes.

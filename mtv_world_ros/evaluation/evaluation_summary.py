@@ -85,7 +85,7 @@ class EvaluationSummary:
 
     @property
     def title(self) -> str:
-        """The checkpoint: what the user calls it, and its fingerprint."""
+        """Label of the checkpoint, and its fingerprint."""
         name, label = self.name, self.label
         return ' · '.join(part for part in (label, name) if part) if label not in name else name
 
@@ -106,7 +106,7 @@ class EvaluationSummary:
         return [result for result in self.results if group.holds(result)]
 
     def estimates(self, view: str | None, group: Group = ALL) -> dict[str, Estimate]:
-        """Return the numbers of a view (None = all) and a group."""
+        """Return the mean scores of a view (None = all) and a group, with intervals."""
         means = [result.means(view) for result in self.chosen(group)]
         found = summarise(means)
         measured = self.distances.get((group.zero_shot, view or ''), {})
@@ -169,7 +169,7 @@ class EvaluationSummary:
 
     @cached_property
     def pictures(self) -> dict[str | None, dict[str, Estimate]]:
-        """Picture scores by view, of all views as that of None."""
+        """Picture scores by view; None is the mean over views."""
         episodes = [result.pictures for result in self.results]
         return {view: picture_estimates(episodes, view) for view in (*self.spec.views, None)}
 
@@ -181,7 +181,7 @@ class EvaluationSummary:
 
     @property
     def dreams(self) -> Dreams:
-        """Grasps that are imagined otherwise than they end, and motion of objects."""
+        """Disagreement of imagined and real grasps, and of moving objects."""
         motions: dict[tuple[str, int, str], list[bool]] = {}
         for result in self.results:
             for row in result.rows:
@@ -196,7 +196,7 @@ class EvaluationSummary:
 
     @property
     def num_compared(self) -> tuple[int, int] | None:
-        """Number of chunks imagined with other commands, and of all; None = not known."""
+        """Number of chunks imagined with shuffled commands, and of all; None = not known."""
         if not all(result.num_chunks for result in self.results):
             return None  # of an earlier version
         num_chunks = sum(result.num_chunks for result in self.results)
@@ -209,7 +209,7 @@ class EvaluationSummary:
 
     @property
     def num_true(self) -> int:
-        """Episodes that were scored against the simulator's masks."""
+        """Number of episodes scored against the simulator's masks."""
         return sum(r.has_ids for r in self.results) if self.settings.get('use_ids') else 0
 
     def _numbers(self, group: Group) -> dict[str, Any]:
@@ -230,7 +230,7 @@ class EvaluationSummary:
         ]
 
     def statuses(self, view: str | None, group: Group = ALL) -> dict[str, int]:
-        """Return how often each status of an object in a stretch was met."""
+        """Return the counts of each status of an object in a stretch."""
         found = [row.status for row in self._rows(view, group)]
         return {word: found.count(word) for word in sorted(set(found))}
 
@@ -264,7 +264,7 @@ class EvaluationSummary:
 
     @property
     def num_chunks(self) -> int:
-        """Chunks of the longest rollout."""
+        """Number of chunks of the longest rollout."""
         frames = [row.num_frames for result in self.results for row in result.rows]
         return -(-max(frames, default=0) // self.spec.num_frames)
 

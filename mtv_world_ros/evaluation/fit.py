@@ -66,7 +66,7 @@ class Sample:
         physics: name of the simulated physics; empty = a real recording, or not stated.
         observed: features of the estimate on the recorded frames; empty where it abstained, or
             they were not judged.
-        resumed: features where all but the last chunk was seen.
+        resumed: features of the estimate if only the last chunk is imagined.
     """
 
     episode: str
@@ -92,7 +92,7 @@ class Sample:
 
     @property
     def as_unforeseen(self) -> Sample:
-        """Copy of the sample without simulated motion; no features if pictures give no verdict."""
+        """Copy of the sample judged by pictures alone; no features where they give no verdict."""
         is_judged = isfinite(self.resumed.get('margin', nan))
         return replace(self, features=({**self.resumed, 'foreseen': nan} if is_judged else {},))
 
@@ -122,7 +122,7 @@ def samples_of(
     kinds: Mapping[str, tuple[str, ...]] | None = None,
     physics: Mapping[str, str] | None = None,
 ) -> list[Sample]:
-    """Return the episodes of known outcome.
+    """Return the samples of scored episodes whose outcome is known.
 
     Args:
         runs: runs of the same episodes, one run a seed.
@@ -163,7 +163,7 @@ def calibrate(
 
     Args:
         samples: imagined episodes of known outcome.
-        segmenter: name of what found the masks.
+        segmenter: name of the segmenter that found the masks.
         l2: strength of the penalty.
         made: command, date and machine, by heading.
 
@@ -266,7 +266,7 @@ def _fit(samples: Sequence[Sample], segmenter: str, l2: float) -> dict[str, Any]
 
 
 def fit_futures(samples: Sequence[Sample], l2: float) -> ShareFit | None:
-    """Return the fit of the share of futures that succeed; None = too few samples have one."""
+    """Fit the estimate to the share of successful futures; None = too few samples have one."""
     # rollouts of several seeds are of one episode with one outcome: one row, not several
     means = [
         (float(np.mean(known)), sample.success)
@@ -380,7 +380,7 @@ class Logistic:
     bias: float
 
     def probability(self, features: FloatArray) -> FloatArray:
-        """Return (N,) for features (N, F)."""
+        """Return the probabilities (N,) of features (N, F)."""
         return expit(features @ self.weights + self.bias)
 
 
@@ -400,7 +400,7 @@ def fit_logistic(
         features: (N, F) features of the samples.
         labels: (N,) outcomes of the samples, 0 or 1.
         l2: strength of the penalty; positive, so that there is one minimum.
-        prior: (F,) weights that hold where the rows say nothing; None = zero.
+        prior: (F,) prior mean of the weights; None = zero.
         non_negative: whether no weight may be below 0, for features that grow with the
             probability.
 

@@ -29,7 +29,7 @@ MODES = ('observe', 'imagine')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stretch:
-    """Recorded stretch of an episode that one rollout is compared with.
+    """Part of a recorded episode that is compared with one rollout.
 
     Attributes:
         index: number of the stretch in the episode.
@@ -74,7 +74,7 @@ def check_mode(mode: str) -> None:
 
 
 def stretches(recording: Recording, spec: WorldModelSpec, mode: str) -> list[Stretch]:
-    """Cut an episode into stretches that are imagined at once.
+    """Cut an episode into stretches; each is imagined as one rollout.
 
     In mode `observe` each stretch is a chunk; a last one shorter than half a chunk is left out
     unless it is the only one. In mode `imagine` the whole episode is one stretch.
@@ -111,7 +111,7 @@ def _cut(
 
 
 def last_chunk(recording: Recording, stretch: Stretch, spec: WorldModelSpec) -> Stretch | None:
-    """Return the last chunk of a longer stretch; None = it is no longer than that."""
+    """Return the last chunk of a stretch; None = the stretch is a single chunk."""
     rows = frame_indices(recording, stretch.start, spec, stretch.num_frames)
     if rows is None or stretch.num_frames <= spec.num_frames:
         return None
@@ -134,7 +134,7 @@ def imagine_stretch(
         pipeline: the world model and all around it.
         recording: the episode that the stretch was cut from.
         stretch: recorded frames to imagine.
-        actions: the episode whose commands are executed: the same one, or another for a control.
+        actions: episode whose commands are executed: the same, or another for a baseline.
         seed: seed of the noise.
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
         num_seeds: rollouts whose mean the success estimate is.

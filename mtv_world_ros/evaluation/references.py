@@ -22,7 +22,7 @@ Reconstruct = Callable[[ByteArray], ByteArray]
 
 
 def check_actions(actions: Sequence[str]) -> None:
-    """Raise ConfigError unless all are of `ACTIONS` and the true ones are among them."""
+    """Raise ConfigError if a name is not in `ACTIONS`, or `true` is missing."""
     for name in actions:
         if name not in ACTIONS:
             raise ConfigError(
@@ -41,7 +41,7 @@ def with_actions(
     stretch: Stretch,
     donor: Recording | None,
 ) -> Recording | None:
-    """Return the episode whose commands of a kind (of `ACTIONS`) are executed for a stretch.
+    """Return the episode whose commands are executed for a stretch.
 
     None = `shuffled`, but there is no episode, the donor, to lend its commands.
     """

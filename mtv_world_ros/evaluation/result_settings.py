@@ -22,11 +22,11 @@ def fingerprint(
     adapter: Path | None = None,
     task: str | TaskSpec | None = None,
 ) -> str:
-    """Return the checkpoint's name and a hash of its files: other weights, other name.
+    """Return the checkpoint's name with a hash of its files.
 
     Args:
         checkpoint: the checkpoint.
-        calibrated: the calibration counts too.
+        calibrated: include the files of the calibration in the hash.
         adapter: LoRA adapter that is used with it.
         task: name or file of the task that is judged, or its definition.
     """
@@ -52,7 +52,7 @@ def check_same_settings(results: Path, settings: Mapping[str, Any], overwrite: b
     Args:
         results: folder of JSON files, each with the `settings` it was made with.
         settings: settings of this run; stored ones may have more keys.
-        overwrite: the user asked to replace such results.
+        overwrite: allow results of other settings, which are replaced.
 
     Raises:
         ConfigError: a file was made with other settings, or by another version.

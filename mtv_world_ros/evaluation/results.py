@@ -70,7 +70,7 @@ class EpisodeResult:
     grasps: tuple[GraspOutcome, ...] = ()
 
     def means(self, view: str | None) -> dict[str, float]:
-        """Return the numbers of a view (None = all views) that are averaged over episodes."""
+        """Return the episode's mean scores of a view (None = all views), by name."""
         views = [numbers for name, numbers in self.quality.items() if view in (None, name)]
         known = [name for name in QUALITY if views and all(name in numbers for numbers in views)]
         quality = {n: float(np.mean([numbers[n] for numbers in views])) for n in known}
@@ -101,7 +101,7 @@ def _nan_for_none(values: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def compare(chunks: Sequence[Prediction], real: ByteArray) -> Comparison:
-    """Return a rollout's chunks with recorded frames (V, T, H, W, 3) of the same times."""
+    """Pair the chunks of a rollout with recorded frames (V, T, H, W, 3) of the same times."""
     videos = [chunk.video for chunk in chunks]
     return Comparison(
         views=videos[0].views,
@@ -156,5 +156,5 @@ def stored_stretch(
 
 
 def rollout_path(out: Path, episode: str) -> Path:
-    """Return where the rollout of an episode lies in an evaluation's folder."""
+    """Return the path of an episode's rollout in the folder of an evaluation."""
     return Path(out) / 'episodes' / f'{episode}.rollout.npz'

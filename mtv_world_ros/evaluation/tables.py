@@ -98,7 +98,7 @@ def rows_csv(summary: EvaluationSummary) -> str:
 
 
 def markdown(summary: EvaluationSummary) -> str:
-    """Return the tables: view by number, task and view by number, statuses, failures."""
+    """Return tables.md: scores by view, by task and view, statuses, failures."""
     counts = ', '.join(
         f'{len(summary.chosen(Group(task=t)))} of {markdown_cell(t or "no task")}'
         for t in summary.tasks
@@ -180,7 +180,7 @@ def controls_table(summary: EvaluationSummary) -> Table:
 
 
 def dreams_table(summary: EvaluationSummary) -> Table:
-    """Return how often imagined objects move and are grasped otherwise than the real ones."""
+    """Return the table of disagreement on moving objects and grasps, see `Dreams`."""
     found = summary.dreams
     rows = {
         'missed grasps that are dreamt as grasps': found.dreamt,
@@ -196,7 +196,7 @@ def dreams_table(summary: EvaluationSummary) -> Table:
 
 
 def chunk_table(summary: EvaluationSummary) -> Table | None:
-    """Return J against the number of the chunk; None where no rollout has two."""
+    """Return the table of J by chunk; None where no rollout has two chunks."""
     if summary.num_chunks < 2:
         return None
     curves = {view: summary.chunk_curve(view) for view in (*summary.spec.views, None)}
@@ -230,7 +230,7 @@ def pictures_table(summary: EvaluationSummary) -> Table | None:
 
 
 def compared_line(summary: EvaluationSummary) -> str:
-    """Return over how many chunks and episodes margins are; empty if that is not known."""
+    """Return the line with the numbers of chunks and episodes behind the margins; may be empty."""
     counts, margin = summary.num_compared, summary.pictures[None].get('margin_over_held')
     if counts is None or margin is None:
         return ''
@@ -248,7 +248,7 @@ def compared_line(summary: EvaluationSummary) -> str:
 
 
 def status_table(summary: EvaluationSummary) -> Table:
-    """Return how often each status of an object in a stretch was met, by view."""
+    """Return the counts of each status of an object in a stretch, by view."""
     views = {view: summary.statuses(view) for view in summary.spec.views}
     words = sorted({word for counts in views.values() for word in counts})
     rows = [[word, *(str(counts.get(word, 0)) for counts in views.values())] for word in words]

@@ -17,7 +17,7 @@ Thickness = Annotated[float, Field(ge=1e-4, le=0.1)]
 
 
 class ContactSpread(Schema):
-    """Standard deviations of what futures begin with."""
+    """Standard deviations of the quantities that differ between futures."""
 
     place_m: float = Field(default=0.001, ge=0, le=1, description='of where objects are [m]')
     camera_m: float = Field(

@@ -58,14 +58,14 @@ class ObjectForesight:
     _whole: dict[tuple[str, ...], FoundObjects] = field(default_factory=dict)
 
     def branch(self, source: Observation) -> ObjectForesight:
-        """Return objects that are looked for in a later real observation.
+        """Return the objects of the same episode, to be found again in a later real frame.
 
-        What they look like where nothing hides them is kept.
+        The pictures of objects that were seen whole are kept.
         """
         return replace(self, source=source, found=None)
 
     def as_fitted(self) -> ObjectForesight:
-        """Return objects that are foreseen with the fitted contact parameters, not their prior.
+        """Return the objects, simulated with the fitted contact parameters, not the prior.
 
         Objects whose simulation has begun go on as they are.
         """
@@ -140,9 +140,9 @@ class ObjectForesight:
         is_begun: bool,
         should_stop: Callable[[], bool],
     ) -> ObjectForesight:
-        """Return the objects at the end of a chunk.
+        """Simulate the objects through a chunk and return their state at its end.
 
-        Pictures go on to show the future that they showed, unless it ends otherwise than most.
+        Pictures keep showing the same future, unless its outcome is that of a minority.
 
         Args:
             plan: commands of the chunk.
@@ -190,7 +190,7 @@ class ObjectForesight:
         return self.found.pictures(times, motion.cameras, motion.camera_poses)
 
     def motions(self, plan: ChunkPlan, is_begun: bool) -> ForeseenMotions | None:
-        """Return the futures until the end of what is kept of a chunk; None = they do not count.
+        """Return the futures up to the last kept frame of a chunk; None = not to be used.
 
         Args:
             plan: the chunk.

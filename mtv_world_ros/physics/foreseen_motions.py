@@ -17,7 +17,7 @@ from mtv_world_ros.robot.plan import ChunkPlan
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForeseenMotions:
-    """Motions since the objects were found.
+    """Simulated motions of the objects in K futures, since the objects were found.
 
     Attributes:
         names: names of O objects.
@@ -61,7 +61,7 @@ class ForeseenMotions:
 def foreseen_of(
     robot: RobotModel, objects: FoundObjects, num_steps: int, *, is_begun: bool = True
 ) -> ForeseenMotions:
-    """Return the foreseen motions of objects, without the steps after `num_steps`.
+    """Return the simulated motions of objects, cut after `num_steps`.
 
     Grippers of a motion without openings are as wide as commanded.
     """

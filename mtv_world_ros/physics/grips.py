@@ -86,7 +86,7 @@ class FingerState:
 
     @classmethod
     def at(cls, openings: FloatArray) -> FingerState:
-        """Return the state of fingers whose openings (A,) alone are known."""
+        """Return the finger state from openings (A,) alone."""
         return cls(
             widest=openings,
             narrowest=openings,
@@ -128,7 +128,7 @@ class FingerState:
         )
 
     def are_stopped(self, settings: GripSettings = _SETTINGS) -> BoolArray:
-        """Return whether something stops the fingers short of shut, and may be held (A,)."""
+        """Return (A,) True where an object keeps the fingers from closing, and may be held."""
         is_between = (self.rest > settings.min_opening) & (self.rest < settings.max_opening)
         has_closed = self.widest - self.rest >= settings.closes_by
         is_stopped = is_between & (has_closed | self.is_refused) & _rests(self.rest_s, settings)
@@ -146,10 +146,10 @@ def watch_fingers(
     commanded: FloatArray | None = None,
     settings: GripSettings = _SETTINGS,
 ) -> tuple[BoolArray, FingerState]:
-    """Return when something stops the fingers short of shut (A, S), and their state at the end.
+    """Return (A, S) True where an object blocks the fingers, and the end state.
 
-    Something does if they have closed, or a command to close further is not followed, and they
-    rest for long enough; the rows of a rest count from its first one on.
+    The fingers are blocked if they have closed, or do not follow a command to close further,
+    and rest for long enough; the rows of a rest count from its first one on.
 
     Args:
         openings: (A, S) measured openings, 0 closed to 1 open.
@@ -187,12 +187,12 @@ class Grip:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GripCourse:
-    """Tools and fingers of a plan, at its rows.
+    """Motion of tools and fingers at the rows of a plan.
 
     Attributes:
         tools: (A, S, 4, 4) T_base_tool [m].
         openings: (A, S) openings of the grippers, 0 closed to 1 open.
-        stopped: (A, S) whether something stops the fingers short of shut.
+        stopped: (A, S) whether an object keeps the fingers from closing.
         widths: (A,) widest distance of the fingers [m].
         fingers: state of the fingers at the last row.
         settings: definition of a grip.
@@ -214,7 +214,7 @@ class GripCourse:
         fingers: FingerState | None = None,
         settings: GripSettings = _SETTINGS,
     ) -> GripCourse:
-        """Return the course of measured joint positions.
+        """Return the tool and finger motion of measured joint positions.
 
         Args:
             robot: robot with the grippers.
@@ -242,7 +242,7 @@ class GripCourse:
         solids: Sequence[Solid],
         holds: Callable[[int], bool] = lambda arm: True,
     ) -> tuple[dict[int, Grip], FloatArray]:
-        """Return the grips at a row, and where the solids are then.
+        """Return the grips at a row, and the poses of the solids.
 
         Args:
             row: number of the row.

@@ -38,7 +38,7 @@ _AS_WIDE = 1.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectMotion:
-    """Rigid motions of objects from a reference on.
+    """Rigid motions of objects, relative to their reference poses.
 
     Attributes:
         reference: (O, 3) centres of the objects at the reference [m]; NaN = not known.
@@ -56,17 +56,17 @@ class ObjectMotion:
     weight: float = 1.0
 
     def moves(self) -> BoolArray:
-        """Return (T, O) whether an object is elsewhere than at first, by more than an error."""
+        """Return (T, O) True where an object is displaced by more than the position error."""
         turned = np.einsum('toii->to', self.rotations) < 1 + 2 * np.cos(_STILL_RAD)
         return (np.linalg.norm(self.displacements, axis=-1) > _STILL_M) | turned
 
     @property
     def displacements(self) -> FloatArray:
-        """(T, O, 3) from where they were at the reference [m]."""
+        """Displacements (T, O, 3) from the reference [m]."""
         return self.points - self.reference
 
     def then(self, motion: ObjectMotion) -> ObjectMotion:
-        """Return both, one after the other; row 0 of the second is the last of the first."""
+        """Return this motion followed by another; its row 0 is the last row of this one."""
         rows = zip(self._rows, motion._rows, strict=True)
         return self._of([np.concatenate([before, after[1:]]) for before, after in rows])
 
@@ -115,17 +115,17 @@ class TrackedObjects(Protocol):
 
     @property
     def sizes(self) -> FloatArray:
-        """(K, O, 3) their extents in each of the motions, upright [m]."""
+        """Upright extents (K, O, 3) of the objects in each motion [m]."""
         ...
 
     @property
     def doubts(self) -> Mapping[int, str]:
-        """Number of an object -> why nothing is foreseen of it, in words."""
+        """Reason why no motion is simulated, by index of the object."""
         ...
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Doubts about the foreseen motions, in words."""
+        """Doubts about the simulated motions, in words."""
         ...
 
     @property
@@ -154,7 +154,7 @@ class TrackedObjects(Protocol):
     def advance(
         self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
     ) -> tuple[tuple[ObjectMotion, ...], TrackedObjects]:
-        """Return where they are at each of 1 + T steps, and then.
+        """Simulate T steps; return the motion at 1 + T rows, and the objects at its end.
 
         The first motion is the expected one; the others, if any, start from poses and sizes within
         the error of the masks. Row 0 is the present.
@@ -170,7 +170,7 @@ class TrackedObjects(Protocol):
 
 
 class ObjectMotionModel(Protocol):
-    """Foresees object motions under commanded joints.
+    """Simulates object motion under joint commands.
 
     Attributes:
         is_fitted: contact parameters were fitted in the robot cell, or confirmed there.
@@ -185,7 +185,7 @@ class ObjectMotionModel(Protocol):
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
     ) -> TrackedObjects:
-        """Return the objects of O names and masks (V, O, H, W), seen at T_base_camera (4, 4)."""
+        """Find the objects of O names in masks (V, O, H, W) of cameras at T_base_camera (4, 4)."""
         ...
 
     def find_again(
@@ -215,7 +215,7 @@ class ObjectMotionModel(Protocol):
         ...
 
     def with_robot(self, robot: RobotModel) -> ObjectMotionModel:
-        """Return the same for a robot of the same joints and tools."""
+        """Return the model for a robot with the same joints and tools."""
         ...
 
     def at_place(self, place: str) -> ObjectMotionModel:
@@ -229,7 +229,7 @@ class ObjectMotionModel(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundObjects:
-    """The named objects as a real frame shows them, and where they are now.
+    """Named objects: their pictures in a real frame, and their present poses.
 
     Attributes:
         names: names of the O objects.
@@ -265,12 +265,12 @@ class FoundObjects:
         poses: FloatArray,
         tracked: TrackedObjects,
     ) -> FoundObjects:
-        """Return objects of masks (V, O, H, W) in frames (V, H, W, 3), seen at (V, 4, 4)."""
+        """Return objects from masks (V, O, H, W) in frames (V, H, W, 3), cameras at (V, 4, 4)."""
         of_each = np.repeat(poses[:, None], len(names), axis=1)
         return cls(names=names, cuts=cut_outs(frames, masks), poses=of_each, tracked=tracked)
 
     def shown_as(self, whole: FoundObjects, hidden: BoolArray) -> FoundObjects:
-        """Return these, those of `hidden` (O,) with the pictures of when they were whole."""
+        """Return the objects; those of `hidden` (O,) keep their pictures from before."""
         cuts = np.where(hidden[:, None, None, None], whole.cuts, self.cuts)
         poses = np.where(hidden[:, None, None], whole.poses, self.poses)
         return replace(self, cuts=cuts, poses=poses)
@@ -281,7 +281,7 @@ class FoundObjects:
         return replace(self, tracked=tracked, motions=(), positions=None, part_row=0)
 
     def foresee(self, parts: Iterable[FloatArray]) -> tuple[FoundObjects, ...]:
-        """Return the objects after each part of a plan, which show the same motion as before.
+        """Simulate the parts of a plan; return the objects at the end, the shown motion kept.
 
         Args:
             parts: (1 + T * `tracked.commands_a_step`, J) joint positions of each part [rad or m],
@@ -339,7 +339,7 @@ class FoundObjects:
     def after(
         self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
     ) -> FoundObjects:
-        """Return the objects after a part of a plan, which show the same motion as before.
+        """Simulate one part of a plan; return the objects at its end, the shown motion kept.
 
         Args:
             positions: (1 + T * `tracked.commands_a_step`, J) [rad or m], evenly spaced.
@@ -375,7 +375,7 @@ def _apart(motions: Sequence[ObjectMotion]) -> FloatArray:
 
 
 def cut_outs(frames: ByteArray, masks: BoolArray) -> ByteArray:
-    """Return (V, O, H, W, 4) colours of objects, black elsewhere, and masks as 0 or 255.
+    """Return cut-outs (V, O, H, W, 4): RGB of each object, and its mask as alpha, 0 or 255.
 
     Args:
         frames: (V, H, W, 3) uint8 RGB.
@@ -393,7 +393,7 @@ def moved_pictures(
     reference_poses: FloatArray,
     poses: FloatArray,
 ) -> ByteArray:
-    """Return the objects alone, (V, T, H, W, 4) uint8 RGB and cover, as they move rigidly.
+    """Return pictures of the moving objects (V, T, H, W, 4), uint8 RGB and alpha.
 
     Each object is warped like a plane through its centre that faces the camera: shifted by the
     projected displacement, scaled by the ratio of depths, turned about the line of sight. Near

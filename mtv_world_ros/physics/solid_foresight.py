@@ -46,10 +46,10 @@ _TABLE_REACH_M = 2.0
 
 
 class SolidForesight:
-    """Find objects in a frame, and predicts their motion under plans in several futures.
+    """Finds objects in a frame, and simulates their motion under plans in K futures.
 
     Args:
-        robot: any whose base stands still.
+        robot: robot with a fixed base.
         response: response of the arms to their commands; None = not known yet.
         settings: settings of contact.
         threads: number of computing threads.
@@ -81,7 +81,7 @@ class SolidForesight:
         return self.engine.arms.notes
 
     def with_robot(self, robot: RobotModel) -> SolidForesight:
-        """Return the same for a robot of the same joints and tools."""
+        """Return the foresight for a robot with the same joints and tools."""
         other = SolidForesight(robot, self.response, self.settings, self._threads)
         other.is_fitted, other._as_fitted = self.is_fitted, self._as_fitted
         return other
@@ -113,7 +113,7 @@ class SolidForesight:
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
     ) -> TrackedSolids:
-        """Return the objects of masks (V, O, H, W), best of the camera's own size.
+        """Find the objects of masks (V, O, H, W), preferably at the camera's resolution.
 
         Args:
             names: names of the O objects; the name of a vessel makes it hollow.
@@ -156,7 +156,7 @@ class SolidForesight:
         poses: Sequence[FloatArray],
         kept: Sequence[KeptPose | None] = (),
     ) -> tuple[TrackedSolids, BoolArray, BoolArray]:
-        """Return objects that something may hide in part by now; see `ObjectMotionModel`."""
+        """Find objects that may be partly hidden; see `ObjectMotionModel.find_again`."""
         points = locate_all(cameras, poses, centroids(masks))
         floor = whole.foresight.settings.table_m
         solids = [
@@ -268,7 +268,7 @@ class TrackedSolids:
 
     @property
     def centres(self) -> FloatArray:
-        """(O, 3) where the solids were found [m], NaN = not seen by two views."""
+        """Positions (O, 3) at which the solids were found [m]; NaN = not seen by two views."""
         unknown = np.full(3, np.nan)
         centres = [unknown if one is None else one.centre for one in self.solids]
         return np.array(centres).reshape(-1, 3)
@@ -284,7 +284,7 @@ class TrackedSolids:
 
     @property
     def refusal(self) -> str:
-        """The reason to give no verdict, as most futures are implausible; empty = none."""
+        """Reason why no verdict is given: most futures are implausible; empty = none."""
         count = self.foresight.settings.num_motions
         if self.state is None or not _too_many(self.state, count):
             return ''
@@ -292,7 +292,7 @@ class TrackedSolids:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Reasons why no motion is foreseen, and doubts about it, in words."""
+        """Reasons why no motion is simulated, and doubts about it, in words."""
         doubts = (*dict.fromkeys(self.doubts.values()), *([self.note] if self.note else ()))
         if self.state is None or not self.state.lost:
             return doubts
@@ -312,14 +312,14 @@ class TrackedSolids:
     def advance(
         self, positions: FloatArray, should_stop: Callable[[], bool] = lambda: False
     ) -> tuple[tuple[ObjectMotion, ...], TrackedSolids]:
-        """Return where they are at each of 1 + T steps in K futures, and then.
+        """Simulate T steps in K futures; return the motions at 1 + T rows, and the end state.
 
         In the first future all is as it was found. Row 0 is where they are now. What cannot be
         foreseen is NaN.
 
         Args:
             positions: (1 + T * `commands_a_step`, J) commanded positions [rad or m].
-            should_stop: asked all the time.
+            should_stop: polled while futures are simulated; true cancels.
 
         Raises:
             RolloutPreempted: `should_stop` said so.
@@ -405,7 +405,7 @@ def table_in(
     cameras: Sequence[CameraModel],
     poses: Sequence[FloatArray],
 ) -> float:
-    """Return the height of a table that nothing is known of [m]; NaN = no object tells.
+    """Estimate the height of the table from objects that stand on it [m]; NaN = not known.
 
     It is the middle one of where objects end below; see `SolidForesight.find`.
     """

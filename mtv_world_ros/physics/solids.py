@@ -104,7 +104,7 @@ class Solid:
         return replace(self, centre=T[:3, :3] @ self.centre + T[:3, 3], yaw=yaw)
 
     def turn_to(self, now: Solid) -> FloatArray:
-        """Return (3, 3) how it has turned."""
+        """Return its rotation matrix (3, 3)."""
         return about_z(now.yaw - self.yaw)
 
 
@@ -127,7 +127,7 @@ def bottom_of(
     floor: float = 0.0,
     fits: int = 2,
 ) -> float:
-    """Return where an object ends below [m]; NaN = two views do not see it.
+    """Return the height of an object's lowest point [m]; NaN = not seen by two views.
 
     Args:
         masks: see `fit_solid`; so are the others.
@@ -155,7 +155,7 @@ def fit_solid(
     is_open: bool = False,
     is_box: bool = False,
 ) -> Solid | None:
-    """Return the solid whose outlines are nearest to those of an object.
+    """Fit a box or cylinder to the outlines of an object.
 
     The place and size of a block with whole masks at 384 x 288 are found to half a millimetre.
     The solid lacks what no mask shows (hidden parts, hollows), apart from `is_open`.

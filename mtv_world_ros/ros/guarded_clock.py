@@ -13,9 +13,9 @@ MAX_CLOCK_S = 2**31 - 1 - 86_400
 
 
 def guard_clock(node: Node) -> None:
-    """Let the node leave out `/clock` messages that are no time.
+    """Make the node ignore `/clock` messages with a negative time.
 
-    rclpy raises on a negative one, which ends the executor, and with it the node. A second call
+    rclpy raises on one, which ends the executor and the node. A second call
     changes nothing.
     """
     source: Any = node._time_source  # rclpy has no public way

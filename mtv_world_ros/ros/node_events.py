@@ -24,11 +24,11 @@ class SensingEvents(Protocol):
         ...
 
     def guarded(self, handle: Callable[..., None]) -> Callable[..., None]:
-        """Return the handler as a callback that no message makes raise."""
+        """Return a callback that counts exceptions of the handler and does not raise."""
         ...
 
     def on_robot(self, robot: RobotModel) -> None:
-        """Take the robot as it describes itself."""
+        """Use the kinematics and limits of the robot's own description."""
         ...
 
 
@@ -52,7 +52,7 @@ class NodeEvents(SensingEvents, Protocol):
         ...
 
     def on_plan(self, plan: JointTrajectoryMsg | Goal, transport_s: float = 0.0) -> None:
-        """Take a plan of the topic or of the action, and how long it was under way [s]."""
+        """Take a plan from topic or action, with its transport delay [s]."""
         ...
 
     def on_refused_plan(self, error: Exception, stamp_ns: int) -> None:
@@ -80,7 +80,7 @@ class NodeEvents(SensingEvents, Protocol):
         ...
 
     def on_error(self, error: Exception) -> None:
-        """Take an error that nobody raised on purpose."""
+        """Report an unexpected exception."""
         ...
 
     def start_waiting(self) -> None:

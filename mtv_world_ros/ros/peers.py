@@ -32,7 +32,7 @@ class Peers:
     def unconnected(self, topics: Iterable[str]) -> list[str]:
         """Return the topics whose publisher, by its node's diagnostics, has no subscriber.
 
-        Two that know of each other from the graph may still not be connected, and what is
+        Nodes that know each other from the graph may still not be connected, and what is
         published until then is lost.
         """
 

@@ -28,12 +28,12 @@ LATCHED = QoSProfile(
 
 
 def is_latched(profile: QoSProfile) -> bool:
-    """Return whether late subscribers get earlier messages."""
+    """Return True if the profile is transient local: late subscribers get earlier messages."""
     return profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
 
 def best_offer(publishers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfile:
-    """Return the best profile that all publishers of a topic can serve.
+    """Return the strongest profile that is compatible with all publishers of a topic.
 
     Args:
         publishers: publishers of the topic, as the graph knows them.
@@ -51,7 +51,7 @@ def best_offer(publishers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfil
 
 
 class QosWatch:
-    """Watch for peers with a quality of service that does not match: no message gets through.
+    """Reports peers whose quality of service is incompatible, so that no message arrives.
 
     Attributes:
         mismatches: present ones, as text with topic, both policies and the fix.

@@ -62,7 +62,7 @@ class ReceivePaths:
     _locks: list[socket.socket] = field(default_factory=list)
 
     def reserve(self, topics: Sequence[str]) -> None:
-        """Give topics a free port that they share."""
+        """Reserve a free UDP port that these topics share."""
         port, lock = _free_port()
         self._locks.append(lock)
         self.ports.update(dict.fromkeys(topics, port))
@@ -92,7 +92,7 @@ PATHS = ReceivePaths()
 
 @contextmanager
 def receive_paths(groups: Sequence[Sequence[str]]) -> Iterator[ReceivePaths]:
-    """Have nodes that are made inside receive topics through UDP ports of their own.
+    """Make nodes created in this context receive topics through UDP ports of their own.
 
     Other middlewares than Fast DDS, and profiles of the user's own, are left alone. What this
     package publishes is sent again after .1 s where it was lost.

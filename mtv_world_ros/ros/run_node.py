@@ -34,9 +34,9 @@ AnyNode = TypeVar('AnyNode', bound=Node)
 
 
 def end_with_parent() -> None:
-    """Let this process get SIGINT when the one that started it is gone, even if it was killed.
+    """Send this process SIGINT when its parent process ends, even by a kill.
 
-    Only where that one asks for it (`child_processes`), and only on Linux.
+    Only where the parent asks for it (`child_processes`), and only on Linux.
     """
     parent = os.environ.pop(PARENT_VARIABLE, '')
     if not parent or not sys.platform.startswith('linux'):
@@ -47,7 +47,7 @@ def end_with_parent() -> None:
 
 
 def guard_node(node: Node) -> None:
-    """Let a node outlive messages and requests of peers that rclpy itself fails on."""
+    """Guard a node against messages and requests on which rclpy raises."""
     guard_parameter_services(node)
     guard_services(node)
     guard_clock(node)
@@ -70,7 +70,7 @@ def run(
     name: str = '',
     own_paths: Sequence[Sequence[str]] = (),
 ) -> int:
-    """Make a node and spin it until it is done, or until SIGINT or SIGTERM.
+    """Create a node and spin it until it is done, or until SIGINT or SIGTERM.
 
     Fast DDS is set to send soon again what a reliable subscriber missed, unless it has a profile.
 

@@ -82,7 +82,7 @@ class ArmScene:
 def arm_scenes(
     recording: Recording, robot: RobotModel, parts: Sequence[LinkShape]
 ) -> list[ArmScene | None]:
-    """Return the scene of each view of a recording; None of a camera that moves."""
+    """Return the background of each view of a recording; None for moving cameras."""
     rows = np.linspace(0, len(recording.times) - 1, _MOST_FRAMES).astype(int)
     rows, moving = np.unique(rows), moving_links(robot)
     found: list[ArmScene | None] = []

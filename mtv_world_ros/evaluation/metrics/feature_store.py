@@ -93,7 +93,7 @@ _SIDES = ('predicted', 'real')
 
 
 def feature_path(out: Path, episode: str) -> Path:
-    """Return where the features of an episode lie in an evaluation's folder."""
+    """Return the path of an episode's features in the folder of an evaluation."""
     return out / 'episodes' / f'{episode}.features.npz'
 
 
@@ -138,7 +138,7 @@ class EpisodeFeatures:
         self._found: dict[str, list[FloatArray]] = {}
 
     def add(self, predicted: ByteArray, real: ByteArray) -> None:
-        """Take the features of a stretch, (V, T, H, W, 3) each."""
+        """Add the features of a stretch: predicted and real frames, (V, T, H, W, 3) each."""
         for side, videos in zip(_SIDES, (predicted, real), strict=True):
             for view, video in zip(self._taker.views, videos, strict=True):
                 for name, features in self._taker.take(video).items():

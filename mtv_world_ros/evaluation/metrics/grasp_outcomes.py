@@ -37,7 +37,7 @@ GRASP_RULE = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GraspOutcome:
-    """Outcome of one attempt of a gripper to grasp an object.
+    """Real and imagined outcome of one attempt to grasp an object.
 
     Attributes:
         stretch: number of the stretch in the episode.
@@ -45,7 +45,7 @@ class GraspOutcome:
         arm: index of the tool.
         name: name of the object.
         real: whether the recorded object goes along with the gripper.
-        imagined: whether the imagined one does.
+        imagined: whether the imagined object goes along with the gripper.
     """
 
     stretch: int
@@ -120,7 +120,7 @@ class Share:
 
     @property
     def text(self) -> str:
-        """Counts, share and interval, for people."""
+        """Counts, share and interval as text."""
         if not self.count:
             return 'none'
         low, high = self.interval
@@ -129,7 +129,7 @@ class Share:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dreams:
-    """Where imagined objects and real ones part.
+    """Disagreement between imagination and recording on grasps and moving objects.
 
     Attributes:
         dreamt: missed grasps that are imagined as grasps.
@@ -145,7 +145,7 @@ class Dreams:
 
     @classmethod
     def of(cls, grasps: Iterable[GraspOutcome], motions: Iterable[tuple[bool, bool]]) -> Dreams:
-        """Return the shares.
+        """Count the shares from all attempts to grasp and all objects.
 
         Args:
             grasps: all attempts.

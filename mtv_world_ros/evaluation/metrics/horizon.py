@@ -59,7 +59,7 @@ def by_chunk(
     field: str,
     num_frames: int,
 ) -> Curve:
-    """Return J of the moving objects of a view for each chunk of its rollouts: how it drifts.
+    """Return J of moving objects by chunk of the rollouts, which shows drift.
 
     All frames of a chunk, `num_frames`, weigh equally; the other arguments are those of `curve`.
     """

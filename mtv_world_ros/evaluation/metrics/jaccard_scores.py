@@ -187,7 +187,7 @@ def _stay(points: FloatArray, objects: tuple[str, ...], names: tuple[str, ...]) 
 
 
 def keep_doubts(first: ObjectMasks, masks: ObjectMasks) -> ObjectMasks:
-    """Return `masks` with the doubts about the objects from which they start.
+    """Return `masks` with the doubts about their first masks added to the status.
 
     Args:
         first: masks of the start frame.
@@ -237,8 +237,8 @@ def score_rows(
         views: names of the V views.
         truth: masks of the recorded frames.
         predicted: scores of the prediction.
-        others: scores by name, of `OTHERS`; those that are missing were not measured.
-        masks: masks in the predicted frames; None = what is imagined to move is not known.
+        others: scores of the baselines by name (a key of `OTHERS`); missing = not measured.
+        masks: masks in the predicted frames; None = imagined motion is not known.
     """
     first = truth.first.masks[:, :, 0]
     imagined = np.zeros_like(truth.moving)

@@ -126,7 +126,7 @@ COPY_DISTANCE = 0.03
 
 
 def displaced_objects(masks: BoolArray, first: BoolArray) -> BoolArray:
-    """Return (V, O) whether a part of an object is seen away from its first mask.
+    """Return (V, O) True where a part of an object appears away from its first mask.
 
     A second object that grows elsewhere while the first one stays is motion, too, which
     `moving_objects` does not see. Frames 1..T of at least two such frames count.
@@ -147,7 +147,7 @@ def displaced_objects(masks: BoolArray, first: BoolArray) -> BoolArray:
 
 
 def moving_objects(true: BoolArray, first: BoolArray) -> BoolArray:
-    """Return (V, O) whether an object moves in the recording.
+    """Return (V, O) True for objects that move in the recording.
 
     It moves if in some frame its mask and its first mask share less than half of the smaller of
     the two. Hiding it, wholly or in part, leaves that share at 1. Frames that show

@@ -66,7 +66,7 @@ _SSIM_C2 = (0.03 * 255) ** 2
 
 
 def picture_scores(frames: ByteArray, real: ByteArray, first: ByteArray) -> dict[str, float]:
-    """Return `MEASURES` of a view but `j_arm`, means over frames; NaN where nothing changes.
+    """Return the picture scores of a view: `MEASURES` without `j_arm`, means over frames.
 
     Args:
         frames: (T, H, W, 3) uint8 RGB imagined.
@@ -106,7 +106,7 @@ def _psnr(error: NDArray[np.float64]) -> float:
 
 
 def changed_pixels(frame: ByteArray, first: ByteArray) -> NDArray[np.bool_]:
-    """Return (H, W) whether a pixel differs between two frames (H, W, 3)."""
+    """Return (H, W) True for pixels that differ between two frames (H, W, 3)."""
     apart = np.abs(frame.astype(np.float32) - first.astype(np.float32)).max(axis=-1)
     return np.asarray(cv2.GaussianBlur(apart, (0, 0), 0.8) > _CHANGED)
 
@@ -177,7 +177,7 @@ def weighted(rows: Sequence[tuple[int, Mapping[str, float]]], name: str) -> floa
 
 
 def episode_pictures(episode: PictureScores, view: str | None) -> dict[str, float]:
-    """Return an episode's numbers of a view (None = mean of all), and margins."""
+    """Return an episode's picture scores of a view (None = mean over views), and margins."""
     views = [numbers for name, numbers in episode.items() if view in (None, name)]
     names = dict.fromkeys(name for numbers in views for name in numbers)
     found = {name: _mean([numbers.get(name, nan) for numbers in views]) for name in names}

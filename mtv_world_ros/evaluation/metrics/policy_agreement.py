@@ -34,7 +34,7 @@ _TWO_GROUPS = 0.3
 def draw_rates(
     judged: FloatArray, true: FloatArray, num_draws: int = 1000, seed: int = 0
 ) -> FloatArray:
-    """Return draws (2, D, P) of the judged and true rates of P policies on endless scenes.
+    """Draw judged and true success rates (2, D, P) of P policies from their posterior.
 
     Args:
         judged: (P, K, E) outcomes on E scenes of each of K tasks, each 0 or 1, or estimates in

@@ -42,7 +42,7 @@ _RANGES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """A mean over the episodes that have the value, and its 95 % interval; NaN = not known."""
+    """Mean over the episodes that have the value, and its 95 % interval; NaN = not known."""
 
     value: float
     interval: Interval

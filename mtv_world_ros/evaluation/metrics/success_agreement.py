@@ -66,7 +66,7 @@ def agreement(judgements: Sequence[Judgement]) -> dict[str, Any]:
 
 
 def expected_calibration_error(probability: FloatArray, real: BoolArray) -> float:
-    """Return how far estimates (N,) are from the share of successes, over bins of estimates.
+    """Return the expected calibration error of estimates (N,).
 
     Bins weigh by how many estimates lie in them (Guo et al., 2017). An estimate is the probability
     of success, not of the likelier outcome.
@@ -95,12 +95,12 @@ def _mean(values: np.ndarray) -> float | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bin:
-    """Estimates of about the same probability, and how often they came true.
+    """Bin of a reliability diagram: estimates of similar probability, and their outcomes.
 
     Attributes:
         middle: middle of the probabilities that belong here.
         estimate: mean of the estimates.
-        came_true: share, with its interval.
+        came_true: share of successes among these episodes.
         interval: 95 % Wilson interval of the share.
         count: number of estimates.
     """

@@ -63,7 +63,7 @@ class ArmState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArmResponse:
-    """See the module.
+    """Second-order response of each joint to its commands; inertia couples the links.
 
     Attributes:
         joint_names: names of the robot's J joints.
@@ -97,7 +97,7 @@ class ArmResponse:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], joint_names: Sequence[str]) -> ArmResponse:
-        """Return what `as_json` gave, of a robot with these joints.
+        """Return the response that `as_json` wrote, for a robot with these joints.
 
         Raises:
             KeyError: a joint or number is missing.
@@ -111,7 +111,7 @@ class ArmResponse:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Return the numbers by joint, and the floor."""
+        """Return the parameters of each joint by name, and the floor, as plain values."""
         joints: dict[str, Any] = {
             joint: {name: float(getattr(self, name)[column]) for name in NUMBERS}
             for column, joint in enumerate(self.joint_names)

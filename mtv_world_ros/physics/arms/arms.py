@@ -70,11 +70,11 @@ class Drives:
     lead: FloatArray
 
     def spread(self, positions: FloatArray) -> FloatArray:
-        """Return degrees of freedom (..., D) of joints (..., J)."""
+        """Return the degrees of freedom (..., D) that belong to joint positions (..., J)."""
         return positions[..., self.columns] * self.multipliers + self.offsets
 
     def joints(self, values: FloatArray, count: int) -> FloatArray:
-        """Return joints (..., J), each the mean of the degrees of freedom (..., D) of it."""
+        """Return joint positions (..., J), the means over their degrees of freedom (..., D)."""
         single = (values - self.offsets) / self.multipliers
         sums = np.zeros((*values.shape[:-1], count))
         np.add.at(np.moveaxis(sums, -1, 0), self.columns, np.moveaxis(single, -1, 0))
@@ -82,7 +82,7 @@ class Drives:
 
 
 class Arms:
-    """Adds a robot to a scene.
+    """Bodies, shapes and drives of a robot, for MuJoCo scenes.
 
     Args:
         robot: robot with any number of arms; its base stands still.
@@ -156,7 +156,7 @@ class Arms:
         self._add_gears(spec)
 
     def finger_dofs(self) -> list[list[int]]:
-        """Return the degrees of freedom of each arm's tool that move fingers."""
+        """Return the degrees of freedom that move the fingers of each arm's tool, as indices."""
         names, found = self.robot.joint_names, []
         for tool in self.robot.tools:
             column = -1 if tool.gripper_joint is None else names.index(tool.gripper_joint)
@@ -322,7 +322,7 @@ class Arms:
 
 
 def set_drives(model: Any, drives: Drives, settings: ContactSettings) -> None:
-    """Write the drives of a scene's arms into a model, those of fingers as they were fitted."""
+    """Write drive parameters into a model; fingers get their fitted ones."""
     way = drives.travels**2
     count = np.bincount(drives.columns)[drives.columns]
     # of a finger of several joints each has its share

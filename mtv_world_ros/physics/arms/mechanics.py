@@ -13,7 +13,7 @@ from mtv_world_ros.robot.model import RobotModel
 
 
 class RobotMechanics:
-    """Evaluates one configuration after the other.
+    """Inertia and fingertip kinematics of a robot, at one configuration a call.
 
     Args:
         robot: the robot.
@@ -62,9 +62,9 @@ class RobotMechanics:
         return np.array(points)
 
     def fingertip_jacobians(self, positions: FloatArray, points: FloatArray) -> FloatArray:
-        """Return how `fingertips` at positions (J,) move with the joints (P, 3, J).
+        """Return the Jacobians (P, 3, J) of `fingertips` at joint positions (J,).
 
-        That the gripper opens is not in them.
+        The motion of the fingers relative to their tool is left out.
         """
         model, data = self._model, self._data
         q = self._robot.configurations(positions[None])[0]

@@ -61,7 +61,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotParts:
-    """Parts of all links, and the assumptions where the description is incomplete.
+    """Convex parts of all links, and assumptions that fill gaps in the description.
 
     Attributes:
         parts: convex parts of the links, P.
@@ -73,7 +73,7 @@ class RobotParts:
 
 
 def load_parts(robot: RobotModel) -> RobotParts:
-    """Return the parts that can touch something.
+    """Load the convex parts of the links, for contact.
 
     These are the URDF's collision elements, or the visual ones of a link without collisions. A
     mesh is replaced by its convex hull; a gripper's mesh by convex pieces, so that an object fits
@@ -105,7 +105,7 @@ def load_parts(robot: RobotModel) -> RobotParts:
 
 
 def with_inertias(robot: RobotModel, parts: Sequence[Part]) -> tuple[RobotModel, tuple[str, ...]]:
-    """Return a robot whose moving bodies all have inertias, and what was assumed.
+    """Return the robot with an inertia for each moving body, and the assumptions as text.
 
     Links that state none are taken to be filled with water.
     """

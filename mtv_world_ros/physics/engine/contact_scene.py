@@ -88,7 +88,7 @@ class _Piece:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompiledScene:
-    """A compiled scene; `model_of` gives it the numbers of a future.
+    """Compiled MuJoCo scene; `model_of` sets the parameters of one future.
 
     Attributes:
         arms: arms of the robot.
@@ -112,7 +112,7 @@ class CompiledScene:
 
     @classmethod
     def compiled(cls, arms: Arms, kinds: Sequence[str]) -> CompiledScene:
-        """Return the scene of a robot and solids of some kinds.
+        """Compile the scene of a robot and of solids of these kinds.
 
         Raises:
             RobotError: MuJoCo refuses the robot.
@@ -147,7 +147,7 @@ class CompiledScene:
     def model_of(
         self, settings: ContactSettings, solids: Sequence[Solid], data: Any = None
     ) -> Any:
-        """Return a model with the numbers of settings and of solids of these kinds.
+        """Return the model with the parameters of the settings and of the solids.
 
         Args:
             settings: settings of contact.
@@ -170,7 +170,7 @@ class CompiledScene:
         return model
 
     def positions(self, arms: FloatArray, solids: Sequence[Solid]) -> FloatArray:
-        """Return qpos with the arms (D,) and the solids where they stand."""
+        """Return MuJoCo's qpos for arm positions (D,) and the poses of the solids."""
         qpos = self.model.qpos0.copy()
         qpos[self.arm_qpos] = arms
         for first, solid in zip(self.solid_qpos, solids, strict=True):

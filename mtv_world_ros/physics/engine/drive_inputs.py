@@ -25,7 +25,7 @@ FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreeMotion:
-    """Motion of the arms that touch no solid, and the control inputs of their drives.
+    """Motion of the arms without contact with solids, and the inputs of their drives.
 
     Attributes:
         controls: (S, D) set points of the drives [rad or m].
@@ -40,11 +40,11 @@ class FreeMotion:
     velocities: FloatArray
 
     def late(self, steps: int, last: FreeMotion | None) -> FreeMotion:
-        """Return the course, delayed by a number of steps.
+        """Return the motion, delayed by a number of steps.
 
         Args:
             steps: steps of the engine.
-            last: the course before it; None = the arms rested.
+            last: motion before this one; None = the arms were at rest.
         """
         if not steps:
             return self
@@ -72,11 +72,11 @@ class FreeMotion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArmsState:
-    """State of the arms, had they touched no solid.
+    """State that the arms would have without contact with solids.
 
     Attributes:
         physics: MuJoCo's full physics state of a scene of the arms and the table.
-        ways: (2, D) set points of the fingers, and their speeds.
+        ways: (2, D) set points and speeds of the fingers.
         commands: (J,) the last ones [rad or m].
     """
 
@@ -86,7 +86,7 @@ class ArmsState:
 
 
 class CoursePlanner:
-    """Computes the course of commands.
+    """Computes the free motion of the arms under commands.
 
     Args:
         scene: scene of the arms without solids.
@@ -114,7 +114,7 @@ class CoursePlanner:
         )
 
     def plan(self, commands: FloatArray, state: ArmsState) -> tuple[FreeMotion, ArmsState]:
-        """Return the course of commands (1 + N, J), `PERIOD_S` apart, and the state after it."""
+        """Return the free motion under commands (1 + N, J), `PERIOD_S` apart, and its end."""
         scene, drives = self._scene, self._scene.arms.drives
         targets = np.concatenate([state.commands[None], commands[1:]])
         rows = drives.spread(self._squeezed(targets))

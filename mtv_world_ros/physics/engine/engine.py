@@ -32,7 +32,7 @@ from mtv_world_ros.physics.mujoco_import import mujoco, Rollout
 
 @dataclass(frozen=True, slots=True)
 class SleepSettings:
-    """Limits below which solids and arms are not simulated.
+    """Thresholds below which solids and arms are put to sleep.
 
     Attributes:
         max_angular_speed_rad_s: a slower solid is at rest.
@@ -191,7 +191,7 @@ class Engine:
         self._rollout = Rollout(nthread=0 if threads < 2 else threads)
 
     def scene_of(self, kinds: Sequence[str]) -> tuple[CompiledScene, list[Any]]:
-        """Return the compiled scene of solids of some kinds, and data of each thread."""
+        """Return the compiled scene for solids of these kinds, and MuJoCo data for each thread."""
         key = tuple(kinds)
         if key not in self._scenes:
             if len(self._scenes) >= 8:
@@ -201,13 +201,13 @@ class Engine:
         return self._scenes[key]
 
     def begin(self, futures: Sequence[Future]) -> Batch:
-        """Return the batch that computes futures of solids of the same kinds."""
+        """Return the batch that simulates these futures; their solids are of the same kinds."""
         return Batch(self, futures)
 
     def run(
         self, models: Sequence[Any], data: Sequence[Any], states: FloatArray, controls: FloatArray
     ) -> FloatArray:
-        """Return the states (K, S, N) of K models at S steps from some states (K, N) on."""
+        """Simulate K models for S steps from states (K, N); return the states (K, S, N)."""
         return self._rollout.rollout(
             models, data, states, controls, chunk_size=1 if self.threads > 1 else None
         )[0]
@@ -245,7 +245,7 @@ class Batch:
         return self._models[0]
 
     def touches_arms(self, positions: FloatArray) -> bool:
-        """Return whether arms at joints (J,) are near a solid, as one that they hold."""
+        """Return True if arms at joint positions (J,) are near a solid, or hold one."""
         at = self._scene.arms.drives.spread(positions)
         return not self._nearby.is_clear(
             self._scene.positions(at, self.futures[0].solids), at[None]

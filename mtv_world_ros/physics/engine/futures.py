@@ -43,7 +43,7 @@ def draw_futures(
     solids: Sequence[Solid],
     drives: Drives,
 ) -> tuple[Future, ...]:
-    """Return `settings.num_motions` futures; in the first all is as it was found.
+    """Return `settings.num_motions` futures; the first has the best estimates.
 
     The same number always gives the same draws, so that plans are compared under the same ones.
 
@@ -96,7 +96,7 @@ def _drawn(
 
 
 def shifted(solid: Solid, shift: FloatArray) -> Solid:
-    """Return a solid that is elsewhere by a shift (3,) [m]."""
+    """Return the solid, shifted by (3,) [m]."""
     return replace(solid, centre=solid.centre + shift)
 
 

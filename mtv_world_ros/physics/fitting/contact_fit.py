@@ -98,7 +98,7 @@ class FreeGrippers:
 
     @classmethod
     def of(cls, robot: RobotModel, positions: FloatArray, recorded: FloatArray) -> FreeGrippers:
-        """Return those of commands and recorded positions (1 + T, J)."""
+        """Return the gripper motion of commands and recorded positions (1 + T, J)."""
         known = np.full_like(recorded, np.nan)
         last = 1
         for tool in robot.tools:
@@ -119,7 +119,7 @@ class FreeGrippers:
 def fit_fingers(
     grippers: Sequence[FreeGrippers], arms: Arms, settings: ContactSettings
 ) -> ContactSettings:
-    """Return settings with the numbers of fingers that explain what grippers reported.
+    """Fit the parameters of the finger drives to measured gripper positions.
 
     The search begins at the settings. Where swinging fingers explain little, they are returned as
     they were, and fingers do not swing.
@@ -217,9 +217,10 @@ class ContactFitSettings:
             which a recording informs it.
         max_small_size_m: largest object whose masks have a common middle in two views [m].
         outline_error_m: error of outlines that does not shrink with their number [m].
-        max_table_spread_m: larger differences of heights are of several tables [m].
+        max_table_spread_m: largest difference of heights of one table [m].
         max_tables: number of recordings whose table is searched.
-        same_command_tolerance: commands this near to the measured positions are these [rad or m].
+        same_command_tolerance: commands that differ less from the measured positions are taken
+            for a copy of them [rad or m].
         squeeze_fraction: extra closing of fingers where commands are measured positions, as a
             fraction of their travel.
         min_visible_fraction: smallest shown area of an unhidden object, relative to frame 0.
@@ -289,14 +290,14 @@ class ContactRecording:
         return np.allclose(self.positions, self.recorded, atol=_FIT.same_command_tolerance)
 
     def table(self) -> float:
-        """Return the height of its own table [m]; NaN = no object tells."""
+        """Return the height of the table of this recording [m]; NaN = not known."""
         frame = self.frame
         return table_in(self.names, frame.masks, frame.cameras, frame.poses)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FittedNumber:
-    """A number that was found.
+    """Fitted parameter with its interval.
 
     Attributes:
         name: name of the setting, or of a product of settings.
@@ -381,12 +382,12 @@ def _unhidden(episode: Episode, views: Sequence[str], num_rows: int) -> BoolArra
 def read_recordings(
     paths: Sequence[Path], robot: RobotModel, views: Sequence[str]
 ) -> tuple[list[ContactRecording], dict[str, str]]:
-    """Return what episodes say about contact, and why others say nothing, by path."""
+    """Read the recordings for the contact fit, and the reasons for unused ones, by path."""
     return read_each(paths, lambda path: read_contact(path, robot, views))
 
 
 def first_settings(arms: Arms) -> ContactSettings:
-    """Return what a search begins with: fingers as their joints follow, objects of plastic."""
+    """Return the initial settings: fitted finger drives, objects of plastic."""
     drives = arms.drives
     stiffness, damping, mass = 200.0, 10.0, 0.05
     if drives.fingers.any():
@@ -415,7 +416,7 @@ def fit_contact(
     progress: Callable[[Sequence[int]], Iterable[int]] = iter,
     place: str = '',
 ) -> tuple[ContactSettings, list[FittedNumber]]:
-    """Return likely settings with their spread, and what was found with intervals.
+    """Fit the contact parameters; return the settings, and each parameter with its interval.
 
     Args:
         recordings: the E recorded episodes.
@@ -858,7 +859,7 @@ def _delay_errors(recording: ContactRecording, arms: Arms) -> FloatArray:
 
 
 def find_cameras(recordings: Sequence[ContactRecording]) -> FittedNumber:
-    """Return how far from where they are the cameras see objects, alike for all of a scene.
+    """Return the common position error of all objects that the cameras cause [m].
 
     Errors of cameras let the rays of two views pass each other: where each ray is off by a
     deviation, they pass by that times the square root of two. Large objects are left out, whose

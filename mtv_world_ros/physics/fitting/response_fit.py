@@ -57,7 +57,7 @@ _TOOL_MOVES = 0.02
 
 
 def joint_recording(path: Path, robot: RobotModel) -> Recording:
-    """Read an episode's commands, and its joint states at the same times.
+    """Read the commands of an episode, and its joint positions at the same times.
 
     Raises:
         EpisodeError: the episode lacks commands or joint states, or these are too far apart.
@@ -117,7 +117,7 @@ def found_response(paths: Sequence[Path], robot: RobotModel) -> tuple[ArmRespons
 def tool_errors(
     robot: RobotModel, recordings: Sequence[Recording], response: ArmResponse | None = None
 ) -> FloatArray:
-    """Return (N,) how far moving tools are from where they are expected [m].
+    """Return the position errors (N,) of moving tools against their expected positions [m].
 
     Expected are the positions that the response predicts; without one, the commands themselves.
     """
@@ -133,7 +133,7 @@ def tool_errors(
 
 
 def fit_response(robot: RobotModel, recordings: Sequence[Recording]) -> ArmResponse:
-    """Return the response that explains recorded joints best."""
+    """Fit the joint response to recordings."""
     parts = [_equations(robot, *recording) for recording in recordings]
     left = np.concatenate([part[0] for part in parts])  # (N, J, 4)
     right = np.concatenate([part[1] for part in parts])  # (N, J)
@@ -152,9 +152,9 @@ def fit_response(robot: RobotModel, recordings: Sequence[Recording]) -> ArmRespo
 def with_floor(
     response: ArmResponse, robot: RobotModel, recordings: Sequence[Recording]
 ) -> ArmResponse:
-    """Return the response with the height at which fingertips stopped though they were to sink.
+    """Return the response with a floor: the height at which fingertips stopped short.
 
-    As it is where too few did, or where that does not explain the recordings better.
+    Unchanged where too few stopped, or where a floor does not explain them better.
     """
     mechanics, stopped = RobotMechanics(robot), []
     for commands, positions in recordings:

@@ -36,14 +36,14 @@ class FirstFrame:
     poses: tuple[FloatArray, ...]
 
     def points(self) -> FloatArray:
-        """Return (O, 3) where the objects are [m], NaN = not seen by two views."""
+        """Return the object positions (O, 3) [m]; NaN = not seen by two views."""
         return locate_all(self.cameras, self.poses, centroids(self.masks))
 
 
 def read_each(
     paths: Sequence[Path], read: Callable[[Path], Read]
 ) -> tuple[list[Read], dict[str, str]]:
-    """Return what is read of each episode, and why others cannot be used, by path."""
+    """Read each episode; return the results, and the reasons for unusable ones, by path."""
     found, skipped = [], {}
     for path in Progress(paths, desc='reading episodes', unit='episode'):
         try:
@@ -54,7 +54,7 @@ def read_each(
 
 
 def object_displacements(episode: Episode, robot: RobotModel, views: Sequence[str]) -> FloatArray:
-    """Return (1 + T, O, 3) how far objects went since the first frame [m], NaN = not known.
+    """Return object displacements (1 + T, O, 3) since the first frame [m]; NaN = not known.
 
     Taken from `/object_poses`, or else from the masks.
 
@@ -86,7 +86,7 @@ def object_displacements(episode: Episode, robot: RobotModel, views: Sequence[st
 
 
 def first_frame(episode: Episode, robot: RobotModel, views: Sequence[str]) -> FirstFrame:
-    """Return the first masks of an episode, which has them and joint states."""
+    """Return the first masks of an episode with masks and joint states."""
     assert episode.masks is not None and episode.joint_states is not None
     columns = [episode.joint_states.joint_names.index(name) for name in robot.joint_names]
     joints = episode.joint_states.positions[:1, columns]
@@ -115,7 +115,7 @@ def fine_commands(
 def recorded_positions(
     states: JointStates, robot: RobotModel, stamps_ns: FloatArray
 ) -> FloatArray:
-    """Return (T, J) where joints were at stamps (T,), in the robot's order [rad or m]."""
+    """Return joint positions (T, J) at stamps (T,), in the robot's order [rad or m]."""
     columns = [states.joint_names.index(name) for name in robot.joint_names]
     found = [np.interp(stamps_ns, states.stamps_ns, states.positions[:, c]) for c in columns]
     return np.stack(found, axis=-1)

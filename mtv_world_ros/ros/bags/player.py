@@ -89,7 +89,7 @@ class Timeline:
 
     @classmethod
     def now(cls, bag_ns: int, rate: float) -> Timeline:
-        """Return the timeline that has a bag time now."""
+        """Return the timeline that is at a bag time now."""
         steady_ns = time.monotonic_ns()
         return cls(bag_ns, steady_ns, rate, read_offset())
 
@@ -109,7 +109,7 @@ class Timeline:
         return self.due(bag_ns) + self.offset.value_ns
 
     def pause(self, duration_ns: int) -> None:
-        """Delay everything after this moment."""
+        """Delay what is still to be played by a pause."""
         self.steady_ns += duration_ns
 
 
@@ -134,12 +134,12 @@ class PlayedPlan:
 
     @property
     def is_open(self) -> bool:
-        """True while an answer is waited for."""
+        """True while no answer to the plan was reported."""
         return not self.state
 
 
 def describe_failed(plans: Sequence[PlayedPlan]) -> str:
-    """Return which of the plans were rejected, failed or not answered, and why; empty = none."""
+    """Describe the plans that were rejected, failed or not answered; empty = none."""
     failed = [plan for plan in plans if plan.state not in _GOOD_ENDS]
     if not failed:
         return ''
@@ -156,7 +156,7 @@ def describe_failed(plans: Sequence[PlayedPlan]) -> str:
 
 
 def describe_left_out(counts: Mapping[str, int], read: Collection[str]) -> str:
-    """Return which trajectory topics no answer was expected on, and how they are named for one.
+    """Describe the trajectory topics that the node does not read, and how to rename them.
 
     Args:
         counts: number of plans by topic, of the topics that the node does not read.
@@ -172,7 +172,7 @@ def describe_left_out(counts: Mapping[str, int], read: Collection[str]) -> str:
 
 
 class Player(Node):
-    """Publishes what an episode holds.
+    """Publishes the messages of a recorded episode.
 
     Args:
         options: options of the command line, see `_parse`.

@@ -18,7 +18,7 @@ from mtv_world_ros.ros.messages.rejection import Reason, Rejection
 
 
 def decode(kind: Any, data: bytes, limit: str = '') -> Any:
-    """Return the message of serialised bytes whose size was checked.
+    """Deserialise a message after its size was checked.
 
     Args:
         kind: class of the message.
@@ -42,7 +42,7 @@ def decode(kind: Any, data: bytes, limit: str = '') -> Any:
 
 
 def bounded(kind: Any, handle: Callable[..., None], limit: str = '') -> Callable[..., None]:
-    """Return the callback of a raw subscription that decodes what `decode` accepts.
+    """Return a callback for raw subscriptions, which deserialises messages by `decode`.
 
     Args:
         kind: class of the message.
@@ -60,7 +60,7 @@ def bounded(kind: Any, handle: Callable[..., None], limit: str = '') -> Callable
 def subscribe_bounded(
     node: Node, kind: Any, topic: str, handle: Callable[[Any], None], qos: QoSProfile | int
 ) -> Subscription:
-    """Subscribe a node that only logs what it refuses."""
+    """Subscribe to a topic; refused messages are only logged."""
     take = bounded(kind, handle)
 
     def logged(data: bytes) -> None:

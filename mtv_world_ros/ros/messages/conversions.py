@@ -100,7 +100,7 @@ def to_trajectory(message: JointTrajectoryMsg) -> JointTrajectory:
 def to_trajectory_message(trajectory: JointTrajectory, header: Header) -> JointTrajectoryMsg:
     """Return the message of a trajectory whose times count from the header's stamp.
 
-    Inverse of the above.
+    Inverse of `to_trajectory`.
     """
     points = []
     for row, seconds in enumerate(trajectory.times):
@@ -115,7 +115,7 @@ def to_trajectory_message(trajectory: JointTrajectory, header: Header) -> JointT
 
 
 def to_sample(message: JointState, joints: Collection[str] | None = None) -> JointSample:
-    """Return the positions of a message by joint, and the joints whose position is no number.
+    """Return joint positions by name, and the names of joints without a finite position.
 
     Args:
         message: message of one or several joints.
@@ -136,7 +136,7 @@ def to_sample(message: JointState, joints: Collection[str] | None = None) -> Joi
 
 
 def check_sample(sample: JointSample) -> None:
-    """Refuse a sample in which a joint has no position that can be used.
+    """Raise if a joint of the sample has no finite position.
 
     Raises:
         Rejection: names the joints.
@@ -163,7 +163,7 @@ def to_joint_state(names: Sequence[str], positions: FloatArray, header: Header) 
 
 
 def to_multi_array(values: FloatArray, labels: Sequence[str]) -> Float32MultiArray:
-    """Return the row-major array, one label a dimension."""
+    """Return the array as a row-major multi-array message with one label a dimension."""
     dimensions = [
         MultiArrayDimension(
             label=label, size=values.shape[axis], stride=int(np.prod(values.shape[axis:]))

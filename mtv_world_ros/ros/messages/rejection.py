@@ -51,7 +51,7 @@ class Reason(StrEnum):
 
 
 class Rejection(MtvWorldError):
-    """A message or a rollout is refused; `reason` is what it counts under."""
+    """Refusal of a message or rollout; `reason` is the code in the counters."""
 
     def __init__(self, reason: Reason, text: str) -> None:
         super().__init__(text)

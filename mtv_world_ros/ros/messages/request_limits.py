@@ -59,7 +59,7 @@ class RefusedRequest:
 
 @cache
 def bounded_request(kind: type, most: int = MOST_ITEMS) -> type:
-    """Return a class in place of a request's, for rclpy to take requests with.
+    """Return a substitute of a request class that refuses lists which are too long.
 
     What it takes is a message of `kind`, or a `RefusedRequest`. A request without lists keeps its
     own class.
@@ -124,7 +124,7 @@ def _class_of(slot: NamespacedType) -> Any:
 
 
 def bounded_action(action: Any, most: int) -> Any:
-    """Return a type in place of an action's, whose goals are taken by `bounded_request`."""
+    """Return a substitute of an action type whose goals are limited by `bounded_request`."""
     goals = action.Impl.SendGoalService
     bounded = type('SendGoalService', (goals,), {'Request': bounded_request(goals.Request, most)})
     impl = type('Impl', (action.Impl,), {'SendGoalService': bounded})
@@ -142,7 +142,7 @@ def guard_services(node: Node) -> None:
 
 
 class RefusingCallback:
-    """Callback of a service that says in its response, if that can, that a request is refused.
+    """Service callback that answers a refused request, with the reason if the type has a text.
 
     Args:
         node: node of the service.

@@ -66,7 +66,7 @@ class PolicySettings(NodeSettings):
 
 
 def chunk_stamps(start_ns: int, num_frames: int, fps: float) -> list[int]:
-    """Return the stamps of a chunk's frames [ns], from the stamp it starts at."""
+    """Return the stamps of a chunk's frames [ns], given its start stamp."""
     return [start_ns + round((k + 1) / fps * NANO) for k in range(num_frames)]
 
 
@@ -150,7 +150,7 @@ class Outputs(Protocol):
         ...
 
     def report(self, state: str, values: Mapping[str, object]) -> None:
-        """Report a chunk, or the begin or end of the episode."""
+        """Report a chunk, the beginning or the end of an episode."""
         ...
 
     def fault(self, kind: str, text: str) -> None:
@@ -177,7 +177,7 @@ class _Chunk:
 
 
 class PolicyLoop:
-    """Runs one episode after the other; everything happens in the caller's thread.
+    """Runs episodes of a policy, one after the other, in the caller's thread.
 
     Args:
         spec: spec of the world model.
@@ -208,7 +208,7 @@ class PolicyLoop:
         self._observation: Observation | None = None
 
     def start(self, make: Callable[[], Policy], settings: PolicySettings) -> None:
-        """Begin an episode; one that runs ends.
+        """Begin an episode, and end the running one.
 
         Args:
             make: returns the policy, in the actor's thread.

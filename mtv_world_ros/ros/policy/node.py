@@ -54,7 +54,7 @@ _MAX_ASKED = 3
 
 
 def load_named_policy(settings: PolicySettings, robot: RobotModel) -> PolicyMaker:
-    """Return the maker of the policy that is set, for a robot."""
+    """Return a function that makes the policy of the parameters, for a robot."""
     check_candidates(settings.policy, robot, settings.candidates)
     return assemble_policy(settings.policy, robot)
 
@@ -62,7 +62,7 @@ def load_named_policy(settings: PolicySettings, robot: RobotModel) -> PolicyMake
 def with_candidates(
     load: Load, settings: PolicySettings, checkpoint: Checkpoint, robot: RobotModel
 ) -> PolicyMaker:
-    """Return the maker of the policy, or of the best of its candidates.
+    """Return the maker of the policy; with candidates, their plans are compared first.
 
     Raises:
         ConfigError: there are several candidates, and nothing that plans can be compared with.
@@ -75,10 +75,10 @@ def with_candidates(
 
 
 class PolicyNode(Node):
-    """Callbacks store; the policy is asked in a thread of its own.
+    """Node that runs a policy: callbacks store messages, a thread asks the policy.
 
     Args:
-        load: finds out from the parameters how the policy is made.
+        load: function that returns the maker of the policy from the parameters.
         context: ROS context of the node; default: the process' own.
 
     Raises:

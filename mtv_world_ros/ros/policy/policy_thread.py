@@ -18,7 +18,7 @@ _CLOSE_S = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolicyAnswer:
-    """The answer to a question.
+    """Answer of the policy to one request.
 
     Attributes:
         ticket: ticket of the question.
@@ -51,7 +51,7 @@ class Actor:
         self._thread.start()
 
     def ask(self, ticket: int, question: Callable[[], JointTrajectory | None]) -> None:
-        """Ask after the questions before it."""
+        """Queue a request; requests are answered in order."""
         self._questions.put((ticket, question))
 
     def take(self) -> list[PolicyAnswer]:

@@ -70,7 +70,7 @@ class RobotDescription:
             raise Rejection(Reason.ROBOT_DESCRIPTION, self.problem)
 
     def values(self) -> dict[str, object]:
-        """For `/diagnostics`."""
+        """Keys and values for `/diagnostics`."""
         if self.problem:
             return {TOPIC: 'another robot'}
         if self._offset_m is None:
@@ -115,7 +115,7 @@ class Extrinsics:
 
     Args:
         node: owner of the subscriptions and the publisher.
-        links: links of the robot, those whose pose its joint states determine.
+        links: links of the robot whose pose follows from its joint states.
         events: events of the node, with its present parameters.
         publishes: whether frames that TF lacks are published.
 
@@ -200,7 +200,7 @@ class Extrinsics:
         self._tree.forget_moving()
 
     def values(self) -> dict[str, object]:
-        """For `/diagnostics`: where each view's pose comes from."""
+        """Source of each view's camera pose, for `/diagnostics`."""
         return {f'extrinsics.{view}': source for view, source in self._sources.items()}
 
     def show(self, scene: SensedScene) -> None:

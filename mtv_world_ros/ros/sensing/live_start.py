@@ -61,7 +61,7 @@ def live_starts(
     ros_arguments: Sequence[str] = (),
     tell: Callable[[str], object] = lambda _: None,
 ) -> Iterator[EpisodeStart]:
-    """Return starts of episodes without end; each is observed when it is asked for.
+    """Yield starts of episodes without end; each observes the cameras anew.
 
     Args:
         spec: spec of the world model; names the views.
@@ -165,7 +165,7 @@ class LiveObserver(Node):
         return parameters.read(self, StartSettings)
 
     def guarded(self, handle: Callable[..., None]) -> Callable[..., None]:
-        """Return the handler as a callback that keeps why a message was refused."""
+        """Return a callback that keeps the reason why the handler refused a message."""
 
         def callback(*arguments: Any) -> None:
             try:

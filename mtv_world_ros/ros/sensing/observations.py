@@ -52,12 +52,12 @@ _COMPARED = ('width', 'height', 'distortion_model', 'k', 'd', 'p', 'binning_x', 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensedScene:
-    """An observation and where it came from.
+    """Observation with its CameraInfo messages and stamp.
 
     Attributes:
         observation: frames and cameras at the model's size, positions in the robot's order.
         camera_infos: CameraInfo of each view's images as received, with their frame_id.
-        source_stamp_ns: stamp of the real frames that it goes back to [ns].
+        source_stamp_ns: stamp of the real frames that it is derived from [ns].
     """
 
     observation: Observation
@@ -129,7 +129,7 @@ class ObservationBuffer:
 
     @property
     def awaits_first(self) -> bool:
-        """True if images of a view, or states of a joint, never came; refused ones did."""
+        """True if no image of a view, or no state of a joint, was ever received."""
         samples = (*self._images.values(), *self._joints.values())
         return any(not one and not one.refusal for one in samples)
 
@@ -216,7 +216,7 @@ class ObservationBuffer:
             raise Rejection(Reason.JOINT_STATE_STALE, stale)
 
     def use_robot(self, robot: RobotModel) -> None:
-        """Take the limits of the same robot as it describes itself."""
+        """Use the limits of the robot's own description."""
         self._reach = ReachWatch(JointReach(robot))
         self._grippers = GripperWatch(travels(robot))
 
@@ -231,7 +231,7 @@ class ObservationBuffer:
         self._unstamped.clear()
 
     def accept_cameras(self, cameras: Sequence[CameraModel]) -> None:
-        """Take changed camera infos as the valid ones from now on.
+        """Accept changed camera infos as valid.
 
         Args:
             cameras: calibrated cameras of the V views.
@@ -386,7 +386,7 @@ class ObservationBuffer:
         return picked
 
     def are_views_apart(self, now_ns: int) -> bool:
-        """Return whether all views have fresh images, and none of them belong together."""
+        """Return True if all views have fresh images, but no set of one moment exists."""
         limits = self._limits()
         if not all(self._images.values()):
             return False
@@ -457,7 +457,7 @@ def _common_size(frames: Sequence[ByteArray], least: tuple[int, int]) -> tuple[i
 
 
 class Intrinsics:
-    """The cameras as their CameraInfo describes them.
+    """Camera intrinsics from the received CameraInfo messages.
 
     Attributes:
         notes: assumptions about images that CameraInfo does not settle, by view.
@@ -511,7 +511,7 @@ class Intrinsics:
             raise Rejection(Reason.CAMERA_INFO_CHANGED, text)
 
     def accept(self, cameras: Sequence[CameraModel]) -> None:
-        """Take changed infos as the valid ones from now on.
+        """Accept changed camera infos as valid.
 
         Args:
             cameras: calibrated cameras of the views. Where they are others than before, the

@@ -127,7 +127,7 @@ class Samples(Generic[Value]):
             items.insert(place, (stamp_ns, value))
 
     def refuse_reason(self, stamp_ns: int, now_ns: int, limit_s: float) -> str:
-        """Return why a sample cannot be taken at this time, or an empty text.
+        """Return the reason why a sample is refused; empty = it can be taken.
 
         Samples from the future would stay the newest. What was stored from there, before the clock
         was set back, is dropped. An old sample does not displace a fresh one.

@@ -119,7 +119,7 @@ class Inputs:
         self._early.add(info['source_timestamp'])
 
     def awaits_texts(self) -> bool:
-        """Return whether an instruction, or names of objects, are kept for this node.
+        """Return True if a publisher holds an instruction or object names for late subscribers.
 
         A publisher keeps its last text for subscribers that come later (transient local).
         """
@@ -273,7 +273,7 @@ class MatchedSubscription:
 
     @property
     def num_publishers(self) -> int:
-        """Publishers it is connected to."""
+        """Number of connected publishers."""
         return self._current.get_publisher_count()
 
     def is_kept_for_it(self) -> bool:

@@ -25,7 +25,7 @@ class Sent:
 
     @property
     def num_frames(self) -> int:
-        """Frames published."""
+        """Number of published frames."""
         return len(self.out_s)
 
 

@@ -223,7 +223,7 @@ class ConfiguredNode:
         self._look_again()
 
     def missing(self) -> Sequence[str]:
-        """Return the inputs that the node lacks; in imagine mode only to begin."""
+        """Return the missing inputs; in imagine mode only those that the first plan needs."""
         if self._description is not None and self._description.problem:
             return [self._description.problem]
         return [*self._inputs.mismatches(), *self._missing_inputs()]
@@ -294,7 +294,7 @@ class ConfiguredNode:
         self._maker.stored_objects = tuple(dict.fromkeys(filter(None, names)))
 
     def on_plan(self, plan: JointTrajectoryMsg | Goal, transport_s: float = 0.0) -> None:
-        """Queue a plan, so that images that came with it are stored before it is checked."""
+        """Queue a plan; it is checked after images that arrived together with it are stored."""
         self._arrived.append(_Arrived(time.monotonic(), plan, transport_s))
         self._arrivals.trigger()
 

@@ -33,7 +33,7 @@ _ROUNDING = 1e-9
 
 
 class FollowJointTrajectory:
-    """Goals take the same path as plans on the topic; a newer plan pre-empts an older one.
+    """Action server whose goals are handled like plans on the topic.
 
     A chunk gives one feedback, of its last frame. The goal ends when the plan does, which is as
     soon as it is computed.
@@ -69,17 +69,17 @@ class FollowJointTrajectory:
         self._server.destroy()
 
     def started(self, goal: Goal, request: Request) -> None:
-        """Take the plan that a goal became."""
+        """Note the number of the rollout that a goal started."""
         goal.request = request
         self._goals[request.rollout] = goal
 
     def refused(self, goal: Goal, error: Exception) -> None:
-        """Take why a goal did not become a plan."""
+        """Abort a goal whose trajectory was rejected, with the reason."""
         reason = error.reason if isinstance(error, Rejection) else None
         self._conclude(goal, 'abort', _code(reason), str(error))
 
     def take(self, result: Result) -> None:
-        """Send feedback of a chunk, or the result, if the plan came from a goal."""
+        """Send the feedback of a chunk, or the result, if the plan came from a goal."""
         goal = self._goals.get(result.request.rollout)
         if goal is None:
             return

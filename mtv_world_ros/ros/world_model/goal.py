@@ -14,11 +14,11 @@ from mtv_world_ros.ros.world_model.worker import Request
 
 @dataclass(eq=False, kw_only=True)
 class Goal:
-    """A goal that was accepted.
+    """Accepted goal of the action.
 
     Attributes:
         handle: rclpy's goal handle.
-        request: the plan that it became; None = it waits to become one.
+        request: request that was made of it; None = it is still waiting.
         violation: name of the code and text of a tolerance that is violated.
     """
 
@@ -28,11 +28,11 @@ class Goal:
 
     @property
     def message(self) -> JointTrajectoryMsg:
-        """Its trajectory."""
+        """Trajectory of the goal."""
         return self.handle.request.trajectory
 
     def check(self, joint_names: Sequence[str]) -> None:
-        """Refuse what no plan on the topic can have.
+        """Raise if the goal has parts that a plan on the topic cannot have.
 
         Args:
             joint_names: joint names of the robot.

@@ -52,7 +52,7 @@ MAX_OFFSET = 0.3
 
 @dataclass(slots=True, eq=False)  # arrays have no truth value: one is only itself
 class Expected:
-    """A chunk and the stamps of its frames that are executed: those before the next plan."""
+    """Chunk with the stamps of its executed frames, those before the next plan."""
 
     chunk: Chunk
     stamps: list[int] = field(default_factory=list)
@@ -102,7 +102,7 @@ class _Cell:
 
 
 class LiveFidelity:
-    """Compares in a thread of its own; publishes `~/fidelity` from the executor.
+    """Compares executed chunks with real frames in a thread; publishes `~/fidelity`.
 
     Chunks of imagine mode are not compared: nobody executes them.
 
@@ -180,7 +180,7 @@ class LiveFidelity:
         self._pipeline, self._fitted = self._pipeline.with_robot(robot), None
 
     def see(self, view: str, message: Image | CompressedImage) -> None:
-        """Take a real image; it is looked at in the thread."""
+        """Queue a real image for the comparison thread."""
         with self._changed:
             self._images.append((view, message))
             self._changed.notify_all()

@@ -34,18 +34,18 @@ class TakesAdapters(Protocol):
     own_adapter: Path | None
 
     def read_adapter(self, path: Path | None) -> Adapter:
-        """Return an adapter that fits."""
+        """Read an adapter; raise if it is of another model."""
         ...
 
     def use_adapter(self, adapter: Adapter) -> None:
-        """Exchange it."""
+        """Replace the present adapter."""
         ...
 
 
 class AdapterSwitch:
-    """Keeps the world model's adapter to what the parameter says.
+    """Exchanges the world model's adapter when the parameter `adapter` changes.
 
-    A value whose adapter cannot be read or is of another model refuses the parameter.
+    A value is refused if its adapter cannot be read, or is of another model.
 
     Args:
         node: node that has the parameter.
@@ -76,7 +76,7 @@ class AdapterSwitch:
         node.add_post_set_parameters_callback(self._take)
 
     def close(self) -> None:
-        """Listen to the parameter no more."""
+        """Stop watching the parameter."""
         self._node.remove_on_set_parameters_callback(self._check)
         self._node.remove_post_set_parameters_callback(self._take)
 

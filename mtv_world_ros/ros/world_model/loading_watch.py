@@ -56,7 +56,7 @@ class LoadingWatch:
         self._node.destroy_subscription(self._plans)
 
     def take(self) -> tuple[bytes, dict[str, int]] | None:
-        """Return the last plan as it was sent, with rclpy's information; None = none came."""
+        """Return the last received plan, serialised, with rclpy's information; None = none."""
         with self._plans.handle:
             return self._plans.handle.take_message(JointTrajectory, True)
 

@@ -27,7 +27,7 @@ Load = Callable[[Settings], Pipeline]
 
 
 class WorldModelNode(LifecycleNode):
-    """Loads when it is configured, takes plans while it is active.
+    """Lifecycle node: loads the model when configured, answers plans while active.
 
     Args:
         load: function that returns the pipeline of the parameters.

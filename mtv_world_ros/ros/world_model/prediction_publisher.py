@@ -95,7 +95,7 @@ _LOOK_PERIOD_S = 0.01
 
 
 class PredictionPublisher:
-    """Takes results in order. Estimates go out at once, masks as fast as they are taken.
+    """Publishes results in order: estimates at once, masks as fast as subscribers take them.
 
     The images go out at the pace that is set: in `burst` as fast as they are taken; in `realtime`
     each one period before its stamp, or at once where that has passed. In imagine mode stamps say
@@ -223,7 +223,7 @@ class PredictionPublisher:
 
 
 class Last(NamedTuple):
-    """Frame that was published last: `time.monotonic` [s], and its rollout and chunk."""
+    """Last published frame: time by `time.monotonic` [s], rollout and chunk."""
 
     out_s: float = 0.0
     rollout: int = 0

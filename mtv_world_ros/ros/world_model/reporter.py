@@ -72,7 +72,7 @@ class Reporter:
         self._status.hardware_id = f'{self._node.get_namespace()}/{name}'.strip('/')
 
     def count(self, what: str) -> None:
-        """Count something that is no rejection."""
+        """Count an event that is no rejection."""
         self._tally.counts[what] += 1
 
     def reject(self, error: Rejection) -> None:
@@ -99,7 +99,7 @@ class Reporter:
         self._publish_report('done', values)
 
     def guarded(self, handle: Callable[..., None]) -> Callable[..., None]:
-        """Return the handler as a callback that no message makes raise."""
+        """Return a callback that counts exceptions of the handler and does not raise."""
 
         def callback(*messages: Any) -> None:
             try:
@@ -125,7 +125,7 @@ class Reporter:
         return callback
 
     def crash(self, error: Exception) -> None:
-        """Count an error that nobody raised on purpose."""
+        """Count and log an unexpected exception."""
         if not self._node.context.ok():
             return  # ROS was shut down under a callback
         self._node.get_logger().error(''.join(traceback.format_exception(error)))
@@ -196,7 +196,7 @@ class Reporter:
 
 
 class Tally:
-    """Counts what happens to messages and rollouts; times are of `time.monotonic`."""
+    """Counters of messages and rollouts; times are of `time.monotonic`."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()

@@ -21,7 +21,7 @@ _MEASURED_SLACK = 0.1
 
 
 class RequestMaker:
-    """Maker of requests: checks a trajectory, adds the scene, instruction and options.
+    """Makes requests: checks a trajectory, adds the scene, instruction and options.
 
     Attributes:
         imagine: whether rollouts start from the last predicted frames.
@@ -52,7 +52,7 @@ class RequestMaker:
         self.stored_objects: tuple[str, ...] = ()
 
     def make(self, message: JointTrajectoryMsg, now_ns: int, received_s: float) -> Request:
-        """Return the request.
+        """Check a trajectory and return its request.
 
         Args:
             message: the policy's plan.
@@ -89,7 +89,7 @@ class RequestMaker:
         )
 
     def is_stop(self, message: JointTrajectoryMsg) -> bool:
-        """Return whether a trajectory without points stops this robot.
+        """Return True if the message is a stop: a trajectory without points for this robot.
 
         It names no joints, or some of the robot's.
         """

@@ -92,7 +92,7 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
-    """The one end of a request.
+    """End of a request; each request has exactly one.
 
     Attributes:
         request: request that has ended.
@@ -219,7 +219,7 @@ class RolloutWorker:
         return self._observed.is_due(stamp_ns)
 
     def see(self, observation: Observation) -> None:
-        """Add a real observation between plans to what later plans are judged with."""
+        """Give the judge a real observation between plans."""
         self._observed.see(observation)
         with self._changed:
             self._changed.notify_all()
