@@ -33,7 +33,8 @@ from mtv_world_ros.core.transforms import looking_along
 from mtv_world_ros.data.episode import JointStates, Track
 from mtv_world_ros.inspection.camera_pose import CameraEstimate, difference, displaced_pose
 from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
-from mtv_world_ros.inspection.cameras.wrist_camera import follow_scene, WristCamera
+from mtv_world_ros.inspection.cameras.scene_tracks import follow_scene
+from mtv_world_ros.inspection.cameras.wrist_camera import WristCamera
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.model import RobotModel

@@ -33,13 +33,10 @@ from mtv_world_ros.core.config import read_yaml
 from mtv_world_ros.core.data_types import CameraModel, FloatArray
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.data.episode_reader import list_episodes, read_episode, read_info
-from mtv_world_ros.inspection.cameras import joint_camera
-from mtv_world_ros.inspection.cameras.shared_camera import (
-    estimate_shared,
-    expected_within,
-    seen_points,
-    SharedEstimate,
-)
+from mtv_world_ros.inspection.cameras import camera_set
+from mtv_world_ros.inspection.cameras.seen_points import seen_points
+from mtv_world_ros.inspection.cameras.shared_camera import estimate_shared
+from mtv_world_ros.inspection.cameras.shared_estimate import expected_within, SharedEstimate
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.model import RobotModel
@@ -139,7 +136,7 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=0)
     options = parser.parse_args()
     if options.bend:
-        joint_camera.LEAST_REACH = 0.0
+        camera_set.LEAST_REACH = 0.0
     points: Points = read_yaml(options.points, 'points file', 'POINTS')
     fitted, others = (
         {view: {name: rows[part] for name, rows in of.items()} for view, of in points.items()}

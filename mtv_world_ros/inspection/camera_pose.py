@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mtv_world_ros.cameras.camera import scaled
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray
@@ -52,52 +50,6 @@ def displaced_pose(T: FloatArray, parameters: FloatArray, centre: FloatArray) ->
     change[:3, :3] = cv2.Rodrigues(np.asarray(parameters[:3], float))[0]
     change[:3, 3] = parameters[3:]
     return middle @ change @ np.linalg.inv(middle) @ T
-
-
-def refine_pose(
-    T: FloatArray,
-    errors: Callable[[FloatArray], NDArray[np.floating]],
-    centre: FloatArray | None = None,
-    *,
-    outlier: float,
-    iterations: int = 10,
-) -> FloatArray:
-    """Return the pose nearby with the least errors (Levenberg-Marquardt).
-
-    Args:
-        T: the pose (4, 4) to start from.
-        errors: (N,) errors of a pose.
-        centre: point that it is turned about; None = its own place.
-        outlier: errors from here on count less (Cauchy's loss).
-        iterations: iterations at most.
-    """
-    damping = 0.01
-
-    def cost(values: NDArray[np.floating]) -> float:
-        return float(np.log1p((values / outlier) ** 2).mean())
-
-    now, slopes = errors(T), None
-    for _ in range(iterations):
-        middle = T[:3, 3] if centre is None else centre
-        if slopes is None:  # a step that was refused changes nothing
-            slopes = np.stack(
-                [(errors(displaced_pose(T, s, middle)) - errors(displaced_pose(T, -s, middle))) / 2
-                 for s in np.diag(UNITS)]
-            )  # fmt: skip
-            weighted = slopes / (1 + (now / outlier) ** 2)
-            normal, gradient = weighted @ slopes.T, weighted @ now
-        damped = normal + damping * np.diag(np.diag(normal)) + 1e-9 * np.eye(6)
-        step = -np.linalg.solve(damped, gradient)
-        step *= min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-9))
-        tried = displaced_pose(T, np.asarray(step * UNITS, np.float64), middle)
-        there = errors(tried)
-        if cost(there) < cost(now):
-            T, now, damping, slopes = tried, there, damping / 3, None
-        else:
-            damping *= 10
-        if float(np.abs(step).max()) < 0.01:
-            break
-    return T
 
 
 def with_pose(camera: CameraModel, T_mount_camera: FloatArray) -> CameraModel:

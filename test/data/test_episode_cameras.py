@@ -20,6 +20,7 @@ from mtv_world_ros.data.episode_cameras import is_imported, views_without_info, 
 from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.inspection.cameras import shared_camera
+from mtv_world_ros.inspection.cameras.shared_estimate import SharedEstimate
 from mtv_world_ros.inspection.motion_residual import MotionResidual
 from mtv_world_ros.inspection.places import CameraPlaces
 from mtv_world_ros.robot.file import load_robot, robot_path
@@ -279,7 +280,7 @@ def measured_as(monkeypatch):
         def estimate(episodes, views, *_, **__):
             count = len(episodes)
             return [
-                shared_camera.SharedEstimate(
+                SharedEstimate(
                     cameras=(camera(view),) * count,
                     places=CameraPlaces(
                         place=np.array(places[:count]), apart=np.zeros((count, count)), matches={}

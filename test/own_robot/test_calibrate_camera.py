@@ -15,7 +15,8 @@ from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.inspection.camera_pose import difference, displaced_pose, jackknife_errors
 from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
-from mtv_world_ros.inspection.cameras.wrist_camera import follow_scene, WristCamera
+from mtv_world_ros.inspection.cameras.scene_tracks import follow_scene
+from mtv_world_ros.inspection.cameras.wrist_camera import WristCamera
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.robot.shape import load_shape
 from test.support.crane import load, make_cameras, make_positions, write_episode

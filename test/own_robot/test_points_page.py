@@ -12,7 +12,7 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode import Episode, EpisodeInfo, JointStates, Track
 from mtv_world_ros.inspection.cameras.finger_tips import tip_middles
 from mtv_world_ros.inspection.cameras.points_page import points_page
-from mtv_world_ros.inspection.cameras.shared_camera import load_points, seen_points
+from mtv_world_ros.inspection.cameras.seen_points import load_points, seen_points
 from mtv_world_ros.inspection.clocks import JointTrack
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.shape import load_shape

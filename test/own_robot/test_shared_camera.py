@@ -14,8 +14,8 @@ from mtv_world_ros.core.data_types import CameraModel
 from mtv_world_ros.core.errors import CalibrationError
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.inspection.camera_pose import displaced_pose
-from mtv_world_ros.inspection.cameras import joint_camera
-from mtv_world_ros.inspection.cameras.shared_camera import (
+from mtv_world_ros.inspection.cameras import camera_set
+from mtv_world_ros.inspection.cameras.shared_estimate import (
     expected_within,
     SharedEstimate,
     stated_error,
@@ -153,7 +153,7 @@ def test_a_seen_point_that_contradicts_the_others_is_named(is_wrong, recorded, t
 def test_a_wide_lens_that_bends_is_estimated(is_estimated, tmp_path, capsys, monkeypatch):
     """A barrel distortion of k1 = -.2, unknown; held at 0 it is far off, and said to be."""
     if not is_estimated:
-        monkeypatch.setattr(joint_camera, 'LEAST_REACH', 9.0)
+        monkeypatch.setattr(camera_set, 'LEAST_REACH', 9.0)
     robot = load(tmp_path)
     K = np.array([[150.0, 0, 158.5], [0, 150, 121.5], [0, 0, 1]])
     pose = looking_at((0.95, 0.35, 0.75), (0.15, 0.0, 0.45))

@@ -24,7 +24,7 @@ from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.cli import main
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import load_recording
-from mtv_world_ros.inspection.cameras import joint_camera
+from mtv_world_ros.inspection.cameras import shared_camera
 from mtv_world_ros.physics.fitting import contact_fit
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.viewing.video import encode_video
@@ -226,7 +226,7 @@ def test_the_page_leads_from_videos_to_a_contact_sheet(lab, monkeypatch, capsys)
     """With at most eight commands, and cameras of which nothing was known."""
     folder, cameras = lab
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(joint_camera, '_STAGES', joint_camera._STAGES[:2])  # the last is finer
+    monkeypatch.setattr(shared_camera, 'STAGES', shared_camera.STAGES[:2])  # the last is finer
     fit = contact_fit.ContactFitSettings(num_draws=8, num_rounds=1)
     monkeypatch.setattr(contact_fit, '_FIT', fit)
     told = [words for words in lines(of_videos=True) if not is_route(words)]

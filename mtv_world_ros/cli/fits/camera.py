@@ -202,7 +202,8 @@ def estimate_camera(
     from dataclasses import replace
 
     from mtv_world_ros.core.errors import CalibrationError, EpisodeError
-    from mtv_world_ros.inspection.cameras.wrist_camera import find_mount, follow_scene, WristCamera
+    from mtv_world_ros.inspection.cameras.scene_tracks import follow_scene
+    from mtv_world_ros.inspection.cameras.wrist_camera import find_mount, WristCamera
     from mtv_world_ros.inspection.clocks import JointTrack
     from mtv_world_ros.robot.shape import moving_links
 

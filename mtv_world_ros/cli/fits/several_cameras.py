@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.core.data_types import CameraModel, FloatArray
     from mtv_world_ros.data.bag_mapping import EpisodeSource
     from mtv_world_ros.data.episode import Episode
-    from mtv_world_ros.inspection.cameras.shared_camera import SharedEstimate
+    from mtv_world_ros.inspection.cameras.shared_estimate import SharedEstimate
     from mtv_world_ros.robot.model import RobotModel
     from mtv_world_ros.robot.shape import LinkShape
 
@@ -50,7 +50,7 @@ def recordings(paths: Sequence[Path]) -> list[Path]:
 
 def calibrate_shared(arguments: argparse.Namespace) -> int:
     """Run the command on all recordings."""
-    from mtv_world_ros.inspection.cameras.shared_camera import load_points
+    from mtv_world_ros.inspection.cameras.seen_points import load_points
     from mtv_world_ros.robot.file import load_robot
     from mtv_world_ros.robot.shape import load_shape
 
