@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mtv_world_ros.cli import make_parser
-from mtv_world_ros.cli.commands import COMMANDS, RENAMED, SECTIONS
+from mtv_world_ros.cli.commands import COMMANDS, SECTIONS
 
 PAGE = Path(__file__).parent / 'commands.md'
 _HEAD = """\
@@ -25,9 +25,7 @@ def page() -> str:
         lines += [f'## {section}', '']
         for name in (name for name, entry in COMMANDS.items() if entry.section == section):
             lines += [f'### mtv-world {name}', '', *_described(parser_of(name)), '']
-    lines += ['## Names before 0.2', '', '| before | now |', '|---|---|']
-    lines += [f'| `{old}` | `{" ".join(words)}` |' for old, words in RENAMED.items()]
-    return '\n'.join([*lines, ''])
+    return '\n'.join(lines)
 
 
 def parser_of(name: str) -> argparse.ArgumentParser:

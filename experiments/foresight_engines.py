@@ -124,7 +124,7 @@ for line in sys.stdin:
         stamp_ns=recording.stamp_ns + round(at * 1e9),
     )
     begun = time.process_time()
-    episode = pipeline.begin(observation, instruction=recording.instruction)
+    episode = pipeline.begin(observation, RolloutOptions(instruction=recording.instruction))
     begun = time.process_time() - begun
     spent = {'begin': begun}
     for prediction in episode.extend(plan):

@@ -15,9 +15,7 @@ The names of `__all__` are the public API; they are imported when they are asked
 from __future__ import annotations
 
 from importlib import import_module
-import os
 from typing import Any, TYPE_CHECKING
-import warnings
 
 if TYPE_CHECKING:
     from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
@@ -168,33 +166,14 @@ _PLACES = {
     # needs an extra, so it is not in __all__
     'WorldEnv': 'rollout.gym_env',
 }
-#: names of version 0.1 -> what replaced them
-_RENAMED = {'ImaginedEpisode': 'Rollout', 'load_pipeline': 'Pipeline.load'}
-
-# Threads of torch that wait for one another sleep. By default they spin: where another process
-# takes a core, those that wait use up the time that the last one needs, and all is many times as
-# slow. The library reads this as it is loaded.
-os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
-# NumPy's matrices are small here, and its threads spin, too: several threads take more CPU time
-# than one (four times as much in a search) and the same wall-clock time.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 
 def __getattr__(name: str) -> Any:
     """Import one of the public names."""
-    new = _RENAMED.get(name, name)
-    if new != name:
-        warnings.warn(
-            f'mtv_world_ros.{name} is now mtv_world_ros.{new}; the old name goes with version 0.3',
-            DeprecationWarning,
-            stacklevel=2,
-        )
-    public, _, method = new.partition('.')
-    if public not in _PLACES:
+    if name not in _PLACES:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    module, _, own = _PLACES[public].partition(':')
-    found = getattr(import_module(f'{__name__}.{module}'), own or public)
-    return getattr(found, method) if method else found
+    module, _, own = _PLACES[name].partition(':')
+    return getattr(import_module(f'{__name__}.{module}'), own or name)
 
 
 def __dir__() -> list[str]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from importlib import metadata
+import os
+import re
 import subprocess
 import sys
 
@@ -11,7 +13,7 @@ import pytest
 
 from mtv_world_ros import cli
 from mtv_world_ros.cli.commands import COMMANDS as COMMANDS_OF_THE_PACKAGE
-from mtv_world_ros.cli.commands import RENAMED
+from mtv_world_ros.cli.commands import REMOVED
 from mtv_world_ros.core import entry_points
 from mtv_world_ros.core.entry_points import load, POLICIES, registered, ROLLOUTS
 from mtv_world_ros.core.errors import ConfigError
@@ -68,15 +70,34 @@ def test_the_overview_imports_no_command():
     assert done.stdout.strip() == "['mtv_world_ros.cli.commands', 'mtv_world_ros.cli.parser']"
 
 
-@pytest.mark.parametrize(('old', 'words'), RENAMED.items())
-def test_an_old_name_says_the_new_one_and_works(old, words, capsys):
+@pytest.mark.parametrize('old', REMOVED)
+def test_an_old_name_of_a_command_says_what_to_use(old, capsys):
     with pytest.raises(SystemExit) as end:
-        cli.main([old] if old == 'faults' else [old, '--help'])
-    assert end.value.code == 0
-    said = capsys.readouterr()
-    assert ' '.join(words) in said.err
-    shown = 'joint_noise' if old == 'faults' else f'usage: mtv-world {" ".join(words)}'
-    assert shown in said.out
+        cli.main([old, '--help'])
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert f"'{old}' is no longer a command" in said
+    use = re.search("use 'mtv-world ([a-z ]+?)( --.*)?'", said)
+    assert use is None or use[1] in COMMANDS_OF_THE_PACKAGE
+
+
+def test_an_import_of_the_package_leaves_the_environment_as_it_is():
+    code = (
+        'import os\n'
+        'before = dict(os.environ)\n'
+        'import mtv_world_ros\n'
+        'for name in mtv_world_ros.__all__: getattr(mtv_world_ros, name)\n'
+        'import mtv_world_ros.cli, mtv_world_ros.ros\n'
+        'after = dict(os.environ, LD_LIBRARY_PATH=before.get("LD_LIBRARY_PATH", ""))\n'
+        'before.setdefault("LD_LIBRARY_PATH", "")  # OpenCV extends it\n'
+        'assert after == before\n'
+        'try: mtv_world_ros.cli.main(["--version"])\n'
+        'except SystemExit: pass\n'
+        'assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"\n'
+    )
+    environment = {k: v for k, v in os.environ.items()
+                   if k not in ('OMP_WAIT_POLICY', 'OPENBLAS_NUM_THREADS')}  # fmt: skip
+    subprocess.run([sys.executable, '-c', code], check=True, env=environment)
 
 
 def registering(monkeypatch, **entries):

@@ -30,15 +30,6 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
         _ = mtv_world_ros.juge
 
 
-def test_old_names_work_and_name_the_new_one():
-    with pytest.warns(DeprecationWarning, match=r'mtv_world_ros\.Rollout'):
-        old = mtv_world_ros.ImaginedEpisode
-    assert old is mtv_world_ros.Rollout
-    with pytest.warns(DeprecationWarning, match=r'mtv_world_ros\.Pipeline\.load'):
-        load = mtv_world_ros.load_pipeline
-    assert load == mtv_world_ros.Pipeline.load
-
-
 EXAMPLES = sorted((Path(__file__).parents[1] / 'examples').glob('*.py'))
 
 

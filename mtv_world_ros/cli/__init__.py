@@ -29,7 +29,6 @@ from mtv_world_ros.cli.commands import (  # noqa: E402
     COMMANDS,
     REMOVED,
     REMOVED_OPTIONS,
-    RENAMED,
     SECTIONS,
 )
 from mtv_world_ros.cli.parser import CommandParser, EMPTY  # noqa: E402
@@ -43,6 +42,7 @@ from mtv_world_ros.core.files import check_name, check_output  # noqa: E402
 from mtv_world_ros.core.processes import (  # noqa: E402
     ended_by_signals,
     is_helper_rank,
+    let_threads_sleep,
     prepare_output,
     stopped_by_sigterm,
 )
@@ -182,18 +182,6 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def _current(words: Sequence[str]) -> list[str]:
-    """Return the words with today's name of the command; say so where it had another name."""
-    if not words:
-        return []
-    first, *rest = words
-    if first in RENAMED:
-        now = ' '.join(RENAMED[first])
-        _said(f"'{first}' is called '{now}' now; the old name works in this release alone", 0)
-        return [*RENAMED[first], *rest]
-    return list(words)
-
-
 def _parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
     """Return a parser that knows the command which words begin with.
 
@@ -223,10 +211,7 @@ def _parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
     if first in known:
         return others
     if first in REMOVED:
-        plain.error(
-            f"'{first}' is no longer a command: no measurement showed its worth; version "
-            f'{REMOVED[first]} has it. Commands are {", ".join(known)}'
-        )
+        plain.error(f"'{first}' is no longer a command: {REMOVED[first]}")
     plain.error(
         f"there is no command '{first}'{nearest(first, known)}; commands are {', '.join(known)}"
     )
@@ -238,7 +223,6 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
             import_module('argcomplete').autocomplete(make_parser())
     for word in words:
         check_name(word)
-    words = _current(words)
     parser = _parser_for(words)
     arguments, more = parser.parse_known_args(words)
     arguments.ros, arguments.command_line = more, words
@@ -288,6 +272,7 @@ def main(argv: list[str] | None = None) -> int:
 
     That is 1 for an error of the user's or of the disk, and 128 + n where signal n ended it.
     """
+    let_threads_sleep()
     prepare_output()
     try:
         with ended_by_signals('mtv-world'):

@@ -93,20 +93,6 @@ COMMANDS = {
     ),
 }  # fmt: skip
 
-#: name that a command had before -> its words now
-RENAMED = {
-    'import-bag': ('import', 'bag'),
-    'import-dataset': ('import', 'lerobot'),
-    'import-videos': ('import', 'videos'),
-    'import-weights': ('import', 'wan'),
-    'export-dataset': ('export', 'lerobot'),
-    'report': ('export', 'report'),
-    'doctor': ('check',),
-    'calibrate': ('fit', 'success'),
-    'fit-contact': ('fit', 'contact'),
-    'calibrate-camera': ('fit', 'camera'),
-    'faults': ('rank', '--list-faults'),
-}
 
 #: options that left, with their command -> what to use now
 REMOVED_OPTIONS = {
@@ -127,5 +113,20 @@ REMOVED_OPTIONS = {
     '--episodes scores another number of them afterwards',
 }
 
-#: commands that left -> the last version that has them
-REMOVED = {'distill': '0.1.0', 'train-motion': '0.1.0'}
+_NO_WORTH = 'no measurement showed its worth; version 0.1.0 has it'
+#: commands that left -> what to use, or why there is nothing
+REMOVED = {
+    'import-bag': "use 'mtv-world import bag'",
+    'import-dataset': "use 'mtv-world import lerobot'",
+    'import-videos': "use 'mtv-world import videos'",
+    'import-weights': "use 'mtv-world import wan'",
+    'export-dataset': "use 'mtv-world export lerobot'",
+    'report': "use 'mtv-world export report'",
+    'doctor': "use 'mtv-world check'",
+    'calibrate': "use 'mtv-world fit success'",
+    'fit-contact': "use 'mtv-world fit contact'",
+    'calibrate-camera': "use 'mtv-world fit camera'",
+    'faults': "use 'mtv-world rank --list-faults'",
+    'distill': _NO_WORTH,
+    'train-motion': _NO_WORTH,
+}

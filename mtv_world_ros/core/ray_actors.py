@@ -15,6 +15,7 @@ from typing import Any, TYPE_CHECKING, TypeVar
 import uuid
 
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+from mtv_world_ros.core.processes import let_threads_sleep
 from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.core.worker_pool import made_run, Run
 
@@ -144,6 +145,7 @@ class _Actor:
         needed: Sequence[Path],
         marker: Path | None,
     ) -> None:
+        let_threads_sleep()
         with suppress(OSError):
             os.chdir(folder)
         self._problem = _unseen(needed, marker)

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any
-import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
 
-from mtv_world_ros.core.errors import ConfigError, nearest
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.robot.plan import PlanLimits
 from mtv_world_ros.success.doubts import ContactTrust
 from mtv_world_ros.success.task import TaskSpec
-
-#: keyword of version 0.1.0 for `RolloutOptions.limits.tolerance`
-_OLD_TOLERANCE = 'limit_tolerance'
 
 
 def never() -> bool:
@@ -68,34 +63,3 @@ class RolloutOptions:
 
 #: options of a rollout without an instruction
 DEFAULT_OPTIONS = RolloutOptions()
-
-
-def with_keywords(options: RolloutOptions, keywords: Mapping[str, Any]) -> RolloutOptions:
-    """Return the options with the keywords that `Pipeline.begin` took in version 0.1.0.
-
-    Raises:
-        TypeError: a keyword is no option.
-    """
-    if not keywords:
-        return options
-    known = [option.name for option in fields(RolloutOptions)]
-    changes = dict(keywords)
-    if _OLD_TOLERANCE in changes:
-        changes['limits'] = replace(options.limits, tolerance=changes.pop(_OLD_TOLERANCE))
-    for name in changes:
-        if name not in known:
-            raise TypeError(
-                f"begin() got an unexpected keyword argument '{name}'{nearest(name, known)}; it "
-                f'takes an observation and RolloutOptions({", ".join(known)})'
-            )
-    shown = ', '.join(
-        f'{name}=PlanLimits(tolerance=...)' if name == 'limits' else f'{name}=...'
-        for name in changes
-    )
-    warnings.warn(
-        f'begin({", ".join(f"{name}=..." for name in keywords)}) is deprecated: give '
-        f'RolloutOptions({shown}) as the second argument',
-        DeprecationWarning,
-        stacklevel=3,
-    )
-    return replace(options, **changes)

@@ -28,7 +28,7 @@ from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import ChunkPlan, Plan
 from mtv_world_ros.rollout.assembly import asked_describer
 from mtv_world_ros.rollout.judge import ChunkStart, ImaginedChunk, Judge, SeenChunk
-from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions, with_keywords
+from mtv_world_ros.rollout.options import DEFAULT_OPTIONS, RolloutOptions
 from mtv_world_ros.rollout.plan_comparison import plans_to_compare
 from mtv_world_ros.rollout.prediction import Prediction, StageClock
 from mtv_world_ros.rollout.rollout import ObservedChunk, Rollout
@@ -252,23 +252,17 @@ class Pipeline:
         return self if judge is self.judge else replace(self, judge=judge)
 
     def begin(
-        self,
-        observation: Observation,
-        options: RolloutOptions = DEFAULT_OPTIONS,
-        **keywords: Any,
+        self, observation: Observation, options: RolloutOptions = DEFAULT_OPTIONS
     ) -> Rollout:
         """Return an episode that begins at an observation (V views, any image size).
 
         Args:
             observation: observation that the rollout begins at.
             options: instruction, objects, seed and other options of the rollout.
-            keywords: options one by one, as version 0.1.0 took them; deprecated.
 
         Raises:
             ObservationError: the views are not the model's.
-            TypeError: a keyword is no option.
         """
-        options = with_keywords(options, keywords)
         return Rollout(pipeline=self, options=options, _states=(self._state_at(observation),))
 
     def compare(

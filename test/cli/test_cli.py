@@ -46,7 +46,10 @@ def test_help_does_not_load_the_model(tmp_path):
 
 def test_numpy_starts_no_threads():
     """Those of its matrix products spin while they wait; ours are small."""
-    code = 'import mtv_world_ros, numpy, os\nprint(len(os.listdir("/proc/self/task")))'
+    code = (
+        'from mtv_world_ros.core.processes import let_threads_sleep\nlet_threads_sleep()\n'
+        'import numpy, os\nprint(len(os.listdir("/proc/self/task")))'
+    )
     kept = {name: text for name, text in os.environ.items() if 'NUM_THREADS' not in name}
     assert subprocess.check_output([sys.executable, '-c', code], env=kept) == b'1\n'
 

@@ -43,7 +43,6 @@ from mtv_world_ros.physics.checkpoint_files import load_foresight
 from mtv_world_ros.physics.object_motion import ObjectMotion
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.robot.plan import PlanLimits
 from mtv_world_ros.robot.shape import load_shape
 from mtv_world_ros.rollout.observed_episode import ObservedEpisode
 from mtv_world_ros.rollout.options import RolloutOptions
@@ -247,16 +246,6 @@ class StoppingWorldModel(CountingWorldModel):
         if len(self.seeds) == 2:
             raise RolloutPreempted('stopped')
         return super().predict(*frames, **options)
-
-
-def test_keywords_of_version_0_1_work_and_say_what_replaced_them(pipeline, recording):
-    observation = observe(recording)
-    with pytest.warns(DeprecationWarning, match=r'give RolloutOptions\(seed=..., limits=PlanLim'):
-        old = pipeline.begin(observation, seed=3, limit_tolerance=0.2)
-    new = pipeline.begin(observation, RolloutOptions(seed=3, limits=PlanLimits(tolerance=0.2)))
-    assert old.options == new.options
-    with pytest.raises(TypeError, match=r"'instructions' \(did you mean 'instruction'\?\)"):
-        pipeline.begin(observation, instructions='stack')
 
 
 @pytest.mark.parametrize('num_seeds', [1, 2])
