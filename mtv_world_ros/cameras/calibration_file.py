@@ -151,6 +151,11 @@ def load_calibration(path: Path | str) -> dict[str, CameraModel]:
 
 def save_calibration(path: Path | str, cameras: Mapping[str, CameraModel]) -> None:
     """Write cameras; `load_calibration` reads back exactly the same values."""
+    write_whole(Path(path), calibration_text(cameras))
+
+
+def calibration_text(cameras: Mapping[str, CameraModel]) -> str:
+    """Return the text of a calibration file."""
     views = {
         view: {
             'width': camera.width,
@@ -164,8 +169,7 @@ def save_calibration(path: Path | str, cameras: Mapping[str, CameraModel]) -> No
         }
         for view, camera in cameras.items()
     }
-    text = yaml.safe_dump({'views': views}, sort_keys=False, default_flow_style=None)
-    write_whole(Path(path), text)
+    return yaml.safe_dump({'views': views}, sort_keys=False, default_flow_style=None)
 
 
 def _camera(view: str, row: Any, where: str) -> CameraModel:

@@ -7,11 +7,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.bundled_help import robots
+from mtv_world_ros.cli.shared_options import add_options
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 
 if TYPE_CHECKING:
     from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.robot.model import RobotModel
+
+
+#: first lines of the cameras of a workcell
+_CAMERAS_HEAD = """\
+# Made from workcell.yaml by mtv-world robot ROBOT --workcell: the simulator's cameras before an
+# episode moves them a little; a recorded episode carries its own. K in px, pixel centres at
+# integers; T_mount_camera: pose of the optical frame (x right, y down, z ahead) in mount_link [m].
+"""
 
 
 def add(commands: Commands) -> None:
@@ -27,6 +36,12 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         '--out', type=Path, help='YAML to write (of a URDF); default: beside the URDF'
     )
+    parser.add_argument(
+        '--workcell',
+        action='store_true',
+        help='write cameras.yaml beside the robot YAML: the cameras of its workcell.yaml',
+    )
+    add_options(parser, 'overwrite')
     parser.add_argument('--picture', type=Path, help='PNG to draw; default: out/robot/<name>.png')
     parser.set_defaults(handler=_robot, default_picture=_default_picture)
 
@@ -64,7 +79,23 @@ def _robot(arguments: argparse.Namespace) -> int:
     picture = arguments.picture or Path('out/robot') / f'{robot.name}.png'
     _draw_robot(robot, picture)
     print(f'robot file: {path}\npicture: {picture}')
+    if arguments.workcell:
+        print(_write_cameras(robot, path.with_name('cameras.yaml'), overwrite=arguments.overwrite))
     return 0
+
+
+def _write_cameras(robot: RobotModel, path: Path, *, overwrite: bool) -> str:
+    """Write the cameras of a robot's workcell; return what was done, in a line."""
+    from mtv_world_ros.cameras.calibration_file import calibration_text
+    from mtv_world_ros.core.files import check_free, write_whole
+    from mtv_world_ros.simulation.scenes.workcell import nominal_cameras
+
+    text = _CAMERAS_HEAD + calibration_text(nominal_cameras(robot))
+    if path.is_file() and path.read_text() == text:
+        return f'cameras: {path} agrees with the workcell'
+    check_free(path, overwrite)
+    write_whole(path, text)
+    return f'cameras: {path}'
 
 
 def _write_guess(urdf: Path, out: Path) -> Path:

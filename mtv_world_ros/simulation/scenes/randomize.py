@@ -27,7 +27,7 @@ from mtv_world_ros.simulation.scenes.scene import (
 )
 from mtv_world_ros.simulation.scenes.shapes import SHAPES
 from mtv_world_ros.simulation.scenes.tasks import ObjectRole, Task
-from mtv_world_ros.simulation.scenes.workcell import PlacementConfig, Workcell
+from mtv_world_ros.simulation.scenes.workcell import NOMINAL_SIZE, PlacementConfig, Workcell
 from mtv_world_ros.success.situation import TruePoses
 from mtv_world_ros.vision.segmenters.colour import PALETTE
 
@@ -47,8 +47,8 @@ class RandomizationConfig:
         placement: limits of the places of objects and goals; None = the workcell's.
     """
 
-    width: int = 384
-    height: int = 288
+    width: int = NOMINAL_SIZE[0]
+    height: int = NOMINAL_SIZE[1]
     cameras: tuple[AnyCameraSpec, ...] | None = None
     jitter: CameraJitter = CameraJitter()
     placement: PlacementConfig | None = None

@@ -11,13 +11,20 @@ import numpy as np
 from pydantic import ConfigDict, Field
 
 from mtv_world_ros.core.config import Length, ListOf, Point, read_yaml, Schema, validated
-from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.core.data_types import CameraModel, FloatArray
 from mtv_world_ros.core.errors import SimulatorError
 from mtv_world_ros.core.files import bundled_names, share_path, WORKCELL_YAML
 from mtv_world_ros.robot.arm_solver import ArmSolver
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.simulation.scenes.cameras import AnyCameraSpec, CameraSpec, WristCameraSpec
+from mtv_world_ros.simulation.scenes.cameras import (
+    AnyCameraSpec,
+    camera_model,
+    CameraSpec,
+    WristCameraSpec,
+)
 
+#: width and height of the images of the cameras of a workcell, unless a scene draws others [px]
+NOMINAL_SIZE = (384, 288)
 #: a joint position; farther away is a wrong unit [rad or m]
 _Joint = Annotated[float, Field(ge=-1000, le=1000)]
 
@@ -105,6 +112,20 @@ class Workcell:
 
 
 @lru_cache(maxsize=8)
+def nominal_cameras(robot: RobotModel) -> dict[str, CameraModel]:
+    """Return the cameras of a robot's workcell by view, as its `cameras.yaml` has them.
+
+    Raises:
+        SimulatorError: there is no workcell for this robot, or it is for other arms or joints.
+        ConfigError: its file has unknown, missing or wrong values.
+    """
+    width, height = NOMINAL_SIZE
+    return {
+        spec.view: camera_model(spec, width, height, robot.base_link)
+        for spec in workcell_of(robot).cameras
+    }
+
+
 def workcell_of(robot: RobotModel) -> Workcell:
     """Return the workcell of a robot: `workcell.yaml` in its folder, else in `config/robots/NAME`.
 

@@ -13,9 +13,8 @@ from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.model import check_positions, RobotModel
 from mtv_world_ros.simulation.collect.record import RecordConfig, simulate
 from mtv_world_ros.simulation.expert.expert import Expert
-from mtv_world_ros.simulation.scenes.cameras import camera_model
 from mtv_world_ros.simulation.scenes.tasks import TASKS
-from mtv_world_ros.simulation.scenes.workcell import workcell_of
+from mtv_world_ros.simulation.scenes.workcell import nominal_cameras, workcell_of
 from mtv_world_ros.simulation.simulator import SimEpisode
 from test.support.tiers import rest_slow
 
@@ -82,15 +81,35 @@ def test_a_redundant_arm_comes_back_to_where_it_rests():
 
 @pytest.mark.parametrize('name', ROBOTS)
 def test_default_calibration_is_that_of_the_workcell(name):
-    robot = bundled(name)
-    stored = load_calibration(share_path('config', 'robots', name, 'cameras.yaml'))
-    workcell = workcell_of(robot)
-    assert list(stored) == [spec.view for spec in workcell.cameras]
-    for spec in workcell.cameras:
-        camera = camera_model(spec, 384, 288, robot.base_link)
-        assert stored[spec.view].mount_link == camera.mount_link
-        np.testing.assert_allclose(stored[spec.view].K, camera.K)
-        np.testing.assert_allclose(stored[spec.view].T_mount_camera, camera.T_mount_camera)
+    path = share_path('config', 'robots', name, 'cameras.yaml')
+    stored, made = load_calibration(path), nominal_cameras(bundled(name))
+    remedy = f'mtv-world robot {path.with_name("robot.yaml")} --workcell --overwrite'
+    assert list(stored) == list(made), remedy
+    for view, camera in made.items():
+        assert stored[view].mount_link == camera.mount_link, remedy
+        assert np.allclose(stored[view].K, camera.K, rtol=1e-12), remedy
+        assert np.allclose(stored[view].T_mount_camera, camera.T_mount_camera, atol=1e-12), remedy
+
+
+def test_the_cameras_of_a_changed_workcell_are_written_by_a_command(tmp_path, capsys):
+    folder = shutil.copytree(share_path('config', 'robots', 'franka'), tmp_path / 'mine')
+    command = ['robot', str(folder / 'robot.yaml'), '--workcell']
+    command += ['--picture', str(tmp_path / 'a.png')]
+    assert main(command) == 0
+    assert 'agrees with the workcell' in capsys.readouterr().out
+    workcell = folder / 'workcell.yaml'
+    workcell.write_text(workcell.read_text().replace('distance: 1.25', 'distance: 2.5'))
+    before = (folder / 'cameras.yaml').read_text()
+    assert main(command) == 1  # nothing that exists is overwritten
+    assert 'cameras.yaml' in capsys.readouterr().err
+    assert (folder / 'cameras.yaml').read_text() == before
+    assert main([*command, '--overwrite']) == 0
+    near, far = (load_calibration(path)['front'] for path in (
+        share_path('config', 'robots', 'franka', 'cameras.yaml'), folder / 'cameras.yaml'
+    ))  # fmt: skip
+    target = np.array([0.0, 0.22, 0.1])  # of the camera in workcell.yaml
+    apart = [np.linalg.norm(one.T_mount_camera[:3, 3] - target) for one in (near, far)]
+    assert np.allclose(apart, [1.25, 2.5])
 
 
 def test_a_robot_of_ones_own_has_its_workcell_in_its_folder(tmp_path):
