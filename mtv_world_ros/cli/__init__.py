@@ -294,7 +294,8 @@ def main(argv: list[str] | None = None) -> int:
     except (MtvWorldError, OSError, MemoryError) as error:
         return _said(f'{error}{_advice(error)}', 1)
     except ModuleNotFoundError as error:
-        from mtv_world_ros.cli.needs import extra_of, missing_text
+        from mtv_world_ros.cli.needs import missing_text
+        from mtv_world_ros.core.extras import extra_of
 
         package = (error.name or '').partition('.')[0]
         if not extra_of(package):

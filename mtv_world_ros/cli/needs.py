@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from importlib import metadata
 from importlib.util import find_spec
-import re
 
 from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.extras import install_command
 
 #: packages that each command always needs
 _ALWAYS = {
@@ -27,8 +26,6 @@ _WITH_OPTION = {
     ('rank', 'ray'): ('ray',),
     ('', 'watch'): ('rerun',),
 }
-#: name of the distribution of a module, where they differ
-_DISTRIBUTIONS = {'rerun': 'rerun-sdk'}
 
 
 def check_needs(words: Sequence[str], arguments: argparse.Namespace) -> None:
@@ -53,22 +50,11 @@ def check_needs(words: Sequence[str], arguments: argparse.Namespace) -> None:
 
 def missing_text(packages: Sequence[str]) -> str:
     """Return the line on packages that are not installed, and what installs them."""
-    extras = dict.fromkeys(filter(None, map(extra_of, packages)))
     are = 'is' if len(packages) == 1 else 'are'
     return (
         f'{", ".join(packages)} {are} not installed: make in the folder of mtv_world_ros '
-        f"(make dev has every extra), or pip install 'mtv_world_ros[{','.join(extras)}]'"
+        f'(make dev has every extra), or {install_command(packages)}'
     )
-
-
-def extra_of(package: str) -> str:
-    """Return the first extra of this package that asks for another one; empty = none does."""
-    name = _DISTRIBUTIONS.get(package, package)
-    for line in metadata.requires('mtv_world_ros') or ():
-        found = re.match(rf'{re.escape(name)}\b(?!-).*extra == .([\w-]+)', line)
-        if found and name:
-            return found[1]
-    return ''
 
 
 def _is_installed(module: str) -> bool:

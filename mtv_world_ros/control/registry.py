@@ -29,7 +29,6 @@ _REGISTRY = Registry(
     setting='video.control',
     required=('create', 'make', 'layout'),
     protocol='mtv_world_ros.control.control.Control',
-    extras={'tokenizers': 'fast_tokens'},
 )
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from enum import StrEnum
 
+from mtv_world_ros.core.extras import needs_text
 from mtv_world_ros.core.shown_text import MOST_OF_ERROR, shown
 
 
@@ -23,6 +24,19 @@ class MtvWorldError(Exception):
 
 class ConfigError(MtvWorldError):
     """A YAML file, parameter or command-line value is wrong."""
+
+
+class MissingPackageError(ConfigError):
+    """A package that an extra of this one installs is not there.
+
+    Args:
+        what: thing that needs it.
+        packages: names of the modules.
+        instead: what to do without them.
+    """
+
+    def __init__(self, what: str, *packages: str, instead: str = '') -> None:
+        super().__init__(needs_text(what, *packages, instead=instead))
 
 
 class RobotError(MtvWorldError):

@@ -14,7 +14,7 @@ import time
 from typing import Any, TYPE_CHECKING, TypeVar
 import uuid
 
-from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+from mtv_world_ros.core.errors import ConfigError, MissingPackageError, MtvWorldError
 from mtv_world_ros.core.processes import let_threads_sleep
 from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.core.worker_pool import made_run, Run
@@ -266,7 +266,7 @@ def _ray() -> Any:
         ray = importlib.import_module('ray')
         importlib.import_module('ray.util')
     except ImportError as error:
-        raise ConfigError(
-            "--ray needs Ray: pip install 'mtv_world_ros[rank]', or leave it out and use --workers"
+        raise MissingPackageError(
+            '--ray', 'ray', instead='leave it out and use --workers'
         ) from error
     return ray

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 import sys
@@ -11,6 +11,7 @@ from typing import Any
 
 from mtv_world_ros.core.entry_points import registered
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
+from mtv_world_ros.core.extras import extra_of, install_command
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,7 +27,6 @@ class Registry:
         made_required: attributes that an instance must have, see `create`.
         protocol: name of the protocol that describes these names.
         others: further valid values of the setting, for error texts; empty = there are none.
-        extras: package that a class imports -> extra of this package that installs it.
     """
 
     kind: str
@@ -37,7 +37,6 @@ class Registry:
     made_required: tuple[str, ...] = ()
     protocol: str = ''
     others: str = ''
-    extras: Mapping[str, str] = field(default_factory=dict)
 
     def names(self) -> list[str]:
         """Return the registered names: the package's, then those of entry points."""
@@ -123,8 +122,8 @@ class Registry:
 
     def _remedy(self, error: Exception) -> str:
         package = getattr(error, 'name', None) if isinstance(error, ModuleNotFoundError) else None
-        if package is not None and package in self.extras:
-            return f"; install it with: pip install 'mtv_world_ros[{self.extras[package]}]'"
+        if package is not None and extra_of(package):
+            return f'; install it with: {install_command([package])}'
         if package is not None and find_spec(package.partition('.')[0]) is None:
             return (
                 f"; install the package that has '{package}', or add its folder to PYTHONPATH "

@@ -24,6 +24,7 @@ from mtv_world_ros.core.bounded_input import (
 )
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
 from mtv_world_ros.core.errors import EpisodeError, MtvWorldError, nearest
+from mtv_world_ros.core.extras import needs_text
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.image_decoding import check_image, to_rgb
 from mtv_world_ros.importing.number_tables import NumberTable
@@ -75,9 +76,7 @@ def _open(path: Path) -> Any:
     try:
         import h5py
     except ImportError as error:
-        raise EpisodeError(
-            f"'{path}' needs h5py: pip install 'mtv_world_ros[import]' (make installs it)"
-        ) from error
+        raise EpisodeError(needs_text(f"'{path}'", 'h5py')) from error
     if problem := placeholder(path):
         raise EpisodeError(f"'{path}' {problem}")
     try:

@@ -29,7 +29,13 @@ from mtv_world_ros.core.bounded_input import (
     require_regular,
 )
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
-from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest, ObservationError
+from mtv_world_ros.core.errors import (
+    ConfigError,
+    EpisodeError,
+    MissingPackageError,
+    nearest,
+    ObservationError,
+)
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data.bag.image_orientation import exif_orientation, turned_upright, UPRIGHT
 from mtv_world_ros.importing.other_formats import conversion_hint
@@ -662,7 +668,5 @@ def pyarrow_modules() -> tuple[Any, Any]:
         import pyarrow
         from pyarrow import parquet
     except ImportError as error:
-        raise ConfigError(
-            "LeRobot datasets need pyarrow: pip install 'mtv_world_ros[import]'"
-        ) from error
+        raise MissingPackageError('a LeRobot data set', 'pyarrow') from error
     return pyarrow, parquet

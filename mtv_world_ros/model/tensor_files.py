@@ -15,7 +15,7 @@ from safetensors import safe_open, SafetensorError
 from torch import Tensor
 
 from mtv_world_ros.core.bounded_input import check_finite, placeholder, read_json, require_regular
-from mtv_world_ros.core.errors import CheckpointError, ConfigError
+from mtv_world_ros.core.errors import CheckpointError, MissingPackageError
 
 PICKLES = ('.bin', '.pt', '.pth', '.ckpt', '.pkl')
 INDEX = '.safetensors.index.json'
@@ -180,13 +180,10 @@ def import_transformers() -> Any:
     """Return the package.
 
     Raises:
-        ConfigError: the package is not installed.
+        MissingPackageError: the package is not installed.
     """
     try:
         import transformers
     except ImportError as error:
-        raise ConfigError(
-            "umT5 and CLIP need the package 'transformers'; install it with "
-            "pip install 'mtv_world_ros[wan]'"
-        ) from error
+        raise MissingPackageError('a text or image encoder', 'transformers') from error
     return transformers

@@ -21,7 +21,13 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from mtv_world_ros.core.bounded_input import limits
 from mtv_world_ros.core.config import Seconds
 from mtv_world_ros.core.data_types import JointTrajectory, Observation
-from mtv_world_ros.core.errors import ConfigError, masked, PolicyError, PolicyServerError
+from mtv_world_ros.core.errors import (
+    ConfigError,
+    masked,
+    MissingPackageError,
+    PolicyError,
+    PolicyServerError,
+)
 from mtv_world_ros.core.shown_text import shown
 from mtv_world_ros.policies.policy import EpisodeOrigin, PolicySettings
 from mtv_world_ros.policies.server_mapping import find, Key, ServerMapping
@@ -68,9 +74,8 @@ class OpenPiConfig(ServerMapping, PolicySettings):
             import msgpack  # noqa: F401
             import websockets  # noqa: F401
         except ImportError as error:
-            raise ConfigError(
-                f"the client of openpi's server needs the package '{error.name}'; install it "
-                "with: pip install 'mtv_world_ros[policies]'"
+            raise MissingPackageError(
+                "the client of openpi's server", error.name or 'websockets'
             ) from error
 
     def make(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mtv_world_ros.core.data_types import ByteArray, JointTrajectory, Observation
 from mtv_world_ros.core.errors import PlanError
+from mtv_world_ros.core.extras import needs_text
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.rollout.world import World
 
@@ -16,7 +17,7 @@ try:
     import gymnasium
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
-        "Gymnasium is not installed; install it with: pip install 'mtv_world_ros[gym]'",
+        needs_text('WorldEnv', 'gymnasium'),
         name=error.name,
     ) from error
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import SimulatorError
+from mtv_world_ros.core.extras import needs_text
 from mtv_world_ros.physics.arms.arm_response import ArmResponse
 from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.physics.solids import Solid
@@ -52,8 +53,7 @@ def second_engine(
         from mtv_world_ros.simulation.dart.stepped_world import SteppedWorld
     except ImportError as error:
         raise SimulatorError(
-            f'the engine dart is not installed ({error}); pip install .[dart], or choose another '
-            '--physics'
+            needs_text('the engine dart', 'dartpy', instead='choose another --physics')
         ) from error
     masses = [float(model.body(item.role).mass[0]) for item in scene.objects]
     solids = [_solid(item) for item in scene.objects]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mtv_world_ros.control.control import Control
 from mtv_world_ros.control.registry import save_control
-from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.errors import MissingPackageError
 from mtv_world_ros.core.files import whole_folder
 from mtv_world_ros.model.card import CheckpointCard
 from mtv_world_ros.model.lora import (
@@ -41,13 +41,10 @@ def add_adapter(transformer: MultiViewWanTransformer, rank: int = 32, alpha: flo
         alpha: the factors' product counts alpha / rank.
 
     Raises:
-        ConfigError: peft is not installed.
+        MissingPackageError: peft is not installed.
     """
     if find_spec('peft') is None:
-        raise ConfigError(
-            "LoRA adapters need the package 'peft'; install it with "
-            "pip install 'mtv_world_ros[wan]'"
-        )
+        raise MissingPackageError('a LoRA adapter', 'peft')
     from peft import LoraConfig
 
     transformer.requires_grad_(False)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from mtv_world_ros.core.data_types import ByteArray
-from mtv_world_ros.core.errors import ConfigError, MtvWorldError
+from mtv_world_ros.core.errors import MissingPackageError, MtvWorldError
 from mtv_world_ros.viewing.scored_rollout import ScoredRollout, StoredRollout
 from mtv_world_ros.viewing.streams import Streams
 from mtv_world_ros.viewing.video import KINDS
@@ -30,7 +30,7 @@ _OPEN_TO_OTHERS = 'Whoever reaches this address can see and copy what is shown, 
 def check_installed() -> None:
     """Raise a `ConfigError` where the Rerun SDK is not installed."""
     if find_spec('rerun') is None:
-        raise ConfigError("the viewer is not installed: pip install 'mtv_world_ros[view]'")
+        raise MissingPackageError('the viewer', 'rerun')
 
 
 def recording(name: str) -> Any:

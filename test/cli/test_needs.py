@@ -5,7 +5,7 @@ import re
 import pytest
 
 from mtv_world_ros.cli import main, needs
-from mtv_world_ros.cli.needs import extra_of
+from mtv_world_ros.core.extras import extra_of
 
 
 @pytest.fixture

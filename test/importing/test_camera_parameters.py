@@ -15,7 +15,7 @@ from mtv_world_ros.core.config import validated
 from mtv_world_ros.core.errors import CalibrationError, ConfigError
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.importing.camera_parameters import camera_track, CameraSource
-from mtv_world_ros.importing.convert import import_dataset
+from mtv_world_ros.importing.lerobot_episodes import import_dataset
 
 #: looks down from 2 m: x right, y down, z ahead in the camera
 POSE = np.array([[1.0, 0, 0, 0.5], [0, -1, 0, -0.25], [0, 0, -1, 2.0], [0, 0, 0, 1]])

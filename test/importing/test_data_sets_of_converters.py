@@ -16,8 +16,9 @@ from mtv_world_ros.cli.imports.common import _import_status
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode import UNKNOWN_CAMERAS
 from mtv_world_ros.data.episode_reader import read_episode, read_info
-from mtv_world_ros.importing.convert import import_dataset, ImportSummary, read_frames
+from mtv_world_ros.importing.convert import ImportSummary
 from mtv_world_ros.importing.lerobot import LeRobotDataset
+from mtv_world_ros.importing.lerobot_episodes import import_dataset, read_frames
 from mtv_world_ros.importing.mapping import guess_mapping, load_mapping
 
 FPS = 10

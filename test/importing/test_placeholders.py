@@ -8,8 +8,8 @@ import pytest
 from mtv_world_ros.core.bounded_input import placeholder
 from mtv_world_ros.core.errors import CheckpointError, EpisodeError
 from mtv_world_ros.data.bag.reader import BagReader
-from mtv_world_ros.importing.convert import import_dataset
 from mtv_world_ros.importing.lerobot import LeRobotDataset
+from mtv_world_ros.importing.lerobot_episodes import import_dataset
 from mtv_world_ros.importing.number_tables import read_table
 from mtv_world_ros.importing.video_frames import frames_at, VideoFileFrames
 from mtv_world_ros.model.tensor_files import read_tensors

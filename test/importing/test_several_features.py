@@ -18,8 +18,8 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import ConfigError, EpisodeError
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.importing import lerobot
-from mtv_world_ros.importing.convert import import_dataset
 from mtv_world_ros.importing.lerobot import LeRobotDataset
+from mtv_world_ros.importing.lerobot_episodes import import_dataset
 
 ARM, GRIPPER = ['shoulder', 'elbow'], ['gripper']
 TABLE = 'data/chunk-000/episode_{:06d}.parquet'

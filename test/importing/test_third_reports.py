@@ -18,8 +18,8 @@ from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag_mapping import BagMapping
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.importing.convert import import_dataset
 from mtv_world_ros.importing.hdf5_files import Hdf5Frames
+from mtv_world_ros.importing.lerobot_episodes import import_dataset
 from mtv_world_ros.viewing.video import encode_video
 from test.support.robot_recordings import Event, events, FPS, JOINTS, ns, positions, SECONDS
 

@@ -8,7 +8,7 @@ from mtv_world_ros.core.config import validated
 from mtv_world_ros.core.errors import ConfigError, EpisodeError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.core.transforms import quaternion
-from mtv_world_ros.importing.convert import import_dataset
+from mtv_world_ros.importing.lerobot_episodes import import_dataset
 from mtv_world_ros.importing.mapping import ActionStream
 from mtv_world_ros.robot.file import load_robot
 

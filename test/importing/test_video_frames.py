@@ -11,7 +11,7 @@ import pytest
 
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.importing.convert import import_dataset
+from mtv_world_ros.importing.lerobot_episodes import import_dataset
 from mtv_world_ros.importing.video_frames import (
     frames_at,
     match_frames,

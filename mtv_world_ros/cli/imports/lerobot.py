@@ -50,8 +50,9 @@ def add(commands: Commands) -> None:
 
 
 def _import_dataset(arguments: argparse.Namespace) -> int:
-    from mtv_world_ros.importing.convert import episode_name, import_dataset, read_frames
+    from mtv_world_ros.importing.convert import episode_name
     from mtv_world_ros.importing.lerobot import LeRobotDataset
+    from mtv_world_ros.importing.lerobot_episodes import import_dataset, read_frames
     from mtv_world_ros.importing.mapping import load_mapping
 
     file = arguments.mapping or _guessed_mapping(arguments)

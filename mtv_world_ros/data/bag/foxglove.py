@@ -20,6 +20,7 @@ from rosbags.typesys.store import Typestore
 
 from mtv_world_ros.core.bounded_input import parse_json
 from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.extras import needs_text
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.video_packets import FFMPEG_PACKET, is_key
 
@@ -75,10 +76,7 @@ def protobuf_reader(schema: Schema) -> Read:
         from google.protobuf.message import DecodeError
         from mcap_protobuf.decoder import DecoderFactory
     except ImportError as error:
-        raise EpisodeError(
-            "it is in Protobuf, which needs 'mcap-protobuf-support' (pip install "
-            "'mtv_world_ros[import]')"
-        ) from error
+        raise EpisodeError(needs_text('its Protobuf', 'mcap-protobuf-support')) from error
     try:
         decode = DecoderFactory().decoder_for('protobuf', schema)
     except (McapError, DecodeError, RecursionError, LookupError, TypeError, ValueError) as error:

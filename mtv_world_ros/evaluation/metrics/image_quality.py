@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.core.data_types import ByteArray
-from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.core.errors import ConfigError, MissingPackageError
 
 #: names of the measures; LPIPS also needs torchvision and downloads its AlexNet weights
 MEASURES = ('psnr', 'ssim', 'lpips')
@@ -36,9 +36,7 @@ def image_quality(names: Sequence[str], device: str = 'cpu') -> ImageQuality | N
     try:
         measures = {name: makers[name]() for name in names}
     except ImportError as error:
-        raise ConfigError(
-            f"quality {', '.join(names)} needs torchmetrics: pip install 'mtv_world_ros[evaluate]'"
-        ) from error
+        raise MissingPackageError(f'quality {", ".join(names)}', 'torchmetrics') from error
 
     def measure(predicted: ByteArray, real: ByteArray) -> dict[str, float]:
         import torch

@@ -121,6 +121,7 @@ class CameraSet:
         *,
         rows: Sequence[int] | None = None,
         points: PointsOfViews | None = None,
+        scaled: bool = False,
         whiten: bool = False,
     ) -> tuple[CameraState, float]:
         """Return the state nearby at which drawn and seen differ least, and the loss there.
@@ -131,6 +132,7 @@ class CameraSet:
             evaluations: maximum number of evaluations of each fit.
             rows: recordings that are fitted to; None = all.
             points: seen points of their views.
+            scaled: see `Outlines.residual`.
             whiten: see `solve`.
         """
         points = points or {}
@@ -150,7 +152,7 @@ class CameraSet:
             for row in range(len(self._outlines)) if rows is None else rows:
                 one, place = self._outlines[row], self._place_of[row]
                 changes = one.read(stage, state.poses[place], state.lens)
-                silhouettes.append(one.residual(place, changes))
+                silhouettes.append(one.residual(place, changes, scaled=scaled))
             state, cost = solve(
                 [*silhouettes, *seen], unknowns, state, evaluations=evaluations, whiten=whiten
             )

@@ -46,6 +46,7 @@ class ImageStage(NamedTuple):
 _OUTLIER = 0.3
 #: drawn change of a pixel that the robot covers in both frames, where the image may change or not
 _INSIDE = 0.3
+SCALED_OUTLIER = 10.0
 #: distance of the pixels that a fit compares; blurred images hold no more [px]
 _STRIDE = 2
 #: links that move less are left out, because an arm at rest does not constrain the pose [m]
@@ -202,17 +203,29 @@ class Outlines:
         along = np.dot(drawn, changes.seen.ravel().astype(np.float64))
         return float(along / (np.linalg.norm(drawn) * changes.deviation))
 
-    def residual(self, place: int, changes: Changes, weight: float = 1.0) -> Residual:
+    def residual(self, place: int, changes: Changes, *, scaled: bool = False) -> Residual:
         """Return drawn minus seen changes as a residual of the pose at a place.
 
         Pixels that differ much, e.g. shadows and parts of the background's colour, count less.
+
+        Args:
+            place: number of the place.
+            changes: changed pixels.
+            scaled: give the drawn changes the mean and the deviation of the seen ones. The sum of
+                the squared errors is least then where the correlation is largest.
         """
 
         def errors(T: FloatArray, lens: FloatArray) -> NDArray[np.floating]:
-            apart = self._drawn(T, _through(changes, lens)) - changes.seen
-            return apart[:, ::_STRIDE, ::_STRIDE].ravel()
+            drawn = self._drawn(T, _through(changes, lens))[:, ::_STRIDE, ::_STRIDE]
+            seen = changes.seen[:, ::_STRIDE, ::_STRIDE]
+            if scaled:
+                drawn = drawn - drawn.mean()
+                drawn *= seen.std() / max(float(drawn.std()), 1e-9)
+                seen = seen - seen.mean()
+            return (drawn - seen).ravel()
 
-        return Residual(place=place, errors=errors, outlier=_OUTLIER, weight=weight)
+        outlier = SCALED_OUTLIER if scaled else _OUTLIER
+        return Residual(place=place, errors=errors, outlier=outlier)
 
     def _drawn(self, T: FloatArray, changes: Changes) -> NDArray[np.float32]:
         """Return the expected change (P, H, W) between the images of each pair, 0 .. 1."""

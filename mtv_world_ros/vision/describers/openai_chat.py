@@ -18,7 +18,7 @@ from pydantic import Field
 from mtv_world_ros.core.bounded_input import parse_json
 from mtv_world_ros.core.config import expected, Schema, Seconds
 from mtv_world_ros.core.data_types import ByteArray
-from mtv_world_ros.core.errors import ConfigError, DescriptionError, masked
+from mtv_world_ros.core.errors import ConfigError, DescriptionError, masked, MissingPackageError
 from mtv_world_ros.core.shown_text import shown
 from mtv_world_ros.vision.describers.vlm import ANSWER_SCHEMA, ChatAnswer, excerpt
 
@@ -221,9 +221,7 @@ def _client(config: OpenAIConfig, key: str) -> Any:
     try:
         import openai
     except ImportError as error:
-        raise ConfigError(
-            f"the describer 'openai' needs the package openai ({error}); pip install '.[describe]'"
-        ) from error
+        raise MissingPackageError("the describer 'openai'", 'openai') from error
     return openai.OpenAI(
         api_key=key or 'none',
         base_url=config.base_url,
