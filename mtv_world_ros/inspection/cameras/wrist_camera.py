@@ -188,7 +188,9 @@ class WristCamera:
         """Return the pose nearby at which the points fit best, and their median distance [px]."""
         state = CameraState(poses={0: T})
         for outlier in _OUTLIERS_PX:
-            state, _ = solve([self._residual(outlier)], Unknowns(), state, evaluations=20)
+            state, _ = solve(
+                [self._residual(outlier)], Unknowns(), state, evaluations=40, tolerance=1e-8
+            )
         T = state.poses[0]
         return T, float(np.median(np.linalg.norm(self._errors(T), axis=-1)))
 
