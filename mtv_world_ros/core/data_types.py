@@ -353,12 +353,14 @@ class FutureEvidence:
         interval: 95 % interval (low, high) of the probability.
         is_fitted: contact parameters were fitted in this robot cell; False = futures are drawn
             from the prior.
+        share: share of the futures that succeed, by their weights; NaN = not known.
     """
 
     outcomes: tuple[bool | None, ...]
     probability: float
     interval: tuple[float, float]
     is_fitted: bool
+    share: float = np.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

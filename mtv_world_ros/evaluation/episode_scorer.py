@@ -105,6 +105,7 @@ class _Found:
     task: TaskSpec | None
     rows: list[ScoreRow] = field(default_factory=list)
     grasps: list[GraspOutcome] = field(default_factory=list)
+    shares: list[tuple[float, float]] = field(default_factory=list)
     shown: list[StoredRollout] = field(default_factory=list)
     quality: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
     pictures: list[tuple[int, dict[str, dict[str, float]]]] = field(default_factory=list)
@@ -153,6 +154,8 @@ class EpisodeScorer:
         for stretch in stretches(recording, self.pipeline.spec, self.config.mode):
             chunks = self._stretch(recording, stretch, donor, names, found)
             success = chunks[-1].success
+            begin_s = float(recording.times[stretch.start] - recording.times[0])
+            found.shares += shares_over_time(chunks, begin_s)
             if self.config.observed:
                 with found.timed('segmenting'):
                     pipeline = self._pipeline_for(names, found.task)
@@ -182,6 +185,7 @@ class EpisodeScorer:
             outcome=recording.outcome,
             rows=tuple(found.rows),
             grasps=tuple(found.grasps),
+            shares=tuple(found.shares),
             quality=_mean_quality(found.quality),
             pictures=mean_pictures(found.pictures),
             num_chunks=len(found.pictures),
@@ -409,6 +413,20 @@ def _mean_quality(
             for name in names
         }
     return found
+
+
+def shares_over_time(chunks: Sequence[Prediction], begin_s: float) -> list[tuple[float, float]]:
+    """Return the end of each chunk of a rollout [s], and the share of the futures that succeed.
+
+    Args:
+        chunks: the chunks of the rollout.
+        begin_s: time at which it begins [s].
+    """
+    return [
+        (round(begin_s + chunk.imagined_seconds, 3), chunk.success.futures.share)
+        for chunk in chunks
+        if chunk.success.futures is not None
+    ]
 
 
 #: estimates of recorded frames up to this one contradict a success [probability]

@@ -44,6 +44,9 @@ class EpisodeResult:
         resumed: features of the success estimate if only the last chunk is imagined.
         has_ids: recorded object identities show which objects move.
         grasps: outcomes of all attempts to grasp; empty in results of earlier versions.
+        shares: time [s] since the episode began, and share of the futures that succeed there, of
+            each chunk's end; empty where no motion was foreseen, and in results of earlier
+            versions.
         digest: digest of the episode's motion, see `Recording`; empty = not known.
     """
 
@@ -68,6 +71,7 @@ class EpisodeResult:
     observed: Mapping[str, float] = field(default_factory=dict)
     resumed: Mapping[str, float] = field(default_factory=dict)
     grasps: tuple[GraspOutcome, ...] = ()
+    shares: tuple[tuple[float, float], ...] = ()
 
     def means(self, view: str | None) -> dict[str, float]:
         """Return the episode's mean scores of a view (None = all views), by name."""
@@ -86,6 +90,7 @@ class EpisodeResult:
         read: dict[str, Any] = dict(values)
         read['rows'] = tuple(ScoreRow.from_json(row) for row in values['rows'])
         read['grasps'] = tuple(GraspOutcome(**grasp) for grasp in values.get('grasps', ()))
+        read['shares'] = tuple((time, share) for time, share in values.get('shares', ()))
         read['reasons'], read['notes'] = tuple(values['reasons']), tuple(values['notes'])
         read['probability'] = np.nan if values['probability'] is None else values['probability']
         ends = values.get('interval') or (None, None)

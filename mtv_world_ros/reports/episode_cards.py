@@ -31,6 +31,8 @@ _PICKED_TILE_PX = 320
 _TILE_PX = 192
 #: number of episodes with a contact sheet if none can be ranked
 _NUM_UNRANKED = 3
+#: most points of time for which the share of futures is written
+_MOST_SHARES = 12
 _BINS = ('0 to .2', '.2 to .4', '.4 to .6', '.6 to .8', '.8 to 1')
 _UNKNOWN = 'not scored'
 _ESTIMATES = ('right', 'wrong', 'no verdict')
@@ -158,8 +160,17 @@ def _row(one: Marked, result: EpisodeResult, key: str) -> dict[str, Any]:
         'views': [f'{view} {number(mean)}' for view, mean in means.items()],
         'estimate': number(result.probability, 2) if known else 'abstains',
         'reasons': '; '.join(result.reasons),
+        'shares': ', '.join(
+            f'{time:.1f} s {number(share, 2)}' for time, share in _thinned(result.shares)
+        ),
         'objects': '; '.join(f'{row.view} {row.name}: {row.status}' for row in doubted),
     }
+
+
+def _thinned(shares: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return at most `_MOST_SHARES` of the shares over time, the last one among them."""
+    step = -(-len(shares) // _MOST_SHARES) or 1
+    return list(shares[::-1][::step][::-1])
 
 
 def _clip(

@@ -20,6 +20,7 @@ from mtv_world_ros.core.processes import threads_each
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.physics.episode_objects import Majority, ObjectForesight
 from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
+from mtv_world_ros.physics.grasp_attempts import attempts_line, foreseen_attempts
 from mtv_world_ros.physics.object_motion import ObjectMotionModel
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import Plan
@@ -247,7 +248,9 @@ class SuccessJudge:
             state, chunk.motion, start.masks, chunk.masks, options, foreseen
         )
         unseen = () if chunk.is_in_view else (_UNSEEN,)
-        estimate = doubted(estimate, (*objects.reasons, *unseen))
+        chained = '' if foreseen is None else attempts_line(foreseen_attempts(foreseen))
+        told = [chained] if chained else []
+        estimate = doubted(estimate, (*told, *objects.reasons, *unseen))
         is_foreseen = isfinite(estimate.features.get('foreseen', nan))
         unplaced = _UNPLACED if objects.starts_later and not is_foreseen else ''
         estimate = doubted(estimate, refusal=state.frame_doubt or objects.refusal or unplaced)

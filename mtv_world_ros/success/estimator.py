@@ -308,6 +308,7 @@ class SuccessEstimator:
             probability=alone.probability,
             interval=(alone.low, alone.high),
             is_fitted=ends.is_fitted,
+            share=ends.share,
         )
         counts = f'{ends.done.sum()} of {len(ends.done)} foreseen motions succeed'
         reasons = [f'{counts}, {ends.share:.0%} by weight']

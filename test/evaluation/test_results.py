@@ -1,12 +1,14 @@
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.evaluation.episode_scorer import shares_over_time
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate
-from mtv_world_ros.evaluation.results import rollout_path
+from mtv_world_ros.evaluation.results import EpisodeResult, rollout_path
 from mtv_world_ros.viewing import stored_rollout
 from mtv_world_ros.viewing.scored_rollout import StoredRollout
 from mtv_world_ros.viewing.stored_rollout import (
@@ -154,3 +156,23 @@ def test_evaluation_keeps_what_it_scored(make_pipeline, episodes, recordings, or
     stored = json.loads((tmp_path / 'episodes' / 'episode_0.json').read_text())['result']
     row = next(r for r in stored['rows'] if r['view'] == 'low' and r['name'] == 'red block')
     assert row['j_frames'] == read.j[0, read.objects.index('red block'), :4].tolist()
+
+
+def test_shares_over_time_are_of_the_end_of_each_chunk_and_are_read_back():
+    def chunk(seconds, share):
+        futures = None if share is None else SimpleNamespace(share=share)
+        return SimpleNamespace(imagined_seconds=seconds, success=SimpleNamespace(futures=futures))
+
+    chunks = [chunk(1.6, 0.25), chunk(3.2, None), chunk(4.8, 1.0)]
+    shares = shares_over_time(chunks, 2.0)
+    assert shares == [(3.6, 0.25), (6.8, 1.0)]
+    values = {
+        'episode': 'a', 'task': '', 'zero_shot': '', 'outcome': 'success', 'rows': (),
+        'quality': {}, 'probability': 0.5, 'reasons': (), 'notes': (), 'seconds_per_chunk': 1.0,
+        'seconds': {}, 'has_ids': False,
+    }  # fmt: skip
+    result = EpisodeResult(**values, shares=tuple(shares))
+    assert EpisodeResult.from_json(json.loads(json.dumps(result.as_json()))).shares == (*shares,)
+    before = EpisodeResult(**values).as_json()
+    before.pop('shares')  # as versions before wrote it
+    assert EpisodeResult.from_json(before).shares == ()
