@@ -31,7 +31,7 @@ from test.support.browser import Browser  # noqa: E402
 
 #: largest width of a picture [px]
 WIDTH = 900
-#: pictures whose words would be too small then
+#: pictures whose words would be too small then; these keep all colours
 WIDE = ('demo', 'viewer')
 #: colours of a picture: it is to be small
 NUM_COLOURS = 128
@@ -54,7 +54,7 @@ VIEWS = {
 
 
 def save(picture: Path, name: str) -> None:
-    """Write a picture in few colours as docs/NAME.png."""
+    """Write a picture as docs/NAME.png, small if it may be."""
     from PIL import Image
 
     shown = cv2.imread(str(picture))
@@ -63,7 +63,7 @@ def save(picture: Path, name: str) -> None:
     small = cv2.resize(shown, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     image = Image.fromarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB))
     out = ROOT / 'docs' / f'{name}.png'
-    image.quantize(NUM_COLOURS).save(out, optimize=True)
+    (image if name in WIDE else image.quantize(NUM_COLOURS)).save(out, optimize=True)
     sys.stdout.write(f'{out}: {out.stat().st_size // 1024} kB\n')
 
 
