@@ -22,7 +22,7 @@ from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.opengl import missing_opengl
 from mtv_world_ros.simulation.scenes.workcell import workcell_of
 from test.support.left_behind import left, restore, state
-from test.support.tiers import tier_lines
+from test.support.tiers import file_seconds, tier_lines
 
 
 def _no_gpu() -> str:
@@ -173,7 +173,15 @@ class Failing:
     return f'{module}:Failing'
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+#: key of pytest's cache: seconds that each file of tests took last, set-up included
+FILE_SECONDS = 'mtv_world_ros/file_seconds'
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    # files that took longest go first, so that no worker has one of them alone at the end
+    cache = getattr(config, 'cache', None)
+    seconds = cache.get(FILE_SECONDS, {}) if cache else {}
+    items.sort(key=lambda item: -seconds.get(item.nodeid.partition('::')[0], 0.0))
     for marker, obstacle in OBSTACLES.items():
         marked = [item for item in items if item.get_closest_marker(marker)]
         reason = obstacle() if marked else ''
@@ -197,5 +205,7 @@ def pytest_terminal_summary(
     for reason, count in counted.most_common():
         terminalreporter.write_line(f'skipped for want of {reason}: {count}')
     reports = [one for kind in ('', 'passed') for one in terminalreporter.stats.get(kind, ())]
+    if (cache := getattr(config, 'cache', None)) is not None:
+        cache.set(FILE_SECONDS, file_seconds(reports, cache.get(FILE_SECONDS, {})))
     for line in tier_lines(reports, most=None if config.getoption('tiers') else MOST_LISTED):
         terminalreporter.write_line(line)

@@ -1,9 +1,12 @@
 """What tests share does what they take for granted."""
 
+from types import SimpleNamespace
+
 import pytest
 
+from test.conftest import FILE_SECONDS, pytest_collection_modifyitems
 from test.support.tables import table
-from test.support.tiers import FAST_LIMIT_S, rest_slow, tier_lines
+from test.support.tiers import FAST_LIMIT_S, file_seconds, rest_slow, tier_lines
 
 
 def test_a_table_tries_all_rows_and_names_those_that_fail(tmp_path):
@@ -48,6 +51,25 @@ def test_items_that_outgrew_the_fast_tier_are_named_and_those_that_shrank():
     assert third == 'below 1 s and marked slow: a.py::test_shrunk'
     assert tier_lines(reports, most=5) == [first, second]
     assert tier_lines(reports[2:4]) == []
+
+
+def test_files_are_ordered_by_the_longest_of_their_runs():
+    reports = [report('a.py::test_b', 1.0, 'setup'), report('a.py::test_b[1]', 2.0)]
+    found = file_seconds([*reports, report('c.py::test_d', 0.5)], {'a.py': 2.5, 'c.py': 4.0})
+    assert found == {'a.py': 3.0, 'c.py': 4.0}
+    assert file_seconds([], found) == found
+
+
+def test_files_that_took_longest_go_first():
+    items = [
+        SimpleNamespace(nodeid=name, get_closest_marker=lambda marker: None)
+        for name in ('quick.py::a', 'new.py::a', 'long.py::a', 'long.py::b')
+    ]
+    seconds = {'quick.py': 1.0, 'long.py': 9.0}
+    cache = SimpleNamespace(get=lambda key, default: seconds if key == FILE_SECONDS else default)
+    pytest_collection_modifyitems(SimpleNamespace(cache=cache), items)
+    names = [item.nodeid for item in items]
+    assert names == ['long.py::a', 'long.py::b', 'quick.py::a', 'new.py::a']
 
 
 def test_parameters_that_stand_for_the_others_are_fast():

@@ -7,7 +7,7 @@ of them and lists those whose marker is wrong.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import pytest
@@ -30,6 +30,22 @@ def rest_slow(values: Iterable[Any], fast: Collection[Any]) -> list[Any]:
         else pytest.param(*(value if isinstance(value, tuple) else (value,)), marks=slow)
         for value in found
     ]
+
+
+def file_seconds(
+    reports: Iterable[pytest.TestReport], before: Mapping[str, float]
+) -> dict[str, float]:
+    """Return the most seconds that a run of each file of tests took.
+
+    Args:
+        reports: reports of set-up, call and tear-down of passed items.
+        before: seconds by file of the runs before.
+    """
+    found: dict[str, float] = defaultdict(float)
+    for report in reports:
+        if isinstance(report, pytest.TestReport):
+            found[report.nodeid.partition('::')[0]] += report.duration
+    return {**before, **{file: max(took, before.get(file, 0.0)) for file, took in found.items()}}
 
 
 def tier_lines(reports: Iterable[pytest.TestReport], most: int | None = None) -> list[str]:
