@@ -40,8 +40,9 @@ style: $(DEV)
 types: $(DEV)
 	$(BIN)/pyright
 
-# a worker has a core: torch's threads would only take turns
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 \
+# a worker has a core: torch's threads would only take turns. Byte code is kept, as hundreds of child
+# processes import the package
+PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 \
 	--dist worksteal
 
 test: style  ## the linters and the fast tests (5 minutes)

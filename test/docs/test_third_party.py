@@ -18,24 +18,30 @@ def notices():
         return __import__('third_party_page')
 
 
-def test_every_package_is_on_the_page_with_its_licence(notices):
+@pytest.fixture(scope='module')
+def listed(notices):
+    """The notices, which take a look into every installed file."""
+    return tuple(notices.notices())
+
+
+def test_every_package_is_on_the_page_with_its_licence(listed):
     text = (ROOT / 'docs' / 'third_party.md').read_text(encoding='utf-8')
-    missing = [one.name for one in notices.notices() if f'| `{one.name}` |' not in text]
+    missing = [one.name for one in listed if f'| `{one.name}` |' not in text]
     assert missing == [], 'run python docs/third_party_page.py'
     assert 'not stated' not in text and '|  |  |' not in text
 
 
-def test_packages_that_carry_the_gpl_say_so(notices):
-    listed = {one.name: ' '.join(one.libraries) for one in notices.notices()}
-    assert 'x264, GPL-2.0-or-later' in listed['av'] and 'x265' in listed['av']
-    assert 'OpenSSL' in listed['opencv-python-headless']
-    others = {name for name, text in listed.items() if 'GPL' in text}
+def test_packages_that_carry_the_gpl_say_so(listed):
+    libraries = {one.name: ' '.join(one.libraries) for one in listed}
+    assert 'x264, GPL-2.0-or-later' in libraries['av'] and 'x265' in libraries['av']
+    assert 'OpenSSL' in libraries['opencv-python-headless']
+    others = {name for name, text in libraries.items() if 'GPL' in text}
     assert others <= {'av', 'opencv-python-headless'}
 
 
-def test_no_package_itself_is_under_a_licence_that_binds_this_one(notices):
-    bound = [one.name for one in notices.notices() if 'GPL' in one.licence]
-    assert all('LGPL' in one.licence for one in notices.notices() if one.name in bound), bound
+def test_no_package_itself_is_under_a_licence_that_binds_this_one(listed):
+    bound = [one for one in listed if 'GPL' in one.licence]
+    assert all('LGPL' in one.licence for one in bound), bound
 
 
 @pytest.mark.parametrize(
