@@ -108,7 +108,7 @@ def render(template: str, **values: Any) -> str:
 
 
 def clicked_frame(recording: str, seconds: float, frame: ByteArray) -> dict[str, object]:
-    """Return what `clicks.html.j2` shows of a frame (H, W, 3) uint8 RGB at a time [s]."""
+    """Return the values of `clicks.html.j2` for a frame (H, W, 3) uint8 RGB at a time [s]."""
     done, data = cv2.imencode('.jpg', frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
     assert done
     return {

@@ -148,7 +148,7 @@ class ActionStream(Stream):
 
 
 def load_mapped_robot(name: Any, info: ValidationInfo[dict[str, Any]]) -> RobotModel:
-    """Load the robot that a mapping names; its file is put into the context."""
+    """Load the robot that a mapping names, and store its file in the validation context."""
     if not isinstance(name, str):
         raise wrong("the name of a bundled robot, or a robot's YAML")
     file = _robot_path(name, info.context['folder'])

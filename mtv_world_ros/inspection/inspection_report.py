@@ -118,7 +118,7 @@ class Section:
         ]
 
     def as_json(self) -> dict[str, Any]:
-        """Return what `check.json` has of it: faults apart from checks that could not be made."""
+        """Return the entry of `check.json`; faults and impossible checks are separate lists."""
         return {
             'verdict': self.verdict,
             **{key: self.numbers.get(key) for key in NUMBERS},

@@ -87,7 +87,7 @@ _COMPILERS = {'cpu': ('CXX', ('g++', 'clang++')), 'cuda': ('CC', ('gcc', 'clang'
 
 
 def compile_blocks(transformer: MultiViewWanTransformer, device: torch.device) -> None:
-    """Compile the repeated block once for all; shapes are static, another one compiles again.
+    """Compile the transformer's repeated block; another input shape compiles it again.
 
     Raises:
         ConfigError: there is no compiler to do it.

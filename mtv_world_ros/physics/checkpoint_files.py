@@ -57,7 +57,9 @@ def load_response(folder: Path, robot: RobotModel) -> ArmResponse | None:
             "fit contact' with episodes of this robot"
         ) from error
     except (OSError, ValueError, TypeError) as error:
-        raise CheckpointError(f"'{file}' cannot be used: {error}; fit it anew") from error
+        raise CheckpointError(
+            f"'{file}' cannot be used: {error}; run mtv-world fit contact again"
+        ) from error
 
 
 def load_contact(folder: Path) -> ContactSettings | None:
@@ -72,7 +74,9 @@ def load_contact(folder: Path) -> ContactSettings | None:
     try:
         values = read_json(file)
     except (OSError, ValueError) as error:
-        raise CheckpointError(f"'{file}' cannot be used: {error}; fit it anew") from error
+        raise CheckpointError(
+            f"'{file}' cannot be used: {error}; run mtv-world fit contact again"
+        ) from error
     return validated(ContactSettings, values, f"'{file}'", error=CheckpointError)
 
 

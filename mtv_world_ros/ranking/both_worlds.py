@@ -176,7 +176,7 @@ def _masks(chunks: Sequence[ObservedChunk] | Sequence[Prediction]) -> BoolArray:
 def verdicts_part(one: SuccessEstimate, other: SuccessEstimate) -> bool:
     """Return True if one verdict is a success, the other a failure, and intervals do not overlap.
 
-    An estimate that is open, or abstains, parts from none.
+    False if either estimate is open or abstains.
     """
     calls = {verdict(estimate.probability, estimate.interval) for estimate in (one, other)}
     low = max(one.interval[0], other.interval[0])

@@ -46,14 +46,14 @@ def weighed(features: Mapping[str, float], name: str) -> float:
 
 
 class Weights(Schema):
-    """A logistic of F features, standardised, weighed and added up.
+    """Logistic regression on F standardised features.
 
     Attributes:
         features: names of the F features.
-        means: F, subtracted; what takes the place of a feature that says nothing.
-        scales: F, divided by.
-        weights: F, logit per scale.
-        bias: logit of an episode whose features are all at their mean.
+        means: (F,) mean of each feature; takes the place of a feature that is NaN.
+        scales: (F,) standard deviation of each feature.
+        weights: (F,) change of the log odds per standard deviation.
+        bias: log odds of an episode whose features are all at their mean.
     """
 
     features: ListOf[str]
@@ -83,7 +83,7 @@ class Weights(Schema):
 
 
 class Calibration(Weights):
-    """Weights that `mtv-world fit success` fitted.
+    """Calibration of the success estimate, fitted by `mtv-world fit success`.
 
     The weights are those of imagined frames. They are not used where object motion is simulated
     and drawn into the control: the frames show what was drawn, and are no second witness.
@@ -99,7 +99,7 @@ class Calibration(Weights):
         tasks: names of the tasks that were fitted on.
         num_episodes: number of episodes that were fitted on.
         num_seeds: number of rollouts of each episode.
-        l2: strength of the pull towards the stated weights (`estimator.STATED_WEIGHTS`).
+        l2: strength of the penalty on the difference from `estimator.STATED_WEIGHTS`.
         scores: scores before and after the fit, the latter on tasks that were left out of it.
         made: command, date, machine.
         fitted_to: robot, cameras and foresight of these episodes; None = it does not say, as
@@ -171,7 +171,7 @@ class Calibration(Weights):
 
 
 class HorizonCurve(Schema):
-    """Mean J of the objects that move, of episodes imagined as a whole from their first frame.
+    """Mean J of moving objects over time, in episodes imagined from their first frame.
 
     Attributes:
         period_s: period between frames [s]; frame k is `(k + 1) * period_s` ahead.
@@ -233,7 +233,7 @@ def fit_path(folder: Path, kind: type[Schema], *, of_pictures: bool = False) -> 
 
 
 def save_fit(folder: Path, fit: Calibration | HorizonCurve, *, of_pictures: bool = False) -> Path:
-    """Write it into a checkpoint; return the file. Arguments as in `fit_path`.
+    """Write a fit into a checkpoint; return the file. Arguments as in `fit_path`.
 
     Raises:
         CheckpointError: the folder cannot be written to.

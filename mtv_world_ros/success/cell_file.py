@@ -44,7 +44,7 @@ class _Contents(Schema):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CellFile:
-    """File of a robot cell.
+    """File with the evidence on contact parameters in one robot cell.
 
     Attributes:
         place: name of the robot cell; not empty.
@@ -108,13 +108,13 @@ class CellFile:
     def update(
         self, confirmation: ContactConfirmation, change: Callable[[ContactConfirmation], object]
     ) -> str:
-        """Change the evidence, beginning from what the file has by now, and write it.
+        """Read the evidence from the file, change it, and write it back.
 
-        Other processes wait meanwhile, so that nodes of one robot cell share its evidence.
+        The file is locked meanwhile, so that nodes of one robot cell share its evidence.
 
         Args:
             confirmation: gets the evidence of the file, then the change.
-            change: changes it.
+            change: function that changes the evidence.
 
         Returns:
             A remark on a file that was damaged; empty = it was not.

@@ -74,16 +74,16 @@ class ComparedPair:
 
     @property
     def better(self) -> int | None:
-        """Index of the better plan; None = not told."""
+        """Index of the better plan; None = neither is better."""
         if RULE.is_better(self.num_first, self.num_second):
             return self.first
         return self.second if RULE.is_better(self.num_second, self.num_first) else None
 
     @property
     def confidence(self) -> float:
-        """Probability that the plan with more successes is better in most futures that differ.
+        """Probability that the plan with more successes is the better one.
 
-        Of futures drawn from the same distribution, which need not be this robot's contact. A
+        The futures that differ are a sample of a distribution, which need not be this robot's. A
         beta posterior of the share, with a uniform prior: .5 where no outcome differs.
         """
         more, less = sorted((self.num_first, self.num_second), reverse=True)
@@ -98,8 +98,8 @@ class Comparison:
 
     Attributes:
         outcomes: outcomes of each of P plans.
-        pairs: all pairs of plans; empty = nothing is told.
-        reason: reason why nothing is told; empty = something may be.
+        pairs: all pairs of plans; empty = the plans cannot be compared.
+        reason: reason why the plans cannot be compared; empty = they can.
         is_fitted: whether futures have contact that was fitted in this robot cell.
     """
 
@@ -142,13 +142,13 @@ class Comparison:
         return 0 if self.reason else len(_common(self.outcomes))
 
     def pair(self, first: int, second: int) -> ComparedPair | None:
-        """Return the pair of two plans; None = nothing is told."""
+        """Return the pair of two plans; None = the plans cannot be compared."""
         wanted = {first, second}
         return next((pair for pair in self.pairs if {pair.first, pair.second} == wanted), None)
 
     @property
     def num_successes(self) -> tuple[int, ...]:
-        """Number of common futures in which each plan succeeds; empty = nothing is told."""
+        """Number of common futures in which each plan succeeds; empty = not compared."""
         if self.reason:
             return ()
         common = _common(self.outcomes)
@@ -156,7 +156,7 @@ class Comparison:
 
     @property
     def beaten(self) -> frozenset[int]:
-        """Plans than which another one is better.
+        """Indices of the plans to which another plan is preferred.
 
         Never all: a better plan succeeds in more of the common futures.
         """
@@ -168,7 +168,7 @@ class Comparison:
 
     @property
     def best(self) -> int:
-        """Index of the first plan than which no other is better."""
+        """Index of the first plan to which no other is preferred."""
         return next(k for k in range(len(self.outcomes)) if k not in self.beaten)
 
     @property
@@ -178,7 +178,7 @@ class Comparison:
         return self.told_as(range(1, count + 1), count)
 
     def told_as(self, numbers: Sequence[int], count: int) -> str:
-        """Return the choice in words, for plans that have other numbers.
+        """Return the choice in words, with other numbers for the plans.
 
         Args:
             numbers: number of each plan.

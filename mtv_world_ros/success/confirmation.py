@@ -47,7 +47,7 @@ class ConfirmationSettings:
 
     @property
     def log_evidence(self) -> float:
-        """Evidence that confirms: by Ville's inequality, rarely reached if parameters do not hold.
+        """Log evidence at which a task is confirmed, by Ville's inequality.
 
         Under the null hypothesis the product of likelihood ratios has a mean of at most 1, however
         many rollouts there are, and so reaches 1 / `false_acceptance` with that probability at
@@ -115,7 +115,7 @@ class TaskEvidence(Schema):
 
     @property
     def counts(self) -> str:
-        """Numbers of ends, in words."""
+        """Counts of foreseen, unforeseen and unseen ends, in words."""
         seen = self.num_foreseen + self.num_unforeseen
         of = seen if not self.num_missing else self.num_foreseen + self.num_missing
         text = f'{self.num_foreseen} of {of} ends as foreseen'
@@ -209,7 +209,7 @@ class ContactConfirmation:
         self._follow(rollout, task).is_whole = False
 
     def finish(self) -> None:
-        """Count the present rollout, which no chunk follows any more."""
+        """Count the present rollout as ended."""
         if self._rollout is not None:
             self._count(self._rollout, is_foreseen=None)
 

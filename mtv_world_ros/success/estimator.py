@@ -141,7 +141,7 @@ class JudgedChunk(NamedTuple):
 
 
 class SuccessEstimator:
-    """Judge rollouts of known tasks."""
+    """Estimates the success of rollouts of known tasks."""
 
     def __init__(
         self,

@@ -85,7 +85,7 @@ class ImaginedScene:
         return point
 
     def goal(self, role: str) -> FloatArray:
-        """See `Situation`; no picture shows it."""
+        """Raise CannotTell: pictures do not show the goal of a scene."""
         raise CannotTell(f"where '{self.bound[role]}' is to go is not known")
 
     def size(self, role: str) -> FloatArray:

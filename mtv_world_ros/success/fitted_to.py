@@ -26,10 +26,10 @@ def _placement(camera: CameraModel) -> FloatArray:
 
 
 class CameraRange(Schema):
-    """Range of the cameras of one view, in the numbers of `_placement`.
+    """Range of camera poses and intrinsics of one view, in the quantities of `_placement`.
 
     Attributes:
-        mount_link: link that carries them.
+        mount_link: link that carries the cameras.
         low: (10,) smallest values.
         high: (10,) largest values.
     """

@@ -49,7 +49,7 @@ class ForeseenEnds:
 
     @property
     def num_effective(self) -> float:
-        """Number of equally weighted motions that would tell as much."""
+        """Effective sample size: number of equally weighted motions with the same information."""
         return float(self.weights.sum() ** 2 / (self.weights**2).sum())
 
     @property
@@ -61,7 +61,7 @@ class ForeseenEnds:
 def foreseen_ends(
     motions: ForeseenMotions, task: TaskSpec, bound: Mapping[str, str], starts: FloatArray
 ) -> ForeseenEnds | None:
-    """Return the outcome of the task at the end of each motion; None = it cannot be told.
+    """Return the outcome of the task at the end of each motion; None = not known.
 
     Args:
         motions: motions of the objects, in several futures.
@@ -105,7 +105,7 @@ class PictureGap:
 
 
 def picture_gap(views: Views, motions: ForeseenMotions, names: Sequence[str]) -> PictureGap | None:
-    """Return how far imagined frames are from the motion that was drawn into their control.
+    """Return the distance of imagined objects from the motion drawn into the control.
 
     Args:
         views: masks of the imagined frames up to the end of the motions.

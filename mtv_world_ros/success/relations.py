@@ -98,7 +98,7 @@ class Relation(Schema):
 
     @property
     def roles(self) -> tuple[str, ...]:
-        """Placeholders that the relation is about, the one that moves first."""
+        """Placeholders of the relation; the moving object comes first."""
         return tuple(getattr(self, key) for key in ('subject', 'target') if hasattr(self, key))
 
     def goal(self, at: Situation) -> Goal | None:

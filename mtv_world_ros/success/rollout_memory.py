@@ -51,7 +51,7 @@ class Footage:
 
     @property
     def num_frames(self) -> int:
-        """T."""
+        """Number of predicted frames, T."""
         return self.masks.masks.shape[2]
 
     def frame_masks(self, frame: int) -> BoolArray:
@@ -127,12 +127,12 @@ class RolloutMemory:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """O names."""
+        """Names of the O objects."""
         return self.start_masks.names
 
     @property
     def num_frames(self) -> int:
-        """N."""
+        """Number of frames until now, N."""
         return self.points.shape[1]
 
     def start_point(self, item: int) -> FloatArray:

@@ -48,7 +48,7 @@ def share_logit(features: Mapping[str, float]) -> float:
 
 
 class ShareFit(Schema):
-    """Logistic of the log odds of the share of futures that succeed.
+    """Logistic regression on the log odds of the share of successful futures.
 
     The default is the share itself. The fit to episodes of known outcome corrects what futures do
     not know: shapes, masks, an engine that is not the world.

@@ -65,7 +65,7 @@ _Nouns = Annotated[ListOf[str], expected('a list of words', EXPECTED, parts=2)]
 
 
 class TaskSpec(Schema):
-    """One task.
+    """Definition of a task: instruction template and relations of objects.
 
     Attributes:
         name: name of the task, e.g. `stack_blocks_two`.
@@ -191,7 +191,7 @@ def _bare(text: str) -> str:
 
 
 def object_called(name: str, names: Sequence[str]) -> str | None:
-    """Return the one of several objects that a name means; None = none, or more than one.
+    """Return the object that a name refers to; None = no object, or more than one.
 
     Args:
         name: name as an instruction says it, e.g. `towel`.

@@ -27,7 +27,7 @@ _HIDDEN_BELOW = 0.8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Views:
-    """The last chunk of a rollout, and what is remembered of the rollout.
+    """Masks of the last chunk of a rollout, and the memory of the chunks before.
 
     Attributes:
         footage: the last chunk.
@@ -64,12 +64,12 @@ class Views:
         return self.memory.start_masks.masks[:, item, 0]
 
     def start_ok(self, item: int) -> BoolArray:
-        """Return (V,) whether that mask is to be trusted."""
+        """Return (V,) True where the start mask of an object is reliable."""
         ok = np.array([row[item] == 'ok' for row in self.memory.start_masks.status])
         return ok & self._is_used()
 
     def end_ok(self, item: int) -> BoolArray:
-        """Return (V,) whether the object is known, and seen in the last frame."""
+        """Return (V,) True where the object is known, and seen in the last frame."""
         return self.footage.known(self.footage.num_frames)[:, item] & self._is_used()
 
     def start_jaccard(self, item: int) -> FloatArray:

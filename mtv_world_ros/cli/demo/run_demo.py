@@ -284,7 +284,7 @@ def _chunk(
     if len(inside) != count:
         raise EpisodeError(
             f'{len(inside)} of {count} frames of rollout {report.get("rollout")} chunk '
-            f'{report.get("chunk")} were received'
+            f'{report.get("chunk")} were received; the machine was too busy, run the demo again'
         )
     # where rollouts overlap, a stamp was predicted twice; each chunk takes the oldest left
     frames = {

@@ -54,7 +54,7 @@ class RandomizationConfig:
     placement: PlacementConfig | None = None
 
     def of(self, workcell: Workcell) -> RandomizationConfig:
-        """Return it with the cameras and limits of a workcell where it has none."""
+        """Return the configuration; missing cameras and limits come from the workcell."""
         return replace(
             self,
             cameras=self.cameras or workcell.cameras,

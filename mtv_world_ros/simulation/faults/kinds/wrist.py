@@ -54,7 +54,7 @@ def rocking_before_grasp(move: MovePlan, size: float) -> MovePlan:
 
 @fault.way_points('rock', FaultSize(0.45, 0.6, (0.42, 0.48), 'rad'), needs=GRIPPER)
 def rocking_before_release(move: MovePlan, size: float) -> MovePlan:
-    """What it holds leans to and fro on its goal, up to this far, before it is let go."""
+    """The held object rocks on its goal by up to this angle before it is released."""
     at = move.index('open')
     return move.insert(at, rock(move.stops[at - 1], size, move.rng))
 
