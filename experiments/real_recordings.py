@@ -2,6 +2,8 @@
 
     python experiments/real_recordings.py verdicts EPISODES [--task TASK.yaml] [--every 8]
     python experiments/real_recordings.py grips EPISODES [--robot ROBOT] [--out FOLDER]
+    python experiments/real_recordings.py shares EPISODES --contact FOLDER [--every 24]
+                                [--memory off]
     python experiments/real_recordings.py carried EPISODES --checkpoint CHECKPOINT
     python experiments/real_recordings.py rollouts EPISODES --checkpoint CHECKPOINT [--memory off]
                                 [--foresight off] [--out out/real_rollouts]
@@ -14,7 +16,9 @@ frames, so that most cuts are failures; somebody who looks at the frames says wh
 right. `grips` prints when something stops the fingers, and whether it is held by the masks that
 follow, which somebody compares with the frames (--out has pictures of each stop); of
 simulated episodes it counts the frames in which an object goes along with a tool, and in which all
-are far from it, with the stops among them. `carried` compares where objects are foreseen in each chunk, from the recorded frame that it
+are far from it, with the stops among them. `shares` foresees the rest of a recording from later
+and later frames, by the masks of the import, and prints the share of futures in which the task
+succeeds, with and without the memory of what frames before showed; no picture is imagined. `carried` compares where objects are foreseen in each chunk, from the recorded frame that it
 starts from, with their recorded masks and with the first frame held; no picture is imagined.
 `rollouts` imagines recordings whole from their first frame: J of the arm in the first chunk and in
 all, PSNR, and J of moving objects, with and without the memory of the background, and foreseen objects. It writes the
@@ -61,7 +65,13 @@ from mtv_world_ros.evaluation.metrics.arm_masks import arm_scenes
 from mtv_world_ros.evaluation.metrics.jaccard_scores import find_masks, true_masks
 from mtv_world_ros.evaluation.metrics.statistics import mean_interval
 from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.physics.checkpoint_files import load_contact
+from mtv_world_ros.physics.foreseen_motions import foreseen_of
+from mtv_world_ros.physics.grasp_attempts import foreseen_attempts
 from mtv_world_ros.physics.grips import watch_fingers
+from mtv_world_ros.physics.object_motion import FoundObjects
+from mtv_world_ros.physics.sights import Sights
+from mtv_world_ros.physics.solid_foresight import SolidForesight
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import load_shape
@@ -69,8 +79,9 @@ from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.success.estimator import SuccessEstimator, verdict_word
+from mtv_world_ros.success.foreseen import foreseen_ends
 from mtv_world_ros.success.rollout_memory import footage_of
-from mtv_world_ros.success.task import load_task, load_tasks
+from mtv_world_ros.success.task import load_task, load_tasks, match_task, object_called, TaskSpec
 from mtv_world_ros.viewing.video import Comparison, contact_sheet
 from mtv_world_ros.vision.held_objects import Hold, judge_stops, Stop, tools_in_views
 from mtv_world_ros.vision.jaccard import jaccard
@@ -497,10 +508,99 @@ def _moving(
     return scores
 
 
+def shares_over_time(arguments: argparse.Namespace) -> None:
+    """Print the share of futures that succeed, foreseen from later and later recorded frames."""
+    folder: Path = arguments.episodes
+    width, height = RECORDED_SIZE
+    spec = WorldModelSpec(
+        views=arguments.views, fps=RECORDED_FPS, num_frames=8, width=width, height=height, robot=''
+    )
+    robot = load_robot(folder / 'robot' / 'robot.yaml')
+    settings = load_contact(arguments.contact)
+    if settings is None:
+        raise SystemExit(f"'{arguments.contact}' has no contact.json")
+    tasks = (
+        *load_tasks(share_path('config', 'tasks', 'any_size')),
+        *map(load_task, arguments.task),
+    )
+    rows = []
+    for path in list_episodes(folder):
+        recording = load_recording(path, spec, robot)
+        matched = match_task(tasks, recording.instruction)
+        if matched is None or recording.object_ids is None:
+            rows.append((path.name, '-', '-', '-', '-', 'no known task'))
+            continue
+        masks = masks_from_ids(recording.object_ids, recording.objects, recording.names).masks
+        foresight = SolidForesight(robot, None, settings)
+        for start in range(0, len(recording.times) - 2, arguments.every):
+            row = _foreseen_from(recording, masks, foresight, matched, start, arguments.memory)
+            rows.append((path.name, f'{recording.times[start] - recording.times[0]:.1f}', *row))
+            print('| ' + ' | '.join(rows[-1]) + ' |', flush=True)
+    head = ('recording', 'from [s]', 'share', 'worth futures', 'kept poses', 'attempts')
+    print(table(head, rows))
+
+
+def _foreseen_from(
+    recording: Recording,
+    masks: BoolArray,
+    foresight: SolidForesight,
+    matched: tuple[TaskSpec, Mapping[str, str]],
+    start: int,
+    memory: str,
+) -> tuple[str, str, str, str]:
+    """Return share, number of futures it is worth, kept poses and attempts, in words."""
+    robot, names = foresight.robot, recording.names
+    motion, period_s = motion_of(recording, robot), 1 / RECORDED_FPS
+    given = recording.cameras, list(motion.camera_poses[:, 0])
+    tracked = whole = foresight.find(names, masks[:, :, 0], *given)
+    words = []
+    if start:
+        stopped, fingers = watch_fingers(motion.openings[:, : start + 1], period_s)
+        seen, kept = motion.first(start + 1), ()
+        if memory == 'on':
+            sights = Sights.begin(names, seen)
+            sights = sights.after(seen, masks[:, :, : start + 1], stopped, period_s)
+            fingers, kept = (
+                replace(fingers, is_refuted=sights.refuted),
+                sights.kept(seen.last().tools[:, 0]),
+            )
+            words = [
+                f'{name} {"held" if one.is_held else "stays"} {one.age_s:.1f} s'
+                for name, one in zip(names, kept, strict=True)
+                if one is not None
+            ]
+        given = recording.cameras, list(motion.camera_poses[:, start])
+        tracked, _, _ = foresight.find_again(whole, names, masks[:, :, start], *given, kept)
+        tracked = tracked.with_fingers(fingers)
+    views, (height, width) = len(recording.cameras), masks.shape[-2:]
+    found = FoundObjects(
+        names=names,
+        cuts=np.zeros((views, len(names), height, width, 4), np.uint8),
+        poses=np.repeat(motion.camera_poses[:, start][:, None], len(names), axis=1),
+        tracked=tracked,
+    )
+    times = recording.times[start:] - recording.times[start]
+    fine = np.arange(0.0, times[-1] + 1e-9, tracked.step_s / tracked.commands_a_step)
+    fine = fine[: 1 + (len(fine) - 1) // tracked.commands_a_step * tracked.commands_a_step]
+    columns = [np.interp(fine, times, column) for column in recording.positions[start:].T]
+    found = found.after(np.stack(columns, axis=-1))
+    motions = foreseen_of(robot, found, len(found.motions[0].points))
+    task, bound = matched
+    bound = {role: object_called(name, names) or name for role, name in bound.items()}
+    ends = foreseen_ends(motions, task, bound, whole.centres)
+    tries = '; '.join(
+        f'{a.closed_s:.1f} s {a.name} {a.share:.2f}' for a in foreseen_attempts(motions)
+    )
+    if ends is None:
+        doubts = '; '.join(dict.fromkeys(tracked.doubts.values()))
+        return '-', '-', ', '.join(words), doubts or tries
+    return f'{ends.share:.2f}', f'{ends.num_effective:.1f}', ', '.join(words), tries
+
+
 def main() -> None:
     """Run one of the measurements."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n', 1)[0])
-    parser.add_argument('what', choices=('verdicts', 'grips', 'carried', 'rollouts'))
+    parser.add_argument('what', choices=('verdicts', 'grips', 'shares', 'carried', 'rollouts'))
     parser.add_argument('episodes', type=Path)
     parser.add_argument(
         '--views', type=lambda text: tuple(text.split(',')), default=('ext1', 'ext2')
@@ -509,6 +609,7 @@ def main() -> None:
     parser.add_argument('--every', type=int, default=8, help='frames between two cuts')
     parser.add_argument('--checkpoint', default='')
     parser.add_argument('--robot', help='of grips: YAML or bundled; default: of EPISODES')
+    parser.add_argument('--contact', type=Path, help='of shares: folder with contact.json')
     parser.add_argument('--memory', choices=('on', 'off'), default='on')
     parser.add_argument('--foresight', choices=('on', 'off'), default='on')
     parser.add_argument('--seed', type=int, default=0)
@@ -517,6 +618,7 @@ def main() -> None:
     {
         'verdicts': judge_recorded,
         'grips': print_grips,
+        'shares': shares_over_time,
         'carried': compare_carried,
         'rollouts': imagine_whole,
     }[arguments.what](arguments)
