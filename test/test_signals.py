@@ -69,7 +69,10 @@ def test_a_command_that_runs_ends_with_one_line(number, tmp_path):
     words = ('mtv_world_ros.cli', 'replay', str(EPISODE), '--offline', '--out', 'out')
     status, said = stopped(tmp_path, 'torch', number, *words)
     assert status == 128 + number
-    assert said == [f'mtv-world: stopped ({signal.Signals(number).name})']
+    assert said == [
+        'mtv-world: replay: loading',
+        f'mtv-world: stopped ({signal.Signals(number).name})',
+    ]
     assert not (tmp_path / 'out').exists()
 
 
