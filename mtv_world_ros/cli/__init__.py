@@ -21,6 +21,7 @@ from pathlib import Path  # noqa: E402
 import shlex  # noqa: E402
 import sys  # noqa: E402
 import threading  # noqa: E402
+import time  # noqa: E402
 from types import ModuleType  # noqa: E402
 from typing import Any  # noqa: E402
 import warnings  # noqa: E402
@@ -70,6 +71,8 @@ _GROUPS = {
 _OWN = 'mtv_world_ros.'
 #: time after which a command says that it is loading; most mistakes are found before [s]
 _FIRST_LINE_S = 0.5
+#: time between further lines until the progress is shown [s]
+_NEXT_LINE_S = 30.0
 #: control characters that messages may hold
 _LINES = '\n\t'
 _DESCRIPTION = 'An online embodied world model for ROS 2.'
@@ -313,13 +316,26 @@ def _said_to_load(words: Sequence[str]) -> Iterator[None]:
     if not name or not COMMANDS[name].is_long or is_helper_rank():
         yield
         return
-    timer = threading.Timer(_FIRST_LINE_S, _said, [f'{name}: loading', 0])
-    timer.daemon = True
-    timer.start()
+    done = threading.Event()
+    threading.Thread(target=_say_loading, args=(name, done), daemon=True).start()
     try:
         yield
     finally:
-        timer.cancel()
+        done.set()
+
+
+def _say_loading(name: str, done: threading.Event) -> None:
+    """Print that a command is loading, then the seconds so far until it shows its progress."""
+    begun_s, wait_s, num_shown = time.monotonic(), _FIRST_LINE_S, _num_progresses()
+    while not done.wait(wait_s) and _num_progresses() == num_shown:
+        so_far = '' if wait_s == _FIRST_LINE_S else f', {time.monotonic() - begun_s:.0f} s so far'
+        _said(f'{name}: loading{so_far}', 0)
+        wait_s = _NEXT_LINE_S
+
+
+def _num_progresses() -> int:
+    progress = sys.modules.get('mtv_world_ros.core.progress')  # importing it may wait for others
+    return progress.Progress.num_shown if progress else 0
 
 
 @contextmanager

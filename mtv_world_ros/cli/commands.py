@@ -36,7 +36,8 @@ COMMANDS = {
         'imagine', 'play an episode into ROS topics, or imagine it offline', 'Look', 'add_replay'
     ),
     'view': CommandEntry(
-        'view', 'show episodes, predictions, rankings or a running node in Rerun', 'Look'
+        'view', 'show episodes, predictions, rankings or a running node in Rerun', 'Look',
+        is_long=False,
     ),
     'imagine': CommandEntry(
         'imagine', 'run a policy for whole episodes in the world model', 'Run', 'add_imagine'

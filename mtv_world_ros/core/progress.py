@@ -32,7 +32,12 @@ class Progress(tqdm):
         is_shown: False prints nothing.
         line_s: time between two lines [s].
         options: other options of tqdm: `desc`, `total`, `initial`.
+
+    Attributes:
+        num_shown: number of progresses that were shown in this process.
     """
+
+    num_shown = 0
 
     def __init__(
         self,
@@ -56,6 +61,7 @@ class Progress(tqdm):
         self._begun_s, self._begun_n = time.monotonic(), self.n
         self._closed = threading.Event()
         if is_shown:
+            Progress.num_shown += 1
             period = _CLOCK_S if self._is_bar else line_s
             arguments = (weakref.ref(self), self._closed, period)
             threading.Thread(target=_tick, args=arguments, name=THREAD, daemon=True).start()

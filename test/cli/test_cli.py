@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 import subprocess
 import sys
+import time
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 from mtv_world_ros.cli import imagine, main
 from mtv_world_ros.cli.commands import REMOVED_OPTIONS
 from mtv_world_ros.core.files import share_path
+from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.rollout import offline
 from mtv_world_ros.rollout.offline import ReplaySummary
 from mtv_world_ros.viewing import sheets
@@ -242,3 +244,24 @@ def test_a_command_that_takes_seconds_says_that_it_is_loading(tmp_path):
     words = [sys.executable, '-c', code, 'replay', str(tmp_path), '--offline']
     run = subprocess.run([*words, '--out', str(tmp_path / 'out')], capture_output=True, text=True)
     assert run.stderr == 'mtv-world: replay: loading\n'
+
+
+def test_a_command_that_still_loads_says_so_until_it_shows_its_progress(capsys, monkeypatch):
+    monkeypatch.setattr('mtv_world_ros.cli._FIRST_LINE_S', 0.05)
+    monkeypatch.setattr('mtv_world_ros.cli._NEXT_LINE_S', 0.06)
+
+    def work(_):
+        time.sleep(0.5)
+        with Progress(total=1):
+            time.sleep(0.1)  # a line may be on its way
+            told.append(capsys.readouterr().err)
+            time.sleep(0.3)
+        return 0
+
+    told = []
+    monkeypatch.setattr('mtv_world_ros.cli.imagine._replay', work)
+    assert main(['replay', 'x', '--offline', '--out', 'y']) == 0
+    first, second, *_ = told[0].splitlines()
+    assert first == 'mtv-world: replay: loading'
+    assert second.startswith('mtv-world: replay: loading, ') and second.endswith(' s so far')
+    assert capsys.readouterr().err == ''
