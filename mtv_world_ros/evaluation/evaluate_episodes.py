@@ -215,7 +215,7 @@ def _progress(results: Sequence[EpisodeResult]) -> str:
         float(mean_of_known(np.array([found[key] for found in means])))
         for key in ('j_moving', 'j_copy_moving')
     )
-    return f'J moving {moving:.3f}, persistence {copy:.3f}'
+    return f'J of moving objects {moving:.3f}, still picture {copy:.3f}'
 
 
 def _distances(
