@@ -38,7 +38,7 @@ from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.objective import NoiseDraws
 from mtv_world_ros.training.trainer import batch_loss, Trainer
 from mtv_world_ros.training.training_config import load_training_config
-from mtv_world_ros.training.training_run import load_recordings, spread
+from mtv_world_ros.training.training_run import load_episodes, spread
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
 _WARM_UP = 2
@@ -61,9 +61,9 @@ def make(options: argparse.Namespace) -> tuple[Trainer, BatchSource]:
     """The trainer and its data, as `mtv-world train` makes them."""
     overrides = {**set_overrides(options.set), 'optimizer.steps': 10**6}
     config = load_training_config(options.preset, overrides)
-    spec, robot = config.spec, load_robot(robot_path(config.video.robot))
+    robot = load_robot(robot_path(config.video.robot))
     paths = spread(select(options.train, default='train').paths, options.episodes)
-    recordings, _ = load_recordings(paths, spec, robot, options.work / 'cache')
+    episodes, _ = load_episodes(paths, config, robot, options.work / 'cache')
     trainer = Trainer(
         config,
         options.work,
@@ -73,7 +73,7 @@ def make(options: argparse.Namespace) -> tuple[Trainer, BatchSource]:
         trained_on={},
     )
     source = BatchSource(
-        recordings,
+        episodes,
         config,
         robot=robot,
         segmenter=choose_segmenter('colour'),

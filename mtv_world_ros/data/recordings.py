@@ -224,7 +224,7 @@ def cached_recording(
         source: topics and calibration of the episode.
         read: reads a file of the cache, as `read_arrays` does.
     """
-    stored = cache / f'{_key(path, spec, robot, source)}.npz'
+    stored = cache / f'{recording_key(path, spec, robot, source)}.npz'
     if stored.is_file():
         with suppress(OSError, ValueError, LookupError, TypeError):
             return _load(stored, path, read)  # where it is damaged it is made anew
@@ -236,7 +236,14 @@ def cached_recording(
     return replace(recording, recorded=()) if read is read_arrays else _load(stored, path, read)
 
 
-def _key(path: Path, spec: WorldModelSpec, robot: RobotModel, source: EpisodeSource) -> str:
+def recording_key(
+    path: Path, spec: WorldModelSpec, robot: RobotModel, source: EpisodeSource = DEFAULT
+) -> str:
+    """Return the name of an episode's file in a cache, without its suffix; see `cached_recording`.
+
+    Raises:
+        OSError: the folder or its calibration cannot be read.
+    """
     files = sorted((f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in path.iterdir())
     parts = [_VERSION, str(path.resolve()), files, spec.views, spec.width, spec.height,
              robot.name, robot.joint_names]  # fmt: skip

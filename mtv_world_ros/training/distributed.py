@@ -146,17 +146,25 @@ class Processes:
             dist.broadcast_object_list(held, src=0)
         return held[0]
 
+    def of_all(self, value: Value) -> list[Value]:
+        """Return the values of all processes (pickled on their way), which have to call this.
+
+        Raises:
+            TrainingError: another process is gone.
+        """
+        found = [value] * self.count
+        if self.count > 1:
+            with self.losses_named():
+                dist.all_gather_object(found, value)
+        return found
+
     def check_same(self, what: str, value: str) -> None:
         """Check that a value is the same in all processes, which have to call this.
 
         Raises:
             TrainingError: values differ; names the first process with another one.
         """
-        if self.count == 1:
-            return
-        found: list[str] = [''] * self.count
-        with self.losses_named():
-            dist.all_gather_object(found, value)
+        found = self.of_all(value)
         for number, theirs in enumerate(found):
             if theirs != found[0]:
                 raise TrainingError(

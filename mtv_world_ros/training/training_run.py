@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import json
 import math
 from pathlib import Path
@@ -30,12 +30,11 @@ from mtv_world_ros.core.errors import (
     TrainingInterrupted,
 )
 from mtv_world_ros.core.files import whole_folder, write_whole
-from mtv_world_ros.core.processes import is_helper_rank
 from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode_reader import list_episodes, read_info
 from mtv_world_ros.data.recording import DEFAULT, Recording
-from mtv_world_ros.data.recordings import cached_recording, clip_starts, described_objects
+from mtv_world_ros.data.recordings import clip_starts, described_objects
 from mtv_world_ros.model.card import CAMERAS, CARD, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.runtime import check_device, choose_dtype
@@ -45,13 +44,17 @@ from mtv_world_ros.robot.model import check_positions, RobotModel
 from mtv_world_ros.robot.shape import moving_links
 from mtv_world_ros.training.base_checkpoint import load_base, needs_base
 from mtv_world_ros.training.clips.batches import BatchSource
+from mtv_world_ros.training.clips.episode_index import (
+    index_episodes,
+    IndexedEpisode,
+    RecordingReader,
+)
 from mtv_world_ros.training.clips.fit_control import fitted_control
 from mtv_world_ros.training.clips.latent_cache import cached_batches, CachedSource
-from mtv_world_ros.training.clips.mapped_arrays import read_mapped
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.log import TrainingLog
-from mtv_world_ros.training.resume import check_architecture, disk_errors_named, DiskError, STATE
+from mtv_world_ros.training.resume import check_architecture, disk_errors_named, STATE
 from mtv_world_ros.training.trainer import check_processes, Trainer
 from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
 from mtv_world_ros.training.unknown_cameras import unknown_camera_lines
@@ -84,55 +87,56 @@ def spread(paths: Sequence[Path], count: int | None) -> list[Path]:
     return [paths[index * len(paths) // count] for index in range(count)]
 
 
-def load_recordings(
+def load_episodes(
     paths: Sequence[Path],
-    spec: WorldModelSpec,
+    config: TrainingConfig,
     robot: RobotModel,
     cache: Path,
     source: EpisodeSource = DEFAULT,
     describer: Describer | None = None,
     broken: Mapping[str, str] = MappingProxyType({}),
-) -> tuple[list[Recording], dict[str, str]]:
-    """Return the usable recordings, and the reason for each one left out, by path.
+    processes: Processes | None = None,
+) -> tuple[list[IndexedEpisode], dict[str, str]]:
+    """Return the usable episodes, and the reason for each one left out, by path.
 
     Args:
         paths: folders of episodes.
-        spec: sizes and rates of the model's inputs and outputs.
+        config: the preset.
         robot: kinematics and limits of the recorded robot.
-        cache: folder of the decoded recordings.
+        cache: folder of the decoded recordings and of their index.
         source: topics and calibration of the episodes.
         describer: names the objects; None = the names stored with the episodes, else those of
             the instructions.
         broken: reasons why episodes are left out, by path.
+        processes: processes that train together and read a share each; None = this one alone.
 
     Raises:
         TrainingError: none is usable.
         DiskError: the cache cannot be written.
     """
-    recordings, skipped = [], {}
-    for path in Progress(
-        paths, desc='reading episodes', unit='episode', is_shown=not is_helper_rank()
-    ):
-        try:
-            if str(path) in broken:
-                raise EpisodeError(broken[str(path)])
-            with disk_errors_named(cache):
-                recording = cached_recording(path, spec, robot, cache, source, read_mapped)
-            check_clips(recording, spec)
-            check_recording(recording, robot)
-            if describer is not None:
-                named = described_objects(path, describer, spec.views[0], source)
-                recording = replace(recording, described=named)
-        except DiskError:
-            raise
-        except MtvWorldError as error:
-            skipped[str(path)] = str(error)
-        else:
-            recordings.append(recording)
-    if not recordings:
+    spec = config.spec
+
+    def check(recording: Recording) -> None:
+        check_clips(recording, spec)
+        check_recording(recording, robot)
+
+    def describe(path: Path) -> tuple[str, ...]:
+        assert describer is not None
+        return described_objects(path, describer, spec.views[0], source)
+
+    episodes, skipped = index_episodes(
+        paths,
+        config,
+        RecordingReader(spec, robot, cache, source),
+        processes or Processes('cpu'),
+        check=check,
+        describe=describe if describer else None,
+        broken=broken,
+    )
+    if not episodes:
         reasons = '; '.join(reason_lines(skipped) or ['none given'])
         raise TrainingError(f'no usable episode: {_other_robot(paths, robot)}{reasons}')
-    return recordings, skipped
+    return episodes, skipped
 
 
 #: joints outside their limits by more are of another unit, zero or robot [rad or m]
@@ -240,21 +244,21 @@ def train(
         check_architecture(out, config)
     out.mkdir(parents=True, exist_ok=True)
     paths = find_episodes(run.dataset) if isinstance(run.dataset, Path) else run.dataset
+    episodes, skipped = load_episodes(
+        spread(paths, run.num_episodes),
+        config,
+        robot,
+        run.cache or out / 'cache',
+        run.source,
+        describer,
+        run.broken,
+        processes,
+    )
+    _save_robot(robot, episodes, out / ROBOT_FOLDER, processes)
     with processes.main_first():
-        recordings, skipped = load_recordings(
-            spread(paths, run.num_episodes),
-            config.spec,
-            robot,
-            run.cache or out / 'cache',
-            run.source,
-            describer,
-            run.broken,
-        )
-    _save_robot(robot, recordings, out / ROBOT_FOLDER, processes)
-    with processes.main_first():
-        control = fitted_control(out, config, recordings, robot, initial=run.initial)
+        control = fitted_control(out, config, episodes, robot, initial=run.initial)
     source: BatchSource | CachedSource = BatchSource(
-        recordings,
+        episodes,
         config,
         robot=robot,
         segmenter=segmenter,
@@ -262,6 +266,7 @@ def train(
         seed=run.seed,
         workers=run.data_workers,
         numbers=processes.share(config.optimizer.batch_size),
+        pin=processes.device.type == 'cuda',
     )
     base = None
     if needs_base(config):
@@ -269,16 +274,16 @@ def train(
             config, run.initial, processes.device, dtype, seed=run.seed, layout=control.layout
         )
     if run.latent_cache is not None:
-        with processes.main_first():
-            source = cached_batches(
-                source,
-                run.latent_cache,
-                config,
-                base,
-                seed=run.seed,
-                dtype=dtype,
-                processes=processes,
-            )
+        source = cached_batches(
+            source,
+            run.latent_cache,
+            config,
+            base,
+            seed=run.seed,
+            dtype=dtype,
+            processes=processes,
+            workers=run.data_workers,
+        )
     trainer = Trainer(
         config.with_steps(source.num_clips),
         out,
@@ -286,9 +291,9 @@ def train(
         device=run.device,
         dtype=dtype,
         trained_on={
-            'episodes': len(recordings),
+            'episodes': len(episodes),
             'skipped': len(skipped),
-            'tasks': sorted({recording.task for recording in recordings}),
+            'tasks': sorted({episode.task for episode in episodes}),
             'clips': source.num_clips,
         },
         processes=processes,
@@ -297,23 +302,24 @@ def train(
     )
     resumed = trainer.load_state()
     trainer.trained_on |= _trained_episodes(
-        recordings, run.initial, trainer.result if resumed else None
+        episodes, run.initial, trainer.result if resumed else None
     ).as_card()
     if run.initial is not None and base is None and not resumed:
         trainer.start_from(run.initial)
     if resumed and processes.of_main(_steps_of(trainer.result)) != trainer.step:
         trainer.export(trainer.result)  # killed after the state was saved
     if processes.is_main:
+        num_dropped = sum(episode.num_dropped for episode in episodes)
         write_whole(out / 'skipped.json', json.dumps(skipped, indent=2))
         Progress.write(
-            f'{len(recordings)} episodes, {len(skipped)} left out (see {out / "skipped.json"}), '
-            f'{source.num_clips} clips, {num_dropped(recordings, config.spec)} dropped for '
+            f'{len(episodes)} episodes, {len(skipped)} left out (see {out / "skipped.json"}), '
+            f'{source.num_clips} clips, {num_dropped} dropped for '
             f'gaps; {"resumed at" if resumed else "starting from"} step {trainer.step}; '
             f'{processes.count} processes'
         )
         left_out = [f'left out: {line}' for line in reason_lines(skipped)]
-        left_out += unknown_camera_lines(skipped, len(recordings) + len(skipped))
-        told = training_notes(trainer.config, recordings, None if resumed else run.initial)
+        left_out += unknown_camera_lines(skipped, len(episodes) + len(skipped))
+        told = training_notes(trainer.config, episodes, None if resumed else run.initial)
         for line in [*left_out, *told]:
             Progress.write(line)
     ideal = None
@@ -330,10 +336,10 @@ def train(
 
 
 def _trained_episodes(
-    recordings: Sequence[Recording], initial: Checkpoint | None, earlier: Path | None
+    episodes: Sequence[IndexedEpisode], initial: Checkpoint | None, earlier: Path | None
 ) -> TrainedEpisodes:
     """Return the episodes of this training, of its initial weights and of the resumed part."""
-    digests = frozenset(recording.digest for recording in recordings)
+    digests = frozenset(episode.digest for episode in episodes)
     found = TrainedEpisodes(digests - {''}, '' not in digests)
     if initial is not None:
         found |= initial.trained_episodes
@@ -343,26 +349,26 @@ def _trained_episodes(
 
 
 def _save_robot(
-    robot: RobotModel, recordings: Sequence[Recording], folder: Path, processes: Processes
+    robot: RobotModel, episodes: Sequence[IndexedEpisode], folder: Path, processes: Processes
 ) -> None:
     """Save the robot and its cameras into a folder, as checkpoints carry them."""
     if robot.file is None or not processes.is_main:
         return
     with disk_errors_named(folder):
         save_robot(robot.file, folder)
-        cameras = common_cameras(recordings)
+        cameras = common_cameras(episodes)
         if cameras is not None:
             save_calibration(folder / CAMERAS, {camera.view: camera for camera in cameras})
 
 
 def training_notes(
-    config: TrainingConfig, recordings: Sequence[Recording], initial: Checkpoint | None = None
+    config: TrainingConfig, episodes: Sequence[IndexedEpisode], initial: Checkpoint | None = None
 ) -> list[str]:
     """Return notes on a training for the user, before it runs.
 
     Args:
         config: configuration of the training.
-        recordings: recordings of the training set.
+        episodes: episodes of the training set.
         initial: checkpoint of the initial weights; None = no such checkpoint.
     """
     found, optimizer = [], config.optimizer
@@ -373,21 +379,16 @@ def training_notes(
             f'the learning rate warms up over {optimizer.warmup} steps, a fifth of the training, '
             f'instead of optimizer.warmup_steps = {optimizer.warmup_steps}'
         )
-    common = common_cameras(recordings)
-    if common is None:
-        kinds = len({tuple(_camera_key(camera) for camera in r.cameras) for r in recordings})
+    keys = [episode.camera_keys for episode in episodes]
+    usual = _common_keys(episodes)
+    if usual is None:
         found.append(
-            f'the episodes have {kinds} different calibrations, none of them that of more than '
-            'half: the checkpoint gets no default calibration, and the node needs '
+            f'the episodes have {len(set(keys))} different calibrations, none of them that of '
+            'more than half: the checkpoint gets no default calibration, and the node needs '
             "'calibration_file'"
         )
         return found
-    usual = tuple(_camera_key(camera) for camera in common)
-    others = [
-        recording.path.name
-        for recording in recordings
-        if tuple(_camera_key(camera) for camera in recording.cameras) != usual
-    ]
+    others = [e.path.name for e in episodes if e.camera_keys != usual]
     if others:
         more = ', ...' * (len(others) > _NAMED)
         found.append(
@@ -412,17 +413,17 @@ def _drawn_otherwise(now: TrajectoryVideoConfig, before: Mapping[str, Any]) -> l
     ]
 
 
-def common_cameras(recordings: Sequence[Recording]) -> tuple[CameraModel, ...] | None:
-    """Return the calibration that more than half of the recordings have, or None."""
-    keys = [tuple(_camera_key(camera) for camera in r.cameras) for r in recordings]
-    key, count = Counter(keys).most_common(1)[0]
-    return recordings[keys.index(key)].cameras if 2 * count > len(keys) else None
+def common_cameras(episodes: Sequence[IndexedEpisode]) -> tuple[CameraModel, ...] | None:
+    """Return the calibration that more than half of the episodes have, or None."""
+    usual = _common_keys(episodes)
+    if usual is None:
+        return None
+    return next(e for e in episodes if e.camera_keys == usual).recording().cameras
 
 
-def _camera_key(camera: CameraModel) -> tuple[object, ...]:
-    numbers = np.concatenate([camera.K.ravel(), camera.T_mount_camera.ravel(), camera.distortion])
-    model = (camera.view, camera.mount_link, camera.distortion_model)
-    return (*model, *numbers.round(6).tolist())
+def _common_keys(episodes: Sequence[IndexedEpisode]) -> tuple[str, ...] | None:
+    keys, count = Counter(e.camera_keys for e in episodes).most_common(1)[0]
+    return keys if 2 * count > len(episodes) else None
 
 
 def _best_score(file: Path) -> float:
@@ -539,16 +540,6 @@ def reason_lines(skipped: Mapping[str, str]) -> list[str]:
         f'{len(names)} x {reason} ({", ".join(names[:_NAMED])}{", ..." * (len(names) > _NAMED)})'
         for reason, names in frequent
     ]
-
-
-def num_dropped(recordings: Sequence[Recording], spec: WorldModelSpec) -> int:
-    """Return how many clips cannot be cut because frames are missing within them."""
-    dropped = 0
-    for recording in recordings:
-        last = recording.times[-1] - spec.chunk_seconds + 1e-6
-        dropped += int((recording.times <= last).sum())
-        dropped -= int((recording.times[clip_starts(recording, spec)] <= last).sum())
-    return dropped
 
 
 _BEST = 'best.json'

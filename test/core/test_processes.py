@@ -15,7 +15,7 @@ from mtv_world_ros.core.executor import run_all
 from mtv_world_ros.core.processes import stop_process, STOPPED_S, StoppedProcesses
 from mtv_world_ros.core.worker_pool import run_job, WorkerPool
 from mtv_world_ros.core.workers import Workers
-from mtv_world_ros.training.clips.batches import ClipWorkers
+from mtv_world_ros.training.clips.step_loader import StepLoader
 from test.support.worker_jobs import LongJobs, make_held_back, make_stopping
 
 
@@ -68,13 +68,16 @@ def test_a_stopped_worker_is_an_error_within_seconds():
 
 def test_forked_workers_that_note_sigterm_as_training_does_end_with_a_broken_pool():
     before = signal.signal(signal.SIGTERM, lambda *_: None)
-    workers = ClipWorkers(lambda step, number: os.getpid(), 2)
+    workers = StepLoader(
+        lambda step, number: os.getpid(), lambda step, pids: pids, numbers=(0, 1), workers=2
+    )
     try:
-        (pid, _) = workers.clips(0, (0, 1))
+        pid, other = workers.batch(0)
+        assert pid == other != os.getpid()
         os.kill(pid, signal.SIGKILL)
-        with pytest.raises(TrainingError, match='was killed at step 1'):
-            for _ in range(100):
-                workers.clips(1, (0, 1))
+        with pytest.raises(TrainingError, match=r'was killed at step \d+'):
+            for step in range(1, 1000):
+                workers.batch(step)
                 time.sleep(0.01)
     finally:
         begin_s = time.monotonic()
@@ -86,15 +89,20 @@ def test_forked_workers_that_note_sigterm_as_training_does_end_with_a_broken_poo
 #: the pool of OpenCV's threads has been used before clips are made
 AFTER_OPENCV = """
 import os, time, cv2, numpy as np
-from mtv_world_ros.training.clips.batches import ClipWorkers
+from mtv_world_ros.training.clips.step_loader import StepLoader
 cv2.setNumThreads(3)
 image, grid = np.zeros((600, 600), np.uint8), np.zeros((600, 600), np.float32)
 tasks = len(os.listdir('/proc/self/task'))
 cv2.remap(image, grid, grid, cv2.INTER_LINEAR)
 assert len(os.listdir('/proc/self/task')) > tasks, 'OpenCV has no pool here'
 time.sleep(0.5)  # its threads wait
-workers = ClipWorkers(lambda step, number: cv2.remap(image, grid, grid, 1).sum(), 2)
-assert workers.clips(0, (0, 1)) == [0, 0]
+workers = StepLoader(
+    lambda step, number: cv2.remap(image, grid, grid, 1).sum(),
+    lambda step, sums: sums,
+    numbers=(0, 1),
+    workers=2,
+)
+assert workers.batch(0) == [0, 0]
 workers.close()
 """
 

@@ -26,9 +26,10 @@ from mtv_world_ros.inspection.inspection_report import BROKEN
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.training.clips.episode_index import IndexedEpisode
 from mtv_world_ros.training.resume import DiskError
 from mtv_world_ros.training.training_config import TrainingRun
-from mtv_world_ros.training.training_run import load_recordings, train, training_notes
+from mtv_world_ros.training.training_run import load_episodes, train, training_notes
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 from test.support.sources import make_source, make_trainer
 
@@ -102,7 +103,11 @@ def test_unusable_episodes_are_counted_by_reason_before_the_first_step(
     franka = load_robot(share_path('config', 'robots', 'franka', 'robot.yaml'))
     said = "of robot 'yam_bimanual', and video.robot is 'franka'; give --set video.robot="
     with pytest.raises(TrainingError, match=said):
-        load_recordings([episode], tiny.spec, franka, tmp_path / 'cache')
+        load_episodes([episode], tiny, franka, tmp_path / 'cache')
+
+
+def indexed(config, *recordings):
+    return [IndexedEpisode.of(recording, config.spec) for recording in recordings]
 
 
 @pytest.fixture
@@ -119,8 +124,8 @@ def test_what_the_doctor_found_broken_is_left_out(report, episode, tiny, robot):
     assert found_broken(report, paths, ('low', 'high')) == whole
     assert found_broken(report, paths, ('low', 'wrist')) == {'data/b': 'wrist: mirrored'} | whole
     with pytest.raises(TrainingError, match='no usable episode: 1 x wrist: mirrored'):
-        load_recordings(
-            [episode], tiny.spec, robot, report / 'cache', broken={str(episode): 'wrist: mirrored'}
+        load_episodes(
+            [episode], tiny, robot, report / 'cache', broken={str(episode): 'wrist: mirrored'}
         )
 
 
@@ -137,10 +142,10 @@ def test_a_report_of_other_episodes_is_refused(report):
 
 def test_weights_that_know_other_drawings_are_told(tiny, recording):
     bundled = Checkpoint.open('bundled')
-    said = ' '.join(training_notes(tiny, [recording], bundled))
+    said = ' '.join(training_notes(tiny, indexed(tiny, recording), bundled))
     assert 'rendering.object_motion=true' in said and 'rendering.finger_width_m=0.008' in said
     alike = tiny.replace(rendering=TrajectoryVideoConfig(**bundled.card.rendering))
-    assert 'starts from' not in ' '.join(training_notes(alike, [recording], bundled))
+    assert 'starts from' not in ' '.join(training_notes(alike, indexed(alike, recording), bundled))
 
 
 def test_episodes_of_other_cameras_than_most_are_named(tiny, recording):
@@ -150,9 +155,11 @@ def test_episodes_of_other_cameras_than_most_are_named(tiny, recording):
     moved = replace(
         recording, path=Path('moved'), cameras=(replace(first, T_mount_camera=pose), *rest)
     )
-    said = ' '.join(training_notes(tiny, [recording, moved, recording]))
+    said = ' '.join(training_notes(tiny, indexed(tiny, recording, moved, recording)))
     assert 'other calibrations than most: 1 (moved)' in said
-    assert 'other calibrations' not in ' '.join(training_notes(tiny, [recording, recording]))
+    assert 'other calibrations' not in ' '.join(
+        training_notes(tiny, indexed(tiny, recording, recording))
+    )
 
 
 def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(tiny, source, tmp_path):

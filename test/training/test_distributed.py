@@ -16,7 +16,14 @@ from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.trainer import Trainer
 from mtv_world_ros.training.training_config import TrainingConfig
-from test.support.sources import make_trainer, run_script, state_tensors, write_preset
+from test.support.sources import (
+    make_source,
+    make_trainer,
+    run_script,
+    state_tensors,
+    with_batch_size,
+    write_preset,
+)
 
 SCRIPT = Path(__file__).parents[1] / 'support' / 'train_recorded.py'
 #: of two processes one gets two of the clips of a step
@@ -53,9 +60,10 @@ def test_two_processes_make_the_steps_of_one(tiny, episode, tmp_path, monkeypatc
     assert len((two / 'log.jsonl').read_text().splitlines()) == 1  # one process writes
 
 
-def test_accumulated_parts_have_the_gradients_of_the_whole(tiny, source, tmp_path):
-    source._numbers = range(3)
+def test_accumulated_parts_have_the_gradients_of_the_whole(tiny, recording, robot, tmp_path):
+    source = make_source([recording], with_batch_size(tiny, 3), robot)
     batch = source.batch(0)
+    source.close()
     whole = gradients(tiny, batch, tmp_path)
     settings = tiny.optimizer.replace(batch_size=3, accumulation=2)
     parts = gradients(tiny.replace(optimizer=settings), batch, tmp_path)

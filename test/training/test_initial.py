@@ -12,6 +12,7 @@ from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.model import checkpoint as opening
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.robot.file import load_robot, robot_path
+from mtv_world_ros.training.clips.episode_index import IndexedEpisode
 from mtv_world_ros.training.clips.fit_control import fitted_control
 from mtv_world_ros.training.training_config import load_training_config, TrainingRun
 from mtv_world_ros.training.training_run import training_notes
@@ -45,7 +46,7 @@ def test_its_card_is_read_once(read, tmp_path):
     robot = load_robot(robot_path('yam_bimanual'))
     recording = load_recording(DEMO, CONFIG.spec, robot)
     fitted_control(tmp_path, CONFIG, [recording], robot, initial=run.initial)
-    training_notes(CONFIG, [recording], run.initial)
+    training_notes(CONFIG, [IndexedEpisode.of(recording, CONFIG.spec)], run.initial)
     assert read == [opened.folder]
 
 

@@ -1,16 +1,13 @@
-"""Training batches by step and clip number, the same in any process, prepared in forked workers.
+"""Training batches by step and clip number, the same in any process.
 
 Shape letters: B batch, V views, T frames, H W pixels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,9 +18,8 @@ from mtv_world_ros.control.control import Control, ControlInputs
 from mtv_world_ros.control.registry import create_control
 from mtv_world_ros.core.data_types import ByteArray
 from mtv_world_ros.core.errors import TrainingError
-from mtv_world_ros.core.worker_pool import run_job, WorkerPool
 from mtv_world_ros.data.recording import Recording
-from mtv_world_ros.data.recordings import clip_starts, cut_clip
+from mtv_world_ros.data.recordings import cut_clip
 from mtv_world_ros.model.conditioning import ControlBatch
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.training.clips.clip_controls import (
@@ -34,6 +30,8 @@ from mtv_world_ros.training.clips.clip_controls import (
     LeadIn,
     Past,
 )
+from mtv_world_ros.training.clips.episode_index import IndexedEpisode
+from mtv_world_ros.training.clips.step_loader import StepLoader
 from mtv_world_ros.training.training_config import TrainingConfig
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
@@ -72,6 +70,12 @@ class ClipBatch:
     step: int = 0
     numbers: Sequence[int] = ()
 
+    def pin_memory(self) -> ClipBatch:
+        """Return a copy in pinned memory, from which a GPU copies faster."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        pinned = {n: v.pin_memory() for n, v in values.items() if isinstance(v, Tensor)}
+        return replace(self, **pinned)
+
     def parts(self, count: int) -> Iterator[ClipBatch]:
         """Yield its clips in `count` batches of nearly equal size."""
         size = len(self.numbers)
@@ -94,10 +98,10 @@ class _Sample(NamedTuple):
 
 
 class BatchSource:
-    """Cuts, renders and disturbs clips; the next batch is prepared during a training step.
+    """Cuts, renders and disturbs clips; the next batches are prepared during a training step.
 
     Args:
-        recordings: episodes that clips are cut from.
+        episodes: episodes that clips are cut from; recordings stay in memory.
         config: views and times of clips, how they are drawn and disturbed, clips per step.
         robot: kinematics of the recorded robot.
         segmenter: finds the objects of the first frames.
@@ -105,11 +109,12 @@ class BatchSource:
         seed: seed of choice and disturbances.
         numbers: the clips of a step that this process makes; None: all.
         workers: processes that make them; 0 = a thread of this one.
+        pin: put batches into pinned memory.
     """
 
     def __init__(
         self,
-        recordings: Sequence[Recording],
+        episodes: Sequence[Recording | IndexedEpisode],
         config: TrainingConfig,
         *,
         robot: RobotModel,
@@ -118,14 +123,18 @@ class BatchSource:
         seed: int,
         numbers: Sequence[int] | None = None,
         workers: int = 0,
+        pin: bool = False,
     ) -> None:
         self._numbers = range(config.optimizer.batch_size) if numbers is None else numbers
         spec, stride_s = config.spec, config.video.clip_stride_s
-        whole = [(r, _spaced(r, clip_starts(r, spec), stride_s)) for r in recordings]
-        self._starts = [(r, starts) for r, starts in whole if len(starts)]
-        if not self._starts:
+        indexed = [
+            IndexedEpisode.of(one, spec, stride_s) if isinstance(one, Recording) else one
+            for one in episodes
+        ]
+        self.episodes = [one for one in indexed if one.starts]
+        if not self.episodes:
             raise TrainingError(
-                f'none of {len(recordings)} episodes is long enough for a clip of '
+                f'none of {len(episodes)} episodes is long enough for a clip of '
                 f'{spec.num_frames} frames at {spec.fps} Hz ({spec.chunk_seconds:.1f} s); '
                 'record longer ones or lower video.num_frames'
             )
@@ -137,41 +146,25 @@ class BatchSource:
         self._foreseen_ratio = config.rendering.foreseen_ratio
         self._spec, self._augment, self._seed = spec, config.augment, seed
         self._history, self._self_rollout = config.history, config.self_rollout
-        self._failed = [pair for pair in self._starts if pair[0].outcome == 'failure']
-        self._pool = ThreadPoolExecutor(max_workers=1)
-        self._workers = ClipWorkers(self._clip, workers) if workers else None
-        self._ahead: tuple[int, Future[ClipBatch]] | None = None
-
-    @property
-    def starts(self) -> list[tuple[Recording, np.ndarray]]:
-        """The recordings that clips are cut from, with the frames that they start from."""
-        return self._starts
+        self._failed = [one for one in self.episodes if one.outcome == 'failure']
+        self._loader = StepLoader(
+            self._clip, self._collated, numbers=self._numbers, workers=workers, pin=pin
+        )
 
     @property
     def num_clips(self) -> int:
         """Clips that can be cut."""
-        return sum(len(starts) for _, starts in self._starts)
+        return sum(len(one.starts) for one in self.episodes)
 
     def batch(self, step: int) -> ClipBatch:
-        """Return the batch of a step, and start preparing the next one."""
-        if self._ahead is not None and self._ahead[0] == step:
-            result = self._ahead[1].result()
-        else:
-            result = self._make(step)
-        self._ahead = (step + 1, self._pool.submit(self._make, step + 1))
-        return result
+        """Return the batch of a step, and start preparing the next ones."""
+        return self._loader.batch(step)
 
     def close(self) -> None:
         """Stop preparing."""
-        self._pool.shutdown(cancel_futures=True)
-        if self._workers is not None:
-            self._workers.close()
+        self._loader.close()
 
-    def _make(self, step: int) -> ClipBatch:
-        if self._workers is None:
-            samples = [self._clip(step, number) for number in self._numbers]
-        else:
-            samples = self._workers.clips(step, self._numbers)
+    def _collated(self, step: int, samples: list[_Sample]) -> ClipBatch:
         return ClipBatch(
             step=step,
             numbers=self._numbers,
@@ -185,8 +178,9 @@ class BatchSource:
 
     def _clip(self, step: int, number: int) -> _Sample:
         rng = np.random.default_rng((self._seed, step, number))
-        recording, starts = self._choose(rng)
-        start = int(starts[rng.integers(len(starts))])
+        episode = self._choose(rng)
+        start = episode.starts[rng.integers(len(episode.starts))]
+        recording = episode.recording()
         lead_in = draw_lead_in(recording, start, self._spec, self._self_rollout, step, rng)
         if lead_in is None:
             clip = cut_clip(recording, start, self._spec)
@@ -225,10 +219,10 @@ class BatchSource:
             history = lead_in.history(self._history.num_frames)
         return draw_past(history, self._history, rng)
 
-    def _choose(self, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:
-        """Draw an episode with the starts of its clips; failed ones with the configured share."""
+    def _choose(self, rng: np.random.Generator) -> IndexedEpisode:
+        """Draw an episode; failed ones with the configured share."""
         share = self._augment.failure_share
-        pool = self._starts
+        pool = self.episodes
         if share is not None and self._failed and rng.random() < share:
             pool = self._failed
         return pool[rng.integers(len(pool))]
@@ -244,15 +238,6 @@ def history_fields(given: Sequence[Past | None]) -> dict[str, Tensor]:
         'history': torch.from_numpy(np.stack([past.frames for past in known])),
         'history_sigmas': torch.tensor([past.sigma for past in known]),
     }
-
-
-def _spaced(recording: Recording, starts: np.ndarray, stride_s: float) -> np.ndarray:
-    """Return the starts that are at least a stride [s] apart."""
-    kept: list[int] = []
-    for start in starts:
-        if not kept or recording.times[start] >= recording.times[kept[-1]] + stride_s - 1e-6:
-            kept.append(int(start))
-    return np.array(kept, dtype=int)
 
 
 def _stacked(ids: Sequence[ByteArray | None]) -> Tensor | None:
@@ -272,38 +257,3 @@ def _disturb(frames: ByteArray, rng: np.random.Generator) -> ByteArray:
     mixed = (1 - share) * frames + share * blurred
     mixed = mixed + rng.normal(0, 255 * START_NOISE_STD * rng.random(), mixed.shape)
     return mixed.round().clip(0, 255).astype(np.uint8)
-
-
-#: makes the clip of a step and a number
-MakeClip = Callable[[int, int], Any]
-
-
-class ClipWorkers:
-    """Source of clips made in forked processes, which share the recordings and use no GPU."""
-
-    def __init__(self, make_clip: MakeClip, count: int) -> None:
-        self._pool = WorkerPool(partial(_on_one_thread, make_clip), count, method='fork')
-
-    def clips(self, step: int, numbers: Sequence[int]) -> list[Any]:
-        """Return the clips of a step.
-
-        Raises:
-            TrainingError: a process was killed.
-        """
-        try:
-            return list(self._pool.map(run_job, [step] * len(numbers), numbers))
-        except BrokenProcessPool as error:
-            raise TrainingError(
-                f'a process that prepares clips was killed at step {step}, perhaps for memory '
-                '(see dmesg); the last saved state is whole: run the same command again, with '
-                'fewer --data-workers if there is too little memory'
-            ) from error
-
-    def close(self) -> None:
-        """End the processes."""
-        self._pool.shutdown(cancel_futures=True)
-
-
-def _on_one_thread(make_clip: MakeClip) -> MakeClip:
-    torch.set_num_threads(1)  # thread pools do not survive a fork
-    return make_clip

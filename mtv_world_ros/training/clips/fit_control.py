@@ -11,10 +11,10 @@ from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.control.control import Control
 from mtv_world_ros.control.registry import CONTROL_FILE, create_control, load_control, save_control
 from mtv_world_ros.core.errors import TrainingError
-from mtv_world_ros.data.recording import Recording
-from mtv_world_ros.data.recordings import clip_starts, cut_clip
+from mtv_world_ros.data.recordings import cut_clip
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.robot.model import RobotModel
+from mtv_world_ros.training.clips.episode_index import IndexedEpisode
 from mtv_world_ros.training.training_config import TrainingConfig
 
 #: largest number of clips that a control is fitted to, spread evenly
@@ -24,7 +24,7 @@ MAX_CLIPS = 4096
 def fitted_control(
     folder: Path,
     config: TrainingConfig,
-    recordings: Sequence[Recording],
+    episodes: Sequence[IndexedEpisode],
     robot: RobotModel,
     *,
     initial: Checkpoint | None = None,
@@ -37,7 +37,7 @@ def fitted_control(
     Args:
         folder: folder of the training.
         config: the preset.
-        recordings: episodes that are trained on.
+        episodes: episodes that are trained on.
         robot: robot of the episodes.
         initial: checkpoint that weights are taken from; None = weights are new.
 
@@ -53,7 +53,7 @@ def fitted_control(
             break
     else:
         if control.state():
-            control = control.fitted(_motions(config, recordings, robot))
+            control = control.fitted(_motions(config, episodes, robot))
     if control.state():
         folder.mkdir(parents=True, exist_ok=True)
         save_control(control, name, folder)
@@ -61,16 +61,16 @@ def fitted_control(
 
 
 def _motions(
-    config: TrainingConfig, recordings: Sequence[Recording], robot: RobotModel
+    config: TrainingConfig, episodes: Sequence[IndexedEpisode], robot: RobotModel
 ) -> list[Motion]:
-    """Return the motions of clips that are spread evenly over the recordings."""
+    """Return the motions of clips that are spread evenly over the episodes."""
     spec = config.spec
-    clips = [(one, int(start)) for one in recordings for start in clip_starts(one, spec)]
+    clips = [(one, start) for one in episodes for start in one.whole]
     if not clips:
         raise TrainingError(
-            f'none of {len(recordings)} episodes is long enough for a clip of {spec.num_frames} '
+            f'none of {len(episodes)} episodes is long enough for a clip of {spec.num_frames} '
             f'frames at {spec.fps} Hz; record longer ones or lower video.num_frames'
         )
     chosen = np.linspace(0, len(clips) - 1, min(len(clips), MAX_CLIPS)).round().astype(int)
-    cut = [cut_clip(recording, start, spec) for recording, start in (clips[i] for i in chosen)]
+    cut = [cut_clip(one.recording(), start, spec) for one, start in (clips[i] for i in chosen)]
     return [Motion.of(robot, clip.cameras, clip.positions) for clip in cut]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-import hashlib
+from functools import lru_cache
 import json
 from pathlib import Path
 import shutil
@@ -25,40 +25,37 @@ from mtv_world_ros.core.data_types import WorldModelSpec
 from mtv_world_ros.core.errors import ConfigError, TrainingError
 from mtv_world_ros.core.files import content_digest, write_whole
 from mtv_world_ros.core.progress import Progress
-from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.data.recordings import cut_clip
 from mtv_world_ros.model.conditioning import Conditioning, ControlBatch, pad_rows, start_slot
-from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.training.base_checkpoint import Base
 from mtv_world_ros.training.clips.batches import BatchSource, ClipBatch, history_fields
 from mtv_world_ros.training.clips.clip_controls import ControlMaker, draw_past, history_before
 from mtv_world_ros.training.clips.encoding import encode_batch, EncodedBatch, Encoders
+from mtv_world_ros.training.clips.episode_index import digest_of, IndexedEpisode, robot_digest
+from mtv_world_ros.training.clips.step_loader import StepLoader
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.objective import pixel_weights, pooled_weights
 from mtv_world_ros.training.training_config import HistoryConfig, ObjectiveConfig, TrainingConfig
 
 #: bytes of tensors that are gathered before they are written
 SHARD_BYTES = 256 * 2**20
+#: longest time in which tensors are gathered, which a killed process loses [s]
+SHARD_S = 60.0
 SETTINGS = 'settings.json'
 _STEM = 'latents'
 _LABELS = 'labels'
-
-
-def digest_of(*values: Any) -> str:
-    """Return 32 hexadecimal digits for plain values."""
-    text = json.dumps(values, sort_keys=True, default=list)
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 class LatentCache:
     """Tensors of clips in shards of safetensors, a folder for each combination of settings.
 
     A shard appears under its name only when it is whole, so that a run that was killed is resumed
-    at its last shard.
+    at its last shard. Several processes fill one cache, each with shards of its own names.
 
     Args:
         root: folder of caches of any settings.
         settings: settings that the tensors of all clips depend on, as plain values.
+        number: number of this process, in the names of the shards that it writes.
         shard_bytes: size at which a shard is written.
 
     Attributes:
@@ -67,17 +64,28 @@ class LatentCache:
     """
 
     def __init__(
-        self, root: Path, settings: Mapping[str, Any], *, shard_bytes: int = SHARD_BYTES
+        self,
+        root: Path,
+        settings: Mapping[str, Any],
+        *,
+        number: int = 0,
+        shard_bytes: int = SHARD_BYTES,
     ) -> None:
         self.root, self.settings = root, json.loads(json.dumps(settings, default=list))
         self.folder = root / digest_of(self.settings)
         self.notes = [] if self.folder.is_dir() else _other_settings(root, self.settings)
-        self._shard_bytes = shard_bytes
+        self._shard_bytes, self._number = shard_bytes, number
+        self._written_s = time.monotonic()
         self._shards: dict[str, Any] = {}
         self._labels: dict[str, str] = {}
         self._waiting: dict[str, Tensor] = {}
         self._waiting_labels: dict[str, str] = {}
-        for file in sorted(self.folder.glob(f'{_STEM}-*.safetensors')):
+        self._opened: set[Path] = set()
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Open the shards that other processes have written."""
+        for file in sorted(set(self.folder.glob(f'{_STEM}-*.safetensors')) - self._opened):
             self._open(file)
 
     def __contains__(self, key: str) -> bool:
@@ -111,7 +119,8 @@ class LatentCache:
         for name, tensor in tensors.items():
             self._waiting[f'{key}/{name}'] = tensor.detach().cpu().contiguous()
         self._waiting_labels[key] = label
-        if sum(t.nbytes for t in self._waiting.values()) >= self._shard_bytes:
+        is_full = sum(t.nbytes for t in self._waiting.values()) >= self._shard_bytes
+        if is_full or time.monotonic() - self._written_s > SHARD_S:
             self.flush()
 
     def flush(self) -> None:
@@ -120,11 +129,12 @@ class LatentCache:
         Raises:
             TrainingError: the disk is full, or the folder cannot be written.
         """
+        self._written_s = time.monotonic()
         if not self._waiting:
             return
         data = save(self._waiting, {_LABELS: json.dumps(self._waiting_labels)})
-        number = len(list(self.folder.glob(f'{_STEM}-*.safetensors')))
-        while (file := self.folder / f'{_STEM}-{number:05d}.safetensors').exists():
+        number, stem = len(self._opened), f'{_STEM}-{self._number:03d}'
+        while (file := self.folder / f'{stem}-{number:05d}.safetensors').exists():
             number += 1
         try:
             text = json.dumps(self.settings, indent=2, sort_keys=True) + '\n'
@@ -141,6 +151,7 @@ class LatentCache:
         self._open(file)
 
     def _open(self, file: Path) -> None:
+        self._opened.add(file)
         try:
             require_regular(file)
             shard: Any = safe_open(file, framework='pt')
@@ -187,19 +198,19 @@ class CachedClip:
     """A clip that a cache holds or will hold.
 
     Attributes:
-        recording: episode of the clip.
+        episode: episode of the clip.
         start: recorded frame that it starts from.
         key: key in the cache.
     """
 
-    recording: Recording
+    episode: IndexedEpisode
     start: int
     key: str
 
     @property
     def label(self) -> str:
         """Its name, independent of its content."""
-        return f'{self.recording.path.name} from frame {self.start}'
+        return f'{self.episode.path.name} from frame {self.start}'
 
 
 def settings_of(
@@ -221,7 +232,7 @@ def settings_of(
         **{f'history.{k}': v for k, v in config.history.model_dump().items()},
         'video.control': video['control'],
         **control.cache_key(),
-        'robot': _robot_digest(controls.robot),
+        'robot': robot_digest(controls.robot),
         'segmenter': controls.segmenter.name if control.uses_masks else None,
     }
     if (base / 'image_encoder').is_dir():
@@ -229,25 +240,16 @@ def settings_of(
     return settings
 
 
-def _robot_digest(robot: RobotModel) -> str:
-    """Return a digest that changes with the robot's kinematics, tools and grippers."""
-    lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
-    rows = np.random.default_rng(0).uniform(lower, upper, (8, len(lower)))
-    poses, openings = robot.tool_poses(rows), robot.gripper_openings(rows)
-    numbers = [np.round(part, 6).tolist() for part in (poses, openings)]
-    return digest_of(robot.name, robot.joint_names, *numbers)[:16]
-
-
-def list_clips(recordings: Sequence[tuple[Recording, np.ndarray]]) -> list[CachedClip]:
-    """Return the clips of recordings and starts, keyed by the content of their episodes."""
+def list_clips(episodes: Sequence[IndexedEpisode]) -> list[CachedClip]:
+    """Return the clips of episodes, keyed by the content of their files."""
     clips = []
-    for recording, starts in recordings:
-        content = content_digest(recording.path)
-        if recording.described:
-            content = digest_of(content, *recording.described)
+    for episode in episodes:
+        content = episode.content_digest()
+        if episode.described:
+            content = digest_of(content, *episode.described)
         clips += [
-            CachedClip(recording=recording, start=int(s), key=digest_of(content, int(s)))
-            for s in starts
+            CachedClip(episode=episode, start=start, key=digest_of(content, start))
+            for start in episode.starts
         ]
     return clips
 
@@ -259,12 +261,13 @@ def read_clip(
 
     Its anchor and history are drawn once, by its start.
     """
-    cut = cut_clip(clip.recording, clip.start, spec)
-    inputs = controls.make(cut, clip.recording.names)
+    recording = clip.episode.recording()
+    cut = cut_clip(recording, clip.start, spec)
+    inputs = controls.make(cut, recording.names)
     past = None
     if history.on:
         rng = np.random.default_rng((_VERSION, clip.start))
-        before = history_before(clip.recording, clip.start, spec, history, rng)
+        before = history_before(recording, clip.start, spec, history, rng)
         past = draw_past(before, history, rng)
     return ClipBatch(
         frames=_alone(cut.frames),
@@ -286,24 +289,31 @@ def encode_missing_clips(
     encoders: Encoders,
     device: torch.device,
     dtype: torch.dtype,
+    *,
+    shares: int = 1,
 ) -> Iterator[str]:
     """Encode the missing clips of a cache; yield after each how many are, and how fast.
+
+    What was encoded is written, too, when an error or a signal ends it.
 
     Raises:
         TrainingError: the disk is full, or will be before all clips are there.
     """
     missing = [clip for clip in clips if clip.key not in cache]
     started = time.perf_counter()
-    for number, clip in enumerate(missing, start=1):
-        tensors = _encode(read(clip), encoders, device, dtype)
-        size = sum(tensor.nbytes for tensor in tensors.values())
-        if number == 1:
-            _check_space(cache.root, size, len(missing))
-        cache.add(clip.key, clip.label, tensors)
-        seconds = time.perf_counter() - started
-        rate = number / max(seconds, 1e-9)
-        yield f'{number} encoded in {seconds:.1f} s ({rate:.2f} clips/s, {size / 1e6:.2f} MB each)'
-    cache.flush()
+    try:
+        for number, clip in enumerate(missing, start=1):
+            tensors = _encode(read(clip), encoders, device, dtype)
+            size = sum(tensor.nbytes for tensor in tensors.values())
+            if number == 1:
+                _check_space(cache.root, size, len(missing) * shares)
+            cache.add(clip.key, clip.label, tensors)
+            seconds = time.perf_counter() - started
+            rate = number / max(seconds, 1e-9)
+            each = f'{size / 1e6:.2f} MB each'
+            yield f'{number} encoded in {seconds:.1f} s ({rate:.2f} clips/s, {each})'
+    finally:
+        cache.flush()
 
 
 def _check_space(root: Path, clip_bytes: int, count: int) -> None:
@@ -354,10 +364,12 @@ def cached_batches(
     seed: int,
     dtype: torch.dtype,
     processes: Processes,
+    workers: int = 0,
 ) -> CachedSource:
     """Encode missing clips, report what was done, and return batches from the cache.
 
-    The source of the same clips, which encodes nothing, is closed.
+    Every process encodes its share; all have to call this. The source of the same clips, which
+    encodes nothing, is closed.
 
     Raises:
         ConfigError: the preset disturbs pictures, or has no encoder worth a cache.
@@ -368,25 +380,42 @@ def cached_batches(
     source.close()
     controls, spec = source.controls, config.spec
     settings = settings_of(config, base.folder, controls, dtype)
-    cache = LatentCache(root, settings)
-    clips = list_clips(source.starts)
-    for note in [*cache.notes, *_changed(cache, clips)]:
-        Progress.write(f'latent cache: {note}')
+    processes.check_same('settings of the latent cache', digest_of(settings))
+    cache = LatentCache(root, settings, number=processes.number)
+    clips = list_clips(source.episodes)
+    if processes.is_main:
+        for note in [*cache.notes, *_changed(cache, clips)]:
+            Progress.write(f'latent cache: {note}')
+    # another process may already have written some: all share out what the main one missed
+    missing = processes.of_main([clip.key for clip in clips if clip.key not in cache])
+    mine = set(missing[processes.number :: processes.count])
     steps = encode_missing_clips(
         cache,
-        clips,
+        [clip for clip in clips if clip.key in mine],
         lambda clip: read_clip(clip, spec, controls, config.history),
         base.encoders,
         processes.device,
         dtype,
+        shares=processes.count,
     )
-    held = sum(clip.key in cache for clip in clips)
-    missing = len(clips) - held
-    done = [*Progress(steps, total=missing, desc='encoding clips', unit='clip')]
-    made = done[-1] if done else 'none to encode'
-    Progress.write(
-        f"latent cache '{cache.folder}': {held} of {len(clips)} clips were there, {made}"
+    bar = Progress(
+        steps,
+        total=len(mine),
+        desc='encoding clips',
+        unit='clip',
+        is_shown=processes.is_main,
     )
+    done = [*bar]
+    processes.any(False)  # all have written theirs
+    cache.refresh()
+    if processes.is_main:
+        made = done[-1] if done else 'none to encode'
+        if processes.count > 1 and missing:
+            made = f'{len(missing)} encoded by {processes.count} processes, of these here {made}'
+        held = len(clips) - len(missing)
+        Progress.write(
+            f"latent cache '{cache.folder}': {held} of {len(clips)} clips were there, {made}"
+        )
     return CachedSource(
         cache,
         clips,
@@ -396,6 +425,7 @@ def cached_batches(
         seed=seed,
         numbers=processes.share(config.optimizer.batch_size),
         device=processes.device,
+        workers=workers,
     )
 
 
@@ -443,6 +473,7 @@ class CachedSource:
         seed: seed of the order.
         numbers: positions of this process's clips in a step; None: all.
         device: device of the batches.
+        workers: processes that read them; 0 = a thread of this one.
     """
 
     def __init__(
@@ -456,11 +487,20 @@ class CachedSource:
         seed: int,
         numbers: Sequence[int] | None = None,
         device: torch.device,
+        workers: int = 0,
     ) -> None:
         self._cache, self._clips, self._objective = cache, clips, objective
         self._text, self._device = text, device
         self._batch_size, self._seed = batch_size, seed
         self._numbers = range(batch_size) if numbers is None else numbers
+        self._order = lru_cache(2)(self._drawn_order)
+        self._loader = StepLoader(
+            self._read,
+            self._collated,
+            numbers=self._numbers,
+            workers=workers,
+            pin=device.type == 'cuda',
+        )
 
     @property
     def num_clips(self) -> int:
@@ -469,13 +509,8 @@ class CachedSource:
 
     def batch(self, step: int) -> EncodedBatch:
         """Return the batch of a step."""
-        clips = [self._clip(step, number) for number in self._numbers]
-        rows = [self._cache.read(clip.key) for clip in clips]
-        held = {
-            name: (pad_rows if name == CONTEXT else torch.stack)([row[name] for row in rows])
-            for name in rows[0]
-        }
-        held = {name: tensor.to(self._device) for name, tensor in held.items()}
+        read = self._loader.batch(step)
+        held = {name: tensor.to(self._device) for name, tensor in read.items()}
         clean, reference = held['clean'], held['reference']
         control = held.get('control', torch.zeros_like(clean))
         cond = Conditioning(
@@ -483,7 +518,7 @@ class CachedSource:
             start_control=control[:, :, :, 0],
             start=start_slot(reference, clean.shape[3], includes_start=True),
             reference=reference,
-            text=self._repeated(self._text, len(rows)),
+            text=self._repeated(self._text, len(clean)),
             image=held.get('image'),
             anchor=held.get('anchor'),
             history=held.get('history'),
@@ -500,12 +535,24 @@ class CachedSource:
         )
 
     def close(self) -> None:
-        """Do nothing: a cache has no processes, unlike other sources."""
+        """Stop reading."""
+        self._loader.close()
+
+    def _read(self, step: int, number: int) -> dict[str, Tensor]:
+        return self._cache.read(self._clip(step, number).key)
+
+    def _collated(self, _: int, rows: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+        return {
+            name: (pad_rows if name == CONTEXT else torch.stack)([row[name] for row in rows])
+            for name in rows[0]
+        }
 
     def _clip(self, step: int, number: int) -> CachedClip:
         epoch, place = divmod(step * self._batch_size + number, len(self._clips))
-        order = np.random.default_rng((self._seed, epoch)).permutation(len(self._clips))
-        return self._clips[order[place]]
+        return self._clips[self._order(epoch)[place]]
+
+    def _drawn_order(self, epoch: int) -> np.ndarray:
+        return np.random.default_rng((self._seed, epoch)).permutation(len(self._clips))
 
     def _repeated(self, text: Tensor | None, count: int) -> Tensor | None:
         return None if text is None else text.to(self._device).expand(count, -1, -1)

@@ -79,8 +79,8 @@ def test_a_batch_is_what_encoding_the_recorded_clips_gives(source, tmp_path, con
     said = capsys.readouterr().out
     assert f'0 of {source.num_clips} clips were there, {source.num_clips} encoded in' in said
     assert 'clips/s' in said
-    recording, starts = source.starts[0]
-    gaps = np.diff(recording.times[starts])
+    recording, starts = source.episodes[0].recording(), source.episodes[0].starts
+    gaps = np.diff(recording.times[list(starts)])
     assert len(starts) == held.num_clips > 2 and (gaps > 2 - 1e-6).all() and (gaps < 2.3).all()
     batch = held.batch(0)
     clip = held._clip(0, 1)
@@ -131,7 +131,7 @@ def test_an_epoch_takes_every_clip_once_and_the_next_in_another_order(source, ro
     held = fill(source, root, config, base)
     count = held.num_clips
     order = [held._clip(*divmod(index, 2)).start for index in range(2 * count)]
-    assert sorted(order[:count]) == sorted(order[count:]) == source.starts[0][1].tolist()
+    assert sorted(order[:count]) == sorted(order[count:]) == list(source.episodes[0].starts)
     assert order[:count] != order[count:]
 
 
