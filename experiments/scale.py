@@ -2,12 +2,14 @@
 
     python experiments/scale.py                 tables of docs/paper_scale.md
     python experiments/scale.py measure         formula against points of this machine
+    python experiments/scale.py start           time to the first step of 1, 2 and 4 processes
+    python experiments/scale.py data            start, memory and clips of 100 to 10,000 episodes
     python experiments/scale.py ray             what Ray adds to a rollout
 
 The constants are those of the pages in `experiments/results` that each names. `measure` compares
 the CPU time of 1, 2 and 4 processes and of 100 to 10,000 episodes with the formula: constants are
-fitted to the smallest two sizes, and the others are predicted. CPU time is taken, as it
-hardly depends on the load.
+fitted to the smallest sizes, and the others are predicted. CPU time is taken, as it
+hardly depends on the load; of several processes, `start` takes that of the slowest.
 """
 
 from __future__ import annotations
@@ -15,7 +17,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import json
 from math import ceil
+import os
 from pathlib import Path
 import resource
 import shutil
@@ -24,13 +28,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from typing import Any
 
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.documents import Table
 from mtv_world_ros.core.executor import run_all
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.core.workers import Workers
-from mtv_world_ros.data.episode_reader import list_episodes, read_info
+from mtv_world_ros.data.episode_reader import list_episodes
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -124,23 +129,191 @@ def _children_cpu_s() -> float:
     return spent.ru_utime + spent.ru_stime
 
 
-def read_cpu_s(count: int, work: Path) -> float:
-    """Return the CPU time of listing and reading the descriptions of some episodes [s]."""
-    folder = work / f'episodes_{count}'
+def copy_episodes(count: int, folder: Path) -> list[Path]:
+    """Return copies of the demo episode with other names and contents; recordings are links."""
     source = share_path('resource', 'demo_episode')
     for index in range(count):
-        # a link for the recording: 10,000 copies need no room
         one = folder / f'stack_blocks_two_{index:05d}'
+        if one.is_dir():
+            continue
         one.mkdir(parents=True)
+        (one / 'copy.txt').write_text(str(index))
         for part in source.iterdir():
             if part.suffix == '.mcap':
                 (one / part.name).symlink_to(part.resolve())
             else:
                 shutil.copy(part, one / part.name)
-    begun = time.process_time()
-    for path in list_episodes(folder):
-        read_info(path)
-    return time.process_time() - begun
+    return list_episodes(folder)[:count]
+
+
+def own_process(what: str, work: Path, *, count: int = 1, number: int = 0) -> list[dict[str, Any]]:
+    """Return what `measured_process` prints, of each process.
+
+    Args:
+        what: what is measured, `data` or `start`.
+        work: folder of the caches.
+        count: number of processes.
+        number: number of episodes.
+    """
+    launcher = ['-m', 'torch.distributed.run', '--standalone', '--nproc-per-node', str(count)]
+    done = subprocess.run(
+        [sys.executable, *launcher, str(Path(__file__)), what, '--work', str(work),
+         '--episodes', str(number)],
+        check=True, cwd=ROOT, stdout=subprocess.PIPE, text=True,
+        env={**os.environ, 'OMP_NUM_THREADS': '1', 'PYTHONPATH': str(ROOT)},
+    )  # fmt: skip
+    rows = [line for line in done.stdout.splitlines() if line.startswith(_MARK)]
+    return [json.loads(row.removeprefix(_MARK)) for row in rows]
+
+
+def measured_process(what: str, work: Path, number: int) -> None:
+    """Measure in this process, one of those that a launcher started, and print JSON.
+
+    Args:
+        what: `data`: start and clips of the preset small; `start`: reading, and latents of an
+            autoencoder with Wan's layers and random weights.
+        work: folder of the caches.
+        number: number of episodes.
+    """
+    from diffusers import AutoencoderKLWan
+    import torch
+
+    from mtv_world_ros.model.autoencoders import WanAutoencoder
+    from mtv_world_ros.robot.file import load_robot, robot_path
+    from mtv_world_ros.training.base_checkpoint import Base
+    from mtv_world_ros.training.clips.batches import BatchSource
+    from mtv_world_ros.training.clips.encoding import Encoders
+    from mtv_world_ros.training.clips.latent_cache import cached_batches
+    from mtv_world_ros.training.distributed import Processes
+    from mtv_world_ros.training.training_config import load_training_config
+    from mtv_world_ros.training.training_run import load_episodes
+    from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    changes: dict[str, Any] = {'video.clip_stride_s': 86400.0}
+    if what == 'start':
+        changes |= {'autoencoder._class_name': 'AutoencoderKLWan', 'augment.start_noise': 0.0}
+        changes |= {'augment.colour_permutation': 0.0, 'augment.failure_share': None}
+    config, processes = load_training_config('small', changes), Processes('cpu')
+    robot = load_robot(robot_path(config.video.robot))
+    processes.any(False)
+    begun, begun_s = time.process_time(), time.perf_counter()
+    found: dict[str, Any] = {}
+
+    def lap(name: str) -> None:
+        found[name] = time.process_time() - begun - sum(found.values())
+
+    paths = list_episodes(work / 'episodes')[:number]
+    cache = work / f'cache_{what}_{processes.count if what == "start" else number}'
+    episodes, _ = load_episodes(paths, config, robot, cache, processes=processes)
+    lap('read')
+    source = BatchSource(episodes, config, robot=robot, segmenter=ColourSegmenter(), seed=0)
+    if what == 'start':
+        small = AutoencoderKLWan(base_dim=16, z_dim=16).eval().requires_grad_(False)
+        encoders = Encoders(autoencoder=WanAutoencoder(small))
+        parts: Any = None  # the cache takes the encoders alone
+        base = Base(folder=work / 'base', checkpoint=parts, encoders=encoders, digest='')
+        latents = work / f'latents_{processes.count}'
+        lap('prepare')
+        cached_batches(
+            source, latents, config, base, seed=0, dtype=torch.float32, processes=processes
+        ).close()
+        lap('encode')
+    else:
+        memory: list[float] = []
+        for step in range(2 * _STEPS + 1):
+            source.batch(step)
+            if step % _STEPS == 0:
+                memory.append(_memory_mib())
+                lap(f'steps_{step}')
+        found['memory_mib'] = memory
+        found['clips'] = source.num_clips
+        source.close()
+    found['wall_s'] = time.perf_counter() - begun_s
+    print(f'{_MARK}{json.dumps(found)}', flush=True)
+    processes.any(False)
+    processes.close()
+
+
+def _memory_mib() -> float:
+    """Return the memory of this process that no file backs [MiB]."""
+    text = Path('/proc/self/status').read_text()
+    return int(text.partition('RssAnon:')[2].split()[0]) / 1024
+
+
+def measure_start() -> int:
+    """Print the time to the first step of 1, 2 and 4 processes."""
+    rows: list[list[str]] = []
+    with tempfile.TemporaryDirectory() as name:
+        work = Path(name)
+        copy_episodes(_START_EPISODES, work / 'episodes')
+        first = 0.0
+        for count in (1, 2, 4):
+            found = own_process('start', work, count=count, number=_START_EPISODES)
+            read, encode = (max(row[key] for row in found) for key in ('read', 'encode'))
+            first = first or read + encode
+            again = own_process('start', work, count=count, number=_START_EPISODES)
+            rest = max(row['read'] + row['encode'] for row in again)
+            gain = first / (read + encode)
+            rows.append([str(count), f'{read:.1f}', f'{encode:.1f}', f'{gain:.2f}', f'{rest:.1f}'])
+    head = ['processes', 'read and check [s]', 'encode [s]', 'gain', 'second start [s]']
+    print(f'{_START_EPISODES} episodes, one clip each; CPU time of the slowest process\n')
+    print(Table(head=head, rows=rows).markdown())
+    return 0
+
+
+def measure_data(sizes: Sequence[int] = (100, 1000, 10_000)) -> int:
+    """Print start, memory and clips of data sets of several sizes."""
+    from mtv_world_ros.data.recordings import recording_key
+    from mtv_world_ros.robot.file import load_robot, robot_path
+    from mtv_world_ros.training.training_config import load_training_config
+
+    config = load_training_config('small')
+    robot = load_robot(robot_path(config.video.robot))
+    rows: list[list[str]] = []
+    with tempfile.TemporaryDirectory() as name:
+        work = Path(name)
+        paths = copy_episodes(max(sizes), work / 'episodes')
+        own_process('data', work, number=1)  # decodes one; the others have equal frames
+        (decoded,) = (work / 'cache_data_1').glob('*.npz')
+        starts: list[float] = []
+        for size in sizes:
+            cache = work / f'cache_data_{size}'
+            cache.mkdir()
+            for path in paths[:size]:
+                key = recording_key(path, config.spec, robot)
+                (cache / f'{key}.npz').hardlink_to(decoded)
+            (first,) = own_process('data', work, number=size)
+            (again,) = own_process('data', work, number=size)
+            memory = again['memory_mib']
+            per_clip = again[f'steps_{2 * _STEPS}'] / _STEPS / config.optimizer.batch_size
+            starts.append(again['read'])
+            rows.append([
+                f'{size:,}', f'{first["read"]:.1f}', f'{again["read"]:.2f}',
+                *(f'{value:.0f}' for value in memory), f'{per_clip * again["clips"]:.0f}',
+            ])  # fmt: skip
+        line = predicted(sizes, starts)
+        for row, size in zip(rows, sizes, strict=True):
+            row.append(f'{line(size):.2f}')
+    head = ['episodes', 'first start [s]', 'later start [s]', 'memory after 1 step [MiB]']
+    head += [
+        f'after {_STEPS}',
+        f'after {2 * _STEPS}',
+        'clips of an epoch [s]',
+        'later start by the formula [s]',
+    ]
+    print('CPU time of one process; memory is what no file backs\n')
+    print(Table(head=head, rows=rows).markdown())
+    return 0
+
+
+#: begins the line of a measured process
+_MARK = 'measured: '
+#: episodes of the table of starts
+_START_EPISODES = 32
+#: steps between two looks at the memory
+_STEPS = 50
 
 
 def train_cpu_s(processes: int, steps: int, work: Path) -> float:
@@ -168,27 +341,20 @@ def predicted(sizes: Sequence[int], found: Sequence[float]) -> Callable[[int], f
 
 
 def measure() -> int:
-    """Print measured points beside what the formula says of them."""
+    """Print measured points of training beside what the formula says of them."""
     with tempfile.TemporaryDirectory() as name:
-        work = Path(name)
-        rows = []
-        sizes = (100, 1000, 10_000)
-        found = [read_cpu_s(size, work) for size in sizes]
-        line = predicted(sizes, found)
-        rows += [
-            [f'{size:,} episodes listed and described', f'{value:.2f}', f'{line(size):.2f}']
-            for size, value in zip(sizes, found, strict=True)
-        ]
-        # startup and steps of one process; others start as long, and share the steps
-        once, more = (train_cpu_s(1, steps, work) for steps in (2, 12))
+        work, rows = Path(name), []
+        # constants: start of one process and of each further one, and a step of four clips
+        once, more, two = (train_cpu_s(n, steps, work) for n, steps in ((1, 2), (1, 12), (2, 2)))
         step_s = (more - once) / 10
-        start_s = once - 2 * step_s
+        start_s, further_s = once - 2 * step_s, two - once
         for processes in (1, 2, 4):
             value = more if processes == 1 else train_cpu_s(processes, 12, work)
-            formula = processes * start_s + 12 * step_s
+            formula = start_s + (processes - 1) * further_s + 12 * step_s
+            ratio = f'{100 * (formula / value - 1):+.0f} %'
             rows.append([f'12 steps on {processes} process{"es" * (processes > 1)}',
-                         f'{value:.1f}', f'{formula:.1f}'])  # fmt: skip
-        print(Table(head=['point', 'CPU time [s]', 'formula [s]'], rows=rows).markdown())
+                         f'{value:.1f}', f'{formula:.1f}', ratio])  # fmt: skip
+        print(Table(head=['point', 'CPU time [s]', 'formula [s]', 'off'], rows=rows).markdown())
     return 0
 
 
@@ -236,10 +402,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument('what', nargs='?', choices=('tables', 'measure', 'ray'), default='tables')
-    what = parser.parse_args().what
-    if what != 'tables':
-        return measure() if what == 'measure' else measure_ray()
+    runs = {'measure': measure, 'ray': measure_ray, 'start': measure_start, 'data': measure_data}
+    parser.add_argument('what', nargs='?', choices=('tables', *runs), default='tables')
+    parser.add_argument(
+        '--work', type=Path, help='folder of a process that `start` or `data` starts'
+    )
+    parser.add_argument('--episodes', type=int, default=0, help='its number of episodes')
+    options = parser.parse_args()
+    if options.work is not None:
+        measured_process(options.what, options.work, options.episodes)
+        return 0
+    if options.what != 'tables':
+        return runs[options.what]()
     print(f'{training_table().markdown()}\n\n{ranking_table().markdown()}')
     return 0
 

@@ -37,6 +37,9 @@ def test_two_processes_train_an_adapter_and_end_well(episode, tmp_path):
     assert said.count('adapter for ') == 1
     assert shlex.quote(str(out / 'adapter')) in said
     assert read_card(out / 'adapter').trained_on['steps'] == 4
+    shards = sorted(file.name for file in (tmp_path / 'latents').rglob('*.safetensors'))
+    assert shards == ['latents-000-00000.safetensors', 'latents-001-00000.safetensors']
+    assert 'encoded by 2 processes' in said + errors
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count
 import signal
+import threading
 from typing import Any, Generic, TypeVar
 
 import cv2
@@ -117,7 +118,11 @@ class StepLoader(Generic[Sample, Batch]):
             multiprocessing_context='fork' if self._workers else None,  # shares what is loaded
             worker_init_fn=_start_worker,
         )
+        before = signal.getsignal(signal.SIGCHLD)
         self._batches = iter(loader)
+        if self._workers and threading.current_thread() is threading.main_thread():
+            # torch's handler raises in the middle of anything; `batch` says it, too
+            signal.signal(signal.SIGCHLD, before)
 
     def _take(self) -> Any:
         batches = self._batches
