@@ -293,6 +293,7 @@ def measure_data(sizes: Sequence[int] = (100, 1000, 10_000)) -> int:
                 f'{size:,}', f'{first["read"]:.1f}', f'{again["read"]:.2f}',
                 *(f'{value:.0f}' for value in memory), f'{per_clip * again["clips"]:.0f}',
             ])  # fmt: skip
+            print(' | '.join(rows[-1]), file=sys.stderr, flush=True)
         line = predicted(sizes, starts)
         for row, size in zip(rows, sizes, strict=True):
             row.append(f'{line(size):.2f}')

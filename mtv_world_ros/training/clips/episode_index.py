@@ -7,6 +7,7 @@ in place of the episodes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 import hashlib
@@ -18,7 +19,7 @@ import numpy as np
 
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.data_types import CameraModel, WorldModelSpec
-from mtv_world_ros.core.errors import MtvWorldError
+from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.core.files import content_digest, write_whole
 from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.data.bag_mapping import EpisodeSource
@@ -223,7 +224,9 @@ def index_episodes(
     keys = {path: reader.key(path) for path in mine if str(path) not in left_out}
     known = {p for p, key in keys.items() if key in held and _file(reader, key).is_file()}
     new = [path for path in keys if path not in known]
-    refuse_test_kinds(new, 'training')
+    for path in new:
+        with suppress(EpisodeError):  # reading names what it lacks
+            refuse_test_kinds([path], 'training')
     rows: dict[str, dict[str, Any]] = {str(path): held[keys[path]] for path in known}
     reasons = {str(path): left_out[str(path)] for path in mine if str(path) in left_out}
     for path in Progress(new, desc='reading episodes', unit='episode', is_shown=processes.is_main):
