@@ -87,7 +87,7 @@ class Intrinsics:
         )
 
     def difference(self, other: Intrinsics) -> str:
-        """Return what is different in another one, as text; empty = nothing."""
+        """Return the differences from another one, as text; empty = equal."""
         pairs = {
             'size': (f'{self.width}x{self.height}', f'{other.width}x{other.height}'),
             'K': (_numbers(self.matrix), _numbers(other.matrix)),

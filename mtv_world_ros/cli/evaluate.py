@@ -243,7 +243,7 @@ def _slug(label: str) -> str:
 def load_pipelines(
     arguments: argparse.Namespace, checkpoint: Checkpoint, **options: Any
 ) -> tuple[Pipeline, Parallel]:
-    """Return the pipeline of this process, and the workers with what makes theirs."""
+    """Return the pipeline of this process, the workers, and the factory of their pipelines."""
     from mtv_world_ros.evaluation.evaluate_episodes import Parallel
     from mtv_world_ros.rollout.pipeline import Pipeline
 

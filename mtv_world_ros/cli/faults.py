@@ -23,7 +23,7 @@ class ListFaults(argparse.Action):
 
 
 def print_faults(asked: str) -> None:
-    """Print fault kinds: name, family, split, sizes, and what the size means.
+    """Print fault kinds: name, family, split, sizes, and the meaning of the size.
 
     Args:
         asked: a split (train, calibrate, test), drawn:SEED, or comma-separated names; empty = all

@@ -49,7 +49,7 @@ def check_needs(words: Sequence[str], arguments: argparse.Namespace) -> None:
 
 
 def missing_text(packages: Sequence[str]) -> str:
-    """Return the line on packages that are not installed, and what installs them."""
+    """Return the line on missing packages, with the command that installs them."""
     are = 'is' if len(packages) == 1 else 'are'
     return (
         f'{", ".join(packages)} {are} not installed: make in the folder of mtv_world_ros '

@@ -71,7 +71,7 @@ class ActionScaling:
         """Return the scaling with stored values.
 
         Raises:
-            CheckpointError: the values are of other numbers, or not finite.
+            CheckpointError: the values are not finite, or their number differs.
         """
         low, high = (np.array(state[key], np.float64) for key in ('low', 'high'))
         names = tuple(str(name) for name in state['names'])

@@ -34,7 +34,7 @@ class SeenFrame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlScene:
-    """One chunk of a plan and the frame that it starts from: what a control is computed from.
+    """Input of a control: one chunk of a plan, and the frame that it starts from.
 
     Attributes:
         motion: 1 + T states of the robot and its cameras; row 0 is the start, row k command k.
@@ -151,7 +151,7 @@ class InputLayout:
         return tuple(name for name in ('video', 'context', 'frame') if getattr(self, name))
 
     def transformer_arguments(self) -> dict[str, Any]:
-        """Return the arguments of the transformer beyond those of a preset."""
+        """Return the transformer's arguments that this layout adds to a preset."""
         return {
             f'{name}_input': asdict(value)
             for name, value in (('context', self.context), ('frame', self.frame))
@@ -159,7 +159,7 @@ class InputLayout:
         }
 
     def check(self, inputs: ControlInputs, name: str) -> None:
-        """Raise if inputs are not those of the layout.
+        """Raise if inputs do not have this layout.
 
         Args:
             inputs: inputs of one chunk.
@@ -257,7 +257,7 @@ class Control(Protocol):
         ...
 
     def unmarked(self, scene: ControlScene) -> ByteArray | None:
-        """Return what `make` draws as it looks (V, 1 + T, H, W, 4), without marks of the plan.
+        """Return real appearance in the control frames (V, 1 + T, H, W, 4), without plan marks.
 
         None = the control draws no such pictures. A model that may copy them copies marks, too.
         """
@@ -270,7 +270,7 @@ class Control(Protocol):
         return self
 
     def state(self) -> dict[str, Any]:
-        """Return what `fitted` found, as plain values for a JSON file."""
+        """Return the fitted statistics as plain values, for a JSON file."""
         return {}
 
     def restored(self, state: Mapping[str, Any]) -> Self:

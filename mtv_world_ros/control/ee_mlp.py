@@ -97,7 +97,7 @@ class EndEffectorMlp(Control):
 
 
 def feature_names(robot: RobotModel) -> tuple[str, ...]:
-    """Return the 10 A names of what `tool_features` returns."""
+    """Return the names of the 10 A features of `tool_features`."""
     return tuple(f'{tool.arm} {part}' for tool in robot.tools for part in PARTS)
 
 

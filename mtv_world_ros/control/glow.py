@@ -131,7 +131,7 @@ class Trail:
         return np.where(brightness >= FAINTEST, brightness, 0.0)
 
     def add(self, glows: Iterable[tuple[Box, GlowArray]]) -> None:
-        """Add points, each as a box inside the image and the (h, w) glow in it."""
+        """Add points; each is a box of the image with its glow (h, w)."""
         for box, glow in glows:
             if not is_empty(box):
                 part = region(self.image, box)

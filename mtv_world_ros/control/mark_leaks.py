@@ -13,7 +13,7 @@ from mtv_world_ros.core.data_types import BoolArray, ByteArray, FloatArray
 
 @dataclass(frozen=True)
 class LeakSettings:
-    """What counts as a mark's colour. Measured with random plans on the bundled checkpoint.
+    """Thresholds of the colour of a mark, measured with random plans on the bundled checkpoint.
 
     Attributes:
         min_chroma: smallest distance of a colour from its grey [grey levels].

@@ -77,7 +77,7 @@ def create_control(name: str, options: ControlOptions) -> Control:
 
 
 def save_control(control: Control, name: str, folder: Path) -> None:
-    """Write what a control was fitted to into a folder; nothing if it has no state."""
+    """Write the fitted statistics of a control, if it has some, into a folder."""
     state = control.state()
     if state:
         text = json.dumps({'control': name, 'state': state}, ensure_ascii=False, indent=1)

@@ -322,7 +322,7 @@ class ObjectMasks:
         return ObjectMasks(names=self.names, masks=self.masks[:, :, -1:], status=self.status)
 
     def filled_from(self, other: ObjectMasks) -> ObjectMasks:
-        """Return the masks, with those of others where none is found and the others are trusted.
+        """Return the masks; missing ones are filled from other masks that are trusted.
 
         Args:
             other: masks of the same names and shape.

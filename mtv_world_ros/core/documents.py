@@ -94,7 +94,7 @@ def number(value: float | None, digits: int = 3) -> str:
 def with_interval(
     value: float | None, interval: Sequence[float | None] | None, digits: int = 3
 ) -> str:
-    """Return a number and its interval in brackets; what is not known is left out."""
+    """Return a number with its interval in brackets; unknown parts are left out."""
     text = number(value, digits)
     low, high = interval or (None, None)
     if text == DASH or low is None or high is None or not isfinite(low):
@@ -103,7 +103,7 @@ def with_interval(
 
 
 def render(template: str, **values: Any) -> str:
-    """Return a template of `resource/report/` with its values; those of HTML are escaped."""
+    """Render a template of `resource/report/` with values; HTML is escaped."""
     return _environment().get_template(template).render(**values)
 
 

@@ -95,7 +95,7 @@ def is_file(path: Path) -> bool:
 
 
 def bundled_names(kind: str, holding: str = '') -> list[str]:
-    """Return the names of the files of `config/<kind>`, of robots those of their folders, sorted.
+    """Return the sorted names of the files in `config/<kind>`; of robots, their folders.
 
     Args:
         kind: folder of `config`.

@@ -53,7 +53,7 @@ def key_of(value: str) -> str:
 
 
 def keyed(value: Any) -> Any:
-    """Return `key: NAME` for the mapping that YAML makes of it without quotes."""
+    """Return the text `key: NAME` that YAML has read as a mapping, because quotes are missing."""
     is_key = isinstance(value, dict) and list(value) == ['key'] and isinstance(value['key'], str)
     return f'{_KEY} {value["key"]}' if is_key else value
 

@@ -65,7 +65,7 @@ def views_without_info(path: Path, topics: Collection[str]) -> list[str]:
 def write_cameras(
     path: Path, cameras: Mapping[str, CameraModel], known: Mapping[str, CameraModel] = {}
 ) -> bool:
-    """Write cameras into an episode; those of other views, and all other messages, stay.
+    """Write cameras into an episode; cameras of other views and all messages are kept.
 
     The bag gets a CameraInfo with each image of the views, and their poses on /tf_static, in place
     of what it had; cameras that move in their link keep their poses of /tf. The folder is made

@@ -71,7 +71,7 @@ def num_turns(
 
 
 def has_turns(count: int, num_samples: int, settings: GripperSettings = SETTINGS) -> bool:
-    """Return True if so many turns are those of two publishers."""
+    """Return True if the number of reversals shows two publishers."""
     return count >= settings.least_turns and count > settings.turns_ratio * num_samples
 
 
@@ -176,7 +176,7 @@ def _whole_senders(others: BoolArray, senders: Sequence[tuple[str, ...]]) -> Boo
 def resting_grippers(
     positions: FloatArray, commanded: Sequence[FloatArray], robot: RobotModel
 ) -> dict[str, str]:
-    """Return what is odd of grippers that stay at one position while their commands move.
+    """Return notes on grippers that do not move while their commands do.
 
     Args:
         positions: (N, J) measured positions in the robot's order [rad or m].

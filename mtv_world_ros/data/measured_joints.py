@@ -526,7 +526,7 @@ def _moves(positions: FloatArray, settings: ReachSettings) -> bool:
 def mend_rows(
     what: str, times: FloatArray, positions: FloatArray, robot: RobotModel
 ) -> tuple[FloatArray, list[str]]:
-    """Return the measured positions (T, J) of the rows of a table, and what was odd.
+    """Return measured positions (T, J) for the rows of a table, and notes on repairs.
 
     A joint without a number, and a row that no joint can have moved to, has a position between
     those of the rows around it.

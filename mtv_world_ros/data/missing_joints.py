@@ -12,7 +12,7 @@ _MAX_PREFIXES = 3
 
 
 def common_prefixes(recorded: Collection[str], joints: Sequence[str]) -> list[str]:
-    """Return the prefixes with each of which all joints are among the recorded names."""
+    """Return the prefixes that turn all joint names into recorded names."""
     first, names = joints[0], set(recorded)
     found = [name.removesuffix(first) for name in recorded if name.endswith(first)]
     return [prefix for prefix in found if prefix and names.issuperset(prefix + j for j in joints)]

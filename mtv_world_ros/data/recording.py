@@ -108,7 +108,7 @@ class Recording:
         )
 
     def observation(self, frame: int) -> Observation:
-        """Return what the robot saw and where it stood at a recorded frame."""
+        """Return the observation at a recorded frame: images and joint positions."""
         frames, cameras = self.seen_at(frame)
         return Observation(
             cameras=cameras,
@@ -281,7 +281,7 @@ def _middles(episode: Episode, view: str, stamps: np.ndarray) -> FloatArray:
 
 
 def stitched_commands(episode: Episode, robot: RobotModel, origin_ns: int) -> JointTrajectory:
-    """Return what was commanded in the robot's joint order; see `stitch`, `complete_plans`."""
+    """Return the commands in the robot's joint order; see `stitch`, `complete_plans`."""
     chunk_s = BagMapping().chunk_s
     whole, _ = complete_plans(episode.trajectories, episode.joint_states, robot, chunk_s)
     matched = [(s, match_joints(t, robot)) for s, t in whole]

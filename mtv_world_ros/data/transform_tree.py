@@ -194,7 +194,7 @@ class TransformTree:
                 del self._edges[other]
 
     def forget_moving(self) -> None:
-        """Forget what /tf said (the clock jumped); /tf_static holds for good."""
+        """Drop transforms of /tf (the clock jumped); those of /tf_static are kept."""
         self._edges = {k: edge for k, edge in self._edges.items() if edge.stamp_ns is None}
 
     def name(self, frame: str) -> str:

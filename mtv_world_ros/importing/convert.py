@@ -86,7 +86,7 @@ def episode_name(number: int) -> str:
 
 
 def unknown_camera_note(folder: Path, view: str, what: str, why: str = '') -> str:
-    """Return what is not known of a view's camera, and the command that estimates it.
+    """Describe the unknown parameters of a view's camera, with the command that estimates them.
 
     Args:
         folder: folder of the episodes.

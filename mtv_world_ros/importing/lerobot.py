@@ -202,7 +202,7 @@ class LeRobotDataset:
         return found
 
     def video_note(self, entry: EpisodeEntry, feature: str) -> str:
-        """Return what was done to the frames of a view and why; empty if nothing was.
+        """Describe the changes made to the frames of a view, with reasons; empty = none.
 
         Call it when the frames have been read.
 

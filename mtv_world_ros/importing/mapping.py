@@ -99,7 +99,7 @@ class ActionStream(Stream):
         return [joint for joint in robot.joint_names if joint not in led]
 
     def columns_among(self, names: Sequence[str], state: Stream | None) -> tuple[JointColumn, ...]:
-        """Return one column a joint; those of the state where the mapping gives none.
+        """Return one column a joint; by default the columns of the state.
 
         Args:
             names: names of the columns; those that are named like the robot's joints go first.
@@ -119,7 +119,7 @@ class ActionStream(Stream):
         robot: RobotModel,
         state: Stream | None = None,
     ) -> tuple[FloatArray, tuple[str, ...]]:
-        """Return (T, J) positions of a feature's values (T, C), and what was odd.
+        """Return commanded positions (T, J) from a feature's values (T, C), and notes on them.
 
         Args:
             values: values in the dataset's units.

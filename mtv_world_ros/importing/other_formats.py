@@ -14,7 +14,7 @@ _RLDS = 'RLDS (TFRecord) is not read: LeRobot converts it, then mtv-world import
 
 
 def zarr_hint(folder: Path) -> str:
-    """Return what converts the zarr arrays of a folder, after a semicolon; empty = none."""
+    """Return a hint on converting a folder of zarr arrays, after a semicolon; empty = none."""
     return f'; {_ZARR}' if _is_zarr(folder) else ''
 
 
@@ -31,7 +31,7 @@ def _is_zarr(path: Path) -> bool:
 
 
 def conversion_hint(path: Path) -> str:
-    """Return what reads or converts a file or folder that is no bag, after a semicolon."""
+    """Return a hint on reading or converting a file that is no bag, after a semicolon."""
     if hint := zarr_hint(path):
         return hint
     names = [path.name] if path.is_file() else []

@@ -72,7 +72,7 @@ class ObjectStage:
         )
 
     def masks(self, recording: str, writer: EpisodeWriter) -> MaskWriter:
-        """Return what finds and stores the masks of the episode's objects."""
+        """Return the step that finds and stores the masks of an episode's objects."""
         if self.segmenter is not None and writer.objects:
             writer.metadata[MASKS_BY] = self.segmenter.name
         starts = {} if self.boxed is None else self.boxed.starts.get(recording, {})
@@ -95,7 +95,7 @@ AS_RECORDED = ObjectStage()
 
 
 def stage_key(describer: Path | None, segmenter: str) -> bytes:
-    """Return what changes with a describer's file, the list that it names, and a segmenter."""
+    """Return a digest of the describer's file, its list of objects, and the segmenter."""
     if describer is None:
         return segmenter.encode()
     values = read_yaml(describer, 'describer file', '--describer')

@@ -115,7 +115,7 @@ class Presentation:
         return round(height / self.pixel_aspect), width
 
     def note(self, stored: ByteArray) -> str:
-        """Return what is done to the stored frames of a video and why; empty if nothing is."""
+        """Describe the changes made to the frames of a video, with reasons; empty = none."""
         done = []
         if turn := self._turn():
             done.append(f'frames are {turn} (display matrix of the file)')
@@ -192,7 +192,7 @@ class VideoStream:
         return self._presentation(frame).apply(_rgb(frame))
 
     def note(self, frame: av.VideoFrame) -> str:
-        """Return what is done to the frames and why; empty if nothing is."""
+        """Describe the changes made to the frames, with reasons; empty = none."""
         return self._presentation(frame).note(_rgb(frame))
 
     def _presentation(self, frame: av.VideoFrame) -> Presentation:
@@ -223,7 +223,7 @@ def _rgb(frame: av.VideoFrame) -> ByteArray:
 
 
 def video_note(path: Path) -> str:
-    """Return what is done to the frames of a video file and why; empty if nothing is.
+    """Describe the changes made to the frames of a video file, with reasons; empty = none.
 
     Raises:
         EpisodeError: see `open_video`.

@@ -144,7 +144,7 @@ def check_commands(
 def response(
     commands: JointTrajectory, origin_ns: int, joints: JointTrack, *, reach_s: float = 2.0
 ) -> tuple[float, float]:
-    """Delay at which the measured joints are nearest to the commands [s], and what is left.
+    """Return the delay between commands and measured joints [s], and the residual.
 
     Returns:
         Delay [s] and root mean square of the rest [rad or m]; NaN where the commands stand still.

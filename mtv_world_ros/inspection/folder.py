@@ -303,7 +303,7 @@ def broken_parts(found: FolderInspection) -> dict[str, dict[str, str]]:
 
 
 def folder_text(found: FolderInspection) -> str:
-    """Return the table as text, with what concerns all episodes below."""
+    """Return the table as text, followed by findings about all episodes."""
     return '\n'.join([*aligned_rows(table(found)), *_conclusions(found)])
 
 

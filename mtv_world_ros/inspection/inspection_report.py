@@ -58,7 +58,7 @@ def not_checked(text: str) -> Finding:
 
 
 def part_not_checked(text: str) -> Finding:
-    """Return why a part of what a view shows was not checked, while the rest was."""
+    """Return the finding that a part of a view was not checked."""
     return Finding(verdict=NOT_CHECKED, text=text, of_a_part=True)
 
 
@@ -79,7 +79,7 @@ def worst_verdict(verdicts: Sequence[str]) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Section:
-    """One view, or what concerns all views (joints, commands, clocks).
+    """Findings on one view, or on joints, commands and clocks of all views.
 
     Attributes:
         name: name of the view, or `recording`.
@@ -97,7 +97,7 @@ class Section:
 
     @property
     def verdict(self) -> str:
-        """The worst of the findings that concern the whole of it."""
+        """Worst verdict of the findings that concern the whole section."""
         return worst_verdict([f.verdict for f in self.findings if not f.of_a_part])
 
     @property
@@ -145,7 +145,7 @@ class Inspection:
 
     @property
     def sections(self) -> tuple[Section, ...]:
-        """Those of the views, then the recording's."""
+        """Sections of the views, then that of the recording."""
         return (*self.views, self.recording)
 
     @property
@@ -200,7 +200,7 @@ def to_text(inspection: Inspection) -> str:
 def to_json(
     inspections: Mapping[str, Inspection], failed: Mapping[str, str] = {}
 ) -> dict[str, Any]:
-    """Return the content of `check.json`: verdicts, numbers, faults and what was not checked.
+    """Return the content of `check.json`: verdicts, numbers, faults, skipped checks.
 
     Args:
         inspections: inspection of each episode, by name.

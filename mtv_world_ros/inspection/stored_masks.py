@@ -14,7 +14,7 @@ _LARGE = 0.15
 
 
 def check_masks(episode: Episode) -> tuple[dict[str, str], list[Finding]]:
-    """Return how often each object is seen, by view, and what is odd; of masks by a segmenter."""
+    """Count how often a segmenter's masks show each object, by view; with notes on oddities."""
     by = episode.info.metadata.get(MASKS_BY, '')
     areas = episode.mask_areas() if by else {}
     measures, findings = {}, []

@@ -204,7 +204,7 @@ def checkpoint_folder(name: str | Path) -> Path:
 
 
 def control_options(card: CheckpointCard, robot: RobotModel) -> ControlOptions:
-    """Return what the control of a checkpoint is created for."""
+    """Return the options that the control of a checkpoint is created with."""
     return ControlOptions(
         robot=robot,
         rendering=card.rendering,

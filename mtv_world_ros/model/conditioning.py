@@ -129,7 +129,7 @@ def encode_frames(autoencoder: Autoencoder, frames: Tensor) -> Tensor:
 
 
 def encode_chunk(autoencoder: Autoencoder, frames: Tensor) -> Tensor:
-    """Return (B, V, C, F, h, w), what denoising 1 + T frames (B, V, 1 + T, H, W, 3) gives."""
+    """Encode 1 + T frames (B, V, 1 + T, H, W, 3) into the latents (B, V, C, F, h, w)."""
     kept = frames if autoencoder.includes_start else frames[:, :, 1:]
     return encode_frames(autoencoder, kept)
 

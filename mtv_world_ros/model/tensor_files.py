@@ -169,7 +169,7 @@ def read_tensors(path: Path, stem: str = '') -> dict[str, Tensor]:
 
 @contextmanager
 def disk_errors() -> Iterator[None]:
-    """Turn what safetensors raises on a full disk into OSError."""
+    """Turn the error of safetensors on a full disk into OSError."""
     try:
         yield
     except SafetensorError as error:

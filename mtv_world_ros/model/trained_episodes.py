@@ -27,7 +27,7 @@ class TrainedEpisodes:
 
     @classmethod
     def of_card(cls, trained_on: Mapping[str, Any]) -> Self:
-        """Return what the entry `trained_on` of a checkpoint's card says."""
+        """Read the entry `trained_on` of a checkpoint's card."""
         digests = trained_on.get(DIGESTS)
         if not isinstance(digests, list) or not digests:
             return cls()

@@ -112,7 +112,7 @@ class LeRobotPolicy:
         return f'lerobot {self._config.policy.type} {self._config.policy.path}'
 
     def reset(self, *, seed: int) -> None:
-        """Let the server forget what it has, and load the policy if that is not done."""
+        """Reset the server's state, and load the policy if necessary."""
         del seed
         self._timestep = 0
         config = self._config

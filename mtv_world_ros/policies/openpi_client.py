@@ -255,7 +255,7 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(data: bytes) -> Any:
-    """Return what the bytes hold.
+    """Decode a msgpack message.
 
     Raises:
         PolicyError: the bytes are not msgpack, or hold a malformed array.

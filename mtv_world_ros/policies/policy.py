@@ -36,7 +36,7 @@ class EpisodeOrigin:
 
 
 class Policy(Protocol):
-    """Decides what the robot does next; the same object runs in imagination and elsewhere."""
+    """A policy: maps an observation to commands, in imagination, simulator or on the robot."""
 
     @property
     def name(self) -> str:

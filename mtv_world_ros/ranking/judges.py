@@ -104,7 +104,7 @@ class Score:
 
     @classmethod
     def share(cls, results: Sequence[Result], is_hit: Callable[[Result], bool]) -> Score:
-        """Return the share of rollouts that are hits; those of a scene are a cluster."""
+        """Return the share of hits among rollouts; rollouts of one scene are a cluster."""
         counts: dict[Scene, list[bool]] = {}
         for result in results:
             counts.setdefault((result.task, result.index), []).append(is_hit(result))

@@ -71,7 +71,7 @@ class ServerProcess:
         self._num_fruitless = 0
 
     def stop(self) -> None:
-        """End the server and what it started."""
+        """End the server and its child processes."""
         if self._process is not None:
             _end(self._process)
             self._process = None

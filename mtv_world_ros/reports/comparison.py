@@ -68,7 +68,7 @@ def all_views(summaries: Sequence[EvaluationSummary]) -> list[str]:
 
 
 def method_table(rows: Sequence[Line], views: Sequence[str]) -> Table:
-    """Return method by view: FID, FVD and J (the paper's table 1), and J of what moves."""
+    """Return the table of methods by view: FID, FVD, J (the paper's table 1), J of moving ones."""
     columns = ('FID ↓', 'FVD ↓', 'J ↑', 'J moving ↑')
     head = ['Method', *(f'{view} {what}' for view in views for what in columns)]
     body = []

@@ -90,7 +90,7 @@ def views_of(evaluations: Sequence[Marked]) -> list[str]:
 
 
 def headline(evaluations: Sequence[Marked]) -> dict[str, Any]:
-    """Return J per view with intervals, and whether it beats what knows nothing."""
+    """Return J per view with intervals, and its margins over the baselines."""
     keys, words = _keys(evaluations)
     overall = [one.found.estimates(None) for one in evaluations]
     return {

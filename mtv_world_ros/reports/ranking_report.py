@@ -131,7 +131,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def order_remark(order: PolicyOrder) -> str:
-    """Return what the order of the policies rests on, and what it does not say."""
+    """Describe the evidence behind the order of the policies, and its limits."""
     if not order.num_scenes:
         return (
             'The policies are not ordered: no two rollouts of one scene have common futures. That '

@@ -85,7 +85,7 @@ def rollout_cards(results: Sequence[Result], out: Path) -> dict[str, Any]:
 
 
 def worst_first(results: Sequence[Result]) -> list[Result]:
-    """Return the rollouts, those first whose imagined estimate is farthest from what happened.
+    """Return the rollouts, sorted by the error of the imagined estimate, largest first.
 
     Of equal ones, those whose worlds part first.
     """
@@ -108,7 +108,7 @@ def _word(final: bool) -> str:
 
 
 def verdict(result: Result) -> str:
-    """Return what the imagined verdict is: right, a false success or failure, or none."""
+    """Return the outcome of the imagined verdict: right, false success, false failure, none."""
     said = result.imagined.success
     if not isfinite(said):
         return 'no verdict'

@@ -208,7 +208,7 @@ def to_columns(
 def column_number(
     column: str | int, names: Sequence[str], count: int, feature: str, what: str
 ) -> int:
-    """Return which of a feature's `count` columns a name or number is.
+    """Return the index of a feature's column, given its name or number.
 
     Raises:
         ConfigError: the column is missing; names what needs it.

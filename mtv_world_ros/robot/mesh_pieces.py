@@ -250,7 +250,7 @@ def outermost(points: FloatArray, directions: int = NUM_HULL_DIRECTIONS) -> Floa
 
 
 def slices(vertices: FloatArray, edges: NDArray[np.int64]) -> list[FloatArray]:
-    """Return the hull's points, or those of slices across the longest axis that hold far less."""
+    """Return the hull's points, or those of slices across its longest axis if far smaller."""
     whole = outermost(vertices)
     middle = vertices - vertices.mean(axis=0)
     axis = np.linalg.svd(middle[:: max(1, len(middle) // 2000)], full_matrices=False)[2][0]

@@ -156,12 +156,12 @@ class RobotModel:
 
     @property
     def is_endless(self) -> BoolArray:
-        """(J,) which of the commanded joints turn without end."""
+        """(J,) True for commanded joints without limits (continuous)."""
         return np.isinf(self.lower) & ~self.slides
 
     @property
     def slides(self) -> BoolArray:
-        """(J,) which of the commanded joints slide; the others turn."""
+        """(J,) True for prismatic joints among the commanded ones."""
         joints = (self._joint(name).shortname() for name in self.joint_names)
         return np.array([name.startswith('JointModelP') for name in joints], np.bool_)
 
@@ -241,7 +241,7 @@ class RobotModel:
 
     @property
     def joint_motions(self) -> FloatArray:
-        """(nv, J) how Pinocchio's velocities follow those of the joints."""
+        """Matrix (nv, J) from joint velocities to Pinocchio's velocities."""
         follows = np.zeros((self.pinocchio_model.nv, len(self.joint_names)))
         for setter in self._setters:
             follows[setter.velocity, setter.column] = setter.multiplier

@@ -220,7 +220,7 @@ class ChunkPlan:
 
     @property
     def num_left(self) -> int:
-        """Number of frames of a whole chunk that are not kept."""
+        """Number of frames at the end of a chunk that are dropped."""
         return len(self.times) - 1 - self.num_frames
 
     def fine_positions(self, step_s: float, each: int = 1) -> FloatArray:

@@ -195,7 +195,7 @@ def moving_links(robot: RobotModel) -> set[str]:
 
 
 def grip_links(robot: RobotModel) -> set[str]:
-    """Return the links that hold things: those of tools, and what gripper joints move."""
+    """Return the links of grippers: those of the tools, and those that gripper joints move."""
     frames = _joint_frames(robot)
     hands = {frames[tool.link] for tool in robot.tools if tool.gripper_joint} - {0}
     moved = {link for tool in robot.tools for link in gripper_links(robot, tool)}
@@ -203,7 +203,7 @@ def grip_links(robot: RobotModel) -> set[str]:
 
 
 def gripper_links(robot: RobotModel, tool: Tool) -> set[str]:
-    """Return the links that a tool's gripper joint moves, itself or by mimics; none without."""
+    """Return the links that a tool's gripper joint moves, directly or by mimic joints."""
     model, gripper = robot.pinocchio_model, tool.gripper_joint
     moved = {m.joint for m in robot.mimics if m.source == gripper} | {gripper}
     return {

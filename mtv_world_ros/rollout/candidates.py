@@ -26,7 +26,7 @@ from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
 
 class CandidatePolicy:
-    """Several instances of one policy with different seeds, of which the best one acts.
+    """Several instances of one policy with different seeds; the best one acts.
 
     The first question of an episode goes to all candidates. Their plans are compared in simulated
     futures of the scene, and the first candidate than which no other one is better acts for the

@@ -66,7 +66,7 @@ class EpisodeViewer:
 
 
 def streams_of(prediction: Prediction) -> Streams:
-    """Return what a chunk shows: imagined and trajectory frames, masks, estimate and reasons."""
+    """Return the streams of a chunk: imagined and trajectory frames, masks, estimate, reasons."""
     video, shown = prediction.video, Streams()
     stamps = [prediction.stamp_ns + round(float(time) * 1e9) for time in video.times]
     for row, view in enumerate(video.views):

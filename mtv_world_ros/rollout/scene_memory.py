@@ -25,7 +25,7 @@ from mtv_world_ros.robot.shape import fill, LinkShape, load_shape, moving_links
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneMemorySettings:
-    """Settings of what counts as covered.
+    """Thresholds at which a pixel counts as covered.
 
     Attributes:
         arm_margin: distance from the drawn robot within which the model's picture counts: cables,

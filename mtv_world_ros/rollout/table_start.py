@@ -70,7 +70,7 @@ def table_start(
     names: tuple[str, ...],
     values: FloatArray,
 ) -> tuple[Observation, JointTrajectory]:
-    """Return what a rollout starts from, and the commands of a table.
+    """Return the observation that a rollout starts from, and the commands of a table.
 
     Args:
         robot: robot whose joints the table names.

@@ -27,7 +27,7 @@ _OF_OTHERS = ('gloo', 'nccl', 'peer', 'connection')
 
 @contextmanager
 def memory_errors_named(device: torch.device) -> Iterator[None]:
-    """Turn an out-of-memory error into one that says what to set.
+    """Turn an out-of-memory error into one that names the settings to change.
 
     Raises:
         TrainingError: in place of torch's error.

@@ -300,7 +300,7 @@ class TrainingConfig(Schema):
         return self.card({}).spec
 
     def control_options(self, robot: RobotModel) -> ControlOptions:
-        """Return what the control is created for."""
+        """Return the options that the control is created with."""
         return ControlOptions(
             robot=robot,
             rendering=self.rendering.model_dump(),

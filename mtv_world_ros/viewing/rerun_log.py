@@ -241,7 +241,7 @@ def open_viewer(
 
 
 def flush(stream: Any, save: Path | None) -> None:
-    """Wait until the viewer or the file has what was logged.
+    """Wait until the viewer or the file has all logged data.
 
     Raises:
         MtvWorldError: the file cannot be written; there is none then.

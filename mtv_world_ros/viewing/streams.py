@@ -71,7 +71,7 @@ class Streams:
 
 
 def read_streams(bags: Sequence[Path]) -> Streams:
-    """Read episodes and predictions; those of one time belong together.
+    """Read episodes and predictions, joined by time.
 
     Raises:
         EpisodeError: one cannot be read, none holds an image, or they are more than a day apart.
@@ -117,7 +117,7 @@ def shown_as(topic: str, msgtype: str) -> tuple[str, ...] | None:
 
 
 def add_message(streams: Streams, message: BagMessage) -> None:
-    """Add what a message shows.
+    """Add the data of a message.
 
     Raises:
         MtvWorldError: the message cannot be read.

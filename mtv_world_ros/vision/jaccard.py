@@ -99,7 +99,7 @@ def held_masks(first: BoolArray, true: ObjectMasks) -> ObjectMasks:
 
 
 def mean_of_known(values: FloatArray, axis: int | tuple[int, ...] | None = None) -> FloatArray:
-    """Return the mean over what is not NaN, NaN where nothing is known."""
+    """Return the mean of the values that are not NaN; NaN if there are none."""
     with warnings.catch_warnings():
         warnings.simplefilter('ignore', RuntimeWarning)
         return np.asarray(np.nanmean(values, axis=axis))

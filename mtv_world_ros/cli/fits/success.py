@@ -134,7 +134,7 @@ def _fitted_to(
 
 
 def result_kinds(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
-    """Return the fault kinds of episodes of scripted policies, by what their results are called.
+    """Return the fault kinds of episodes of scripted policies, by name of the result.
 
     Raises:
         EpisodeError: the metadata of an episode cannot be used.

@@ -86,7 +86,7 @@ def add_common_options(
     *,
     calibration: str,
 ) -> None:
-    """Add the options that all imports have, and what runs one.
+    """Add the options that all imports have, and the handler.
 
     Args:
         parser: parser of the import.

@@ -67,7 +67,7 @@ class _Layout:
 
 
 def is_only_padded(content: bytes, warning: str) -> bool:
-    """Return True if a file decodes whole but for surplus bytes before its markers.
+    """Return True if surplus bytes before markers are the only fault of a JPEG file.
 
     Args:
         content: bytes of a JPEG file.

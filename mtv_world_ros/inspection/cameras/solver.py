@@ -65,7 +65,7 @@ class Residual:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Unknowns:
-    """Unknowns of a problem, and what is known about them beforehand.
+    """Unknowns of a camera problem, with their priors.
 
     Attributes:
         centre: (3,) point that poses are turned about; None = the camera.

@@ -46,7 +46,7 @@ class Context(NamedTuple):
     image: Tensor | None = None
 
     def with_history(self, num_history: int) -> Context:
-        """Return the context of a grid with history frames, which see what the reference sees."""
+        """Return the context for a grid with history frames, which get the reference's context."""
         if self.by_slot is None or not num_history:
             return self
         first = self.by_slot[:, :1].expand(-1, num_history, -1, -1)

@@ -21,7 +21,7 @@ START_IMAGES = ('both', 'either')
 
 
 def embed_video(transformer: Any, x: Tensor, temb: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Return tokens (B, V, f, h, w, D) of x (B, V, C_in, F, H, W), and what is skipped with.
+    """Embed x (B, V, C_in, F, H, W) as tokens (B, V, f, h, w, D); also return the skips.
 
     Args:
         transformer: transformer whose `patch_embedding` is used.
@@ -105,7 +105,7 @@ def unembed(
     reference: Tensor,
     control: Tensor,
 ) -> Tensor:
-    """Return (B, V, C, F, H, W) of the kept tokens (B, V, f, h, w, D).
+    """Project tokens (B, V, f, h, w, D) to the output latents (B, V, C, F, H, W).
 
     Args:
         transformer: transformer whose `proj_out` is used.

@@ -69,7 +69,7 @@ class FollowJointTrajectory:
         self._server.destroy()
 
     def started(self, goal: Goal, request: Request) -> None:
-        """Note the number of the rollout that a goal started."""
+        """Store the request that was made from a goal."""
         goal.request = request
         self._goals[request.rollout] = goal
 

@@ -195,8 +195,8 @@ def carry_out(
 def as_published(commands: JointTrajectory, config: RecordConfig) -> JointTrajectory:
     """Return commands at every control period, interpolated between action chunks' points.
 
-    Chunks have fewer points, so that what is quicker than them is not in them. The arms do what
-    the recording says, so that commands and motion match.
+    Chunks have fewer points than control periods, so that fast motion between points is lost.
+    The arms follow these commands, so that recorded commands and motion match.
     """
     num = len(commands.times) - 1
     starts = np.arange(0, num, round(config.chunk_s / CONTROL_PERIOD_S)) * CONTROL_PERIOD_S

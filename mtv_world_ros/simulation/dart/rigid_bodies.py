@@ -162,7 +162,7 @@ class RigidBodies:
         )
 
     def passes(self, way: FloatArray, velocity: FloatArray) -> bool:
-        """Move the arms along their way (D,) if they touch nothing there, else not at all."""
+        """Move the arms along their way (D,) unless they would touch something."""
         skeleton = self.arms.skeleton
         before = np.array(skeleton.getPositions())
         skeleton.setPositions(way)
@@ -405,7 +405,7 @@ class DrivenArms:
         return forces, (1 - added) * pulls
 
     def forces(self, carried: FloatArray, way: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return (D,) forces: what carries the arms, and what pulls them back to the way."""
+        """Return the forces (D,) of the drives: gravity compensation and tracking."""
         off = way - self.skeleton.getPositions()
         slow = velocity - self.skeleton.getVelocities()
         return carried + self._stiffness * off + self._damping * slow

@@ -37,7 +37,7 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RandomizationConfig:
-    """Ranges of what an episode draws.
+    """Ranges of the random draws of an episode.
 
     Attributes:
         width: image width [px].

@@ -50,7 +50,7 @@ class Grasp:
         return (size[0] - self.rim_m) / 2 * side
 
     def width(self, size: Size) -> float:
-        """Return what is between the closed fingers [m]."""
+        """Return the width between the closed fingers [m]."""
         return size[0] if self.rim_m is None else self.rim_m
 
 

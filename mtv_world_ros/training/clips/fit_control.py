@@ -29,7 +29,7 @@ def fitted_control(
     *,
     initial: Checkpoint | None = None,
 ) -> Control:
-    """Return the control of a training; what it was fitted to is stored in the folder.
+    """Return the control of a training; its statistics are stored in the folder.
 
     A training that is resumed keeps what it was fitted to. One that starts from the weights of a
     checkpoint takes over the checkpoint's, whose numbers these weights know.

@@ -366,7 +366,7 @@ def cached_batches(
     processes: Processes,
     workers: int = 0,
 ) -> CachedSource:
-    """Encode missing clips, report what was done, and return batches from the cache.
+    """Encode missing clips, report their number, and return batches from the cache.
 
     Every process encodes its share; all have to call this. The source of the same clips, which
     encodes nothing, is closed.

@@ -36,7 +36,7 @@ DINO_EDGES = (800, 1333)
 
 
 def stated_normalisation(config: dict[str, Any], default: Normalisation) -> Normalisation:
-    """Return what a preprocessor_config.json states, else the model family's own.
+    """Return the normalisation of preprocessor_config.json, else the model family's.
 
     Raises:
         CheckpointError: the preprocessor is not for images of three channels.

@@ -217,7 +217,7 @@ class PromptedSegmenter:
 
 @contextmanager
 def memory_errors(name: str, device: str) -> Iterator[None]:
-    """Turn torch's error into one that says what can be done."""
+    """Turn torch's out-of-memory error into one that names remedies."""
     import torch
 
     try:

@@ -65,7 +65,7 @@ class Sam2Video:
         return self.tracker(session, frame=pixels, frame_idx=index)
 
     def masks_in_boxes(self, frame: ByteArray, boxes: FloatArray) -> BoolArray:
-        """Return the (N, H, W) masks of what is in (N, 4) corner boxes [px] of a frame."""
+        """Return the masks (N, H, W) of the objects in corner boxes (N, 4) [px] of a frame."""
         import torch
 
         height, width = frame.shape[:2]

@@ -51,7 +51,7 @@ def check_request(
     first_masks: BoolArray | None,
     first_frames: ByteArray | None,
 ) -> None:
-    """Check what a segmenter is given, see `Segmenter.segment`.
+    """Check the arguments of `Segmenter.segment`.
 
     Raises:
         ObservationError: sizes or numbers do not fit each other.

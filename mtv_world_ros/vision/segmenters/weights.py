@@ -157,7 +157,7 @@ def load_tokenizer(folder: Path) -> Any:
 
 
 def preprocessor_config(folder: Path) -> dict[str, Any]:
-    """Return what the folder says of the preparation of images; empty where it says nothing."""
+    """Read the image preprocessing of a folder of weights; empty if it states none."""
     path = folder / 'preprocessor_config.json'
     return _read(path) if path.is_file() else {}
 
