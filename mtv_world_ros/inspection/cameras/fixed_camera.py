@@ -99,7 +99,7 @@ class FixedCamera:
             starts = self._set.around(0, seed, progress)[:_NUM_STARTS]
         ends = [self._set.refined(start, _FIRST_STAGES, 15)[0] for start in progress(starts)]
         state = max(ends, key=lambda end: float(self._set.fits(end, _FIRST_STAGES[-1])[0]))
-        state, _ = self._set.refined(state, _NEAR_STAGES, 25, whiten=True)
+        state, _ = self._set.refined(state, _NEAR_STAGES, 25, scaled=True, whiten=True)
         state, _ = self._set.refined(state, (_FINE_STAGE,), 15)
         T = state.poses[0]
         fine = self._outlines.read(_FINE_STAGE, T, state.lens)

@@ -46,7 +46,8 @@ class ImageStage(NamedTuple):
 _OUTLIER = 0.3
 #: drawn change of a pixel that the robot covers in both frames, where the image may change or not
 _INSIDE = 0.3
-SCALED_OUTLIER = 10.0
+#: outlier threshold of scaled changes: none is one, as in a correlation
+_SCALED_OUTLIER = 10.0
 #: distance of the pixels that a fit compares; blurred images hold no more [px]
 _STRIDE = 2
 #: links that move less are left out, because an arm at rest does not constrain the pose [m]
@@ -224,7 +225,7 @@ class Outlines:
                 seen = seen - seen.mean()
             return (drawn - seen).ravel()
 
-        outlier = SCALED_OUTLIER if scaled else _OUTLIER
+        outlier = _SCALED_OUTLIER if scaled else _OUTLIER
         return Residual(place=place, errors=errors, outlier=outlier)
 
     def _drawn(self, T: FloatArray, changes: Changes) -> NDArray[np.float32]:
