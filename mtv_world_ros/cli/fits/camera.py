@@ -12,8 +12,11 @@ from mtv_world_ros.cli.bundled_help import robots
 from mtv_world_ros.cli.fits.several_cameras import (
     calibrate_shared,
     is_shared,
+    known_shapes,
+    other_views,
     read_for_checks,
     robot_file,
+    save_camera,
 )
 from mtv_world_ros.cli.shared_options import add_options, names
 from mtv_world_ros.core.errors import ConfigError
@@ -143,23 +146,12 @@ def _calibrate_camera(arguments: argparse.Namespace) -> int:
 
 
 def _calibrate_one(arguments: argparse.Namespace) -> int:
-    from dataclasses import replace
-
-    from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
-    from mtv_world_ros.core.images import write_png
     from mtv_world_ros.inspection.camera_pose import difference
-    from mtv_world_ros.inspection.clocks import JointTrack
-    from mtv_world_ros.inspection.inspect import overlay_picture
     from mtv_world_ros.robot.file import load_robot
     from mtv_world_ros.robot.shape import load_shape
 
     out = arguments.out or Path('out/camera') / f'{arguments.view}.yaml'
-    known = load_calibration(out) if out.is_file() else {}
-    if arguments.view in known and arguments.out is not None and not arguments.overwrite:
-        raise ConfigError(
-            f"'{out}' has view '{arguments.view}' already; name another --out, or --overwrite to "
-            'replace it'
-        )
+    known = other_views(out, arguments.view, arguments)
     file, source = robot_file(arguments, arguments.episode)
     robot = load_robot(file)
     episode = read_for_checks(
@@ -176,17 +168,7 @@ def _calibrate_one(arguments: argparse.Namespace) -> int:
     if arguments.guess and guess.mount_link == camera.mount_link:
         mm, degrees = difference(guess.T_mount_camera, camera.T_mount_camera)
         print(f'the guess was {mm:.0f} mm and {degrees:.1f} degrees away')
-    assert episode.joint_states is not None
-    picture = overlay_picture(
-        replace(episode, cameras={arguments.view: camera}),
-        arguments.view,
-        robot,
-        load_shape(robot).parts,
-        JointTrack(episode.joint_states, robot),
-    )
-    write_png(out.with_suffix('.png'), picture)
-    save_calibration(out, {**known, arguments.view: camera})
-    print(f'calibration: {out}\nlook at it: {out.with_suffix(".png")}')
+    save_camera(out, known, camera, episode, robot, load_shape(robot).parts)
     return 0
 
 
@@ -277,7 +259,6 @@ def _estimate_fixed(
     from mtv_world_ros.core.progress import Progress
     from mtv_world_ros.core.transforms import inverse
     from mtv_world_ros.inspection.cameras.fixed_camera import FixedCamera
-    from mtv_world_ros.robot.shape import load_shape
 
     def rest(name: str) -> FloatArray:
         return robot.link_poses(name, np.zeros((1, len(robot.joint_names))))[0]
@@ -287,13 +268,7 @@ def _estimate_fixed(
         mount_link=robot.base_link,
         T_mount_camera=rest(camera.mount_link) @ camera.T_mount_camera,
     )
-    shape = load_shape(robot)
-    if not shape.is_known:
-        raise ConfigError(
-            f'a fixed camera is found by how the robot looks, but it has {shape.source}; give it '
-            'the meshes of its URDF'
-        )
-    fixed = FixedCamera(track, on_base, robot, shape.parts, joints)
+    fixed = FixedCamera(track, on_base, robot, known_shapes(robot), joints)
     found = fixed.estimate(
         guess=arguments.guess,
         seed=arguments.seed,

@@ -52,7 +52,6 @@ def calibrate_shared(arguments: argparse.Namespace) -> int:
     """Run the command on all recordings."""
     from mtv_world_ros.inspection.cameras.seen_points import load_points
     from mtv_world_ros.robot.file import load_robot
-    from mtv_world_ros.robot.shape import load_shape
 
     if arguments.mount_link or arguments.between:
         raise ConfigError('--mount-link and --between are for one recording')
@@ -76,16 +75,11 @@ def calibrate_shared(arguments: argparse.Namespace) -> int:
             '--overwrite estimates them anew and replaces them'
         )
         return _apply(arguments, episodes, {})
-    shape = load_shape(robot)
-    if not shape.is_known:
-        raise ConfigError(
-            f'a fixed camera is found by how the robot looks, but it has {shape.source}; give it '
-            'the meshes of its URDF'
-        )
+    parts = known_shapes(robot)
     groups = [views] if arguments.same_focal else [[view] for view in views]
     status = 0
     for group in groups:
-        found = _estimate(arguments, group, points, episodes, robot, shape.parts)
+        found = _estimate(arguments, group, points, episodes, robot, parts)
         if arguments.apply:
             by_view = {one.cameras[0].view: one for one in found}
             status = max(status, _apply(arguments, episodes, by_view))
@@ -295,13 +289,6 @@ def _write(
     parts: Sequence[LinkShape],
 ) -> None:
     """Write a calibration file and a picture a place."""
-    from dataclasses import replace
-
-    from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
-    from mtv_world_ros.core.images import write_png
-    from mtv_world_ros.inspection.clocks import JointTrack
-    from mtv_world_ros.inspection.inspect import overlay_picture
-
     view = estimate.cameras[0].view
     out = arguments.out or Path('out/camera') / f'{view}.yaml'
     numbers = estimate.places.place.tolist()
@@ -309,20 +296,66 @@ def _write(
     stem = f'{out.stem}_{view}' if len(arguments.views) > 1 and arguments.out else out.stem
     for place in dict.fromkeys(numbers):
         file = out.with_stem(f'{stem}_{place}' if several else stem)
-        known = load_calibration(file) if file.is_file() else {}
-        if view in known and arguments.out is not None and not arguments.overwrite:
-            raise ConfigError(
-                f"'{file}' has view '{view}' already; name another --out, or --overwrite to "
-                'replace it'
-            )
+        known = other_views(file, view, arguments)
         first = numbers.index(place)
-        save_calibration(file, {**known, view: estimate.cameras[first]})
-        states = episodes[first].joint_states
-        assert states is not None
-        shown = replace(episodes[first], cameras={view: estimate.cameras[first]})
-        picture = overlay_picture(shown, view, robot, parts, JointTrack(states, robot))
-        write_png(file.with_suffix('.png'), picture)
-        print(f'calibration: {file}\nlook at it: {file.with_suffix(".png")}')
+        save_camera(file, known, estimate.cameras[first], episodes[first], robot, parts)
+
+
+def known_shapes(robot: RobotModel) -> Sequence[LinkShape]:
+    """Return the shapes of a robot's links.
+
+    Raises:
+        ConfigError: they are not known.
+    """
+    from mtv_world_ros.robot.shape import load_shape
+
+    shape = load_shape(robot)
+    if not shape.is_known:
+        raise ConfigError(
+            f'a fixed camera is found by how the robot looks, but it has {shape.source}; give it '
+            'the meshes of its URDF'
+        )
+    return shape.parts
+
+
+def other_views(file: Path, view: str, arguments: argparse.Namespace) -> dict[str, CameraModel]:
+    """Return the cameras that a calibration file has; empty without a file.
+
+    Raises:
+        ConfigError: the user named the file, and it has the view already.
+    """
+    from mtv_world_ros.cameras.calibration_file import load_calibration
+
+    known = load_calibration(file) if file.is_file() else {}
+    if view in known and arguments.out is not None and not arguments.overwrite:
+        raise ConfigError(
+            f"'{file}' has view '{view}' already; name another --out, or --overwrite to replace it"
+        )
+    return known
+
+
+def save_camera(
+    file: Path,
+    known: dict[str, CameraModel],
+    camera: CameraModel,
+    episode: Episode,
+    robot: RobotModel,
+    parts: Sequence[LinkShape],
+) -> None:
+    """Write a camera into a calibration file, and a picture of the robot drawn with it."""
+    from dataclasses import replace
+
+    from mtv_world_ros.cameras.calibration_file import save_calibration
+    from mtv_world_ros.core.images import write_png
+    from mtv_world_ros.inspection.clocks import JointTrack
+    from mtv_world_ros.inspection.inspect import overlay_picture
+
+    assert episode.joint_states is not None
+    shown = replace(episode, cameras={camera.view: camera})
+    joints = JointTrack(episode.joint_states, robot)
+    write_png(file.with_suffix('.png'), overlay_picture(shown, camera.view, robot, parts, joints))
+    save_calibration(file, {**known, camera.view: camera})
+    print(f'calibration: {file}\nlook at it: {file.with_suffix(".png")}')
 
 
 def _apply(
