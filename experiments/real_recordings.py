@@ -2,8 +2,8 @@
 
     python experiments/real_recordings.py verdicts EPISODES [--task TASK.yaml] [--every 8]
     python experiments/real_recordings.py grips EPISODES [--robot ROBOT] [--out FOLDER]
-    python experiments/real_recordings.py shares EPISODES --contact FOLDER [--every 24]
-                                [--memory off]
+    python experiments/real_recordings.py shares EPISODES [--every 16] [--stop-holds 0.75]
+                                [--contact FOLDER] [--memory off]
     python experiments/real_recordings.py carried EPISODES --checkpoint CHECKPOINT
     python experiments/real_recordings.py rollouts EPISODES --checkpoint CHECKPOINT [--memory off]
                                 [--foresight off] [--out out/real_rollouts]
@@ -65,7 +65,10 @@ from mtv_world_ros.evaluation.metrics.arm_masks import arm_scenes
 from mtv_world_ros.evaluation.metrics.jaccard_scores import find_masks, true_masks
 from mtv_world_ros.evaluation.metrics.statistics import mean_interval
 from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.physics.arms.arms import Arms
 from mtv_world_ros.physics.checkpoint_files import load_contact
+from mtv_world_ros.physics.contact_settings import ContactSettings
+from mtv_world_ros.physics.fitting.contact_fit import first_settings
 from mtv_world_ros.physics.foreseen_motions import foreseen_of
 from mtv_world_ros.physics.grasp_attempts import foreseen_attempts
 from mtv_world_ros.physics.grips import watch_fingers
@@ -89,6 +92,8 @@ from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids
 
 #: size at which recorded frames are judged, and their rate [px], [Hz]
 RECORDED_SIZE, RECORDED_FPS = (320, 192), 5.0
+#: what the cameras are off where contact is guessed, as `mtv-world fit contact` finds it there [m]
+CAMERA_ERROR_M = 0.003
 
 
 def recordings(folder: Path, spec: WorldModelSpec) -> Iterator[Recording]:
@@ -516,9 +521,9 @@ def shares_over_time(arguments: argparse.Namespace) -> None:
         views=arguments.views, fps=RECORDED_FPS, num_frames=8, width=width, height=height, robot=''
     )
     robot = load_robot(folder / 'robot' / 'robot.yaml')
-    settings = load_contact(arguments.contact)
+    settings = load_contact(arguments.contact) if arguments.contact else None
     if settings is None:
-        raise SystemExit(f"'{arguments.contact}' has no contact.json")
+        settings = guessed_contact(robot, arguments.stop_holds)
     tasks = (
         *load_tasks(share_path('config', 'tasks', 'any_size')),
         *map(load_task, arguments.task),
@@ -538,6 +543,20 @@ def shares_over_time(arguments: argparse.Namespace) -> None:
             print('| ' + ' | '.join(rows[-1]) + ' |', flush=True)
     head = ('recording', 'from [s]', 'share', 'worth futures', 'kept poses', 'attempts')
     print(table(head, rows))
+
+
+def guessed_contact(robot: RobotModel, stop_holds: float) -> ContactSettings:
+    """Return guessed numbers of contact for recordings whose commands are measured positions."""
+    first = first_settings(Arms(robot, None))
+    return first.model_copy(
+        update={
+            'table_varies': True,
+            'squeeze': 0.1,
+            'grips_hold': True,
+            'stop_holds': stop_holds,
+            'spread': first.spread.model_copy(update={'camera_m': CAMERA_ERROR_M}),
+        }
+    )
 
 
 def _foreseen_from(
@@ -609,7 +628,14 @@ def main() -> None:
     parser.add_argument('--every', type=int, default=8, help='frames between two cuts')
     parser.add_argument('--checkpoint', default='')
     parser.add_argument('--robot', help='of grips: YAML or bundled; default: of EPISODES')
-    parser.add_argument('--contact', type=Path, help='of shares: folder with contact.json')
+    parser.add_argument(
+        '--contact',
+        type=Path,
+        help='of shares: folder with contact.json; default: a guess',
+    )
+    parser.add_argument(
+        '--stop-holds', type=float, default=0.75, help='of shares: of stops that hold, if guessed'
+    )
     parser.add_argument('--memory', choices=('on', 'off'), default='on')
     parser.add_argument('--foresight', choices=('on', 'off'), default='on')
     parser.add_argument('--seed', type=int, default=0)

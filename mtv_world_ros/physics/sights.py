@@ -29,6 +29,9 @@ class SightSettings:
         min_area: smallest area in each view, of the largest one so far, at which nothing hides an
             object [fraction].
         min_views: views that have to see it so.
+        min_far_area: the same limit while every tool is farther than `far_m`: an object that was
+            turned shows less of itself.
+        far_m: distance of a tool point from the middle beyond which the hand hides nothing [m].
         inside: smallest share of a visible part within the last free mask at which the object has
             not moved.
         margin: tolerance of that mask [fraction of image width].
@@ -41,6 +44,8 @@ class SightSettings:
 
     min_area: float = 0.85
     min_views: int = 2
+    min_far_area: float = 0.6
+    far_m: float = 0.12
     inside: float = 0.85
     margin: float = 0.015
     reach_m: float = 0.07
@@ -283,12 +288,15 @@ class Sights:
         if evidence is not None and arm is not None:
             evidence = evidence.after(masks, pixels[arm], STOP_SETTINGS)
         counted = largest > 0
-        is_free = bool(
-            counted.sum() >= settings.min_views
-            and (areas >= settings.min_area * largest)[counted].all()
-        )
-        found = locate(self.cameras, list(poses), centroids(masks)) if is_free else None
-        if found is not None and np.isfinite(found.point).all():
+        shown = (areas[counted] / largest[counted]).min(initial=1.0)
+        found = None
+        if counted.sum() >= settings.min_views and shown >= settings.min_far_area:
+            found = locate(self.cameras, list(poses), centroids(masks))
+        if (
+            found is not None
+            and np.isfinite(found.point).all()
+            and (shown >= settings.min_area or _is_far(tools, found.point, settings))
+        ):
             return Sight(
                 masks=masks,
                 poses=poses,
@@ -311,6 +319,11 @@ class Sights:
             is_inside=(is_near or bool(masks.any())) and _is_inside(masks, poses, sight, settings),
             evidence=evidence,
         )
+
+
+def _is_far(tools: FloatArray, point: FloatArray, settings: SightSettings) -> bool:
+    """Return whether all tools (A, 4, 4) are too far from a point (3,) to hide it."""
+    return bool((np.linalg.norm(tools[:, :3, 3] - point, axis=-1) > settings.far_m).all())
 
 
 def _nearest(

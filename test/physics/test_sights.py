@@ -103,7 +103,7 @@ def test_what_fingers_hold_keeps_its_place_in_the_gripper():
 
 def test_a_stop_that_held_nothing_leaves_the_object_where_it_was():
     way = np.concatenate([_still(3), _lifted(8)])
-    shown = [1, 1] + [0.4] * 3 + [0.7] * 6
+    shown = [1, 1] + [0.4] * 3 + [0.55] * 6
     sights = _watched(way, _still(11), shown, [0, 0] + [1] * 9)
     assert sights.of_each[0].hold is Hold.NOT_HELD and sights.refuted.tolist() == [True]
     (kept,) = sights.kept(_motion(way[-1:]).tools[:, 0])
@@ -148,3 +148,12 @@ def test_a_robot_without_a_gripper_holds_nothing():
     )
     assert not len(sights.refuted)
     assert sights.kept(motion.tools[:, -1])[0].age_s == pytest.approx(2 * PERIOD_S)
+
+
+def test_an_object_that_was_turned_is_free_again_once_the_hand_is_far():
+    """It shows less of itself than before; while the hand is near, it may be hidden."""
+    away = np.concatenate([_still(3), _lifted(8)])
+    shown = [1, 1] + [0.7] * 9
+    still_near = _watched(_still(11), _still(11), shown, [0] * 11)
+    assert still_near.of_each[0].age_s == pytest.approx(9 * PERIOD_S)
+    assert _watched(away, _still(11), shown, [0] * 11).of_each[0].age_s == 0.0
