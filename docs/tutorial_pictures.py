@@ -45,7 +45,6 @@ FILES = {
 PAGES = {
     'tutorial_ranking': 'out/judge/ranking/ranking.html',
     'tutorial_scores': 'out/tutorial/scores/report.html',
-    'ranking_page': 'out/judge/ranking/ranking.html#rollouts',
     'evaluation_page': 'out/tutorial/scores/report.html#episodes',
 }
 VIEWS = {
