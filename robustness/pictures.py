@@ -173,7 +173,7 @@ class Row:
             if isfinite(self.success.probability)
             else '–'
         )
-        reason = next(iter(self.success.reasons), '').removeprefix('abstains: ')
+        reason = next(iter(self.success.reasons), '').removeprefix('cannot tell, because ')
         mark = '' if real is None else 'SURER' if self.is_surer_than(real) else 'no'
         return f'| {self.name} | {self.views} | {shown} | {self.word} | {mark} | {reason[:150]} |'
 

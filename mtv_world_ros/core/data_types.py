@@ -19,6 +19,7 @@ from mtv_world_ros.core.errors import (
     ObservationError,
     TrajectoryError,
 )
+from mtv_world_ros.core.estimate_words import trust_of
 
 FloatArray = NDArray[np.float64]
 ByteArray = NDArray[np.uint8]
@@ -371,7 +372,7 @@ class SuccessEstimate:
         probability: probability in [0, 1]; NaN = abstains.
         interval: (low, high); NaN where it abstains.
         jaccard: (V, O) Jaccard index, NaN where absent.
-        reasons: grounds of the estimate, or why it abstains.
+        reasons: grounds of the estimate, or why it abstains; one of them is `trust`.
         features: inputs of the calibration by name; empty where the estimate abstains.
         is_calibrated: whether the probability is a fitted one.
         num_seeds: rollouts that it is the mean of.
@@ -393,6 +394,14 @@ class SuccessEstimate:
         object.__setattr__(self, 'reasons', tuple(self.reasons))
         object.__setattr__(self, 'features', MappingProxyType(dict(self.features)))
         freeze_array(self, 'jaccard', (None, None), np.float64)
+
+    @property
+    def trust(self) -> str:
+        """How far it is to be trusted, in one sentence.
+
+        It begins with `fitted here`, `not fitted here` or `cannot tell, because`.
+        """
+        return trust_of(self.reasons)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

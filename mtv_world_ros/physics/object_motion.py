@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.core.data_types import BoolArray, ByteArray, CameraModel, FloatArray
+from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.physics.grips import FingerState
 from mtv_world_ros.physics.sights import KeptPose
 from mtv_world_ros.robot.model import RobotModel
@@ -174,9 +175,11 @@ class ObjectMotionModel(Protocol):
 
     Attributes:
         is_fitted: contact parameters were fitted in the robot cell, or confirmed there.
+        settings: contact parameters.
     """
 
     is_fitted: bool
+    settings: ContactSettings
 
     def find(
         self,

@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, ConfigDict, TypeAdapter
 
 from mtv_world_ros.core.data_types import SuccessEstimate
 from mtv_world_ros.core.errors import ConfigError, PolicyError, SimulatorError
+from mtv_world_ros.core.estimate_words import cannot_tell
 from mtv_world_ros.simulation.collect.episode_jobs import episode_seed
 from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.expert.scripted_policy import scripted_policy
@@ -105,7 +106,7 @@ class StoredEstimate:
     def of(cls, estimate: SuccessEstimate | None) -> StoredEstimate:
         """Return an estimate in plain values; None = the policy gave no answer to judge."""
         if estimate is None:
-            return cls.stated(nan, 'abstains: the policy gave no answer')
+            return cls.stated(nan, cannot_tell('the policy gave no answer'))
         return cls(
             probability=float(estimate.probability),
             interval=estimate.interval,
@@ -117,7 +118,7 @@ class StoredEstimate:
     def of_motions(cls, estimate: SuccessEstimate | None) -> StoredEstimate:
         """Return the estimate of foreseen motions alone, without the imagined frames."""
         if estimate is None or estimate.futures is None:
-            return cls.stated(nan, 'abstains: no motion was foreseen')
+            return cls.stated(nan, cannot_tell('no motion was foreseen'))
         if not isfinite(estimate.probability):
             return cls.stated(nan, estimate.reasons[0])
         return cls(
@@ -139,7 +140,7 @@ class StoredEstimate:
         return verdict(self.probability, self.interval)
 
 
-_NOT_MEASURED = StoredEstimate.stated(nan, 'abstains: not measured')
+_NOT_MEASURED = StoredEstimate.stated(nan, cannot_tell('it was not measured'))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

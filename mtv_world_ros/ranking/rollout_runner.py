@@ -13,6 +13,7 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import ObjectMasks, SuccessEstimate
 from mtv_world_ros.core.errors import CannotTell, ConfigError
+from mtv_world_ros.core.estimate_words import cannot_tell
 from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.ranking.both_worlds import BothWorlds
@@ -185,7 +186,7 @@ class RolloutRunner:
         try:
             success = judge_without_pictures(self.pipeline, episode, commands)
         except CannotTell as reason:
-            return StoredEstimate.stated(nan, f'abstains: {reason}')
+            return StoredEstimate.stated(nan, cannot_tell(reason))
         return StoredEstimate.stated(float(success), 'the no-picture rule')
 
     def _begin(self, real: SimulatedRollout, job: Job, objects: tuple[str, ...] = ()) -> Rollout:

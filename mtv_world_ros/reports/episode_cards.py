@@ -11,6 +11,7 @@ import numpy as np
 
 from mtv_world_ros.core.documents import number
 from mtv_world_ros.core.errors import EpisodeError
+from mtv_world_ros.core.estimate_words import CANNOT_TELL, state_of
 from mtv_world_ros.evaluation.evaluation_summary import EvaluationSummary
 from mtv_world_ros.evaluation.metrics.jaccard_scores import episode_means
 from mtv_world_ros.evaluation.results import EpisodeResult
@@ -153,12 +154,13 @@ def _about(result: EpisodeResult) -> str:
 def _row(one: Marked, result: EpisodeResult, key: str) -> dict[str, Any]:
     """Return J by view, the success estimate and its reasons."""
     means = {view: episode_means(result.rows, view)[key] for view in one.found.spec.views}
-    known = isfinite(result.probability)
+    known, state = isfinite(result.probability), state_of(result.reasons)
+    state = f' ({state})' if state else ''
     doubted = [row for row in result.rows if row.name and row.status != 'ok']
     return {
         'mark': one,
         'views': [f'{view} {number(mean)}' for view, mean in means.items()],
-        'estimate': number(result.probability, 2) if known else 'abstains',
+        'estimate': f'{number(result.probability, 2)}{state}' if known else CANNOT_TELL,
         'reasons': '; '.join(result.reasons),
         'shares': ', '.join(
             f'{time:.1f} s {number(share, 2)}' for time, share in _thinned(result.shares)

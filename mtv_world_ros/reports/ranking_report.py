@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import Path
@@ -10,6 +11,13 @@ from typing import Any
 from markupsafe import Markup
 
 from mtv_world_ros.core.documents import DASH, render, Table
+from mtv_world_ros.core.estimate_words import (
+    CANNOT_TELL,
+    FITTED_HERE,
+    NOT_FITTED_HERE,
+    state_of,
+    trust_of,
+)
 from mtv_world_ros.core.files import write_json, write_whole
 from mtv_world_ros.evaluation.metrics.statistics import MIN_EPISODES, MIN_SCENES
 from mtv_world_ros.ranking.judges import (
@@ -199,11 +207,7 @@ def remarks(summary: Summary) -> list[str]:
 def _notes(summary: Summary) -> list[str]:
     """Return remarks on this ranking: its truth, agreement, calibration, and what is missing."""
     found = [_truth_remark(summary), _agreement_remark(summary), _unknown_remark(summary)]
-    reasons = ' '.join(reason for result in summary.results for reason in result.imagined.reasons)
-    if 'uncalibrated' in reasons:
-        is_fitted = '; weights fitted on ' in reasons
-        weights = 'fitted elsewhere' if is_fitted else 'stated ones, not fitted ones'
-        found.append(f'The estimates are not calibrated: their weights are {weights}.')
+    found.append(_trust_remark(summary))
     cut = sum(not result.is_over for result in summary.results)
     if cut:
         found.append(f'{cut} rollouts were cut off by the limit of chunks.')
@@ -214,6 +218,22 @@ def _notes(summary: Summary) -> list[str]:
             f'{first.name}: {reason}'
         )
     return [remark for remark in found if remark]
+
+
+def _trust_remark(summary: Summary) -> str:
+    """Return how many imagined estimates are in each state of trust, with a sentence of each."""
+    sentences: dict[str, list[str]] = {FITTED_HERE: [], NOT_FITTED_HERE: [], CANNOT_TELL: []}
+    for result in summary.results:
+        if state := state_of(result.imagined.reasons):
+            sentences[state].append(trust_of(result.imagined.reasons))
+    total = sum(map(len, sentences.values()))
+    told = [
+        f'{len(found)} of {total} {Counter(found).most_common(1)[0][0]}'
+        for found in sentences.values()
+        if found
+    ]
+    text = '; '.join(told)
+    return f'Trust in the imagined estimates, with the commonest reason: {text}.' if text else ''
 
 
 def _truth_remark(summary: Summary) -> str:

@@ -11,6 +11,7 @@ from urllib.parse import quote
 from markupsafe import escape, Markup
 
 from mtv_world_ros.core.documents import number
+from mtv_world_ros.core.estimate_words import CANNOT_TELL, state_of
 from mtv_world_ros.ranking.both_worlds import SHEET, VIDEO
 from mtv_world_ros.ranking.rollout_jobs import Result, StoredEstimate, WorldComparison
 from mtv_world_ros.ranking.run_jobs import FOLDER
@@ -116,8 +117,11 @@ def verdict(result: Result) -> str:
 
 
 def estimate_text(judged: StoredEstimate) -> str:
-    """Return an estimate in words."""
-    return number(judged.probability, 2) if isfinite(judged.probability) else 'abstains'
+    """Return an estimate with its state of trust, e.g. `0.98 (fitted here)`."""
+    if not isfinite(judged.probability):
+        return CANNOT_TELL
+    state = state_of(judged.reasons)
+    return number(judged.probability, 2) + (f' ({state})' if state else '')
 
 
 def _first_to_part(course: WorldComparison | None) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from math import isfinite
 from pathlib import Path
 
+from mtv_world_ros.core.estimate_words import CANNOT_TELL
 from mtv_world_ros.evaluation.results import EpisodeResult
 from mtv_world_ros.reports.read_back import read_evaluations
 from mtv_world_ros.viewing.scored_rollout import ScoredRollout, StoredRollout
@@ -31,7 +32,7 @@ def scored_rollouts(folder: Path, count: int) -> Iterator[ScoredRollout]:
 
 def _evaluated(name: str, rollout: StoredRollout, result: EpisodeResult) -> ScoredRollout:
     last, estimate = float(rollout.times[-1]), result.probability
-    text = f'success {estimate:.2f}' if isfinite(estimate) else 'abstains'
+    text = f'success {estimate:.2f}' if isfinite(estimate) else CANNOT_TELL
     return ScoredRollout(
         name=name,
         rollout=rollout,

@@ -400,6 +400,7 @@ class _EpisodeRun:
             'num_chunks': self._num_chunks,
             **{key: value if isfinite(value) else None for key, value in numbers.items()},
             'verdict': verdict_word(probability, (low, high)),
+            'trust': '' if success is None else success.trust,
             'reasons': '' if success is None else '; '.join(success.reasons),
         }
 

@@ -18,6 +18,7 @@ from mtv_world_ros.core.data_types import (
     Observation,
     SuccessEstimate,
 )
+from mtv_world_ros.core.estimate_words import cannot_tell, without_state
 from mtv_world_ros.physics.episode_objects import ObjectForesight
 from mtv_world_ros.success.calibration import HorizonCurve
 
@@ -126,7 +127,8 @@ def mean_estimate(estimates: Sequence[SuccessEstimate]) -> SuccessEstimate:
         return first
     if 2 * len(known) <= num:
         reasons = next(e.reasons for e in estimates if not isfinite(e.probability))
-        text = f'abstains: {num - len(known)} of {num} seeds do; {reasons[0]}'
+        why = without_state(reasons[0])
+        text = cannot_tell(f'{num - len(known)} of {num} seeds cannot: {why}')
         return replace(
             first,
             probability=nan,

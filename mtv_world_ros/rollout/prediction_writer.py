@@ -158,6 +158,7 @@ def chunk_values(chunk: Prediction) -> dict[str, object]:
         'success': chunk.success.probability,
         'success_low': chunk.success.interval[0],
         'success_high': chunk.success.interval[1],
+        'success_trust': chunk.success.trust,
         'success_reasons': chunk.success.reasons,
         **{f'stage_s.{stage}': seconds for stage, seconds in chunk.seconds.items()},
     }

@@ -36,12 +36,13 @@ from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.plan_comparison import foreseen_outcomes
 from mtv_world_ros.success.calibration import Fits, HorizonCurve, load_fits
 from mtv_world_ros.success.comparison import Comparison
-from mtv_world_ros.success.doubts import doubted, Grounds, widened
+from mtv_world_ros.success.doubts import Grounds, widened
 from mtv_world_ros.success.estimator import SuccessEstimator, verdict_word
 from mtv_world_ros.success.fitted_to import Setting
 from mtv_world_ros.success.own_tasks import bundled_tasks, chosen_task
 from mtv_world_ros.success.rollout_memory import footage_of, RolloutMemory
 from mtv_world_ros.success.task import TaskSpec
+from mtv_world_ros.success.trust import OtherCell, with_notes, without_verdict
 from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
 from mtv_world_ros.vision.frame_check import check_frames, check_stretch, frame_doubt, lost_objects
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
@@ -250,10 +251,10 @@ class SuccessJudge:
         unseen = () if chunk.is_in_view else (_UNSEEN,)
         chained = '' if foreseen is None else attempts_line(foreseen_attempts(foreseen))
         told = [chained] if chained else []
-        estimate = doubted(estimate, (*told, *objects.reasons, *unseen))
+        estimate = with_notes(estimate, (*told, *objects.reasons, *unseen))
         is_foreseen = isfinite(estimate.features.get('foreseen', nan))
         unplaced = _UNPLACED if objects.starts_later and not is_foreseen else ''
-        estimate = doubted(estimate, refusal=state.frame_doubt or objects.refusal or unplaced)
+        estimate = without_verdict(estimate, state.frame_doubt or objects.refusal or unplaced)
         return Judgement(estimate, foreseen, replace(state, memory=memory))
 
     def see(self, state: JudgeState, chunk: SeenChunk, options: RolloutOptions) -> Judgement:
@@ -264,7 +265,7 @@ class SuccessJudge:
         )
         views = [camera.view for camera in chunk.motion.cameras]
         doubts = check_stretch(chunk.frames, positions[1:], views)
-        estimate = doubted(estimate, refusal='; '.join(doubts))
+        estimate = without_verdict(estimate, '; '.join(doubts))
         state = replace(
             state,
             objects=state.objects.watched(
@@ -318,16 +319,21 @@ class SuccessJudge:
         """Return the estimate after a chunk of 1 + T states, and what it remembers."""
         check, footage = state.camera_check, footage_of(motion, start_masks, masks)
         judged = self.estimator.for_task(options.task).estimate(
-            footage, options.instruction, state.memory, foreseen, is_real=is_real
+            footage,
+            options.instruction,
+            state.memory,
+            foreseen,
+            is_real=is_real,
+            cell=_other_cell(state.objects),
         )
         estimate = judged.estimate if is_real else self.grounds.bear(judged.estimate)
-        estimate = doubted(estimate, check.notes, check.refusal)
+        estimate = without_verdict(with_notes(estimate, check.notes), check.refusal)
         if options.doubt:
             estimate = widened(estimate, options.doubt)
         if foreseen is not None and options.contact.text:
             is_open = verdict_word(estimate.probability, estimate.interval) == 'open'
             word = 'open: ' if is_open and not options.contact.is_confirmed else ''
-            estimate = doubted(estimate, (f'{word}{options.contact.text}',))
+            estimate = with_notes(estimate, (f'{word}{options.contact.text}',))
         return estimate, judged.memory
 
     def _frame_doubt(self, state: JudgeState, start_masks: ObjectMasks) -> str:
@@ -348,6 +354,19 @@ class SuccessJudge:
             return None if ends is None else ends.is_majority
 
         return majority
+
+
+def _other_cell(objects: ObjectForesight) -> OtherCell | None:
+    """Return the robot cell of an episode if contact was not fitted in it."""
+    model = objects.model
+    if model is None or model.is_fitted:
+        return None
+    origin = model.settings.fitted
+    return OtherCell(
+        here=objects.first.place,
+        fitted='' if origin is None else origin.place or '',
+        doubt=model.settings.doubt,
+    )
 
 
 def _tasks(task: str | TaskSpec | None) -> tuple[tuple[TaskSpec, ...], str | None]:

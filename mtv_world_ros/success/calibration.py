@@ -147,9 +147,9 @@ class Calibration(Weights):
     def objection(self, task: str, segmenter: str) -> str:
         """Return why the weights do not hold for a task and segmenter; empty = they hold."""
         if segmenter != self.segmenter:
-            return f"uncalibrated for the segmenter '{segmenter}' (fitted with '{self.segmenter}')"
+            return f"fitted with the segmenter '{self.segmenter}', not with '{segmenter}'"
         if task not in self.tasks:
-            return f"uncalibrated for the task '{task}' (fitted on {len(self.tasks)} others)"
+            return f"fitted on {len(self.tasks)} tasks without '{task}'"
         return ''
 
     def elsewhere(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isfinite, log, nan
 
 import numpy as np
 
 from mtv_world_ros.core.data_types import BoolArray, FloatArray, SuccessEstimate
+from mtv_world_ros.success.trust import not_fitted_here, with_trust, without_verdict
 
 #: an object nearer than this to one of its futures moved as foreseen [m]; masks of small pictures
 #: are no more exact
@@ -166,26 +166,6 @@ class ContactTrust:
     text: str = ''
 
 
-def doubted(
-    estimate: SuccessEstimate, notes: Sequence[str] = (), refusal: str = ''
-) -> SuccessEstimate:
-    """Return an estimate with remarks, or without a verdict.
-
-    Args:
-        estimate: estimate of pictures and foreseen motions.
-        notes: remarks for the reader, one line each.
-        refusal: reason why there is no verdict; empty = there may be one.
-    """
-    if refusal:
-        return replace(
-            estimate,
-            probability=nan,
-            interval=(nan, nan),
-            reasons=(f'abstains: {refusal}', *estimate.reasons),
-        )
-    return replace(estimate, reasons=(*estimate.reasons, *notes)) if notes else estimate
-
-
 #: shrinkage of a doubted estimate towards 0.5 [fraction of its distance from 0.5]
 _SHRINKAGE = 0.5
 #: minimum half width of the interval of a doubted estimate
@@ -209,11 +189,16 @@ def widened(estimate: SuccessEstimate, doubt: str) -> SuccessEstimate:
         estimate: estimate under the fitted physics.
         doubt: reason why the fitted physics does not hold.
     """
-    reasons = (doubt, *estimate.reasons)
     if not isfinite(estimate.probability):
-        return replace(estimate, reasons=reasons)
+        return replace(estimate, reasons=(*estimate.reasons, doubt))
     middle, interval = shrunk(estimate.probability, estimate.interval)
-    return replace(estimate, probability=middle, interval=interval, reasons=reasons)
+    return replace(
+        estimate,
+        probability=middle,
+        interval=interval,
+        reasons=with_trust(estimate.reasons, not_fitted_here(doubt)),
+        is_calibrated=False,
+    )
 
 
 #: commands that calibrate an estimate
@@ -248,7 +233,7 @@ class Grounds:
         never = '' if is_calibrated else 'the estimate was never calibrated for this checkpoint'
         return cls(
             foreseen=contact
-            and f'{contact}, and the estimate is uncalibrated: run {_FIT}, or {_CALIBRATE}',
+            and f'{contact}, and the estimate was not fitted here: run {_FIT}, or {_CALIBRATE}',
             pictures=never and f'{never}, and no motion is foreseen: run {_CALIBRATE}, or {_FIT}',
         )
 
@@ -262,4 +247,4 @@ class Grounds:
             return estimate
         low, high = estimate.interval
         without = f'without this doubt {estimate.probability:.2f} [{low:.2f}, {high:.2f}]'
-        return doubted(estimate, refusal=f'{refusal}; {without}')
+        return without_verdict(estimate, f'{refusal}; {without}')

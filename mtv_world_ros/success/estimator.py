@@ -12,6 +12,7 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import FloatArray, FutureEvidence, SuccessEstimate
 from mtv_world_ros.core.errors import CannotTell, ConfigError, nearest
+from mtv_world_ros.core.estimate_words import cannot_tell
 from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
 from mtv_world_ros.success.calibration import Calibration, DOUBTS, weighed
 from mtv_world_ros.success.doubts import shrunk
@@ -29,6 +30,7 @@ from mtv_world_ros.success.rollout_memory import Footage, remember, RolloutMemor
 from mtv_world_ros.success.share_fit import ShareEstimate, ShareFit
 from mtv_world_ros.success.situation import grippers_open, grippers_released
 from mtv_world_ros.success.task import load_tasks, match_task, object_called, TaskSpec
+from mtv_world_ros.success.trust import fitted_here, not_fitted_here, odd_sizes, OtherCell
 from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
@@ -66,15 +68,10 @@ def verdict_word(probability: float, interval: tuple[float, float] = (nan, nan))
 
 __all__ = ['JudgedChunk', 'SuccessEstimator', 'load_tasks']
 
-#: why no estimate rests on the futures as they were fitted
-NOT_FITTED_HERE = (
-    'contact parameters were not fitted on this robot, so that futures are drawn from a wide '
-    'prior; run mtv-world fit contact on recordings of this robot'
-)
 #: objection to calibrations of earlier versions
 _COUNTED_TWICE = (
-    'uncalibrated: the calibration of this checkpoint counts frames as evidence beside the motion '
-    'that was drawn into them; run mtv-world fit success again'
+    'the fit of this checkpoint counts frames as evidence, too, although motion was drawn into '
+    'them (run mtv-world fit success again)'
 )
 _SHARE = 'the share of simulated futures that succeed'
 _STATED = 'a logistic with stated weights, given the world model'
@@ -203,6 +200,7 @@ class SuccessEstimator:
         foreseen: ForeseenMotions | None = None,
         *,
         is_real: bool = False,
+        cell: OtherCell | None = None,
     ) -> JudgedChunk:
         """Return the probability that the task is done at the end of a rollout's chunk.
 
@@ -215,6 +213,7 @@ class SuccessEstimator:
             memory: memory of the chunks before; None = the chunk is the rollout's first.
             foreseen: motions of the objects up to the chunk's end.
             is_real: whether the frames are real, not imagined.
+            cell: the robot cell, where contact was not fitted in it; None = nothing is known.
         """
         memory = remember(memory, footage)
         try:
@@ -238,7 +237,11 @@ class SuccessEstimator:
         if ends is None or foreseen is None:
             return JudgedChunk(self._judge(task, evidence, views, subjects, is_real), memory)
         gap = picture_gap(views, foreseen, [bound[role] for role in task.movers])
-        judged = self._judge_futures(task, evidence, views, subjects, ends, gap)
+        items = {role: foreseen.names.index(name) for role, name in bound.items()}
+        sizes = odd_sizes(foreseen.sizes, items, task.sizes_m)
+        judged = self._judge_futures(
+            task, evidence, views, subjects, ends, gap, (cell or OtherCell(), sizes)
+        )
         return JudgedChunk(judged, memory)
 
     def foresee(
@@ -280,8 +283,13 @@ class SuccessEstimator:
         subjects: Sequence[int],
         ends: ForeseenEnds,
         gap: PictureGap | None,
+        other: tuple[OtherCell, str],
     ) -> SuccessEstimate:
-        """Return the estimate of simulated futures, which decide alone."""
+        """Return the estimate of simulated futures, which decide alone.
+
+        `other` is the robot cell and how the objects' sizes differ from usual ones; both count
+        where contact was not fitted.
+        """
         features = {
             **evidence.features,
             'foreseen': foreseen_feature(ends),
@@ -289,16 +297,21 @@ class SuccessEstimator:
             'picture_gap': nan if gap is None else gap.distance_m,
             'released': _released(task, views, subjects),
         }
-        basis, elsewhere, fit = self._objection(task, _SHARE), '', ShareFit()
-        if not basis and self.calibration is not None:
+        fit, elsewhere = ShareFit(), self._elsewhere(views, True)
+        objection = self._objection(task)
+        if not objection and self.calibration is not None:
             if self.calibration.futures is None:
-                basis = f'{_COUNTED_TWICE}: {_SHARE}'
+                objection = _COUNTED_TWICE
             else:
-                fit, elsewhere = self.calibration.futures, self._elsewhere(views, True)
+                fit = self.calibration.futures
+        trust = self._trust(objection, elsewhere, is_real=False, stated=_SHARE)
+        is_calibrated = not (objection or elsewhere) and ends.is_fitted
         if not ends.is_fitted:
             # the fit is to futures of a known place; those of a prior are wider
             fit = ShareFit(max_picture_gap_m=fit.max_picture_gap_m)
-            basis, elsewhere = f'uncalibrated: {NOT_FITTED_HERE}', ''
+            cell, sizes = other
+            unknown = self.calibration is None or self.setting is None
+            trust = cell.sentence(None if unknown else objection or elsewhere or sizes)
         probability, low, high = estimate_of_futures(fit, features, is_fitted=ends.is_fitted)
         alone = estimate_of_futures(
             fit, {**features, 'picture_gap': nan}, is_fitted=ends.is_fitted
@@ -316,8 +329,7 @@ class SuccessEstimator:
             reasons.append(gap.text)
         reasons += self._shown(task, evidence, views)
         reasons += self._gripper_reasons(task, views, features)
-        reasons.append(basis or self._origin(elsewhere, is_real=False))
-        is_calibrated = not (basis or elsewhere)
+        reasons.append(trust)
         numbers = (low, probability, high)
         judged = _estimate(numbers, evidence, views, reasons, features, is_calibrated)
         return replace(judged, futures=futures)
@@ -334,9 +346,9 @@ class SuccessEstimator:
         features, spread = dict(evidence.features), 1.96 * evidence.sigma
         features['foreseen'] = nan
         features['released'] = _released(task, views, subjects)
-        basis = self._objection(task, _STATED)
+        objection = self._objection(task)
         weights = None
-        if self.calibration is not None and not basis:
+        if self.calibration is not None and not objection:
             weights = self.calibration.given(is_real)
         counted = dict(features)
         if is_real and weights is None:  # what was really seen needs no grasp that explains it
@@ -351,8 +363,8 @@ class SuccessEstimator:
         reasons = self._shown(task, evidence, views)
         reasons += self._gripper_reasons(task, views, features)
         elsewhere = self._elsewhere(views, False) if weights else ''
-        reasons.append(basis or self._origin(elsewhere, is_real))
-        is_calibrated = not (basis or elsewhere)
+        reasons.append(self._trust(objection, elsewhere, is_real=is_real, stated=_STATED))
+        is_calibrated = not (objection or elsewhere)
         return _estimate((low, middle, high), evidence, views, reasons, features, is_calibrated)
 
     @staticmethod
@@ -376,17 +388,11 @@ class SuccessEstimator:
             return [_STILL_CLOSED[task.gripper]]
         return []
 
-    def _objection(self, task: TaskSpec, stated: str) -> str:
-        """Return the reason why the probability is not fitted; empty if it is fitted.
-
-        Args:
-            task: task that is judged.
-            stated: name of the estimate that is used instead.
-        """
+    def _objection(self, task: TaskSpec) -> str:
+        """Return the reason why no weights of a fit are used; empty if they are."""
         if self.calibration is None:
-            return f'uncalibrated: {stated}'
-        objection = self.calibration.objection(task.name, self.segmenter)
-        return objection and f'{objection}: {stated}'
+            return 'there is no fit (run mtv-world fit success)'
+        return self.calibration.objection(task.name, self.segmenter)
 
     def _elsewhere(self, views: Views, is_foreseen: bool) -> str:
         """Return the difference from the setting of the fit; empty if the settings are equal."""
@@ -395,17 +401,25 @@ class SuccessEstimator:
         cameras = [camera for camera in views.footage.cameras if camera.view in views.used]
         return self.calibration.elsewhere(self.setting, cameras, is_foreseen=is_foreseen)
 
-    def _origin(self, elsewhere: str, is_real: bool) -> str:
-        """Return a description of the episodes that the weights were fitted on."""
+    def _trust(self, objection: str, elsewhere: str, *, is_real: bool, stated: str) -> str:
+        """Return the sentence about the trust in an estimate.
+
+        Args:
+            objection: why no weights of a fit are used; empty = they are.
+            elsewhere: how the setting differs from that of the fit; empty = it does not.
+            is_real: whether the frames are real.
+            stated: what the estimate is where no weights of a fit are used.
+        """
         calibration = self.calibration
-        assert calibration is not None
-        called = f'uncalibrated: {elsewhere}; weights' if elsewhere else 'calibrated:'
+        if objection or calibration is None:
+            return not_fitted_here(f'{objection}, so this is {stated}')
         given = 'frames that were seen' if is_real else 'the world model'
         optimism = '' if is_real else calibration.optimism
-        return (
-            f'{called} fitted on {calibration.num_episodes} episodes of '
-            f'{len(calibration.tasks)} tasks, given {given}'
-        ) + (f'; {optimism}' if optimism else '')
+        text = (
+            f'weights of {calibration.num_episodes} episodes of {len(calibration.tasks)} tasks, '
+            f'given {given}'
+        ) + (f', {optimism}' if optimism else '')
+        return not_fitted_here(f'{elsewhere}, with {text}') if elsewhere else fitted_here(text)
 
 
 def _released(task: TaskSpec, views: Views, subjects: Sequence[int]) -> float:
@@ -435,7 +449,7 @@ def _abstains(reason: CannotTell, views: Views, subjects: Sequence[int]) -> Succ
         probability=nan,
         interval=(nan, nan),
         jaccard=_jaccard(views, {}, subjects),
-        reasons=(f'abstains: {reason}',),
+        reasons=(cannot_tell(reason),),
     )
 
 

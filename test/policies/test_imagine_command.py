@@ -13,9 +13,9 @@ import pytest
 from mtv_world_ros.cameras.calibration_file import load_calibration, save_calibration
 from mtv_world_ros.cli import main
 from mtv_world_ros.cli.imagine import episode_table
+from mtv_world_ros.core.estimate_words import NOT_FITTED_HERE
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.rollout import imagined_episodes
-from mtv_world_ros.success.estimator import NOT_FITTED_HERE
 from mtv_world_ros.viewing.streams import read_streams
 
 DEMO = share_path('resource', 'demo_episode')

@@ -59,7 +59,7 @@ def test_damaged_pictures_are_never_surer_and_the_camera_is_named(pipeline, reco
             assert not isfinite(found.probability) or row.word == real.word
         else:
             assert not isfinite(found.probability)
-            assert found.reasons[0].startswith("abstains: camera 'low'"), found.reasons[0]
+            assert found.trust.startswith("cannot tell, because camera 'low'"), found.reasons[0]
 
 
 def test_undamaged_pictures_through_the_same_path_are_no_damage(pipeline, recording, real):

@@ -52,7 +52,7 @@ def test_seeds_that_agree_are_no_surer_than_one_of_them():
 def test_one_of_two_that_know_is_not_most_of_them():
     found = mean_estimate([estimate(0.9), estimate(nan, 'abstains: lost')])
     assert np.isnan(found.probability) and np.isnan(found.interval).all()
-    assert found.reasons[0] == 'abstains: 1 of 2 seeds do; abstains: lost'
+    assert found.trust == 'cannot tell, because 1 of 2 seeds cannot: lost'
 
 
 def test_two_of_three_that_know_are():

@@ -99,9 +99,10 @@ def test_target_that_was_dragged_along_counts_where_it_ends():
     assert found.probability > 0.8
 
 
-def test_every_estimate_says_it_is_uncalibrated():
+def test_every_estimate_says_how_far_it_is_to_be_trusted():
     found = estimate((BLUE[0] - 0.13, BLUE[1], 0.025), LEFT)
-    assert any('uncalibrated' in reason for reason in found.reasons)
+    assert found.trust == found.reasons[-1]
+    assert found.trust.startswith('not fitted here: there is no fit')
 
 
 def test_closed_gripper_is_no_success():
@@ -114,7 +115,9 @@ def test_closed_gripper_is_no_success():
 
 def assert_abstains(found, *words):
     assert np.isnan(found.probability) and np.isnan(found.interval).all()
-    assert all(word in found.reasons[0] for word in ('abstains', *words)), found.reasons
+    assert all(word in found.reasons[0] for word in ('cannot tell, because', *words)), (
+        found.reasons
+    )
 
 
 def test_unknown_instruction_abstains_and_names_the_known_tasks():
@@ -210,9 +213,17 @@ def put_to_the_left():
 @pytest.mark.parametrize(
     ('segmenter', 'task', 'words'),
     [
-        ('colour', 'place_block_a2b_left', 'calibrated: fitted on 40 episodes of 1 tasks'),
-        ('sam2', 'place_block_a2b_left', "uncalibrated for the segmenter 'sam2'"),
-        ('colour', 'stack_blocks_two', "uncalibrated for the task 'place_block_a2b_left'"),
+        ('colour', 'place_block_a2b_left', 'fitted here: weights of 40 episodes of 1 tasks'),
+        (
+            'sam2',
+            'place_block_a2b_left',
+            "not fitted here: fitted with the segmenter 'colour', not with 'sam2', so this is a",
+        ),
+        (
+            'colour',
+            'stack_blocks_two',
+            "not fitted here: fitted on 1 tasks without 'place_block_a2b_left', so this is a",
+        ),
     ],
 )
 def test_fitted_weights_are_used_only_where_they_were_fitted(segmenter, task, words):
@@ -223,30 +234,30 @@ def test_fitted_weights_are_used_only_where_they_were_fitted(segmenter, task, wo
     )
     shown = put_to_the_left()
     found = estimator.estimate(shown, LEFT).estimate
-    assert found.reasons[-1].startswith(words)
-    assert 'given the world model' in found.reasons[-1]
-    assert found.is_calibrated == words.startswith('calibrated')
+    assert found.trust.startswith(words)
+    assert 'given the world model' in found.trust
+    assert found.is_calibrated == words.startswith('fitted')
     # weights of zero say one half, whatever is seen; the stated ones do not
     assert (found.probability == 0.5) == found.is_calibrated
 
 
-def test_elsewhere_fitted_weights_are_used_and_called_uncalibrated():
+def test_weights_of_a_fit_elsewhere_are_used_and_called_not_fitted_here():
     shown, tasks = put_to_the_left(), load_tasks(share_path('config', 'tasks'))
     here = Setting(robot='one', tools=((0.0, 0.0, 0.0),))
     calibration = CALIBRATION.replace(fitted_to=FittedTo.episodes(here, [shown.cameras]))
     for setting, words in (
-        (here, 'calibrated: fitted on 40'),
+        (here, 'fitted here: weights of 40'),
         (
             here.replace(robot='two'),
-            "uncalibrated: fitted with another robot than this 'two'; weights fitted on 40",
+            "not fitted here: fitted with another robot than this 'two', with weights of 40",
         ),
     ):
         estimator = SuccessEstimator(
             tasks, calibration=calibration, segmenter=Named('colour'), setting=setting
         )
         found = estimator.estimate(shown, LEFT).estimate
-        assert found.reasons[-1].startswith(words)
-        assert found.is_calibrated == words.startswith('calibrated')
+        assert found.trust.startswith(words)
+        assert found.is_calibrated == words.startswith('fitted')
         assert found.probability == 0.5
 
 

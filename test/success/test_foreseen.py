@@ -224,8 +224,8 @@ def test_an_uncalibrated_estimate_of_futures_says_that_it_is_their_share(calibra
     shown = footage(masks(path(RED, GOAL), [BLUE] * 9), masks([RED], [BLUE]))
     found = estimator.estimate(shown, LEFT, foreseen=held(GOAL, GOAL, RED)).estimate
     assert found.probability == pytest.approx(3 / 5)
-    assert found.reasons[-1].startswith('uncalibrated')
-    assert found.reasons[-1].endswith('the share of simulated futures that succeed')
+    assert found.trust.startswith('not fitted here')
+    assert found.trust.endswith('the share of simulated futures that succeed')
 
 
 def test_where_nothing_was_fitted_futures_that_disagree_leave_the_verdict_open():
@@ -236,7 +236,8 @@ def test_where_nothing_was_fitted_futures_that_disagree_leave_the_verdict_open()
     assert found.probability == pytest.approx(16 / 18)
     assert found.interval[0] < 0.05 and found.interval[1] > 0.95
     assert verdict_word(found.probability, found.interval) == 'open'
-    assert not found.is_calibrated and 'not fitted on this robot' in found.reasons[-1]
+    assert not found.is_calibrated
+    assert found.trust.startswith('not fitted here') and 'wide prior' in found.trust
     # what no value of the prior changes has a verdict
     for end, word in ((GOAL, 'success'), (RED, 'failure')):
         alike = replace(held(*[end] * 16), is_fitted=False)

@@ -83,7 +83,8 @@ def test_estimates_widen():
     found = widened(sure, 'another physics')
     assert found.probability == pytest.approx(0.73)
     assert found.interval == (pytest.approx(0.38), 1.0)
-    assert found.reasons == ('another physics', 'why')
+    assert found.reasons == ('why', 'not fitted here: another physics')
+    assert not found.is_calibrated
     none = SuccessEstimate(
         probability=nan, interval=(nan, nan), jaccard=np.zeros((2, 1)), reasons=('abstains',)
     )

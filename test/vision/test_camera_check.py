@@ -13,7 +13,7 @@ from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.shape import load_shape, rods
 from mtv_world_ros.simulation.expert.expert import home_positions
 from mtv_world_ros.simulation.simulator import SimEpisode
-from mtv_world_ros.success.doubts import doubted
+from mtv_world_ros.success.trust import with_notes, without_verdict
 from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
 
 ROBOT = load_robot(bundled('robots', 'yam_bimanual', '--robot'))
@@ -115,9 +115,9 @@ def test_a_refusal_takes_the_verdict_and_notes_leave_it():
     estimate = SuccessEstimate(
         probability=0.8, interval=(0.7, 0.9), jaccard=np.zeros((2, 1)), reasons=('why',)
     )
-    assert doubted(estimate) is estimate
-    noted = doubted(estimate, ['look'])
+    assert with_notes(estimate, ()) is estimate and without_verdict(estimate, '') is estimate
+    noted = with_notes(estimate, ['look'])
     assert noted.probability == 0.8 and noted.reasons == ('why', 'look')
-    refused = doubted(estimate, ['look'], 'the camera is off')
+    refused = without_verdict(estimate, 'the camera is off')
     assert np.isnan(refused.probability) and np.isnan(refused.interval).all()
-    assert refused.reasons == ('abstains: the camera is off', 'why')
+    assert refused.reasons == ('cannot tell, because the camera is off', 'why')

@@ -131,7 +131,7 @@ class PredictedFrames:
 #: ends of an episode that are no fault
 GOOD_ENDS = ('done', 'max_chunks', 'stopped')
 #: of the world model's reports of chunks: what the last one says is what an episode amounts to
-ESTIMATE = ('success', 'success_low', 'success_high', 'success_reasons')
+ESTIMATE = ('success', 'success_low', 'success_high', 'success_trust', 'success_reasons')
 #: what an episode waits for, and how it ends where that does not come
 _OVERDUE = {
     'resetting': 'late',

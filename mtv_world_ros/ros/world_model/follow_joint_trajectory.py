@@ -226,10 +226,10 @@ def _verdict(ended: Ended) -> str:
         return 'nothing was imagined'
     prediction = ended.last.prediction
     success = prediction.success
-    reasons = '; '.join(success.reasons).removeprefix('abstains: ')
+    reasons = '; '.join(success.reasons)
     known = f'{ended.num_chunks} of {prediction.num_chunks} chunks imagined'
     if isnan(success.probability):
-        return f'{known}; the success estimate abstains: {reasons}'
+        return f'{known}; {reasons}'
     low, high = success.interval
     return f'{known}; success {success.probability:.2f} ({low:.2f} to {high:.2f}): {reasons}'
 

@@ -32,8 +32,8 @@ from mtv_world_ros.ros.world_model.worker import Chunk, Request, Result
 from mtv_world_ros.success.cell_file import CellFile
 from mtv_world_ros.success.confirmation import ContactConfirmation
 from mtv_world_ros.success.doubts import chunk_end, ContactTrust, PhysicsWatch
-from mtv_world_ros.success.estimator import NOT_FITTED_HERE
 from mtv_world_ros.success.task import match_task
+from mtv_world_ros.success.trust import OTHER_CELL
 from mtv_world_ros.vision.jaccard import held_masks, mean_of_known, object_jaccard
 
 #: chunks that wait for their real frames; the oldest is given up for a newer one
@@ -433,7 +433,7 @@ class LiveFidelity:
             return self.watch.doubt
         cell = self._cell(place)
         is_confirmed = cell.confirmation.is_complete and not cell.refusal
-        return cell.text if is_confirmed else f'{cell.text}; {NOT_FITTED_HERE}'
+        return cell.text if is_confirmed else f'{cell.text}; {OTHER_CELL}'
 
     def _real_episode(self, chunk: Chunk) -> Rollout:
         """Return the real frames of the chunk's rollout; a new episode if some are missing."""

@@ -364,6 +364,7 @@ def _success_values(success: SuccessEstimate) -> dict[str, object]:
         'success_spread': success.spread,
         'success_num_seeds': success.num_seeds,
         'success_calibrated': success.is_calibrated,
+        'success_trust': success.trust,
         'success_reasons': '; '.join(success.reasons),
     }
 
