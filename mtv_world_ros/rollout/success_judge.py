@@ -253,7 +253,8 @@ class SuccessJudge:
         told = [chained] if chained else []
         estimate = with_notes(estimate, (*told, *objects.reasons, *unseen))
         is_foreseen = isfinite(estimate.features.get('foreseen', nan))
-        unplaced = _UNPLACED if objects.starts_later and not is_foreseen else ''
+        is_untold = objects.starts_later or isfinite(estimate.probability)
+        unplaced = _UNPLACED if objects.model and not is_foreseen and is_untold else ''
         estimate = without_verdict(estimate, state.frame_doubt or objects.refusal or unplaced)
         return Judgement(estimate, foreseen, replace(state, memory=memory))
 

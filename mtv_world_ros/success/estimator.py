@@ -16,7 +16,14 @@ from mtv_world_ros.core.estimate_words import cannot_tell
 from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
 from mtv_world_ros.success.calibration import Calibration, DOUBTS, weighed
 from mtv_world_ros.success.doubts import shrunk
-from mtv_world_ros.success.evidence import clipped, Evidence, gather, MAX_MARGIN, view_mean
+from mtv_world_ros.success.evidence import (
+    clipped,
+    Evidence,
+    gather,
+    LIMITS,
+    MAX_MARGIN,
+    view_mean,
+)
 from mtv_world_ros.success.fitted_to import Setting
 from mtv_world_ros.success.foreseen import (
     foreseen_ends,
@@ -114,11 +121,13 @@ def estimate_of_futures(
 ) -> ShareEstimate:
     """Return the probability of success from the features of simulated futures.
 
-    Frames count where they contradict the drawn motion: the estimate is then less sure.
+    Frames count where they contradict the drawn motion: the estimate is then less sure. Futures
+    whose simulation was lost may have succeeded or failed: the interval holds both.
 
     Args:
         fit: fit of the share of futures that succeed.
-        features: features of an estimate: `foreseen`, `futures`, `released` and `picture_gap`.
+        features: features of an estimate: `foreseen`, `futures`, `lost`, `released` and
+            `picture_gap`.
         is_fitted: contact parameters were fitted in this robot cell.
     """
     share, number = (1 + features['foreseen']) / 2, features['futures']
@@ -127,6 +136,13 @@ def estimate_of_futures(
         probability, (low, high) = shrunk(probability, (low, high))
     if features.get('released', nan) == 0.0:
         low, probability = 0.0, min(probability, UNDONE_PROBABILITY)
+    num_lost = features.get('lost', 0.0)
+    if num_lost:
+        total = number + num_lost
+        for num_done in (share * number, share * number + num_lost):
+            whole = {**features, 'foreseen': 2 * num_done / total - 1, 'futures': total, 'lost': 0}
+            side = estimate_of_futures(fit, whole, is_fitted=is_fitted)
+            low, high = min(low, side.low), max(high, side.high)
     return ShareEstimate(probability, low, max(high, probability))
 
 
@@ -294,6 +310,7 @@ class SuccessEstimator:
             **evidence.features,
             'foreseen': foreseen_feature(ends),
             'futures': ends.num_effective,
+            'lost': float(ends.num_lost),
             'picture_gap': nan if gap is None else gap.distance_m,
             'released': _released(task, views, subjects),
         }
@@ -312,10 +329,9 @@ class SuccessEstimator:
             cell, sizes = other
             unknown = self.calibration is None or self.setting is None
             trust = cell.sentence(None if unknown else objection or elsewhere or sizes)
-        probability, low, high = estimate_of_futures(fit, features, is_fitted=ends.is_fitted)
-        alone = estimate_of_futures(
-            fit, {**features, 'picture_gap': nan}, is_fitted=ends.is_fitted
-        )
+        is_unchecked = self._is_release_unknown(task, features)
+        probability, low, high = self._of_futures(fit, features, ends, is_unchecked)
+        alone = self._of_futures(fit, {**features, 'picture_gap': nan}, ends, is_unchecked)
         futures = FutureEvidence(
             outcomes=ends.outcomes,
             probability=alone.probability,
@@ -333,6 +349,35 @@ class SuccessEstimator:
         numbers = (low, probability, high)
         judged = _estimate(numbers, evidence, views, reasons, features, is_calibrated)
         return replace(judged, futures=futures)
+
+    def _of_futures(
+        self,
+        fit: ShareFit,
+        features: Mapping[str, float],
+        ends: ForeseenEnds,
+        is_unchecked: bool,
+    ) -> ShareEstimate:
+        """Return the estimate by a fit; where it is not that of the calibration, at least as wide.
+
+        Args:
+            fit: fit of the share of futures that is used.
+            features: see `estimate_of_futures`.
+            ends: outcomes of the futures.
+            is_unchecked: it is not known whether grippers let go.
+        """
+        found = estimate_of_futures(fit, features, is_fitted=ends.is_fitted)
+        known = None if self.calibration is None else self.calibration.futures
+        if known is not None and known is not fit:
+            fitted = estimate_of_futures(known, features)
+            found = found._replace(
+                low=min(found.low, fitted.low), high=max(found.high, fitted.high)
+            )
+        return found._replace(low=0.0) if is_unchecked else found
+
+    @staticmethod
+    def _is_release_unknown(task: TaskSpec, features: Mapping[str, float]) -> bool:
+        """Return True if a task asks for grippers that let go, and whether they did is unknown."""
+        return task.gripper != 'any' and isnan(features['released'])
 
     def _judge(
         self,
@@ -354,11 +399,16 @@ class SuccessEstimator:
         if is_real and weights is None:  # what was really seen needs no grasp that explains it
             counted |= dict.fromkeys(DOUBTS, nan)
         probability = weights.probability if weights else stated_probability
+        unknown = evidence.unknown
+        if is_real and weights is None:
+            unknown -= DOUBTS
+        worst = counted | {name: LIMITS[name][0] for name in unknown}
+        best = counted | {name: LIMITS[name][1] for name in unknown}
         low, middle, high = (
-            capped(probability({**counted, 'margin': clipped(margin)}), features)
-            for margin in (features['margin'] + shift for shift in (-spread, 0.0, spread))
+            capped(probability({**given, 'margin': clipped(features['margin'] + shift)}), given)
+            for given, shift in ((worst, -spread), (counted, 0.0), (best, spread))
         )
-        if features['released'] == 0.0:
+        if features['released'] == 0.0 or self._is_release_unknown(task, features):
             low = 0.0
         reasons = self._shown(task, evidence, views)
         reasons += self._gripper_reasons(task, views, features)
@@ -382,8 +432,8 @@ class SuccessEstimator:
     @staticmethod
     def _gripper_reasons(task: TaskSpec, views: Views, features: Mapping[str, float]) -> list[str]:
         """Return doubts about the grippers, in words."""
-        if task.gripper != 'any' and views.footage.openings is None:
-            return ['gripper not checked']
+        if SuccessEstimator._is_release_unknown(task, features):
+            return ['gripper not checked: a success cannot be told (`gripper: any` allows that)']
         if features['released'] == 0.0:
             return [_STILL_CLOSED[task.gripper]]
         return []
@@ -430,8 +480,10 @@ def _released(task: TaskSpec, views: Views, subjects: Sequence[int]) -> float:
     footage = views.footage
     if footage.openings is None or task.gripper == 'any':
         return nan
-    if task.gripper == 'open' or footage.tools is None:
+    if task.gripper == 'open':
         return float(grippers_open(footage.openings)[-1])
+    if footage.tools is None:  # a closed gripper may be away from what it moved
+        return 1.0 if grippers_open(footage.openings)[-1] else nan
     points = views.memory.points[subjects, -1:]
     return float(grippers_released(footage.openings[:, -1:], footage.tools[:, -1:], points)[-1])
 

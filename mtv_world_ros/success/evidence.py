@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import isfinite, nan
+from math import isfinite, isnan, nan
 
 import numpy as np
 
@@ -133,6 +133,8 @@ class ImaginedScene:
         return np.concatenate([[0.0], counts])[np.cumsum(known)]
 
 
+#: relations of an object with what contains or carries it
+_CONTAINING = (Within, Inside, ServedOn)
 #: limit of margins [softness lengths]
 MAX_MARGIN = 3.0
 #: maximum horizontal distance of a tool from the centre of an object that it grasped [m]
@@ -143,6 +145,14 @@ RIM_GAP_M = 0.01
 CARRY_ERROR_M = 0.025
 #: upper limit of J between the start mask and the goal mask
 MAX_START_JACCARD = 0.5
+#: least and largest value of the features that masks may not show although the task has them
+LIMITS = {
+    'goal': (-1.0, 1.0),
+    'contained': (-1.0, 1.0),
+    'grasp': (-MAX_MARGIN, 1.0),
+    'carry': (-MAX_MARGIN, 1.0),
+    'moved': (0.0, 1.0),
+}
 #: names of the features of masks, in order
 FEATURES: tuple[str, ...] = (
     'margin',
@@ -166,6 +176,7 @@ class Evidence:
         sigma: standard error of the worst margin, in units of its softness.
         goal_jaccard: object -> (V,) J with its goal mask.
         notes: assumptions made on the way.
+        unknown: names of features that the task has, and that pictures do not show.
     """
 
     worst: Margin | None
@@ -173,6 +184,7 @@ class Evidence:
     sigma: float
     goal_jaccard: Mapping[int, FloatArray]
     notes: tuple[str, ...]
+    unknown: frozenset[str] = frozenset()
 
     @classmethod
     def none(cls, reason: CannotTell) -> Evidence:
@@ -210,6 +222,13 @@ def gather(views: Views, task: TaskSpec, bound: Mapping[str, str]) -> Evidence:
         'carry': carry,
         'moved': _moved(scene, task),
     }
+    asked = {
+        'goal': any(relation.goal(scene) is not None for relation in task.relations),
+        'contained': any(isinstance(one, _CONTAINING) for one in task.relations),
+        'grasp': bool(task.movers),
+        'carry': bool(task.movers),
+        'moved': bool(task.movers),
+    }
     sigma = float(np.hypot.reduce(sorted(scene.sigmas.values())[-2:])) if scene.sigmas else 0.0
     return Evidence(
         worst=worst,
@@ -217,6 +236,7 @@ def gather(views: Views, task: TaskSpec, bound: Mapping[str, str]) -> Evidence:
         sigma=sigma / (worst.soft or task.softness_m) if worst.unit == 'm' else 0.0,
         goal_jaccard=goals,
         notes=tuple(scene.notes),
+        unknown=frozenset(name for name in LIMITS if asked[name] and isnan(features[name])),
     )
 
 
@@ -271,7 +291,7 @@ def _contained(scene: ImaginedScene, task: TaskSpec) -> float:
     shares = [
         scene.views.containment(scene.item(relation.subject), scene.item(relation.target))
         for relation in task.relations
-        if isinstance(relation, Within | Inside | ServedOn)
+        if isinstance(relation, _CONTAINING)
     ]
     known = [share for share in shares if isfinite(share)]
     return 2 * min(known) - 1 if known else nan
@@ -287,9 +307,13 @@ def _grasps(scene: ImaginedScene, task: TaskSpec) -> tuple[float, float]:
         return nan, nan
     near, along = [1.0], [1.0]
     for role in task.movers:
+        if not _is_start_known(scene, role):
+            return nan, nan
         if not _has_moved(scene, role):
             continue
         off, error = _nearest_grasp(scene, role, is_rim=scene.bound[role].split()[-1] in task.rims)
+        if isnan(off):
+            return nan, nan
         near.append(1 - off)
         along.append(1 - error / CARRY_ERROR_M)
         if off > 1:
@@ -299,26 +323,33 @@ def _grasps(scene: ImaginedScene, task: TaskSpec) -> tuple[float, float]:
 
 
 def _moved(scene: ImaginedScene, task: TaskSpec) -> float:
-    """Return 0 if an object that the task moves is known to have stayed at its start, else 1."""
+    """Return 0 if an object that the task moves is known to have stayed at its start, else 1.
+
+    NaN = of one it is not known.
+    """
     for role in task.movers:
         trail = scene.views.memory.points[scene.item(role)]
         known = np.isfinite(trail).all(1)
         if known.sum() > 2 and known[0] and not _has_moved(scene, role):
             scene.notes[f"'{scene.bound[role]}' has not moved"] = None
             return 0.0
-    return 1.0
+    return 1.0 if all(_is_start_known(scene, role) for role in task.movers) else nan
 
 
 def _nearest_grasp(scene: ImaginedScene, role: str, *, is_rim: bool) -> tuple[float, float]:
-    """Distance of the nearest grasp (1 = the limit), and the error of the path it explains [m]."""
+    """Distance of the nearest grasp (1 = the limit), and the error of the path it explains [m].
+
+    NaN = a gripper closed while it was not known where the object is, and no other one grasped it.
+    """
     item = scene.item(role)
-    best, error = np.inf, np.inf
+    best, error, is_unknown = np.inf, np.inf, False
     for grasp in scene.views.memory.grasps:
         away = float(np.hypot(*(grasp.closed_at - grasp.points[item])[:2])) / GRASP_M
         off = max(float(grasp.gaps_m[item]), 0.0) / RIM_GAP_M if is_rim else away
+        is_unknown |= isnan(away)
         if off < best:  # NaN is not
             best, error = off, _carry_error(scene, role, grasp)
-    return best, error
+    return (nan, nan) if is_unknown and best > 1 else (best, error)
 
 
 def _carry_error(scene: ImaginedScene, role: str, grasp: ObservedGrasp) -> float:
@@ -330,6 +361,11 @@ def _carry_error(scene: ImaginedScene, role: str, grasp: ObservedGrasp) -> float
         until = tools[grasp.arm, -1]
     way = scene.centres(role)[-1] - grasp.points[scene.item(role)]
     return float(np.hypot(*(way - (until - grasp.closed_at))[:2]))
+
+
+def _is_start_known(scene: ImaginedScene, role: str) -> bool:
+    """Return True if it is known where the object was in the rollout's first frame."""
+    return bool(np.isfinite(scene.views.memory.start_point(scene.item(role))).all())
 
 
 def _has_moved(scene: ImaginedScene, role: str) -> bool:

@@ -53,6 +53,11 @@ class ForeseenEnds:
         return float(self.weights.sum() ** 2 / (self.weights**2).sum())
 
     @property
+    def num_lost(self) -> int:
+        """Number of motions whose simulation was lost."""
+        return int((self.weights <= 0).sum())
+
+    @property
     def is_majority(self) -> BoolArray:
         """(K,) whether a motion has the outcome of the weighted majority."""
         return self.done == (self.share >= 0.5)

@@ -14,6 +14,7 @@ from mtv_world_ros.core.estimate_words import (
     FITTED_HERE,
     is_trust,
     NOT_FITTED_HERE,
+    without_state,
 )
 
 #: largest difference of an object's mean extent from its usual one [fraction]
@@ -60,8 +61,8 @@ def without_verdict(estimate: SuccessEstimate, why: str) -> SuccessEstimate:
     """
     if not why:
         return estimate
-    kept = (reason for reason in estimate.reasons if not is_trust(reason))
-    reasons = (cannot_tell(why), *kept)
+    known = (without_state(reason) for reason in estimate.reasons)
+    reasons = (cannot_tell(why), *(reason for reason in known if not is_trust(reason)))
     return replace(estimate, probability=nan, interval=(nan, nan), reasons=reasons)
 
 

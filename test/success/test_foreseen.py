@@ -24,6 +24,7 @@ TASKS = load_tasks(share_path('config', 'tasks'))
 CALIBRATION = load_fit(share_path('resource', 'checkpoint'), Calibration)
 COLOUR = choose_segmenter('colour')
 GOAL = (BLUE[0] - 0.13, BLUE[1], 0.025)
+OPEN = np.ones(2)
 
 
 def matched():
@@ -198,7 +199,7 @@ def test_frames_that_contradict_the_drawn_motion_are_named_and_open_the_verdict(
     drawn = held(*[GOAL] * 16)
     said = {}
     for name, end in (('as drawn', GOAL), ('otherwise', RED)):
-        frames = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]))
+        frames = footage(masks(path(RED, end), [BLUE] * 9), masks([RED], [BLUE]), OPEN)
         said[name] = estimator.estimate(frames, LEFT, foreseen=drawn).estimate
     away = np.linalg.norm(np.array(GOAL) - RED)
     assert said['otherwise'].features['picture_gap'] == pytest.approx(away, abs=0.005)
@@ -230,7 +231,7 @@ def test_an_uncalibrated_estimate_of_futures_says_that_it_is_their_share(calibra
 
 def test_where_nothing_was_fitted_futures_that_disagree_leave_the_verdict_open():
     estimator = SuccessEstimator(TASKS, calibration=CALIBRATION, segmenter=COLOUR)
-    shown = footage(masks(path(RED, GOAL), [BLUE] * 9), masks([RED], [BLUE]))
+    shown = footage(masks(path(RED, GOAL), [BLUE] * 9), masks([RED], [BLUE]), OPEN)
     mixed = replace(held(*[GOAL] * 15, RED), is_fitted=False)
     found = estimator.estimate(shown, LEFT, foreseen=mixed).estimate
     assert found.probability == pytest.approx(16 / 18)
