@@ -149,6 +149,7 @@ def row(
 ) -> list[str]:
     """One line of the table."""
     chunks = {r['rollout']: r for r in reports if r['state'] == 'chunk'}
+    foreseen = {r['rollout']: r for r in reports if r['state'] == 'foreseen'}
     sent = {r['rollout']: r for r in reports if r['state'] == 'published'}
     ends = Counter(r['state'] for r in reports if r['state'] in ENDS)
 
@@ -165,6 +166,8 @@ def row(
         ', '.join(f'{number} {state}' for state, number in ends.items()),
         str(computed),
         str(len(chunks)),
+        str(len(foreseen.keys() | chunks.keys())),
+        median('latency_s', foreseen),
         median('latency_s', chunks),
         median('lead_s', chunks),
         f'{min(leads):.2f}' if leads else '–',
@@ -266,12 +269,15 @@ def main() -> int:
     with page.old_checkout() if options.old else nullcontext() as old:
         rows = measure(options, old)
     header = ['version', 'pace', 'plans a second', 'of [s]', 'load', 'plans', 'ended',
-              'with a chunk', 'with a verdict',
-              'plan to verdict [s]', 'lead [s]', 'least lead [s]', 'in the first half',
+              'with a chunk', 'with a final verdict', 'with a verdict',
+              'plan to first verdict [s]', 'plan to final verdict [s]', 'lead [s]',
+              'least lead [s]', 'in the first half',
               'CPU a chunk [s]', 'plan to first frame [s]', 'frames ahead [s]']  # fmt: skip
     body = (
         f'Plans on the bundled episode, {options.seconds:g} s a line, as the '
-        'node reports them; medians. Lead: time from the verdict to the end of what it judges. '
+        'node reports them; medians. The first verdict is that of the futures (`foreseen`), the '
+        'final one has the imagined frames, too. Lead: time from the final verdict to the end of '
+        'what it judges. '
         'In the first half: verdicts that were there before half of the plan was over. CPU a '
         'chunk: CPU time of the whole node (all threads, images taken in, real frames looked at, '
         'rollouts pre-empted) for each chunk computed. Frames ahead: time from publishing an '

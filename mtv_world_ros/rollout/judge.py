@@ -30,6 +30,7 @@ from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.success.rollout_memory import RolloutMemory
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.vision.camera_check import CameraCheck
+from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,11 +155,14 @@ class Judge(Protocol):
         """Measured Jaccard index by horizon; None = not measured."""
         ...
 
-    def begin(self, observation: Observation, *, foresees: bool) -> JudgeState:
+    def begin(
+        self, observation: Observation, *, segmenter: Segmenter, foresees: bool
+    ) -> JudgeState:
         """Return the evidence of an episode at its first real observation.
 
         Args:
             observation: the observation at any image size.
+            segmenter: finds the objects in real frames.
             foresees: whether the world model is shown simulated object motion.
         """
         ...
@@ -173,6 +177,22 @@ class Judge(Protocol):
 
         Raises:
             RolloutPreempted: `should_stop` of the options said so.
+        """
+        ...
+
+    def ahead(
+        self, state: JudgeState, start: ChunkStart, motion: Motion, options: RolloutOptions
+    ) -> SuccessEstimate | None:
+        """Return the verdict before frames are imagined, which `judge` can only widen.
+
+        Args:
+            state: evidence as `foresee` returned it.
+            start: the chunk.
+            motion: motion of robot and cameras at the start and the frames.
+            options: instruction, objects and task.
+
+        Returns:
+            The estimate; None = the frames are needed for one.
         """
         ...
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from mtv_world_ros.core.data_types import SuccessEstimate
 from mtv_world_ros.core.errors import ConfigError
-from mtv_world_ros.robot.plan import PlanLimits
+from mtv_world_ros.robot.plan import ChunkPlan, PlanLimits
 from mtv_world_ros.success.doubts import ContactTrust
 from mtv_world_ros.success.task import TaskSpec
 
@@ -36,6 +37,8 @@ class RolloutOptions:
         doubt: reason why the fitted physics does not hold here, which widens the estimate; empty
             = no contradiction was observed.
         contact: evidence on contact parameters that were fitted in another robot cell.
+        on_foreseen: called with each chunk and its estimate once futures tell it, before frames
+            are imagined; the estimate with the frames can only be wider. None = not wanted.
     """
 
     instruction: str = ''
@@ -49,6 +52,7 @@ class RolloutOptions:
     should_stop: Callable[[], bool] = never
     doubt: str = ''
     contact: ContactTrust = ContactTrust()
+    on_foreseen: Callable[[ChunkPlan, SuccessEstimate], None] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'objects', tuple(self.objects))

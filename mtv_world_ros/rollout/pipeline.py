@@ -306,7 +306,9 @@ class Pipeline:
 
     def _state_at(self, observation: Observation) -> RolloutState:
         """Return the state of an episode that begins at an observation, with checked cameras."""
-        evidence = self.judge.begin(observation, foresees=self.control.shows_objects)
+        evidence = self.judge.begin(
+            observation, segmenter=self.segmenter, foresees=self.control.shows_objects
+        )
         return RolloutState.at(evidence.objects.first, self.spec, evidence)
 
     def name_objects(
@@ -344,6 +346,10 @@ class Pipeline:
             plan=plan, observation=start, masks=start_masks, num_imagined=state.num_imagined
         )
         evidence = self.judge.foresee(state.evidence, chunk_start, options)
+        if options.on_foreseen is not None:
+            early = self.judge.ahead(evidence, chunk_start, motion, options)
+            if early is not None:
+                options.on_foreseen(plan, early)
         scene = ControlScene(
             motion=motion,
             times=plan.times,

@@ -155,7 +155,13 @@ class Rollout:
             first_seed = options.seed + self.num_chunks
             made = [
                 self.pipeline.imagine(
-                    state, plan, replace(options, seed=first_seed + SEED_STEP * number)
+                    state,
+                    plan,
+                    replace(
+                        options,
+                        seed=first_seed + SEED_STEP * number,
+                        on_foreseen=None if number else options.on_foreseen,
+                    ),
                 )
                 for number, state in enumerate(states)
             ]

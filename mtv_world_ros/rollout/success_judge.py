@@ -59,7 +59,6 @@ class SuccessJudge:
 
     Attributes:
         robot: joints, limits and tools.
-        segmenter: finds the objects in real frames.
         estimator: estimates the task from evidence, with its calibration.
         object_motion: foresees object motions; None = the imagined frames alone decide.
         horizon: measured J by horizon; None = not measured.
@@ -72,7 +71,6 @@ class SuccessJudge:
     """
 
     robot: RobotModel
-    segmenter: Segmenter
     estimator: SuccessEstimator
     object_motion: ObjectMotionModel | None = None
     horizon: HorizonCurve | None = None
@@ -97,7 +95,6 @@ class SuccessJudge:
         """
         return cls(
             robot=robot,
-            segmenter=segmenter,
             estimator=SuccessEstimator(*_tasks(task), segmenter=segmenter),
         )
 
@@ -141,7 +138,6 @@ class SuccessJudge:
         calibration = fits.calibration if calibrated else None
         judge = cls(
             robot=robot,
-            segmenter=segmenter,
             estimator=SuccessEstimator(
                 *_tasks(task),
                 calibration=calibration,
@@ -204,7 +200,9 @@ class SuccessJudge:
         model = self.object_motion
         return model is None or not self.checks_place or model.at_place(place) is model
 
-    def begin(self, observation: Observation, *, foresees: bool) -> JudgeState:
+    def begin(
+        self, observation: Observation, *, segmenter: Segmenter, foresees: bool
+    ) -> JudgeState:
         """Return the evidence at an episode's first observation, with checked cameras."""
         checker = self.camera_checker
         check = CameraCheck() if checker is None else checker.check(observation)
@@ -214,7 +212,7 @@ class SuccessJudge:
             model = model.at_place(observation.place)
         objects = ObjectForesight(
             model=model,
-            segmenter=self.segmenter,
+            segmenter=segmenter,
             robot=self.robot,
             first=observation,
             source=observation,
@@ -238,6 +236,28 @@ class SuccessJudge:
             options.should_stop,
         )
         return replace(state, objects=objects)
+
+    def ahead(
+        self, state: JudgeState, start: ChunkStart, motion: Motion, options: RolloutOptions
+    ) -> SuccessEstimate | None:
+        """Return the verdict before frames are imagined; see `Judge.ahead`."""
+        objects = state.objects
+        foreseen = objects.motions(start.plan, state.is_begun(start.num_imagined))
+        if foreseen is None:
+            return None
+        estimate = self.estimator.for_task(options.task).ahead(
+            foreseen,
+            options.instruction,
+            state.memory,
+            start.observation.cameras,
+            knows_grippers=motion.openings is not None,
+            cell=_other_cell(objects),
+        )
+        if estimate is None:
+            return None
+        estimate = self._doubted(self.grounds.bear(estimate), state, options, is_foreseen=True)
+        estimate = with_notes(estimate, objects.reasons)
+        return without_verdict(estimate, state.frame_doubt or objects.refusal)
 
     def judge(
         self, state: JudgeState, start: ChunkStart, chunk: ImaginedChunk, options: RolloutOptions
@@ -318,7 +338,7 @@ class SuccessJudge:
         is_real: bool = False,
     ) -> tuple[SuccessEstimate, RolloutMemory]:
         """Return the estimate after a chunk of 1 + T states, and what it remembers."""
-        check, footage = state.camera_check, footage_of(motion, start_masks, masks)
+        footage = footage_of(motion, start_masks, masks)
         judged = self.estimator.for_task(options.task).estimate(
             footage,
             options.instruction,
@@ -328,14 +348,28 @@ class SuccessJudge:
             cell=_other_cell(state.objects),
         )
         estimate = judged.estimate if is_real else self.grounds.bear(judged.estimate)
+        is_foreseen = foreseen is not None
+        estimate = self._doubted(estimate, state, options, is_foreseen=is_foreseen)
+        return estimate, judged.memory
+
+    @staticmethod
+    def _doubted(
+        estimate: SuccessEstimate,
+        state: JudgeState,
+        options: RolloutOptions,
+        *,
+        is_foreseen: bool,
+    ) -> SuccessEstimate:
+        """Return an estimate with the doubts about cameras and physics."""
+        check = state.camera_check
         estimate = without_verdict(with_notes(estimate, check.notes), check.refusal)
         if options.doubt:
             estimate = widened(estimate, options.doubt)
-        if foreseen is not None and options.contact.text:
+        if is_foreseen and options.contact.text:
             is_open = verdict_word(estimate.probability, estimate.interval) == 'open'
             word = 'open: ' if is_open and not options.contact.is_confirmed else ''
             estimate = with_notes(estimate, (f'{word}{options.contact.text}',))
-        return estimate, judged.memory
+        return estimate
 
     def _frame_doubt(self, state: JudgeState, start_masks: ObjectMasks) -> str:
         """Return why the real frames that a later plan starts from allow no verdict."""

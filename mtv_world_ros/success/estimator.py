@@ -10,7 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mtv_world_ros.core.data_types import FloatArray, FutureEvidence, SuccessEstimate
+from mtv_world_ros.core.data_types import (
+    CameraModel,
+    FloatArray,
+    FutureEvidence,
+    SuccessEstimate,
+)
 from mtv_world_ros.core.errors import CannotTell, ConfigError, nearest
 from mtv_world_ros.core.estimate_words import cannot_tell
 from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
@@ -80,6 +85,8 @@ _COUNTED_TWICE = (
     'the fit of this checkpoint counts frames as evidence, too, although motion was drawn into '
     'them (run mtv-world fit success again)'
 )
+#: remark on an estimate without imagined frames
+_AHEAD = 'foreseen: without imagined frames, which can only widen it'
 _SHARE = 'the share of simulated futures that succeed'
 _STATED = 'a logistic with stated weights, given the world model'
 #: largest probability of a task that cannot be done yet: a gripper that has to be open is closed,
@@ -144,6 +151,16 @@ def estimate_of_futures(
             side = estimate_of_futures(fit, whole, is_fitted=is_fitted)
             low, high = min(low, side.low), max(high, side.high)
     return ShareEstimate(probability, low, max(high, probability))
+
+
+class _FutureVerdict(NamedTuple):
+    """Estimate of simulated futures."""
+
+    fit: ShareFit
+    with_pictures: ShareEstimate
+    alone: FutureEvidence
+    trust: str
+    is_calibrated: bool
 
 
 class JudgedChunk(NamedTuple):
@@ -277,6 +294,56 @@ class SuccessEstimator:
         starts = foreseen.points[0, 0] if memory is None else memory.points[:, 0]
         return foreseen_ends(foreseen, task, bound, starts)
 
+    def ahead(
+        self,
+        foreseen: ForeseenMotions,
+        instruction: str,
+        memory: RolloutMemory | None,
+        cameras: Sequence[CameraModel],
+        *,
+        knows_grippers: bool = True,
+        cell: OtherCell | None = None,
+    ) -> SuccessEstimate | None:
+        """Return the estimate at the end of motions before frames are imagined.
+
+        The estimate with the frames has an interval that holds this one.
+
+        Args:
+            foreseen: motions since the objects were found.
+            instruction: text for the robot; selects the task and its objects.
+            memory: memory of the rollout; None = the rollout begins where they were found.
+            cameras: cameras of the start frame.
+            knows_grippers: whether the openings of grippers are known.
+            cell: see `estimate`.
+
+        Returns:
+            The estimate, whose Jaccard indices are NaN; None = motions do not tell.
+        """
+        ends = self.foresee(foreseen, instruction, memory)
+        if ends is None:
+            return None
+        task, bound = self._task(instruction, foreseen.names)
+        features = {
+            'foreseen': foreseen_feature(ends),
+            'futures': ends.num_effective,
+            'lost': float(ends.num_lost),
+            'picture_gap': nan,
+            'released': 1.0 if knows_grippers else nan,  # futures have it in their outcomes
+        }
+        items = {role: foreseen.names.index(name) for role, name in bound.items()}
+        sizes = odd_sizes(foreseen.sizes, items, task.sizes_m)
+        used = [camera for camera in cameras if not task.views or camera.view in task.views]
+        said = self._futures(task, ends, features, used, cell or OtherCell(), sizes)
+        return SuccessEstimate(
+            probability=said.alone.probability,
+            interval=said.alone.interval,
+            jaccard=np.full((len(cameras), len(foreseen.names)), nan),
+            reasons=(ends.text, _AHEAD, said.trust),
+            features=features,
+            is_calibrated=said.is_calibrated,
+            futures=said.alone,
+        )
+
     def _task(self, instruction: str, names: tuple[str, ...]) -> tuple[TaskSpec, dict[str, str]]:
         """Return the task and its objects; a given task takes the objects in their order."""
         matched = match_task(self.tasks, instruction)
@@ -314,7 +381,39 @@ class SuccessEstimator:
             'picture_gap': nan if gap is None else gap.distance_m,
             'released': _released(task, views, subjects),
         }
-        fit, elsewhere = ShareFit(), self._elsewhere(views, True)
+        cameras = [camera for camera in views.footage.cameras if camera.view in views.used]
+        said = self._futures(task, ends, features, cameras, *other)
+        reasons = [ends.text]
+        if gap is not None and gap.distance_m > said.fit.max_picture_gap_m:
+            reasons.append(gap.text)
+        reasons += self._shown(task, evidence, views)
+        reasons += self._gripper_reasons(task, views, features)
+        reasons.append(said.trust)
+        found = said.with_pictures
+        numbers = (found.low, found.probability, found.high)
+        judged = _estimate(numbers, evidence, views, reasons, features, said.is_calibrated)
+        return replace(judged, futures=said.alone)
+
+    def _futures(
+        self,
+        task: TaskSpec,
+        ends: ForeseenEnds,
+        features: Mapping[str, float],
+        cameras: Sequence[CameraModel],
+        cell: OtherCell,
+        sizes: str,
+    ) -> _FutureVerdict:
+        """Return the estimate of simulated futures and the trust in it.
+
+        Args:
+            task: task that is judged.
+            ends: outcomes of the futures.
+            features: see `estimate_of_futures`.
+            cameras: cameras whose views the task uses.
+            cell: the robot cell, where contact was not fitted in it.
+            sizes: how the objects' sizes differ from usual ones; empty = they do not.
+        """
+        fit, elsewhere = ShareFit(), self._elsewhere(cameras, True)
         objection = self._objection(task)
         if not objection and self.calibration is not None:
             if self.calibration.futures is None:
@@ -322,33 +421,26 @@ class SuccessEstimator:
             else:
                 fit = self.calibration.futures
         trust = self._trust(objection, elsewhere, is_real=False, stated=_SHARE)
-        is_calibrated = not (objection or elsewhere) and ends.is_fitted
         if not ends.is_fitted:
             # the fit is to futures of a known place; those of a prior are wider
             fit = ShareFit(max_picture_gap_m=fit.max_picture_gap_m)
-            cell, sizes = other
             unknown = self.calibration is None or self.setting is None
             trust = cell.sentence(None if unknown else objection or elsewhere or sizes)
         is_unchecked = self._is_release_unknown(task, features)
-        probability, low, high = self._of_futures(fit, features, ends, is_unchecked)
         alone = self._of_futures(fit, {**features, 'picture_gap': nan}, ends, is_unchecked)
-        futures = FutureEvidence(
-            outcomes=ends.outcomes,
-            probability=alone.probability,
-            interval=(alone.low, alone.high),
-            is_fitted=ends.is_fitted,
-            share=ends.share,
+        return _FutureVerdict(
+            fit=fit,
+            with_pictures=self._of_futures(fit, features, ends, is_unchecked),
+            alone=FutureEvidence(
+                outcomes=ends.outcomes,
+                probability=alone.probability,
+                interval=(alone.low, alone.high),
+                is_fitted=ends.is_fitted,
+                share=ends.share,
+            ),
+            trust=trust,
+            is_calibrated=not (objection or elsewhere) and ends.is_fitted,
         )
-        counts = f'{ends.done.sum()} of {len(ends.done)} foreseen motions succeed'
-        reasons = [f'{counts}, {ends.share:.0%} by weight']
-        if gap is not None and gap.distance_m > fit.max_picture_gap_m:
-            reasons.append(gap.text)
-        reasons += self._shown(task, evidence, views)
-        reasons += self._gripper_reasons(task, views, features)
-        reasons.append(trust)
-        numbers = (low, probability, high)
-        judged = _estimate(numbers, evidence, views, reasons, features, is_calibrated)
-        return replace(judged, futures=futures)
 
     def _of_futures(
         self,
@@ -412,7 +504,8 @@ class SuccessEstimator:
             low = 0.0
         reasons = self._shown(task, evidence, views)
         reasons += self._gripper_reasons(task, views, features)
-        elsewhere = self._elsewhere(views, False) if weights else ''
+        cameras = [camera for camera in views.footage.cameras if camera.view in views.used]
+        elsewhere = self._elsewhere(cameras, False) if weights else ''
         reasons.append(self._trust(objection, elsewhere, is_real=is_real, stated=_STATED))
         is_calibrated = not (objection or elsewhere)
         return _estimate((low, middle, high), evidence, views, reasons, features, is_calibrated)
@@ -444,11 +537,10 @@ class SuccessEstimator:
             return 'there is no fit (run mtv-world fit success)'
         return self.calibration.objection(task.name, self.segmenter)
 
-    def _elsewhere(self, views: Views, is_foreseen: bool) -> str:
+    def _elsewhere(self, cameras: Sequence[CameraModel], is_foreseen: bool) -> str:
         """Return the difference from the setting of the fit; empty if the settings are equal."""
         if self.calibration is None or self.setting is None:
             return ''
-        cameras = [camera for camera in views.footage.cameras if camera.view in views.used]
         return self.calibration.elsewhere(self.setting, cameras, is_foreseen=is_foreseen)
 
     def _trust(self, objection: str, elsewhere: str, *, is_real: bool, stated: str) -> str:

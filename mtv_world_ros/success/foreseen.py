@@ -53,6 +53,12 @@ class ForeseenEnds:
         return float(self.weights.sum() ** 2 / (self.weights**2).sum())
 
     @property
+    def text(self) -> str:
+        """Share of the motions that succeed, in words."""
+        counts = f'{self.done.sum()} of {len(self.done)} foreseen motions succeed'
+        return f'{counts}, {self.share:.0%} by weight'
+
+    @property
     def num_lost(self) -> int:
         """Number of motions whose simulation was lost."""
         return int((self.weights <= 0).sum())

@@ -60,7 +60,7 @@ def runner(robot, expert):
         robot=robot,
         world_model=world_model,
         segmenter=segmenter,
-        judge=SuccessJudge(robot=robot, segmenter=segmenter, estimator=estimator),
+        judge=SuccessJudge(robot=robot, estimator=estimator),
         control=TrajectoryVideo(config=TrajectoryVideoConfig()),
     )
 

@@ -61,3 +61,34 @@ def test_what_the_robot_saw_at_a_frame_is_an_observation(recording):
     assert seen.stamp_ns == recording.stamp_ns + round(float(recording.times[7]) * 1e9)
     assert (seen.positions == recording.positions[7]).all()
     assert tuple(camera.view for camera in seen.cameras) == ('low', 'high')
+
+
+def test_the_verdict_of_futures_is_there_before_the_model_runs(pipeline, recording):
+    """Frames can only widen it."""
+    order = []
+
+    class Watched:
+        spec = pipeline.spec
+
+        def predict(self, *inputs, **options):
+            order.append('model')
+            return pipeline.world_model.predict(*inputs, **options)
+
+    def take(plan, success):
+        order.append((plan.chunk, success))
+
+    episode = replace(pipeline, world_model=Watched()).begin(
+        recording.observation(0),
+        mtv_world_ros.RolloutOptions(
+            instruction=recording.instruction, num_inference_steps=1, on_foreseen=take
+        ),
+    )
+    commands = mtv_world_ros.commands_from(recording, 0)
+    final = [chunk.success for chunk in episode.extend(commands)]
+    assert order[1::2] == ['model'] * len(final)
+    early = order[::2]
+    assert [chunk for chunk, _ in early] == list(range(len(final)))
+    for (_, success), after in zip(early, final, strict=True):
+        assert success.futures.outcomes == after.futures.outcomes
+        assert after.interval[0] <= success.interval[0] <= success.interval[1] <= after.interval[1]
+        assert success.trust == after.trust and any('foreseen: ' in r for r in success.reasons)

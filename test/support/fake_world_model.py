@@ -82,7 +82,7 @@ def load(settings):
         robot=robot,
         world_model=FakeWorldModel(),
         segmenter=segmenter,
-        judge=SuccessJudge(robot=robot, segmenter=segmenter, estimator=estimator),
+        judge=SuccessJudge(robot=robot, estimator=estimator),
         control=TrajectoryVideo(config=TrajectoryVideoConfig()),
         objects=settings.objects,
         describer=asked_describer(settings.describer),

@@ -158,7 +158,7 @@ def make_pipeline(robot) -> Callable[..., Pipeline]:
             robot=robot,
             world_model=world_model or PersistenceWorldModel(SPEC),
             segmenter=segmenter,
-            judge=SuccessJudge(robot=robot, segmenter=segmenter, estimator=estimator),
+            judge=SuccessJudge(robot=robot, estimator=estimator),
             control=TrajectoryVideo(config=TrajectoryVideoConfig()),
             **options,  # type: ignore[arg-type]
         )

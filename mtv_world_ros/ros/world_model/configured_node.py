@@ -42,7 +42,7 @@ from mtv_world_ros.ros.world_model.loading import (
 from mtv_world_ros.ros.world_model.prediction_publisher import PredictionPublisher
 from mtv_world_ros.ros.world_model.reporter import Reporter
 from mtv_world_ros.ros.world_model.request_maker import RequestMaker
-from mtv_world_ros.ros.world_model.worker import RolloutWorker
+from mtv_world_ros.ros.world_model.worker import Foreseen, RolloutWorker
 
 #: the first plan of an imagined episode may come this long before what it answers [s]: a lost
 #: message without a next one comes again after the sender's heartbeat, by default every 3 s
@@ -386,6 +386,9 @@ class ConfiguredNode:
 
     def _publish_results(self) -> None:
         for result in self._worker.take():
+            if isinstance(result, Foreseen):
+                self.guarded(self._reporter.foreseen)(result)
+                continue
             takers = [self._fidelity.expect, self._publisher.add]
             takers += [self._action.take] if self._action is not None else []
             for take in takers:

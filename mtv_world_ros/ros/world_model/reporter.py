@@ -19,7 +19,7 @@ from mtv_world_ros.ros.parameters import Settings
 from mtv_world_ros.ros.status_publisher import READY, StatusPublisher
 from mtv_world_ros.ros.world_model.chunk_outcomes import ScoredChunk, Sent
 from mtv_world_ros.ros.world_model.prediction_publisher import stamp_of
-from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Request
+from mtv_world_ros.ros.world_model.worker import Chunk, Ended, Foreseen, Request
 
 _LEVELS = {
     'rejected': DiagnosticStatus.WARN,
@@ -131,6 +131,17 @@ class Reporter:
         self._node.get_logger().error(''.join(traceback.format_exception(error)))
         text = f'{type(error).__name__}: {error}'
         self._tally.reject(Rejection(Reason.INTERNAL_ERROR, text), time.monotonic())
+
+    def foreseen(self, found: Foreseen) -> None:
+        """Report the estimate of a chunk whose frames are not imagined yet."""
+        values = {
+            **_request_values(found.request),
+            'chunk': found.chunk,
+            'num_chunks': found.num_chunks,
+            'latency_s': found.ready_s - found.request.received_s,
+            **_success_values(found.success),
+        }
+        self._publish_report('foreseen', values)
 
     def judged(self, chunk: Chunk) -> None:
         """Count and report a chunk that was predicted; its estimate is out."""

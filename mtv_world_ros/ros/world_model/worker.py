@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from threading import Condition, current_thread, Thread
 import time
 import traceback
 
-from mtv_world_ros.core.data_types import Observation
+from mtv_world_ros.core.data_types import Observation, SuccessEstimate
 from mtv_world_ros.core.errors import ModelMemoryError, MtvWorldError, PlanError, RolloutPreempted
 from mtv_world_ros.robot.model import RobotModel
-from mtv_world_ros.robot.plan import Plan
+from mtv_world_ros.robot.plan import ChunkPlan, Plan
 from mtv_world_ros.rollout.observed_episode import ObservedEpisode
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
@@ -91,6 +92,25 @@ class Chunk:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Foreseen:
+    """The estimate of a chunk whose frames are not imagined yet.
+
+    Attributes:
+        request: request that the chunk answers.
+        chunk: index of the chunk in its rollout.
+        num_chunks: chunks of the rollout.
+        success: the estimate of simulated futures.
+        ready_s: time at which it was ready [s], of `time.monotonic`.
+    """
+
+    request: Request
+    chunk: int
+    num_chunks: int
+    success: SuccessEstimate
+    ready_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
     """End of a request; each request has exactly one.
 
@@ -113,7 +133,7 @@ class Ended:
     trace: str = ''
 
 
-Result = Chunk | Ended
+Result = Chunk | Foreseen | Ended
 
 
 class RolloutWorker:
@@ -415,7 +435,21 @@ class RolloutWorker:
             should_stop=self._should_stop,
             doubt='' if request.imagine else self.doubt(),
             contact=self.contact(settings.place, request.instruction),
+            on_foreseen=partial(self._put_foreseen, request),
         )
+
+    def _put_foreseen(self, request: Request, plan: ChunkPlan, success: SuccessEstimate) -> None:
+        """Hand on the estimate of a chunk whose frames are not imagined yet."""
+        found = Foreseen(
+            request=request,
+            chunk=plan.chunk,
+            num_chunks=plan.num_chunks,
+            success=success,
+            ready_s=time.monotonic(),
+        )
+        with self._changed:
+            if not (self._abandoned or self._closing or self._is_given_up):
+                self._put(found)
 
     def _begin(self, request: Request, options: RolloutOptions) -> tuple[SensedScene, Rollout]:
         """Return the start scene and its episode: the present one, or a new one."""

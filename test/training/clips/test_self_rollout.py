@@ -110,7 +110,7 @@ def test_the_start_is_the_models_own_rollout_and_the_target_the_recording(
         robot=robot,
         world_model=model,
         segmenter=segmenter,
-        judge=SuccessJudge(robot=robot, segmenter=segmenter, estimator=estimator),
+        judge=SuccessJudge(robot=robot, estimator=estimator),
         control=trainer.control,
     )
     for index in rolled:
