@@ -25,7 +25,7 @@ def test_the_sheet_has_a_line_of_every_view():
     assert notes[3:6] == [
         'success after each chunk (recorded outcome: success):',
         '  1. 0.25: 4 of 16 foreseen motions succeed',
-        "  2. no estimate: 'x' is no task",
+        "  2. cannot tell, because 'x' is no task",
     ]
     assert len(notes) == 6
     speed = _speed_notes(report)
