@@ -10,6 +10,7 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import FloatArray, SuccessEstimate
 from mtv_world_ros.core.estimate_words import (
+    BECAUSE,
     cannot_tell,
     FITTED_HERE,
     is_trust,
@@ -47,7 +48,7 @@ def with_notes(estimate: SuccessEstimate, notes: Iterable[str]) -> SuccessEstima
     notes, reasons = tuple(notes), estimate.reasons
     if not notes:
         return estimate
-    if not reasons or not is_trust(reasons[-1]):
+    if not reasons or not is_trust(reasons[-1]) or reasons[-1].startswith(BECAUSE):
         return replace(estimate, reasons=(*reasons, *notes))
     return replace(estimate, reasons=(*reasons[:-1], *notes, reasons[-1]))
 

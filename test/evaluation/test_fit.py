@@ -500,8 +500,8 @@ def test_broken_calibration_says_what_to_do(tmp_path, change, message):
 def test_calibration_does_not_hold_for_another_segmenter_or_task():
     calibration = calibrate(made_samples(), segmenter='colour').calibration
     assert calibration.objection('stack', 'colour') == ''
-    assert "segmenter 'sam2' (fitted with 'colour')" in calibration.objection('stack', 'sam2')
-    assert "task 'pour'" in calibration.objection('pour', 'colour')
+    assert "segmenter 'colour', not with 'sam2'" in calibration.objection('stack', 'sam2')
+    assert "tasks without 'pour'" in calibration.objection('pour', 'colour')
 
 
 CURVE = HorizonCurve(
