@@ -36,8 +36,8 @@ from mtv_world_ros.rollout.scene_memory import SceneKeeper, SceneMemory
 from mtv_world_ros.rollout.state import RolloutState
 from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.success.comparison import Comparison
-from mtv_world_ros.success.doubts import doubted
 from mtv_world_ros.success.task import TaskSpec
+from mtv_world_ros.success.trust import with_notes
 from mtv_world_ros.vision.describers.describer import Describer, name_objects
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
@@ -387,7 +387,7 @@ class Pipeline:
             motion=motion, masks=masks, is_in_view=control.video is None or bool(in_view.any())
         )
         success, foreseen, evidence = self.judge.judge(evidence, chunk_start, imagined, options)
-        success = doubted(success, leak_notes)
+        success = with_notes(success, leak_notes)
         clock.lap('success')
         times = plan.times[1 : plan.num_frames + 1]
         stamp_ns = plan.stamp_ns + round(float(times[-1]) * 1e9)

@@ -133,7 +133,8 @@ class Ended:
     trace: str = ''
 
 
-Result = Chunk | Foreseen | Ended
+#: what takers of results are given; `Foreseen` is reported alone
+Result = Chunk | Ended
 
 
 class RolloutWorker:
@@ -166,7 +167,7 @@ class RolloutWorker:
         self._closing = False
         self._episode: Rollout | None = None
         self._last: SensedScene | None = None
-        self._results: deque[Result] = deque()
+        self._results: deque[Result | Foreseen] = deque()
         #: time of the thread's last step [s]; None = it waits for work
         self._beat_s: float | None = None
         self._thread = self._new_thread()
@@ -297,7 +298,7 @@ class RolloutWorker:
                 self._put(Ended(request=pending, state='preempted', num_chunks=0, text=text))
                 self._pending = None
 
-    def take(self) -> list[Result]:
+    def take(self) -> list[Result | Foreseen]:
         """Return the results since the last call, in order."""
         with self._changed:
             taken = list(self._results)
@@ -463,6 +464,6 @@ class RolloutWorker:
         self.camera_check = episode.camera_check
         return scene, episode
 
-    def _put(self, result: Result) -> None:
+    def _put(self, result: Result | Foreseen) -> None:
         self._results.append(result)
         self._notify()
