@@ -240,7 +240,7 @@ class _Writer:
     def finish(self) -> None:
         """Write the metadata."""
         if not self._entries:
-            raise EpisodeError('there is no episode to export')
+            raise EpisodeError('there is no episode to export; name a folder that holds some')
         names = list(self._entries[0])
         _write_table(
             self.root / _EPISODES, {name: [row[name] for row in self._entries] for name in names}
@@ -267,7 +267,8 @@ class _Writer:
         is_odd = any(camera.width % 2 or camera.height % 2 for camera in rows.cameras)
         if self._as_videos and is_odd:
             raise EpisodeError(
-                f'the images are {look(rows.cameras)}; MP4 needs an even width and height'
+                f'the images are {look(rows.cameras)}; MP4 needs an even width and height; '
+                'give --size, or --images for PNG'
             )
 
     def _info(self) -> dict[str, Any]:

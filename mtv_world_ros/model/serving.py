@@ -66,7 +66,7 @@ def _set_attention(transformer: MultiViewWanTransformer, name: str) -> None:
 def decoder_of(
     autoencoder: Autoencoder, serving: ServingOptions, dtype: torch.dtype
 ) -> Autoencoder:
-    """Return the decoder: the autoencoder, on its device, or the tiny one in its place.
+    """Return the decoder: the autoencoder on its device, or the tiny autoencoder.
 
     Raises:
         CheckpointError: the tiny one's weights cannot be read, or are for other latents.

@@ -60,7 +60,7 @@ class WorldModel(Protocol):
 
     @property
     def spec(self) -> WorldModelSpec:
-        """Its frame size, rate and views."""
+        """Frame size, rate and views of the model."""
         ...
 
     def predict(

@@ -181,7 +181,7 @@ class DelayLine:
         self._last = deque([first] * (int(periods) + 2), maxlen=int(periods) + 2)
 
     def pass_on(self, command: FloatArray) -> FloatArray:
-        """Send a command (J,); return the one (J,) that arrives meanwhile."""
+        """Add a command (J,) to the delay line; return the command (J,) that leaves it."""
         self._last.append(command)
         return self._last[1] * (1 - self._share) + self._last[0] * self._share
 

@@ -154,7 +154,7 @@ class BatchMotion:
     Attributes:
         points: (K, T + 1, O, 3) centres of the solids [m].
         rotations: (K, T + 1, O, 3, 3) rotation matrices of the solids.
-        joints: (K, T + 1, J) joints of the robot, which what it touches may stop [rad or m].
+        joints: (K, T + 1, J) joints of the robot, which contact may stop [rad or m].
         steps: steps of the engine that were computed, of all futures together.
     """
 

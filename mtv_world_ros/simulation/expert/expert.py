@@ -31,8 +31,9 @@ class PickingConfig:
     """Gaps between fingers and objects.
 
     Attributes:
-        release: release on either side when the fingers let go; they open wholly above [m].
-        miss_margin: miss margin between the fingers and an object that is missed, range [m].
+        release: gap on either side of the object when the fingers release it; they open fully
+            above it [m].
+        miss_margin: range of the gap between the fingers and an object that they miss [m].
         max_miss: largest shift past an object, across the fingers' travel [m].
     """
 
