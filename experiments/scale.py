@@ -312,7 +312,7 @@ def measure_data(sizes: Sequence[int] = (100, 1000, 10_000)) -> int:
 #: begins the line of a measured process
 _MARK = 'measured: '
 #: episodes of the table of starts
-_START_EPISODES = 32
+_START_EPISODES = 16
 #: steps between two looks at the memory
 _STEPS = 50
 

@@ -103,6 +103,17 @@ def test_processes_wait_for_the_main_one_longer_than_nccl_does(monkeypatch):
     assert given['timeout'] > 10 * timedelta(minutes=10)
 
 
+def test_a_process_that_sees_other_files_is_named(monkeypatch):
+    def gather(found: list[str], mine: str) -> None:
+        found[:] = [mine, mine, 'others']
+
+    processes = Processes('cpu')
+    processes.count = 3
+    monkeypatch.setattr('torch.distributed.all_gather_object', gather)
+    with pytest.raises(TrainingError, match='the episodes of process 2 differ from those of pro'):
+        processes.check_same('the episodes', 'mine')
+
+
 def test_fewer_clips_than_processes_are_refused(tiny, tmp_path):
     processes = Processes('cpu')
     processes.count = 2

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 
 import pytest
 
+from mtv_world_ros.core.writer_lock import only_writer
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.training.training_config import load_training_config
 from test.support.launched import torchrun
@@ -47,3 +49,12 @@ def test_a_dry_run_is_printed_once():
     status, said, errors = torchrun(2, ['train', '--dry-run', *TINY])
     assert status == 0, errors
     assert said.count('per step, the transformer alone:') == 1
+
+
+@pytest.mark.slow
+def test_a_second_run_into_a_folder_that_is_written_is_told_at_once(episode, tmp_path):
+    with only_writer(tmp_path / 'out'):
+        status, said, errors = torchrun(2, ['train', str(episode), '--out', str(tmp_path / 'out')])
+    assert status == 1
+    assert f"'{tmp_path / 'out'}' is being written by process {os.getpid()}" in errors
+    assert not (tmp_path / 'out').exists() and 'checkpoint: ' not in said
