@@ -288,7 +288,7 @@ def measure_data(sizes: Sequence[int] = (100, 1000, 10_000)) -> int:
             (again,) = own_process('data', work, number=size)
             memory = again['memory_mib']
             per_clip = again[f'steps_{2 * _STEPS}'] / _STEPS / config.optimizer.batch_size
-            starts.append(again['read'])
+            starts.append(first['read'])
             rows.append([
                 f'{size:,}', f'{first["read"]:.1f}', f'{again["read"]:.2f}',
                 *(f'{value:.0f}' for value in memory), f'{per_clip * again["clips"]:.0f}',
@@ -296,14 +296,10 @@ def measure_data(sizes: Sequence[int] = (100, 1000, 10_000)) -> int:
             print(' | '.join(rows[-1]), file=sys.stderr, flush=True)
         line = predicted(sizes, starts)
         for row, size in zip(rows, sizes, strict=True):
-            row.append(f'{line(size):.2f}')
-    head = ['episodes', 'first start [s]', 'later start [s]', 'memory after 1 step [MiB]']
-    head += [
-        f'after {_STEPS}',
-        f'after {2 * _STEPS}',
-        'clips of an epoch [s]',
-        'later start by the formula [s]',
-    ]
+            row.insert(2, f'{line(size):.1f}')
+    head = ['episodes', 'first start [s]', 'formula [s]', 'later start [s]']
+    head += ['memory after 1 step [MiB]', f'after {_STEPS}', f'after {2 * _STEPS}']
+    head += ['clips of an epoch [s]']
     print('CPU time of one process; memory is what no file backs\n')
     print(Table(head=head, rows=rows).markdown())
     return 0
