@@ -270,7 +270,7 @@ def measure_data(sizes: Sequence[int] = (100, 1000, 10_000)) -> int:
     from mtv_world_ros.training.training_config import load_training_config
 
     config = load_training_config('small')
-    robot = load_robot(robot_path(config.video.robot))
+    robot, spec = load_robot(robot_path(config.video.robot)), config.spec
     rows: list[list[str]] = []
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
@@ -281,7 +281,7 @@ def measure_data(sizes: Sequence[int] = (100, 1000, 10_000)) -> int:
         for size in sizes:
             cache = work / f'cache_data_{size}'
             cache.mkdir()
-            keys = [recording_key(path, config.spec, robot) for path in paths[:size]]
+            keys = [recording_key(path, spec, robot) for path in paths[:size]]
             for key in keys:
                 (cache / f'{key}.npz').hardlink_to(decoded)
             if size <= _READ_EPISODES:
