@@ -47,6 +47,7 @@ from lite_features import NAME as LITE
 import numpy as np
 
 from mtv_world_ros.cli import main as mtv_world
+from mtv_world_ros.cli.parser import CommandParser
 from mtv_world_ros.cli.shared_options import add_options, machine
 from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.control.registry import control_class, TRAJECTORY_VIDEO
@@ -1267,11 +1268,9 @@ def all_tasks() -> list[str]:
     return [task.name for task in load_tasks(share_path('config', 'tasks'))]
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> CommandParser:
     """Return the parser of the options."""
-    made = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    made = CommandParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = made.add_argument
     add('--out', type=Path, required=True, help='goes on with what is there')
     add(

@@ -210,8 +210,8 @@ def through_node(folder: Path, one: Signal) -> None:
 
     path = make_episode(folder)
     options = DemoOptions(
-        checkpoint='bundled', calibration=folder / 'calibration.yaml', robot=None, device='cpu',
-        num_threads=1, num_inference_steps=1, seed=0,
+        checkpoint='bundled', calibration=folder / 'calibration.yaml', device='cpu', num_threads=1,
+        num_inference_steps=1,
     )  # fmt: skip
     record_through_node(path, ros().VIEWS, folder / 'out', options)
 
