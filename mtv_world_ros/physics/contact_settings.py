@@ -63,6 +63,10 @@ ENOUGH_TELLING = 3
 MAX_HOLD_FACTOR = float(np.exp(2 * ndtri(0.95) * PRIOR_LOG_STD))
 
 
+#: friction x stiffness of fingers / density [N m^2/kg]
+HoldParameter = Annotated[float, Field(gt=0, le=1e9)]
+
+
 class ContactOrigin(Schema):
     """Recordings that contact settings were fitted to."""
 
@@ -73,7 +77,7 @@ class ContactOrigin(Schema):
         default=None,
         description='robot cell of the recordings; null = older file, which holds everywhere',
     )
-    hold: ListOf[float] = Field(
+    hold: ListOf[HoldParameter] = Field(
         default=(),
         max_length=2,
         description='90 % interval of friction x stiffness of fingers / density, which decides '

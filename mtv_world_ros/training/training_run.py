@@ -242,7 +242,6 @@ def train(
     check_processes(config.optimizer, processes)
     with processes.main_first():
         check_architecture(out, config)
-    out.mkdir(parents=True, exist_ok=True)
     paths = find_episodes(run.dataset) if isinstance(run.dataset, Path) else run.dataset
     episodes, skipped = load_episodes(
         spread(paths, run.num_episodes),
@@ -254,6 +253,7 @@ def train(
         run.broken,
         processes,
     )
+    out.mkdir(parents=True, exist_ok=True)
     _save_robot(robot, episodes, out / ROBOT_FOLDER, processes)
     with processes.main_first():
         control = fitted_control(out, config, episodes, robot, initial=run.initial)

@@ -133,7 +133,7 @@ def test_a_cluster_that_is_started_here_listens_on_this_machine_alone(
         (tmp_path / 'ray' / 'ray_current_cluster').write_text('192.0.2.1:6392')
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    with pytest.raises(ConfigError, match='needs Ray'):
+    with pytest.raises(ConfigError, match='needs ray'):
         next(score_all([(7, 9)], make_scorer, Workers(ray=address)))
     assert (os.environ.get('RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER') == '0') == is_local
 

@@ -88,5 +88,5 @@ def test_drives_that_explicit_steps_would_excite_are_refused(expert):
 def test_without_the_engine_an_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, 'mtv_world_ros.simulation.dart.stepped_world', None)
     sim = SimEpisode(ROBOT, Expert(ROBOT, physics=PHYSICS).home, rendering=False, physics=PHYSICS)
-    with pytest.raises(SimulatorError, match=r'pip install \.\[dart\]'):
+    with pytest.raises(SimulatorError, match=r'needs dartpy: pip install .mtv_world_ros\[dart\]'):
         sim.reset(SEED, TASK)
