@@ -63,6 +63,31 @@ def only_writer(path: Path, option: str = '--out') -> Iterator[None]:
                 folder.rmdir()
 
 
+@contextmanager
+def turn_to_write(path: Path) -> Iterator[None]:
+    """Wait until no other process has its turn to change a file, and hold the turn.
+
+    On a file system without locks nothing is held.
+
+    Args:
+        path: the file; its lock, `.NAME.mtv-lock`, stays beside it.
+
+    Raises:
+        OSError: the lock cannot be made.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(_lock_path(path), _FLAGS, 0o666)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def _make_parents(target: Path) -> list[Path]:
     """Make the folders above a path; return those that were missing, the deepest first."""
     missing = [folder for folder in target.parents if not folder.exists()]

@@ -45,9 +45,10 @@ def foreseen_attempts(motions: ForeseenMotions) -> tuple[ForeseenAttempt, ...]:
     """Return the attempts in which the tool moves far enough to tell, in order of time.
 
     Args:
-        motions: foreseen motions since the objects were found.
+        motions: foreseen motions since the objects were found; there are no attempts where the
+            simulation of every future was lost.
     """
-    if motions.tools is None or not motions.names:
+    if motions.tools is None or not motions.names or not motions.weights.any():
         return ()
     found, weights = [], motions.weights / motions.weights.sum()
     for arm, way in enumerate(motions.tools):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
-import fcntl
 from hashlib import sha256
 import os
 from pathlib import Path
@@ -16,14 +16,13 @@ from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.config import Schema
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.files import write_json
+from mtv_world_ros.core.writer_lock import turn_to_write
 from mtv_world_ros.success.confirmation import ContactConfirmation, TaskEvidence
 
 #: folder of the files in ROS_HOME
 FOLDER = Path('mtv_world', 'cells')
 #: most characters of a cell's name in the name of its file
 _NAME_LENGTH = 60
-#: a link in place of the lock is not followed
-_LOCK_FLAGS = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 
 
 class _Contents(Schema):
@@ -123,21 +122,17 @@ class CellFile:
             ConfigError: the file is of another cell, robot or fit, or cannot be read.
             OSError: the file cannot be written; `confirmation` is changed all the same.
         """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            lock = os.open(self.path.with_suffix('.lock'), _LOCK_FLAGS, 0o644)
-        except OSError:
-            change(confirmation)
-            raise
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(turn_to_write(self.path))
+            except OSError:
+                change(confirmation)
+                raise
             found, remark = self.load()
             confirmation.tasks = dict(found.tasks)
             change(confirmation)
             if confirmation.tasks != found.tasks:
                 self.store(confirmation)
-        finally:
-            os.close(lock)
         return remark
 
     def store(self, confirmation: ContactConfirmation) -> None:

@@ -1,5 +1,6 @@
 """Evidence of a robot cell survives restarts; damaged and foreign files are named."""
 
+import errno
 import json
 import os
 from threading import Thread
@@ -50,6 +51,16 @@ def test_two_nodes_of_a_cell_share_its_evidence(tmp_path):
     for thread in threads:
         thread.join()
     assert file.load()[0].tasks['stack'].num_foreseen == 50
+
+
+def test_a_file_system_without_locks_keeps_the_evidence(tmp_path, monkeypatch):
+    def no_locks(descriptor, what):
+        raise OSError(errno.ENOLCK, 'no locks available')
+
+    monkeypatch.setattr('fcntl.flock', no_locks)
+    file, found = cell(tmp_path), ContactConfirmation()
+    file.update(found, lambda c: c.take(seen_end(0.0), 0, 'stack'))
+    assert file.load()[0].tasks['stack'].num_foreseen == 1
 
 
 def test_evidence_is_changed_in_memory_where_it_cannot_be_written(tmp_path):
