@@ -270,11 +270,8 @@ class SuccessEstimator:
         if ends is None or foreseen is None:
             return JudgedChunk(self._judge(task, evidence, views, subjects, is_real), memory)
         gap = picture_gap(views, foreseen, [bound[role] for role in task.movers])
-        items = {role: foreseen.names.index(name) for role, name in bound.items()}
-        sizes = odd_sizes(foreseen.sizes, items, task.sizes_m)
-        judged = self._judge_futures(
-            task, evidence, views, subjects, ends, gap, (cell or OtherCell(), sizes)
-        )
+        cell = _with_sizes(cell, task, bound, foreseen)
+        judged = self._judge_futures(task, evidence, views, subjects, ends, gap, cell)
         return JudgedChunk(judged, memory)
 
     def foresee(
@@ -330,10 +327,9 @@ class SuccessEstimator:
             'picture_gap': nan,
             'released': 1.0 if knows_grippers else nan,  # futures have it in their outcomes
         }
-        items = {role: foreseen.names.index(name) for role, name in bound.items()}
-        sizes = odd_sizes(foreseen.sizes, items, task.sizes_m)
+        cell = _with_sizes(cell, task, bound, foreseen)
         used = [camera for camera in cameras if not task.views or camera.view in task.views]
-        said = self._futures(task, ends, features, used, cell or OtherCell(), sizes)
+        said = self._futures(task, ends, features, used, cell)
         return SuccessEstimate(
             probability=said.alone.probability,
             interval=said.alone.interval,
@@ -366,13 +362,9 @@ class SuccessEstimator:
         subjects: Sequence[int],
         ends: ForeseenEnds,
         gap: PictureGap | None,
-        other: tuple[OtherCell, str],
+        cell: OtherCell,
     ) -> SuccessEstimate:
-        """Return the estimate of simulated futures, which decide alone.
-
-        `other` is the robot cell and how the objects' sizes differ from usual ones; both count
-        where contact was not fitted.
-        """
+        """Return the estimate of simulated futures, which decide alone."""
         features = {
             **evidence.features,
             'foreseen': foreseen_feature(ends),
@@ -382,7 +374,7 @@ class SuccessEstimator:
             'released': _released(task, views, subjects),
         }
         cameras = [camera for camera in views.footage.cameras if camera.view in views.used]
-        said = self._futures(task, ends, features, cameras, *other)
+        said = self._futures(task, ends, features, cameras, cell)
         reasons = [ends.text]
         if gap is not None and gap.distance_m > said.fit.max_picture_gap_m:
             reasons.append(gap.text)
@@ -401,7 +393,6 @@ class SuccessEstimator:
         features: Mapping[str, float],
         cameras: Sequence[CameraModel],
         cell: OtherCell,
-        sizes: str,
     ) -> _FutureVerdict:
         """Return the estimate of simulated futures and the trust in it.
 
@@ -411,7 +402,6 @@ class SuccessEstimator:
             features: see `estimate_of_futures`.
             cameras: cameras whose views the task uses.
             cell: the robot cell, where contact was not fitted in it.
-            sizes: how the objects' sizes differ from usual ones; empty = they do not.
         """
         fit, elsewhere = ShareFit(), self._elsewhere(cameras, True)
         objection = self._objection(task)
@@ -425,7 +415,7 @@ class SuccessEstimator:
             # the fit is to futures of a known place; those of a prior are wider
             fit = ShareFit(max_picture_gap_m=fit.max_picture_gap_m)
             unknown = self.calibration is None or self.setting is None
-            trust = cell.sentence(None if unknown else objection or elsewhere or sizes)
+            trust = cell.sentence(None if unknown else objection or elsewhere or cell.sizes)
         is_unchecked = self._is_release_unknown(task, features)
         alone = self._of_futures(fit, {**features, 'picture_gap': nan}, ends, is_unchecked)
         return _FutureVerdict(
@@ -595,6 +585,18 @@ def _abstains(reason: CannotTell, views: Views, subjects: Sequence[int]) -> Succ
         jaccard=_jaccard(views, {}, subjects),
         reasons=(cannot_tell(reason),),
     )
+
+
+def _with_sizes(
+    cell: OtherCell | None,
+    task: TaskSpec,
+    bound: Mapping[str, str],
+    foreseen: ForeseenMotions,
+) -> OtherCell:
+    """Return the robot cell with how the sizes of the objects in it differ from usual ones."""
+    items = {role: foreseen.names.index(name) for role, name in bound.items()}
+    sizes = odd_sizes(foreseen.sizes, items, task.sizes_m)
+    return replace(cell or OtherCell(), sizes=sizes)
 
 
 def _estimate(

@@ -75,11 +75,13 @@ class OtherCell:
         here: name of the robot cell; empty = not stated.
         fitted: name of the robot cell of the fit; empty = there is none.
         doubt: reason why contact parameters hold in no robot cell; empty = they hold in one.
+        sizes: how the objects' sizes differ from usual ones; empty = they do not.
     """
 
     here: str = ''
     fitted: str = ''
     doubt: str = ''
+    sizes: str = ''
 
     def sentence(self, difference: str | None) -> str:
         """Return the sentence about an estimate in this robot cell.

@@ -53,6 +53,10 @@ def test_weights_of_the_futures_count():
     assert first.share == pytest.approx(0.2 / 2.2) and second.share == pytest.approx(2 / 2.2)
 
 
+def test_futures_that_were_all_lost_chain_no_attempts():
+    assert foreseen_attempts(replace(_plan(), weights=np.zeros(4))) == ()
+
+
 def test_a_plan_that_chains_attempts_says_how_sure_each_is():
     line = attempts_line(foreseen_attempts(_plan()))
     assert line.startswith("2 attempts to grasp in a row: at 0.6 s 'block' goes along in 50% of")
