@@ -35,12 +35,21 @@ class Peers:
         Nodes that know each other from the graph may still not be connected, and what is
         published until then is lost.
         """
+        return self._counted_zero('subscribers', topics)
 
-        def has_none(topic: str) -> bool:
-            counts = (state.get(f'subscribers.{topic}') for state in self._newest.values())
+    def unheard(self, topics: Iterable[str]) -> list[str]:
+        """Return the topics whose subscriber, by its node's diagnostics, has no publisher.
+
+        A publisher may count a subscriber that does not know it yet, and hears nothing.
+        """
+        return self._counted_zero('publishers', topics)
+
+    def _counted_zero(self, kind: str, topics: Iterable[str]) -> list[str]:
+        def is_counted(topic: str) -> bool:
+            counts = (state.get(f'{kind}.{topic}') for state in self._newest.values())
             return any(count is not None and _is_zero(count) for count in counts)
 
-        return [topic for topic in topics if has_none(topic)]
+        return [topic for topic in topics if is_counted(topic)]
 
     def _status_name(self, name: str) -> str:
         """Return a node's name, absolute or in this node's namespace, as diagnostics have it."""

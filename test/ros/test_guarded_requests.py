@@ -98,16 +98,19 @@ def test_services_are_guarded_once(context):
         assert [service.callback for service in node.services] == callbacks
 
 
+@pytest.mark.parametrize(
+    ('kind', 'named'), [('subscribers', Peers.unconnected), ('publishers', Peers.unheard)]
+)
 @pytest.mark.parametrize('count', ['', 'x', '-1', '1e9', '\N{SUPERSCRIPT TWO}', '9' * 5000, '٣'])
-def test_a_count_of_diagnostics_that_is_no_number_says_nothing(context, count):
+def test_a_count_of_diagnostics_that_is_no_number_says_nothing(context, count, kind, named):
     with ended(Node('any')) as node:
         peers = Peers(node)
-        values = [KeyValue(key='subscribers./plan', value=count)]
+        values = [KeyValue(key=f'{kind}./plan', value=count)]
         peers._on_diagnostics(DiagnosticArray(status=[DiagnosticStatus(name='n', values=values)]))
-        assert peers.unconnected(['/plan']) == []
-        values = [KeyValue(key='subscribers./plan', value='0')]
+        assert named(peers, ['/plan']) == []
+        values = [KeyValue(key=f'{kind}./plan', value='0')]
         peers._on_diagnostics(DiagnosticArray(status=[DiagnosticStatus(name='n', values=values)]))
-        assert peers.unconnected(['/plan']) == ['/plan']
+        assert named(peers, ['/plan']) == ['/plan']
 
 
 def test_a_message_that_cannot_be_shown_does_not_end_the_viewer(context, monkeypatch):

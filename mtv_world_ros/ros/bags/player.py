@@ -59,6 +59,8 @@ _CLOCK_PERIOD_NS = 10_000_000
 _CLOCK_STEP_NS = 50_000_000
 #: connections that do not change for this long are complete [s]
 _SETTLED_S = 0.5
+#: nodes get this long to hear what is played, by their diagnostics [s]
+_HEARD_S = 10.0
 #: after this long it says what it waits for
 _SILENT_S = 2.0
 ENDS = ('done', 'preempted', 'rejected', 'failed', 'reset')
@@ -374,12 +376,19 @@ class Player(Node):
         return unsubscribed or self._peers.unconnected(topics)
 
     def _wait_until_settled(self, end_s: float) -> None:
-        """Wait until the number of connections has not changed for a while."""
+        """Wait until the number of connections has not changed for a while.
+
+        Where nodes say in diagnostics that they hear nobody on a topic that is played, it waits
+        for that, too; some never will, as their quality of service does not fit.
+        """
         known, since_s = self._connections(), time.monotonic()
+        heard_s = min(since_s + _HEARD_S, end_s)
+        topics = [publisher.topic_name for publisher in self._outputs.values()]
         while time.monotonic() < min(since_s + _SETTLED_S, end_s):
             self._executor.spin_once(timeout_sec=0.05)
             now = self._connections()
-            if now != known:
+            is_unheard = time.monotonic() < heard_s and bool(self._peers.unheard(topics))
+            if now != known or is_unheard:
                 known, since_s = now, time.monotonic()
 
     def _connections(self) -> list[tuple[int, int]]:

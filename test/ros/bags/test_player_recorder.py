@@ -295,6 +295,36 @@ def test_plans_of_a_node_that_ended_meanwhile_are_a_failure(episode, launch, cli
 
 
 @pytest.mark.slow
+def test_a_node_that_does_not_hear_the_cameras_yet_is_waited_for(episode, launch, client):
+    """A publisher counts subscribers that do not know it yet: what it then sends is lost."""
+    client.subscribe(JointTrajectory, '/joint_trajectory', depth=10)
+    client.subscribe(CompressedImage, IMAGE, depth=10)
+    taken = client.received['/joint_trajectory']
+    taken.clear()
+    diagnostics = client.node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+    heard = False
+
+    def tell():
+        values = [KeyValue(key=f'publishers.{IMAGE}', value=str(int(heard)))]
+        diagnostics.publish(DiagnosticArray(status=[DiagnosticStatus(name='n', values=values)]))
+
+    timer = client.node.create_timer(0.05, tell)
+    player = launch('player', episode, '--rate', '4')
+    end_s = time.monotonic() + 60
+    while not diagnostics.get_subscription_count() and time.monotonic() < end_s:
+        client.executor.spin_once(timeout_sec=0.05)
+    for _ in range(60):  # longer than it waits for connections
+        client.executor.spin_once(timeout_sec=0.05)
+    assert not taken and player.poll() is None
+    heard = True
+    client.wait(lambda: len(taken) >= len(PLANS), 'both plans')
+    client.node.destroy_timer(timer)
+    client.node.destroy_publisher(diagnostics)
+    code, said = finish(player)
+    assert code == 0, said
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize('options', [('--lock-step',), ()])
 def test_only_plans_that_the_reporting_node_reads_are_to_be_answered(
     options, tmp_path, launch, client, ros
