@@ -78,6 +78,7 @@ def save_state(
             with processes.losses_named(), _one_process_is_meant():
                 checkpoint.save(tensors, storage_writer=writer)
         except CheckpointException as error:
+            _raise_stop(error)
             raise OSError(_of_processes(error)) from error
         if processes.is_main:
             (partial / _CARD_FILE).write_text(json.dumps(whole))
@@ -104,6 +105,13 @@ def _one_process_is_meant() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings('ignore', message='torch.distributed is disabled')
         yield
+
+
+def _raise_stop(error: CheckpointException) -> None:
+    """Raise what stopped a process, such as a second Ctrl-C: torch's error holds it, too."""
+    for stop, _ in error.failures.values():
+        if not isinstance(stop, Exception):
+            raise stop from error
 
 
 def _of_processes(error: CheckpointException) -> str:
@@ -198,6 +206,8 @@ def load_state(
         for name, tensor in tensors.items():
             check_finite(tensor.to_local() if isinstance(tensor, DTensor) else tensor, name, held)
     except (CheckpointException, OSError, SafetensorError, KeyError, RuntimeError) as error:
+        if isinstance(error, CheckpointException):
+            _raise_stop(error)
         said = _of_processes(error) if isinstance(error, CheckpointException) else error
         raise TrainingError(
             f"'{held}' is damaged or of another model: {said}; give the preset it was trained "

@@ -26,6 +26,7 @@ from mtv_world_ros.inspection.inspection_report import BROKEN
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.trained_model import load_trained_model
 from mtv_world_ros.robot.file import load_robot
+from mtv_world_ros.training import resume
 from mtv_world_ros.training.clips.episode_index import IndexedEpisode
 from mtv_world_ros.training.resume import DiskError
 from mtv_world_ros.training.training_config import TrainingRun
@@ -183,6 +184,25 @@ def test_a_full_disk_leaves_the_last_state_and_checkpoint_whole(tiny, source, tm
     assert (
         load_trained_model(Checkpoint.open(tmp_path / 'checkpoint')).card.trained_on['steps'] == 1
     )
+
+
+def test_a_second_interrupt_while_a_state_is_written_ends_it_as_an_interrupt(
+    tiny, source, tmp_path, monkeypatch
+):
+    """Torch's error holds it, and it is no trouble of the disk."""
+    trainer = make_trainer(tiny, tmp_path)
+    reports = trainer.run(source, save_every=1, on_save=lambda _: None)
+    for _ in range(2):  # the second call saves what the first one did
+        next(reports)
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(resume.HuggingFaceStorageWriter, 'write_data', stopped)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.save_state()
+    resumed = make_trainer(tiny, tmp_path)
+    assert resumed.load_state() and resumed.step == 1
 
 
 def test_a_killed_data_process_is_said_and_others_make_the_same_clips(
