@@ -53,7 +53,7 @@ from mtv_world_ros.cli.train import set_overrides
 from mtv_world_ros.control.registry import control_class, TRAJECTORY_VIDEO
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.documents import DASH, Table
-from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.files import share_path, whole_folder, write_json, write_whole
 from mtv_world_ros.data.splits import CARD_FILE, EVERY, select
 from mtv_world_ros.evaluation.evaluation_summary import (
@@ -1132,8 +1132,8 @@ def chosen_rows(
         return [*_SIMULATED, *(real if has_real else [])]
     for name in names:
         if name not in known:
-            raise ConfigError(
-                f"--rows '{name}' is no row{nearest(name, known)}; rows are {', '.join(known)}"
+            raise ConfigError.unknown(
+                '--rows', name, known, is_not=' is no row', listed='; rows are'
             )
         if known[name].is_real and not has_real:
             raise ConfigError(

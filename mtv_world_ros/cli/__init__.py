@@ -38,6 +38,7 @@ from mtv_world_ros.core.errors import (  # noqa: E402
     MtvWorldError,
     nearest,
     TrainingInterrupted,
+    UnknownNameError,
 )
 from mtv_world_ros.core.files import check_name, check_output  # noqa: E402
 from mtv_world_ros.core.processes import (  # noqa: E402
@@ -216,7 +217,7 @@ def _parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
     if first in REMOVED:
         plain.error(f"'{first}' is no longer a command: {REMOVED[first]}")
     plain.error(
-        f"there is no command '{first}'{nearest(first, known)}; commands are {', '.join(known)}"
+        str(UnknownNameError('there is no command', first, known, listed='; commands are'))
     )
 
 

@@ -25,7 +25,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 import yaml
 
 from mtv_world_ros.core.bounded_input import parse_yaml, read_text
-from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError, UnknownNameError
 
 Item = TypeVar('Item')
 Model = TypeVar('Model', bound='Schema')
@@ -135,9 +135,7 @@ class Schema(BaseModel):
             if key in cls.removed:
                 raise ValueError(f"key '{key}' is gone: {cls.removed[key]}; delete the key")
             if key not in known:
-                raise ValueError(
-                    f"unknown key '{key}'{nearest(str(key), known)}; known are {', '.join(known)}"
-                )
+                raise UnknownNameError('unknown key', str(key), known, listed='; known are')
         return values
 
     @model_validator(mode='after')
@@ -228,7 +226,7 @@ def _quoted(error: ErrorDetails) -> str:
         return f'{name} is {value!r}; {name} must be a list'
     if error['type'] == 'literal_error':
         known = _choices(error)
-        return f'{name} is {value!r}{nearest(str(value), known)}; valid are {", ".join(known)}'
+        return str(UnknownNameError(f'{name} is', value, known, listed='; valid are'))
     return f'{name} is {value!r}, must be {_valid(error)}'
 
 
@@ -236,8 +234,7 @@ def _dotted(error: ErrorDetails, section: str) -> str:
     """Return e.g. `optimizer.steps is 0; it must be at least 1`."""
     name, value = '.'.join(filter(None, (section, _path(error['loc'])))), error['input']
     if error['type'] == 'literal_error':
-        known = _choices(error)
-        return f'{name} {value!r} is not one of {", ".join(known)}{nearest(str(value), known)}'
+        return str(UnknownNameError(name, value, _choices(error)))
     return f'{name} is {value!r}; it must be {_valid(error)}'
 
 

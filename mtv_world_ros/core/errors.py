@@ -5,9 +5,55 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 from enum import StrEnum
+from itertools import islice
+from typing import Self, TypedDict, Unpack
 
 from mtv_world_ros.core.extras import needs_text
 from mtv_world_ros.core.shown_text import MOST_OF_ERROR, shown
+
+
+class UnknownNameText(TypedDict, total=False):
+    """Parts of the text on a name that is not known, each with its own punctuation.
+
+    Attributes:
+        is_not: words behind the name; ` is not one of` where `listed` is left out.
+        listed: words in front of the valid names; left out = those follow `is_not`.
+        advice: where to set the name, or to add one.
+        most: names that are listed; 0 = none, where they are too many or stand in `listed`.
+    """
+
+    is_not: str
+    listed: str
+    advice: str
+    most: int
+
+
+class UnknownNameError(ValueError):
+    """A name is not one of those that are valid: `x 'a' is not one of b, c (did you mean 'b'?)`.
+
+    Validators of pydantic raise it; elsewhere `ConfigError.unknown` and its like make an error of
+    the package of it.
+
+    Args:
+        what: words in front of the name.
+        name: name that was given.
+        known: valid names.
+        text: further parts of the text.
+    """
+
+    def __init__(
+        self, what: str, name: object, known: Iterable[object], **text: Unpack[UnknownNameText]
+    ) -> None:
+        names = [str(one) for one in known]
+        listed, most = text.get('listed', ''), text.get('most', len(names) or 1)
+        valid = f' {", ".join(islice(names, most)) or "none"}' if most else ''
+        valid += ', ...' if 0 < most < len(names) else ''
+        hint = nearest(str(name), names)
+        given = f"'{name}'" if isinstance(name, str) else repr(name)
+        is_not = text.get('is_not', '' if listed or not most else ' is not one of')
+        parts = [f'{what} {given}'.lstrip(), is_not]
+        parts += [hint, listed, valid] if listed else [valid, hint]
+        super().__init__(''.join([*parts, text.get('advice', '')]))
 
 
 class MtvWorldError(Exception):
@@ -16,6 +62,13 @@ class MtvWorldError(Exception):
     Parts of it come from files, messages and servers: control characters except line ends are
     shown as escapes, and what is longer than `MOST_OF_ERROR` is cut.
     """
+
+    @classmethod
+    def unknown(
+        cls, what: str, name: object, known: Iterable[object], **text: Unpack[UnknownNameText]
+    ) -> Self:
+        """Return the error on a name that is not known; the arguments are `UnknownNameError`'s."""
+        return cls(str(UnknownNameError(what, name, known, **text)))
 
     def __str__(self) -> str:
         """Return the text as it may be shown."""

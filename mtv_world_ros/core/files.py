@@ -19,7 +19,7 @@ import sys
 import tempfile
 from typing import Any
 
-from mtv_world_ros.core.errors import ConfigError, nearest
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.core.writer_lock import LOCK_NAME
 
 PACKAGE = 'mtv_world_ros'
@@ -79,9 +79,12 @@ def bundled(kind: str, name: str | Path, setting: str) -> Path:
         return path / ROBOT_YAML
     files = _bundled_files(kind)
     if str(name) not in files:
-        raise ConfigError(
-            f"'{name}' is not in config/{kind}{nearest(str(name), list(files))}; set '{setting}' "
-            f'to a YAML file or to one of {", ".join(files)}'
+        raise ConfigError.unknown(
+            '',
+            str(name),
+            files,
+            is_not=f' is not in config/{kind}',
+            listed=f"; set '{setting}' to a YAML file or to one of",
         )
     return files[str(name)]
 

@@ -10,7 +10,7 @@ import sys
 from typing import Any
 
 from mtv_world_ros.core.entry_points import registered
-from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.extras import extra_of, install_command
 
 
@@ -51,10 +51,14 @@ class Registry:
         known = self.names()
         if ':' not in name and name not in known:
             also = f', or to {self.others}' if self.others else ''
-            raise ConfigError(
-                f"{self.kind} '{name}' is not registered{nearest(name, known)}; registered are "
-                f'{", ".join(known) or "none"}. Set {self.setting} to one of them, to the name of '
-                f"an entry point of the group '{self.group}', or to module:Class{also}"
+            raise ConfigError.unknown(
+                self.kind,
+                name,
+                known,
+                is_not=' is not registered',
+                listed='; registered are',
+                advice=f'. Set {self.setting} to one of them, to the name of an entry point of '
+                f"the group '{self.group}', or to module:Class{also}",
             )
         return name
 

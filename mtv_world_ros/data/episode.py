@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mtv_world_ros.core.bounded_input import parse_json
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray, JointTrajectory
-from mtv_world_ros.core.errors import DamagedFrameError, EpisodeError, MtvWorldError, nearest
+from mtv_world_ros.core.errors import DamagedFrameError, EpisodeError, MtvWorldError
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.resample import interpolated, match_joints
 
@@ -72,9 +72,7 @@ def optical_frame(view: str) -> str:
 def check_outcome(outcome: str) -> str:
     """Return `outcome` if it is one of `OUTCOMES`, else raise EpisodeError."""
     if outcome not in OUTCOMES:
-        raise EpisodeError(
-            f"outcome '{outcome}' is not one of {', '.join(OUTCOMES)}{nearest(outcome, OUTCOMES)}"
-        )
+        raise EpisodeError.unknown('outcome', outcome, OUTCOMES)
     return outcome
 
 

@@ -28,7 +28,6 @@ from mtv_world_ros.core.errors import (
     CalibrationError,
     EpisodeError,
     MtvWorldError,
-    nearest,
     TrajectoryError,
 )
 from mtv_world_ros.core.files import check_name
@@ -1249,10 +1248,11 @@ def find_topics(
         views = [key for key in named if key not in STREAMS] or _plain_views(images)
     unknown = [key for key in named if key not in STREAMS and key not in views]
     if unknown:
-        known = [*views, *STREAMS]
-        raise EpisodeError(
-            f"topics: '{unknown[0]}' is neither a view nor a stream; known are "
-            f'{", ".join(known)}{nearest(unknown[0], known)}'
+        raise EpisodeError.unknown(
+            'topics:',
+            unknown[0],
+            [*views, *STREAMS],
+            is_not=' is neither a view nor a stream; known are',
         )
     if not views:
         raise EpisodeError(
@@ -1278,10 +1278,12 @@ def _view_topics(
     image = next((topic for topic in forms if topic in images), None)
     if image is None:
         there = _plain_views(images)
-        raise EpisodeError(
-            f"'{path}' has no view '{view}': there are no images at '{wanted}' or "
-            f"'{wanted}/compressed'; its views are {_listed(there)}{nearest(view, there)}, its "
-            f'image topics {_listed(images)} (map a view to a topic in `topics`)'
+        raise EpisodeError.unknown(
+            f"'{path}' has no view",
+            view,
+            there,
+            is_not=f": there are no images at '{wanted}' or '{wanted}/compressed'; its views are",
+            advice=f', its image topics {_listed(images)} (map a view to a topic in `topics`)',
         )
     camera = image.removesuffix('/compressed').removesuffix('/ffmpeg').rpartition('/')[0]
     return ViewTopics(

@@ -12,7 +12,7 @@ from pydantic import BaseModel, BeforeValidator, ValidationError
 
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.entry_points import policy_kind
-from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest, PolicyError
+from mtv_world_ros.core.errors import ConfigError, EpisodeError, PolicyError
 from mtv_world_ros.data.episode import EpisodeInfo
 from mtv_world_ros.data.episode_reader import list_episodes, read_info
 
@@ -164,9 +164,8 @@ def of_physics(selection: Selection, physics: str | None = None) -> tuple[Select
     paths = [path for path, name in found.items() if name == physics]
     if not paths:
         known = sorted(set(found.values()))
-        raise ConfigError(
-            f"no episode is of the physics '{physics}'{nearest(physics, known)} (--physics); "
-            f'there are {", ".join(known)}'
+        raise ConfigError.unknown(
+            'no episode is of the physics', physics, known, listed=' (--physics); there are'
         )
     return replace(selection, paths=paths), f'{physics} ({len(paths)})'
 
@@ -258,9 +257,7 @@ def _names(dataset: Path, splits: Mapping[str, Any], split: str) -> set[str] | N
     if split == EVERY:
         return None
     if split not in splits:
-        known = [*splits, EVERY]
-        raise ConfigError(
-            f"split '{split}'{nearest(split, known)} is not one of '{dataset}', which has "
-            f'{", ".join(known)}'
+        raise ConfigError.unknown(
+            'split', split, [*splits, EVERY], listed=f" is not one of '{dataset}', which has"
         )
     return set(splits[split])

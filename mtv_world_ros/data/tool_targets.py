@@ -16,7 +16,7 @@ from pydantic import Field
 
 from mtv_world_ros.core.config import Pair, Schema
 from mtv_world_ros.core.data_types import FloatArray, JointTrajectory
-from mtv_world_ros.core.errors import EpisodeError, nearest, TrajectoryError
+from mtv_world_ros.core.errors import EpisodeError, TrajectoryError, UnknownNameError
 from mtv_world_ros.data.episode import JointStates
 from mtv_world_ros.robot.arm_solver import ArmSolver
 from mtv_world_ros.robot.model import RobotModel, Tool
@@ -52,15 +52,13 @@ class ToolTargets(Schema):
         """
         tools = {tool.arm: tool for tool in robot.tools}
         if arm not in tools:
-            raise ValueError(
-                f"tools: robot '{robot.name}' has no arm '{arm}'{nearest(arm, tools)}; it has "
-                f'{", ".join(tools)}'
+            raise UnknownNameError(
+                f"tools: robot '{robot.name}' has no arm", arm, tools, listed='; it has'
             )
         for link in filter(None, (self.frame, self.link)):
             if link not in robot.link_names:
-                raise ValueError(
-                    f"tools: robot '{robot.name}' has no link '{link}'"
-                    f'{nearest(link, robot.link_names)}'
+                raise UnknownNameError(
+                    f"tools: robot '{robot.name}' has no link", link, robot.link_names, most=0
                 )
         if not self.link:
             return tools[arm]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import pinocchio as pin
 
 from mtv_world_ros.core.data_types import FloatArray
-from mtv_world_ros.core.errors import CalibrationError, nearest
+from mtv_world_ros.core.errors import CalibrationError
 from mtv_world_ros.core.transforms import inverse, pose
 
 #: variation below which a transform on /tf is static [m, entries of the rotation]
@@ -260,9 +260,11 @@ class TransformTree:
         """
         frame = self.name(frame)
         if frame not in self.frames:
-            raise CalibrationError(
-                f"/tf and /tf_static have no frame '{frame}'{nearest(frame, self.frames)}; they "
-                f'have {", ".join(sorted(self.frames)) or "none"}'
+            raise CalibrationError.unknown(
+                '/tf and /tf_static have no frame',
+                frame,
+                sorted(self.frames),
+                listed='; they have',
             )
         fixed = {}
         for mount in self._reachable(frame, only_still=True):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mtv_world_ros.core.data_types import ByteArray, JointTrajectory
-from mtv_world_ros.core.errors import ConfigError, nearest
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.data.recording import Recording
 from mtv_world_ros.evaluation.imagined_stretches import Stretch
 from mtv_world_ros.rollout.pipeline import WorldModel
@@ -25,9 +25,7 @@ def check_actions(actions: Sequence[str]) -> None:
     """Raise ConfigError if a name is not in `ACTIONS`, or `true` is missing."""
     for name in actions:
         if name not in ACTIONS:
-            raise ConfigError(
-                f"actions '{name}'{nearest(name, ACTIONS)} is not one of {', '.join(ACTIONS)}"
-            )
+            raise ConfigError.unknown('actions', name, ACTIONS, listed=' is not one of')
     if 'true' not in actions:
         raise ConfigError(
             f"actions are {', '.join(actions) or 'empty'}; 'true' must be among them, since the "

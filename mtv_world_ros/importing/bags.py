@@ -19,7 +19,6 @@ from mtv_world_ros.core.errors import (
     DamagedFrameError,
     EpisodeError,
     MtvWorldError,
-    nearest,
     ObservationError,
     RobotError,
     TrajectoryError,
@@ -324,10 +323,13 @@ def _outcome(episode: Episode, name: str) -> str:
     """Return the outcome that a bag has under a key of its custom_data."""
     known = episode.info.metadata
     if name not in known:
-        raise EpisodeError(
-            f"'{episode.info.path}' has no outcome '{name}' in custom_data of metadata.yaml"
-            f'{nearest(name, known)}; it has {", ".join(known) or "no key"} (ros2 bag record '
-            '--custom-data KEY=VALUE writes one)'
+        raise EpisodeError.unknown(
+            f"'{episode.info.path}' has no outcome",
+            name,
+            known,
+            is_not=' in custom_data of metadata.yaml',
+            listed='; it has',
+            advice=' (ros2 bag record --custom-data KEY=VALUE writes one)',
         )
     return parse_outcome(known[name], f"'{episode.info.path}': outcome '{name}'")
 

@@ -16,7 +16,7 @@ from mtv_world_ros.cameras.image_window import windowed_camera
 from mtv_world_ros.core.bounded_input import fill_template, read_json
 from mtv_world_ros.core.config import Pair, Schema, wrong
 from mtv_world_ros.core.data_types import CameraModel, FloatArray
-from mtv_world_ros.core.errors import CalibrationError, ConfigError, nearest
+from mtv_world_ros.core.errors import CalibrationError, ConfigError
 from mtv_world_ros.core.transforms import inverse, is_rigid, rotation
 from mtv_world_ros.robot.joint_columns import Unit, UNITS
 
@@ -155,9 +155,8 @@ def camera_track(
     if source.calibration is not None:
         cameras = load_calibration(source.calibration)
         if source.view not in cameras:
-            raise CalibrationError(
-                f"'{source.calibration}' has no view '{source.view}'"
-                f'{nearest(source.view, cameras)}; it has {", ".join(cameras)}'
+            raise CalibrationError.unknown(
+                f"'{source.calibration}' has no view", source.view, cameras, listed='; it has'
             )
         return sized_camera(cameras[source.view], size)
     row = source.camera
@@ -252,9 +251,12 @@ class _Lookup:
         if isinstance(found, Mapping) and part in found:
             return found[part]
         known = list(found) if isinstance(found, Mapping) else []
-        raise CalibrationError(
-            f"{self._source.where}: '{self._file}' has no '{path}': '{part}' is not there"
-            f'{nearest(part, map(str, known))}; there are {known or type(found).__name__}'
+        raise CalibrationError.unknown(
+            f"{self._source.where}: '{self._file}' has no '{path}':",
+            part,
+            known or [type(found).__name__],
+            is_not=' is not there',
+            listed='; there are',
         )
 
     def _constant(self, feature: str) -> FloatArray:

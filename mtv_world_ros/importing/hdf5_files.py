@@ -23,7 +23,7 @@ from mtv_world_ros.core.bounded_input import (
     require_regular,
 )
 from mtv_world_ros.core.data_types import ByteArray, FloatArray
-from mtv_world_ros.core.errors import EpisodeError, MtvWorldError, nearest
+from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.core.extras import needs_text
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.image_decoding import check_image, to_rgb
@@ -119,9 +119,8 @@ def _link(group: Any, name: str, where: str) -> Any:
     link = group.get(name, getlink=True) if is_group and name in set(group.keys()) else None
     if link is None:
         known = [str(name) for name in group][:_MOST_NAMES] if is_group else []
-        raise EpisodeError(
-            f"{where} has no '{name}' in '{group.name}'{nearest(name, known)}; it has "
-            f'{", ".join(known) or "nothing"}'
+        raise EpisodeError.unknown(
+            f'{where} has no', name, known, is_not=f" in '{group.name}'", listed='; it has'
         )
     return link
 

@@ -33,7 +33,6 @@ from mtv_world_ros.core.errors import (
     ConfigError,
     EpisodeError,
     MissingPackageError,
-    nearest,
     ObservationError,
 )
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
@@ -138,9 +137,8 @@ class LeRobotDataset:
         known = [n for n, f in self.features.items() if not kinds or f.get('dtype') in kinds]
         if name not in known:
             what = 'image or video feature' if kinds else 'feature'
-            raise ConfigError(
-                f"'{self.root}' has no {what} '{name}'{nearest(name, known)}; it has "
-                f'{", ".join(known) or "none"}'
+            raise ConfigError.unknown(
+                f"'{self.root}' has no {what}", name, known, listed='; it has'
             )
         return self.features[name]
 

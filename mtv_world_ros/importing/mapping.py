@@ -22,7 +22,7 @@ from mtv_world_ros.cameras.calibration_file import load_calibration
 from mtv_world_ros.core.bounded_input import require_regular
 from mtv_world_ros.core.config import ListOf, read_yaml, validated, wrong
 from mtv_world_ros.core.data_types import FloatArray
-from mtv_world_ros.core.errors import ConfigError, nearest
+from mtv_world_ros.core.errors import ConfigError, UnknownNameError
 from mtv_world_ros.core.files import bundled
 from mtv_world_ros.data.bag_mapping import Written
 from mtv_world_ros.data.episode import check_outcome
@@ -93,9 +93,7 @@ class ActionStream(Stream):
         for joint in self.differences:
             if joint in led or joint not in robot.joint_names:
                 known = [name for name in robot.joint_names if name not in led]
-                raise ValueError(
-                    f"differences: '{joint}' is not among {known}{nearest(joint, known)}"
-                )
+                raise UnknownNameError('differences:', joint, known, is_not=' is not among')
         return [joint for joint in robot.joint_names if joint not in led]
 
     def columns_among(self, names: Sequence[str], state: Stream | None) -> tuple[JointColumn, ...]:

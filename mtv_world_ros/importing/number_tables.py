@@ -16,7 +16,7 @@ import numpy as np
 
 from mtv_world_ros.core.bounded_input import parse_json, placeholder, read_bytes, read_text
 from mtv_world_ros.core.data_types import FloatArray
-from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest
+from mtv_world_ros.core.errors import ConfigError, EpisodeError
 
 #: separators of columns, in the order in which they are tried
 SEPARATORS = {',': 'a comma', ';': 'a semicolon', '\t': 'a tab', '|': 'a bar'}
@@ -98,10 +98,7 @@ def read_table(path: Path, features: Sequence[str]) -> NumberTable:
 def _json_columns(keys: Mapping[str, Any], feature: str, path: Path) -> FloatArray:
     """Return the (T, C) values of a key; a list of numbers is one column."""
     if feature not in keys:
-        raise EpisodeError(
-            f"'{path}' has no '{feature}'{nearest(feature, keys)}; it has "
-            f'{", ".join(map(str, keys))}'
-        )
+        raise EpisodeError.unknown(f"'{path}' has no", feature, keys, listed='; it has')
     table = np.asarray(keys[feature], float)
     if table.ndim == 1:
         table = table[:, None]

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, Strict
 
 from mtv_world_ros.core.config import expected, ListOf, Number, read_yaml, Schema, validated, wrong
 from mtv_world_ros.core.data_types import BoolArray, ByteArray
-from mtv_world_ros.core.errors import ConfigError, nearest
+from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.vision.segmenters.examples import Box, Example, ObjectExamples
 
@@ -127,10 +127,12 @@ def learn_objects(
     """
     missing = tuple(name for name in boxes.recordings if name not in found)
     if len(missing) == len(boxes.recordings):
-        raise ConfigError(
-            f"objects: there is no recording '{missing[0]}'{nearest(missing[0], found)}, nor any "
-            f'other that has boxes; there are {", ".join(list(found)[:_LISTED])}'
-            f'{", ..." if len(found) > _LISTED else ""}'
+        raise ConfigError.unknown(
+            'objects: there is no recording',
+            missing[0],
+            found,
+            listed=', nor any other that has boxes; there are',
+            most=_LISTED,
         )
     frames: list[tuple[ByteArray, dict[str, Box]]] = []
     starts: dict[str, dict[str, tuple[ByteArray, Mapping[str, BoolArray]]]] = {}
@@ -157,9 +159,8 @@ def _by_frame(
 ) -> dict[int, dict[str, Box]]:
     """Return the boxes by name, by number of the frame."""
     if rows and view not in episode.images:
-        raise ConfigError(
-            f"objects: there is no view '{view}'{nearest(view, episode.views)}; there are "
-            f'{", ".join(episode.views)}'
+        raise ConfigError.unknown(
+            'objects: there is no view', view, episode.views, listed='; there are'
         )
     found: dict[int, dict[str, Box]] = {}
     for name, drawn in rows.items():

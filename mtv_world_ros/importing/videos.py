@@ -16,7 +16,7 @@ from mtv_world_ros.cameras.camera import unknown_camera
 from mtv_world_ros.cameras.foreign_calibrations import ForeignCalibration, read_foreign
 from mtv_world_ros.core.config import read_yaml, validated, wrong
 from mtv_world_ros.core.data_types import CameraModel, FloatArray
-from mtv_world_ros.core.errors import CalibrationError, ConfigError, EpisodeError, nearest
+from mtv_world_ros.core.errors import CalibrationError, ConfigError, EpisodeError
 from mtv_world_ros.data.bag_mapping import BagMapping, key_of, keyed, ViewSource, Written
 from mtv_world_ros.data.episode import (
     Episode,
@@ -365,9 +365,12 @@ class _GivenCameras:
         lens, robot = foreign.lenses.get(view), mapping.robot
         pose = next((one for one in foreign.poses if one.view in (view, one.child)), None)
         if pose is not None and pose.parent not in robot.link_names:
-            raise CalibrationError(
-                f"'{pose.file}': '{pose.parent}' is no link of robot '{robot.name}'"
-                f'{nearest(pose.parent, robot.link_names)}'
+            raise CalibrationError.unknown(
+                f"'{pose.file}':",
+                pose.parent,
+                robot.link_names,
+                is_not=f" is no link of robot '{robot.name}'",
+                most=0,
             )
         if lens is None:
             if pose is not None:
@@ -526,9 +529,7 @@ def _times(table: NumberTable, mapping: VideoMapping) -> tuple[FloatArray, list[
     if mapping.fps is not None:
         return np.arange(len(table.values)) / mapping.fps, []
     if name not in keys:
-        raise EpisodeError(
-            f"'{path}' has no '{name}'{nearest(name, keys)}; it has {', '.join(keys)}"
-        )
+        raise EpisodeError.unknown(f"'{path}' has no", name, keys, listed='; it has')
     if name in table.names:
         table.check_numbers([table.names.index(name)])
     try:
@@ -551,9 +552,7 @@ def _outcome(keys: Mapping[str, Any], mapping: VideoMapping, path: Path) -> str:
     if not name:
         return mapping.outcome
     if name not in keys:
-        raise EpisodeError(
-            f"'{path}' has no outcome '{name}'{nearest(name, keys)}; it has {', '.join(keys)}"
-        )
+        raise EpisodeError.unknown(f"'{path}' has no outcome", name, keys, listed='; it has')
     return parse_outcome(keys[name], f"'{path}': outcome '{name}'")
 
 

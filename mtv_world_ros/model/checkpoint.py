@@ -10,7 +10,7 @@ from typing import Any
 from mtv_world_ros.control.control import Control, ControlOptions
 from mtv_world_ros.control.registry import CONTROL_FILE, load_control
 from mtv_world_ros.core.data_types import WorldModelSpec
-from mtv_world_ros.core.errors import CalibrationError, CheckpointError, ConfigError, nearest
+from mtv_world_ros.core.errors import CalibrationError, CheckpointError, ConfigError
 from mtv_world_ros.core.files import content_digest, ROBOT_YAML, share_path
 from mtv_world_ros.model.card import (
     ADAPTER_FOLDER,
@@ -196,9 +196,12 @@ def checkpoint_folder(name: str | Path) -> Path:
         return share_path('resource', folder)
     path = Path(name)
     if not path.exists() and path.name.replace('_', '-').startswith(BUNDLED):
-        raise CheckpointError(
-            f"checkpoint '{name}' is no folder and no checkpoint of the package"
-            f'{nearest(str(name), BUNDLED_FOLDERS)}; those are {", ".join(BUNDLED_FOLDERS)}'
+        raise CheckpointError.unknown(
+            'checkpoint',
+            str(name),
+            BUNDLED_FOLDERS,
+            is_not=' is no folder and no checkpoint of the package',
+            listed='; those are',
         )
     return path
 

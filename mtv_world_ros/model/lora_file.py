@@ -19,7 +19,7 @@ from torch import nn, Tensor
 
 from mtv_world_ros.core.bounded_input import check_finite, parse_json, read_json, require_regular
 from mtv_world_ros.core.config import Count, Number, Schema, validated
-from mtv_world_ros.core.errors import CheckpointError, ConfigError, nearest
+from mtv_world_ros.core.errors import CheckpointError, ConfigError
 from mtv_world_ros.model.tensor_files import pickle_error, PICKLES
 
 #: diffusers' key for peft's configuration in a file; peft's own file for it, and its prefix
@@ -155,9 +155,13 @@ def read_lora(file: Path, transformer: nn.Module) -> dict[str, Factors]:
     found: dict[str, Factors] = {}
     for module, parts in _by_module(file, tensors).items():
         if module not in names:
-            raise CheckpointError(
-                f"'{file}': '{module}' is no layer of this transformer{nearest(module, names)}; "
-                'the LoRA is for another model'
+            raise CheckpointError.unknown(
+                f"'{file}':",
+                module,
+                names,
+                is_not=' is no layer of this transformer',
+                advice='; the LoRA is for another model',
+                most=0,
             )
         if names[module] in found:
             raise CheckpointError(f"'{file}': layer '{module}' is there under two names")

@@ -12,7 +12,7 @@ from diffusers import (
 )
 
 from mtv_world_ros.core.data_types import WorldModelSpec
-from mtv_world_ros.core.errors import CheckpointError, nearest
+from mtv_world_ros.core.errors import CheckpointError
 from mtv_world_ros.core.network_sizes import check_sizes
 from mtv_world_ros.model.autoencoders import (
     SpaceToDepthAutoencoder,
@@ -100,8 +100,6 @@ def _split(
     arguments = dict(config)
     name = arguments.pop('_class_name', default)
     if name not in known:
-        raise CheckpointError(
-            f"{what} '{name}' is not one of {', '.join(known)}{nearest(name, known)}"
-        )
+        raise CheckpointError.unknown(what, name, known)
     check_sizes(arguments, what)
     return name, arguments

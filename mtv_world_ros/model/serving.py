@@ -21,7 +21,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from mtv_world_ros.core.config import Schema, validated
-from mtv_world_ros.core.errors import CheckpointError, ConfigError, ModelMemoryError, nearest
+from mtv_world_ros.core.errors import CheckpointError, ConfigError, ModelMemoryError
 from mtv_world_ros.model.autoencoders import TinyAutoencoder, WanAutoencoder
 from mtv_world_ros.model.parts import Autoencoder, build_autoencoder
 from mtv_world_ros.model.runtime import place
@@ -162,9 +162,7 @@ class ServingOptions(Schema):
             name, _, value = part.partition('=')
             if name not in cls.model_fields:
                 known = list(cls.model_fields)
-                raise ConfigError(
-                    f"serving: '{name}' is not one of {', '.join(known)}{nearest(name, known)}"
-                )
+                raise ConfigError.unknown('serving:', name, known)
             is_text = isinstance(cls.model_fields[name].default, str)
             values[name] = value if is_text else _plain(value)
         return validated(cls, values, 'serving')

@@ -19,7 +19,7 @@ from mtv_world_ros.core.data_types import (
     JointTrajectory,
     Observation,
 )
-from mtv_world_ros.core.errors import ConfigError, nearest, PolicyError
+from mtv_world_ros.core.errors import ConfigError, PolicyError, UnknownNameError
 from mtv_world_ros.core.shown_text import shown
 from mtv_world_ros.robot.joint_columns import JointColumn, JointTable, to_columns, to_positions
 from mtv_world_ros.robot.model import RobotModel
@@ -164,9 +164,8 @@ class ActionOutput(JointTable):
             raise ValueError("'positions' is for 'action: velocity'; all values are positions")
         for joint in self.positions:
             if joint not in robot.joint_names:
-                known = robot.joint_names
-                raise ValueError(
-                    f"positions: '{joint}' is not among {list(known)}{nearest(joint, known)}"
+                raise UnknownNameError(
+                    'positions:', joint, robot.joint_names, is_not=' is not among'
                 )
         return set(self.positions)
 

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, model_validator, PrivateAttr, Valid
 
 from mtv_world_ros.core.config import expected, Number, Pair, Schema
 from mtv_world_ros.core.data_types import FloatArray
-from mtv_world_ros.core.errors import ConfigError, nearest
+from mtv_world_ros.core.errors import ConfigError, UnknownNameError
 from mtv_world_ros.robot.model import RobotModel
 
 #: factor to rad or m
@@ -138,10 +138,7 @@ class JointTable(Schema):
             entries = {joint: ColumnEntry(column=joint) for joint in needed or known}
         for joint in entries:
             if joint not in known:
-                raise ValueError(
-                    f"joints: unknown key '{joint}'{nearest(joint, known)}; known are "
-                    f'{", ".join(known)}'
-                )
+                raise UnknownNameError('joints: unknown key', joint, known, listed='; known are')
         missing = [joint for joint in needed if joint not in entries]
         if missing:
             raise ValueError(
@@ -221,11 +218,11 @@ def column_number(
         )
     if column in names:
         return list(names).index(column)
-    known = (
-        f'its columns are {", ".join(names)}'
-        if names
-        else 'its columns have no names: give numbers'
-    )
-    raise ConfigError(
-        f"{what}: feature '{feature}' has no column '{column}'{nearest(column, names)}; {known}"
+    if not names:
+        raise ConfigError(
+            f"{what}: feature '{feature}' has no column '{column}'; its columns have no names: "
+            'give numbers'
+        )
+    raise ConfigError.unknown(
+        f"{what}: feature '{feature}' has no column", column, names, listed='; its columns are'
     )

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
-from mtv_world_ros.core.errors import nearest, RobotError, TrajectoryError
+from mtv_world_ros.core.errors import RobotError, TrajectoryError
 from mtv_world_ros.core.transforms import inverse, is_rigid
 
 #: how far outside the limits a position is still accepted: recorded states overshoot [rad or m]
@@ -320,9 +320,11 @@ class RobotModel:
         speeds = np.where(speeds > 0, speeds, np.inf)
         for name, speed in self.speed_limits.items():
             if name not in self.joint_names:
-                raise RobotError(
-                    f"'speed_limits' of robot '{self.name}' names '{name}', which is not among "
-                    f'its joints {list(self.joint_names)}{nearest(name, self.joint_names)}'
+                raise RobotError.unknown(
+                    f"'speed_limits' of robot '{self.name}' names",
+                    name,
+                    self.joint_names,
+                    is_not=', which is not among its joints',
                 )
             speeds[self.joint_names.index(name)] = speed
         for array in (lower, upper, speeds):
@@ -333,8 +335,8 @@ class RobotModel:
         model = self.pinocchio_model
         if not model.existJointName(name):
             known = list(model.names)[1:]
-            raise RobotError(
-                f"robot '{self.name}' has no joint '{name}'{nearest(name, known)}; it has {known}"
+            raise RobotError.unknown(
+                f"robot '{self.name}' has no joint", name, known, listed='; it has'
             )
         joint = model.joints[model.getJointId(name)]
         if joint.nv != 1:
@@ -346,9 +348,8 @@ class RobotModel:
 
     def _frame(self, link: str) -> int:
         if link not in self._frames:
-            raise RobotError(
-                f"robot '{self.name}' has no link '{link}'{nearest(link, self._frames)}; "
-                f'it has {list(self._frames)}'
+            raise RobotError.unknown(
+                f"robot '{self.name}' has no link", link, self._frames, listed='; it has'
             )
         return self._frames[link]
 
@@ -370,9 +371,11 @@ class RobotModel:
 
     def _check_commanded(self, joint: str, why: str) -> None:
         if joint not in self.joint_names:
-            raise RobotError(
-                f"robot '{self.name}': {why} '{joint}', which is not among the joints "
-                f'{list(self.joint_names)}{nearest(joint, self.joint_names)}'
+            raise RobotError.unknown(
+                f"robot '{self.name}': {why}",
+                joint,
+                self.joint_names,
+                is_not=', which is not among the joints',
             )
 
 

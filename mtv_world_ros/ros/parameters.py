@@ -21,7 +21,7 @@ from rclpy.parameter import Parameter
 import yaml
 
 from mtv_world_ros.core.config import ListOf, Model, Schema
-from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest
+from mtv_world_ros.core.errors import ConfigError, MtvWorldError, nearest, UnknownNameError
 from mtv_world_ros.robot.plan import PlanLimits
 from mtv_world_ros.ros.messages.request_limits import RefusingCallback
 from mtv_world_ros.vision.segmenters.registry import SEGMENTERS
@@ -491,8 +491,7 @@ def _refusal(name: str, field: FieldInfo, value: object) -> str:
     valid = choices(field)
     if not valid or value in valid:
         return ''
-    hint = nearest(str(value), valid)
-    return f"{name} is '{value}'{hint}; it must be one of {', '.join(valid)}"
+    return str(UnknownNameError(f'{name} is', str(value), valid, listed='; it must be one of'))
 
 
 def _check(node: Node, kind: type[Schema], parameters: list[Parameter]) -> None:

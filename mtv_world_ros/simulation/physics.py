@@ -14,7 +14,7 @@ from pydantic import Field
 
 from mtv_world_ros.core.config import Factor, read_yaml, Schema, validated, Wait
 from mtv_world_ros.core.data_types import ByteArray, CameraModel, FloatArray
-from mtv_world_ros.core.errors import nearest, SimulatorError
+from mtv_world_ros.core.errors import SimulatorError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.simulation.arms.actuator import Actuator
@@ -213,8 +213,11 @@ def physics_named(name: str) -> Physics:
     """
     known = catalogue()
     if name not in known:
-        raise SimulatorError(
-            f"unknown physics '{name}'{nearest(name, known)} (--physics); known are "
-            f'{", ".join(known)} (config/physics.yaml)'
+        raise SimulatorError.unknown(
+            'unknown physics',
+            name,
+            known,
+            listed=' (--physics); known are',
+            advice=' (config/physics.yaml)',
         )
     return known[name]

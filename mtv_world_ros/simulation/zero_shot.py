@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mtv_world_ros.core.errors import nearest, SimulatorError
+from mtv_world_ros.core.errors import SimulatorError
 from mtv_world_ros.simulation.scenes.cameras import CameraMoves, moved_camera
 from mtv_world_ros.simulation.scenes.randomize import RandomizationConfig
 from mtv_world_ros.simulation.scenes.shapes import SHAPES
@@ -37,9 +37,12 @@ def kinds_named(text: str | Sequence[str]) -> tuple[str, ...]:
     kinds = tuple(dict.fromkeys(name.strip() for name in names if name.strip()))
     for kind in kinds:
         if kind not in KINDS:
-            raise SimulatorError(
-                f"unknown zero-shot set '{kind}'{nearest(kind, KINDS)}; known are "
-                f'{", ".join(KINDS)}; set --zero-shot'
+            raise SimulatorError.unknown(
+                'unknown zero-shot set',
+                kind,
+                KINDS,
+                listed='; known are',
+                advice='; set --zero-shot',
             )
     return kinds
 

@@ -16,7 +16,7 @@ from mtv_world_ros.core.data_types import (
     FutureEvidence,
     SuccessEstimate,
 )
-from mtv_world_ros.core.errors import CannotTell, ConfigError, nearest
+from mtv_world_ros.core.errors import CannotTell, ConfigError
 from mtv_world_ros.core.estimate_words import cannot_tell
 from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
 from mtv_world_ros.success.calibration import Calibration, DOUBTS, weighed
@@ -196,9 +196,13 @@ class SuccessEstimator:
         """
         names = [known.name for known in tasks]
         if task is not None and task not in names:
-            raise ConfigError(
-                f"task '{task}' is not known{nearest(task, names)}; known are {sorted(names)} "
-                '(add a file to config/tasks)'
+            raise ConfigError.unknown(
+                'task',
+                task,
+                sorted(names),
+                is_not=' is not known',
+                listed='; known are',
+                advice=' (add a file to config/tasks)',
             )
         self.tasks = tuple(known for known in tasks if task in (None, known.name))
         self.is_given = task is not None

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from mtv_world_ros.core.errors import ConfigError, EpisodeError, nearest
+from mtv_world_ros.core.errors import ConfigError, EpisodeError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.episode import EpisodeInfo, TASK_DEFINITION
 from mtv_world_ros.data.episode_reader import read_info
@@ -131,8 +131,12 @@ def chosen_task(word: str | None, own: Iterable[TaskSpec]) -> TaskSpec | None:
         )
     found = {**known, **defined}
     if word not in found:
-        raise ConfigError(
-            f"task '{word}' is not known{nearest(word, found)}; known are {sorted(found)} "
-            '(or give the YAML file of a task)'
+        raise ConfigError.unknown(
+            'task',
+            word,
+            sorted(found),
+            is_not=' is not known',
+            listed='; known are',
+            advice=' (or give the YAML file of a task)',
         )
     return found[word]

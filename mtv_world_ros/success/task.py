@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, model_validator, PlainValidator
 from mtv_world_ros.core.bounded_input import parse_json
 from mtv_world_ros.core.config import expected, ListOf, read_yaml, Schema, validated, wrong
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
-from mtv_world_ros.core.errors import ConfigError, nearest
+from mtv_world_ros.core.errors import ConfigError, UnknownNameError
 from mtv_world_ros.success.relations import EXPECTED, KINDS, Length, Lengths3, Relation
 from mtv_world_ros.success.situation import grippers_open, grippers_released, Situation
 from mtv_world_ros.vision.describers.describer import ends_phrase
@@ -39,7 +39,7 @@ def _relation(data: Any) -> Relation:
         return data
     kind = data.get('kind') if isinstance(data, Mapping) else None
     if kind not in KINDS:
-        raise ValueError(f"kind is '{kind}'{nearest(str(kind), KINDS)}; known are {sorted(KINDS)}")
+        raise UnknownNameError('kind is', str(kind), sorted(KINDS), listed='; known are')
     return KINDS[kind].model_validate(data)
 
 

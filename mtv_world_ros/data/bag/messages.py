@@ -14,7 +14,7 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
 from mtv_world_ros.core.data_types import CameraModel, JointTrajectory
-from mtv_world_ros.core.errors import EpisodeError, nearest
+from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.core.transforms import quaternion, rotation
 from mtv_world_ros.data.bag.video_packets import FFMPEG_PACKET, FFMPEG_PACKET_DEFINITION
 
@@ -67,9 +67,12 @@ def check_type(msgtype: str) -> str:
     """
     known = typestore().fielddefs
     if msgtype not in known:
-        raise EpisodeError(
-            f"message type '{msgtype}' is not one of the standard packages of Jazzy"
-            f'{nearest(msgtype, known)}'
+        raise EpisodeError.unknown(
+            'message type',
+            msgtype,
+            known,
+            is_not=' is not one of the standard packages of Jazzy',
+            most=0,
         )
     return msgtype
 

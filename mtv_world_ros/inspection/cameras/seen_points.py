@@ -12,7 +12,7 @@ import numpy as np
 from mtv_world_ros.cameras.camera import project
 from mtv_world_ros.core.config import read_yaml
 from mtv_world_ros.core.data_types import CameraModel, FloatArray
-from mtv_world_ros.core.errors import ConfigError, nearest
+from mtv_world_ros.core.errors import ConfigError, UnknownNameError
 from mtv_world_ros.core.transforms import inverse
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.inspection.cameras.finger_tips import tip_middles
@@ -167,7 +167,7 @@ def _row(row: Any, arms: Sequence[str]) -> FloatArray:
     if isinstance(row, list) and len(row) == 4:
         *row, arm = row
         if arm not in arms:
-            raise ValueError(f"'{arm}' is no arm{nearest(str(arm), arms)}; arms are {[*arms]}")
+            raise UnknownNameError('', arm, arms, is_not=' is no arm', listed='; arms are')
         return np.append(_row(row, arms), arms.index(arm))
     numbers = np.asarray(row, float)
     if numbers.shape != (3,) or not np.isfinite(numbers).all():

@@ -66,9 +66,12 @@ def kind_named(name: str) -> str:
     if is_drawn(name):
         return name
     if name not in _NAMES:
-        raise PolicyError(
-            f"unknown fault kind '{name}'{nearest(name, _NAMES)}; known are the splits "
-            f'{", ".join(SPLITS)} and {_ALL}'
+        raise PolicyError.unknown(
+            'unknown fault kind',
+            name,
+            _NAMES,
+            listed=f'; known are the splits {", ".join(SPLITS)} and {_ALL}',
+            most=0,
         )
     return _NAMES[name]
 
@@ -97,9 +100,12 @@ def kinds_of(split: str) -> tuple[str, ...]:
     if word in DRAWN_SETS and seed.isdecimal() and len(seed) < 10:
         return drawn_names(int(seed), word)
     if split not in SPLITS:
-        raise PolicyError(
-            f"unknown split of fault kinds '{split}'{nearest(split, SPLITS)}; known are "
-            f'{", ".join((*SPLITS, *(f"{drawn}:SEED" for drawn in DRAWN_SETS)))}'
+        raise PolicyError.unknown(
+            'unknown split of fault kinds',
+            split,
+            SPLITS,
+            listed='; known are',
+            advice=''.join(f', {drawn}:SEED' for drawn in DRAWN_SETS),
         )
     return tuple(name for name, kind in FAULTS.items() if kind.split == split)
 
@@ -174,9 +180,12 @@ def parse_variant(text: str) -> PolicyVariant:
     sizes: dict[str, float] = {}
     for fault, size in re.findall(r'-([a-z][a-z_0-9]*)-([\d.]+)', name):
         if fault not in _NAMES and not is_drawn(fault):
-            raise PolicyError(
-                f"policy '{text}': unknown fault '{fault}'{nearest(fault, _NAMES)}; known are "
-                f'{_ALL}'
+            raise PolicyError.unknown(
+                f"policy '{text}': unknown fault",
+                fault,
+                _NAMES,
+                listed=f'; known are {_ALL}',
+                most=0,
             )
         if kind_named(fault) in map(kind_named, sizes):
             raise PolicyError(f"policy '{text}': fault '{fault}' is given twice")

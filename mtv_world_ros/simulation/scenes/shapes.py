@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.core.errors import nearest, SimulatorError
+from mtv_world_ros.core.errors import SimulatorError
 from mtv_world_ros.simulation.scenes.mjcf import template
 from mtv_world_ros.success.relations import FLOOR_M
 from mtv_world_ros.vision.segmenters.colour import PALETTE
@@ -149,7 +149,5 @@ def shape_named(name: str) -> Shape:
         SimulatorError: unknown name; the text names the nearest known one.
     """
     if name not in SHAPES:
-        raise SimulatorError(
-            f"unknown shape '{name}'{nearest(name, SHAPES)}; known are {sorted(SHAPES)}"
-        )
+        raise SimulatorError.unknown('unknown shape', name, sorted(SHAPES), listed='; known are')
     return SHAPES[name]

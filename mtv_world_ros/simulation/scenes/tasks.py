@@ -27,7 +27,7 @@ from mtv_world_ros.core.config import (
     validated,
 )
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
-from mtv_world_ros.core.errors import ConfigError, nearest, SimulatorError
+from mtv_world_ros.core.errors import ConfigError, SimulatorError, UnknownNameError
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.simulation.scenes.shapes import SHAPES
 from mtv_world_ros.success.own_tasks import bundled_tasks, YAML
@@ -72,8 +72,7 @@ _PAGE = 'docs/tasks.md'
 def _known_shapes(shapes: tuple[str, ...]) -> tuple[str, ...]:
     for shape in shapes:
         if shape not in SHAPES:
-            known = ', '.join(sorted(SHAPES))
-            raise ValueError(f"unknown shape '{shape}'{nearest(shape, SHAPES)}; known are {known}")
+            raise UnknownNameError('unknown shape', shape, sorted(SHAPES), listed='; known are')
     if not shapes:
         raise ValueError(f'no shape is given; known are {", ".join(sorted(SHAPES))}')
     return shapes
@@ -152,10 +151,13 @@ def _move(data: Any) -> Move:
         strange = next((key for key in data if key not in known), None)
         if strange is not None:
             known = dict.fromkeys([*PickPlace.model_fields, *Shake.model_fields])
-            raise ValueError(
-                f"unknown key '{strange}'{nearest(str(strange), known)}; a move that places has "
-                f'{", ".join(PickPlace.model_fields)}, one that shakes '
-                f'{", ".join(Shake.model_fields)}'
+            raise UnknownNameError(
+                'unknown key',
+                str(strange),
+                known,
+                listed=f'; a move that places has {", ".join(PickPlace.model_fields)}, one that '
+                f'shakes {", ".join(Shake.model_fields)}',
+                most=0,
             )
         return Shake.model_validate(data)
     return PickPlace.model_validate(data)
@@ -259,9 +261,14 @@ def _fault_of_names(definition: TaskSpec, scene: SceneSpec) -> str:
     always = [role.role for role in scene.roles if role.probability == 1]
     for role in re.findall(r'\{(\w+)\}', definition.instruction):
         if role not in always:
-            return (
-                f"the instruction has {{{role}}}, but scene.roles has no '{role}' of "
-                f'probability 1{nearest(role, names)}; it has {", ".join(names) or "none"}'
+            return str(
+                UnknownNameError(
+                    f'the instruction has {{{role}}}, but scene.roles has no',
+                    role,
+                    names,
+                    is_not=' of probability 1',
+                    listed='; it has',
+                )
             )
     return ''
 
@@ -271,9 +278,13 @@ def _fault_of_moves(definition: TaskSpec, scene: SceneSpec) -> str:
     always = {role.role: role for role in scene.roles if role.probability == 1}
     for number, move in enumerate(scene.moves):
         if move.subject not in always:
-            return (
-                f"scene.moves[{number}].subject is '{move.subject}'"
-                f'{nearest(move.subject, always)}; it must be one of {", ".join(always)}'
+            return str(
+                UnknownNameError(
+                    f'scene.moves[{number}].subject is',
+                    move.subject,
+                    always,
+                    listed='; it must be one of',
+                )
             )
         fixed = [s for s in always[move.subject].shapes if SHAPES[s].grasp is None]
         if fixed:
@@ -283,9 +294,13 @@ def _fault_of_moves(definition: TaskSpec, scene: SceneSpec) -> str:
             )
         if isinstance(move, PickPlace) and move.reference not in {*always, START, TABLE}:
             known = [*always, START, TABLE]
-            return (
-                f"scene.moves[{number}].reference is '{move.reference}'"
-                f'{nearest(move.reference, known)}; it must be one of {", ".join(known)}'
+            return str(
+                UnknownNameError(
+                    f'scene.moves[{number}].reference is',
+                    move.reference,
+                    known,
+                    listed='; it must be one of',
+                )
             )
         if isinstance(move, PickPlace) and move.rest != 'table' and move.reference not in always:
             return (
@@ -312,9 +327,8 @@ def _read_tasks() -> dict[str, Task]:
     names = [name for name in tasks if not places[name]]
     for name in (name for name in tasks if places[name]):
         if places[name] not in names:
-            raise ConfigError(
-                f"task '{name}': scene.after is '{places[name]}'{nearest(places[name], names)}; "
-                f'it must be one of {", ".join(names)}'
+            raise ConfigError.unknown(
+                f"task '{name}': scene.after is", places[name], names, listed='; it must be one of'
             )
         names.insert(names.index(places[name]) + 1, name)
     ordered = {name: tasks[name] for name in names}
@@ -375,7 +389,9 @@ def task_named(name: str) -> Task:
                 f"task '{name}' has no scene: it can be judged, but not simulated; those with a "
                 f'scene are {known}'
             )
-        raise SimulatorError(f"unknown task '{name}'{nearest(name, TASKS)}; known are {known}")
+        raise SimulatorError.unknown(
+            'unknown task', name, TASKS, listed=f'; known are {known}', most=0
+        )
     return TASKS[name]
 
 

@@ -8,7 +8,7 @@ import re
 from typing import Any, Protocol
 
 from mtv_world_ros.core.data_types import ByteArray
-from mtv_world_ros.core.errors import DescriptionError, nearest
+from mtv_world_ros.core.errors import DescriptionError, UnknownNameError
 from mtv_world_ros.vision.segmenters.colour import PALETTE
 
 ROLES = ('manipuland', 'support', 'container')
@@ -95,7 +95,7 @@ def _problems(item: Any, complete: bool) -> list[str]:
     if not isinstance(item, Mapping):
         return [f'expected keys and values, got {_short(item)}']
     problems = [
-        f"unknown key '{key}'{nearest(str(key), KEYS)}; valid are {', '.join(KEYS)}"
+        str(UnknownNameError('unknown key', str(key), KEYS, listed='; valid are'))
         for key in item
         if key not in KEYS
     ]

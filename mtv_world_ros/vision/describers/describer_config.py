@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from mtv_world_ros.core.config import read_yaml, Schema, validated
 from mtv_world_ros.core.data_types import ByteArray
-from mtv_world_ros.core.errors import ConfigError, DescriptionError, nearest
+from mtv_world_ros.core.errors import ConfigError, DescriptionError, nearest, UnknownNameError
 from mtv_world_ros.vision.describers.describer import check_objects, DescribedObject
 from mtv_world_ros.vision.describers.openai_chat import OpenAIConfig
 
@@ -101,9 +101,7 @@ def _known(kind: Any) -> str:
     if not isinstance(kind, str):
         raise ValueError(f"'kind' is {kind!r}; expected a text")
     if kind not in KINDS:
-        raise ValueError(
-            f"kind '{kind}' is none{nearest(kind, KINDS)}; valid are {', '.join(KINDS)}"
-        )
+        raise UnknownNameError('kind', kind, KINDS, is_not=' is none', listed='; valid are')
     return kind
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.data_types import ByteArray
-from mtv_world_ros.core.errors import ConfigError, DescriptionError, nearest
+from mtv_world_ros.core.errors import ConfigError, DescriptionError
 from mtv_world_ros.core.files import write_whole
 from mtv_world_ros.vision.describers.describer import (
     BOX_SCALE,
@@ -95,7 +95,7 @@ def read_answer(text: str) -> tuple[DescribedObject, ...]:
     answer = _json_in(text.rpartition('</think>')[2])
     for key in answer:
         if key != 'objects':
-            raise DescriptionError(f"unknown key '{key}'{nearest(key, ['objects'])}")
+            raise DescriptionError.unknown('unknown key', key, ['objects'], most=0)
     if 'objects' not in answer:
         raise DescriptionError("the key 'objects' is missing")
     return check_objects(answer['objects'], complete=True)
