@@ -34,7 +34,9 @@ def test_the_run_on_a_gpu_goes_through_on_a_cpu_at_tiny_size(tmp_path: Path) -> 
     told = subprocess.run(command, capture_output=True, text=True, check=False)
     assert told.returncode == 0, told.stdout + told.stderr
     page = (tmp_path / 'page.md').read_text()
-    assert page.strip() == told.stdout.strip()
+    printed, _, brought = told.stdout.partition('bring back: ')
+    assert page.strip() == printed.strip()
+    assert Path(brought.rpartition(' (')[0]).is_file()
     for part in ('Speed', 'Training'):
         assert f'## {part}: status 0, ' in page
     for row in ('one step of the transformer', 'tiny_decoder=random', 'seconds a step'):

@@ -179,7 +179,8 @@ def test_the_page_leads_from_a_urdf_to_predictions(at_the_desk, capsys):
         said = capsys.readouterr()
         assert status == STATUS.get(command, 0), f'{words}: {said.out}{said.err}'
         done.append(command)
-    assert done == ['robot', 'import bag', 'check', 'train', 'evaluate', 'replay']
+    assert done == ['robot', 'import bag', 'check', 'task', 'train', 'evaluate', 'replay']
+    assert (at_the_desk / 'my_task.yaml').is_file()
     assert (at_the_desk / 'out' / 'mine' / 'metrics.json').is_file()
 
 

@@ -391,10 +391,12 @@ class Player(Node):
             if now != known or is_unheard:
                 known, since_s = now, time.monotonic()
 
-    def _connections(self) -> list[tuple[int, int]]:
+    def _connections(self) -> list[int]:
+        outputs = self._outputs.values()
         return [
-            (publisher.get_subscription_count(), self.count_subscribers(publisher.topic_name))
-            for publisher in self._outputs.values()
+            *(publisher.get_subscription_count() for publisher in outputs),
+            *(self.count_subscribers(publisher.topic_name) for publisher in outputs),
+            self.count_publishers(self._reports),
         ]
 
     def _play_once(self) -> None:
