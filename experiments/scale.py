@@ -284,18 +284,13 @@ def measure_data(sizes: Sequence[int] = (100, 1000, 10_000)) -> int:
             keys = [recording_key(path, spec, robot) for path in paths[:size]]
             for key in keys:
                 (cache / f'{key}.npz').hardlink_to(decoded)
-            if size <= _READ_EPISODES:
-                (first,) = own_process('data', work, number=size)
-                starts.append(first['read'])
-            else:  # rows of the index are copied
-                (index,) = (work / f'cache_data_{sizes[1]}').glob('index-*.json')
-                row = next(iter(read_json(index).values()))
-                (cache / index.name).write_text(json.dumps(dict.fromkeys(keys, row)))
+            (first,) = own_process('data', work, number=size)
+            starts.append(first['read'])
             (again,) = own_process('data', work, number=size)
             per_clip = again[f'steps_{2 * _STEPS}'] / _STEPS / config.optimizer.batch_size
             rows.append([
-                f'{size:,}', f'{starts[-1]:.1f}' if size <= _READ_EPISODES else '-',
-                f'{again["read"]:.2f}', *(f'{value:.0f}' for value in again['memory_mib']),
+                f'{size:,}', f'{starts[-1]:.1f}', f'{again["read"]:.2f}',
+                *(f'{value:.0f}' for value in again['memory_mib']),
                 f'{per_clip * again["clips"]:.0f}',
             ])  # fmt: skip
             print(' | '.join(rows[-1]), file=sys.stderr, flush=True)
@@ -314,8 +309,6 @@ def measure_data(sizes: Sequence[int] = (100, 1000, 10_000)) -> int:
 _MARK = 'measured: '
 #: episodes of the table of starts
 _START_EPISODES = 16
-#: larger data sets are not read: rows of the index are copied
-_READ_EPISODES = 1000
 #: steps between two looks at the memory
 _STEPS = 50
 

@@ -182,7 +182,7 @@ def add_imagine(commands: Commands) -> None:
 
 def _imagine(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.core.errors import ConfigError
-    from mtv_world_ros.data.episode_reader import list_episodes
+    from mtv_world_ros.data.splits import find_episodes
 
     is_table = is_asked_for(arguments)
     workers = workers_of(arguments, arguments.checkpoint, *arguments.episodes)
@@ -198,7 +198,7 @@ def _imagine(arguments: argparse.Namespace) -> int:
     for folder in arguments.episodes:
         if not folder.exists():
             raise EpisodeError(f"there is no episode '{folder}'")
-    episodes = [path for folder in arguments.episodes for path in list_episodes(folder)]
+    episodes = [path for folder in arguments.episodes for path in find_episodes(folder)]
     if bool(episodes) == arguments.live:
         raise ConfigError(
             'give --episodes with recorded episodes to start from, --live to start from the '

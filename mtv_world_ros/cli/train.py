@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.data.bag_mapping import EpisodeSource
+    from mtv_world_ros.training.distributed import Processes
     from mtv_world_ros.training.training_config import TrainingConfig
     from mtv_world_ros.training.training_run import HeldOut, Judge
     from mtv_world_ros.viewing.scored_rollout import StoredRollout
@@ -419,7 +420,8 @@ def _judge(
 ) -> Judge:
     """Return a function that scores checkpoints by J of moving objects, as `mtv-world evaluate`.
 
-    `OUT/held_out` gets a folder per step, with `metrics.json` and an MP4 per episode.
+    `OUT/held_out` gets a folder per step, with `metrics.json` and an MP4 per episode. Processes
+    that train together score and draw a share of the episodes each.
     """
     import torch
 
@@ -434,7 +436,7 @@ def _judge(
 
     describer = asked_describer(arguments.describer)
 
-    def judge(checkpoint: Path, step: int) -> HeldOutScores:
+    def judge(checkpoint: Path, step: int, processes: Processes) -> HeldOutScores:
         folder = arguments.out / 'held_out' / f'{step:07d}'
         is_adapter = (checkpoint / ADAPTER).is_file()
         pipeline = Pipeline.load(
@@ -450,12 +452,15 @@ def _judge(
             paths,
             folder,
             EvaluationConfig(actions=('true',), ceiling=False, source=source),
+            peers=processes,
             describer=describer,
             show_progress=False,
         )
-        for result in summary.results:
+        for result in summary.results[processes.number :: processes.count]:
             _show(load_rollout(rollout_path(folder, result.episode)), folder / result.episode)
-        shutil.rmtree(folder / 'episodes')
+        processes.any(False)  # all have read their rollouts
+        if processes.is_main:
+            shutil.rmtree(folder / 'episodes')
         by_view = {None: '', **{view: f'_{view}' for view in pipeline.spec.views}}
         numbers = {
             name + suffix: round(estimates[name].value, 4)

@@ -15,6 +15,7 @@ from mtv_world_ros.core.entry_points import policy_kind
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, PolicyError
 from mtv_world_ros.data.episode import EpisodeInfo
 from mtv_world_ros.data.episode_reader import list_episodes, read_info
+from mtv_world_ros.data.other_formats import conversion_hint
 
 #: key of the metadata that names the policy of an episode
 POLICY = 'policy'
@@ -107,6 +108,23 @@ class Selection:
         return f'{len(self.paths)} of {self.num_in_dataset} episodes, split {self.split}'
 
 
+def find_episodes(dataset: Path) -> list[Path]:
+    """Return the episode folders anywhere in a folder, by path; see `list_episodes`.
+
+    Raises:
+        EpisodeError: there is none; says how to get some, also from other formats.
+    """
+    found = list_episodes(dataset)
+    if not found:
+        advice = conversion_hint(dataset) or (
+            "; record some with 'ros2 bag record -s mcap' or 'mtv-world collect'"
+        )
+        raise EpisodeError(
+            f"'{dataset}' holds no episodes (folders with metadata.yaml and an .mcap){advice}"
+        )
+    return found
+
+
 def select(
     dataset: Path, split: str | None = None, limit: int | None = None, *, default: str = 'test'
 ) -> Selection:
@@ -124,12 +142,7 @@ def select(
         ConfigError: no such split, the card cannot be read, or siblings are not of one scene or
             not in one split.
     """
-    found = list_episodes(dataset)
-    if not found:
-        raise EpisodeError(
-            f"'{dataset}' holds no episodes (folders with metadata.yaml and an .mcap); record "
-            "some with 'ros2 bag record -s mcap' or 'mtv-world collect'"
-        )
+    found = find_episodes(dataset)
     card = _card(dataset)
     _check_siblings(dataset, card)
     if split is None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -47,6 +47,7 @@ DEFAULTS = EvaluationConfig()
 _MAX_DONORS = 3
 #: makes the pipeline anew, in another process
 MakePipeline = Callable[[], Pipeline]
+Value = TypeVar('Value')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +63,22 @@ class Parallel:
     make_pipeline: MakePipeline
 
 
+class Peers(Protocol):
+    """Processes that evaluate together, each with a pipeline of its own.
+
+    Attributes:
+        number: number of this process, from 0; process 0 writes the summary.
+        count: number of processes.
+    """
+
+    number: int
+    count: int
+
+    def of_all(self, value: Value) -> list[Value]:
+        """Return the values of all processes, which have to call this."""
+        ...
+
+
 def evaluate(
     pipeline: Pipeline,
     episode_paths: Sequence[Path],
@@ -74,6 +91,7 @@ def evaluate(
     provenance: Mapping[str, str] = MappingProxyType({}),
     trained_on: TrainedEpisodes | None = None,
     parallel: Parallel | None = None,
+    peers: Peers | None = None,
     describer: Describer | None = None,
     overwrite: bool = False,
     show_progress: bool = True,
@@ -97,6 +115,8 @@ def evaluate(
         trained_on: episodes that the checkpoint was trained on; how many of them are scored goes
             into the provenance. None = nothing is said.
         parallel: workers to score with; None = this process.
+        peers: processes that call this with the same arguments and score a share each; all return
+            the same summary. None = this process scores every episode.
         describer: names the objects from each episode's first frame; None = see `EvaluationJob`.
         overwrite: replace results of other settings; only asked where there is a name.
         show_progress: show the progress.
@@ -112,14 +132,19 @@ def evaluate(
     check_same_settings(out / 'episodes', run.settings, overwrite or not name)
     tasks = {} if pipeline.judge.estimator.is_given else own_tasks(episode_paths)
     jobs = make_jobs(episode_paths, zero_shot, config.seed, tasks)
-    results, failed = [], {}
-    bar = Progress(run.results(jobs), total=len(jobs), unit='episode', is_shown=show_progress)
+    mine = jobs if peers is None else jobs[peers.number :: peers.count]
+    bar = Progress(run.results(mine), total=len(mine), unit='episode', is_shown=show_progress)
+    results, failed = [], dict[str, str]()
     for job, result in bar:
         if isinstance(result, EpisodeResult):
             results.append(result)
             bar.set_postfix_str(_progress(results))
         else:
             failed[str(job.path)] = result
+    if peers is not None:
+        parts = peers.of_all((results, failed))
+        results = [result for found, _ in parts for result in found]
+        failed = {path: reason for _, left_out in parts for path, reason in left_out.items()}
     if not results:
         reason = next(iter(failed.items()), ('', 'none was given'))
         raise EpisodeError(f'no episode could be scored; {reason[0]}: {reason[1]}')
@@ -138,7 +163,8 @@ def evaluate(
         failed=dict(sorted(failed.items())),
     )
     summary = replace(summary, distances=_distances(summary, config))
-    write_summary(summary)
+    if peers is None or peers.number == 0:
+        write_summary(summary)
     return summary
 
 

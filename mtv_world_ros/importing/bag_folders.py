@@ -9,7 +9,7 @@ import re
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.bag.reader import is_storage, ROS1_SUFFIX
 from mtv_world_ros.data.episode_reader import list_episodes
-from mtv_world_ros.importing.other_formats import conversion_hint
+from mtv_world_ros.data.other_formats import conversion_hint
 
 #: number that rosbag2 adds to the files of a bag that it splits
 _PART = re.compile(r'_\d+$')

@@ -37,7 +37,7 @@ from mtv_world_ros.core.errors import (
 )
 from mtv_world_ros.data.bag.image_decoding import compressed_to_rgb
 from mtv_world_ros.data.bag.image_orientation import exif_orientation, turned_upright, UPRIGHT
-from mtv_world_ros.importing.other_formats import conversion_hint
+from mtv_world_ros.data.other_formats import conversion_hint
 from mtv_world_ros.importing.video_frames import frames_at, times_in_video, video_note
 
 VERSIONS = ('v2.0', 'v2.1', 'v3.0')

@@ -29,6 +29,7 @@ from mtv_world_ros.data.episode import (
 from mtv_world_ros.data.gripper_sources import resting_grippers
 from mtv_world_ros.data.joint_plans import trajectories_to
 from mtv_world_ros.data.measured_joints import mend_rows
+from mtv_world_ros.data.other_formats import zarr_hint
 from mtv_world_ros.data.stream_clocks import check_row_times
 from mtv_world_ros.importing.bags import write_imported
 from mtv_world_ros.importing.calibration_directions import settle_directions
@@ -44,7 +45,6 @@ from mtv_world_ros.importing.hdf5_files import (
 )
 from mtv_world_ros.importing.mapping import ActionStream, digest_of, load_mapped_robot
 from mtv_world_ros.importing.number_tables import NumberTable, read_table
-from mtv_world_ros.importing.other_formats import zarr_hint
 from mtv_world_ros.importing.stored_objects import AS_RECORDED, ObjectStage
 from mtv_world_ros.importing.tool_poses import joints_of_poses
 from mtv_world_ros.importing.unused_parts import unused_columns, unused_files, unused_keys

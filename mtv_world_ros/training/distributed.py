@@ -16,8 +16,8 @@ import torch.distributed as dist
 from mtv_world_ros.core.errors import TrainingError
 
 Value = TypeVar('Value')
-#: timeout of processes that wait for the main one, which alone scores held-out episodes; NCCL's
-#: default of 10 minutes would end the training
+#: timeout of processes that wait for those whose share of reading, encoding or scoring takes
+#: longer; NCCL's default of 10 minutes would end the training
 _PATIENCE = timedelta(days=1)
 #: time in which the processes that are left tell each other so [s]
 _ROLL_CALL_S = 3.0

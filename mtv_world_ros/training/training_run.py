@@ -32,9 +32,10 @@ from mtv_world_ros.core.errors import (
 from mtv_world_ros.core.files import whole_folder, write_whole
 from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.data.bag_mapping import EpisodeSource
-from mtv_world_ros.data.episode_reader import list_episodes, read_info
+from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.data.recording import DEFAULT, Recording
 from mtv_world_ros.data.recordings import clip_starts, described_objects
+from mtv_world_ros.data.splits import find_episodes
 from mtv_world_ros.model.card import CAMERAS, CARD, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.runtime import check_device, choose_dtype
@@ -60,21 +61,6 @@ from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
 from mtv_world_ros.training.unknown_cameras import unknown_camera_lines
 from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
-
-
-def find_episodes(dataset: Path) -> list[Path]:
-    """Return the episode folders (those with a `metadata.yaml`) below a folder, sorted.
-
-    Raises:
-        TrainingError: there is none.
-    """
-    found = list_episodes(dataset)
-    if not found:
-        raise TrainingError(
-            f"'{dataset}' holds no episodes (folders with metadata.yaml and an .mcap); record "
-            "some with 'ros2 bag record -s mcap' or 'mtv-world collect'"
-        )
-    return found
 
 
 def spread(paths: Sequence[Path], count: int | None) -> list[Path]:
@@ -553,8 +539,9 @@ class HeldOutScores:
     numbers: Mapping[str, float]
 
 
-#: scores the checkpoint in a folder at a step; injected, since training does not import evaluation
-Judge = Callable[[Path, int], HeldOutScores]
+#: scores the checkpoint in a folder at a step, called by all processes, which share the episodes;
+#: injected, since training does not import evaluation
+Judge = Callable[[Path, int, Processes], HeldOutScores]
 
 
 class HeldOut:
@@ -576,15 +563,16 @@ class HeldOut:
     def after(self, step: int, trainer: Trainer, log: TrainingLog) -> None:
         """Score the averaged weights if due; the best go to the result's folder with `-best`.
 
-        All processes have to call this; the main one scores.
+        All processes have to call this; each scores a share, and the main one writes.
         """
         if step % self._every and step != trainer.config.optimizer.steps:
             return
-        folder = trainer.folder
+        folder, processes = trainer.folder, trainer.processes
         trainer.export(trainer.result)
-        if not trainer.processes.is_main:
+        processes.any(False)  # the main process has written it
+        judged = self._judge(trainer.result, step, processes)
+        if not processes.is_main:
             return
-        judged = self._judge(trainer.result, step)
         log.write(step, dict(judged.numbers))
         best = folder / _BEST
         if judged.score > _best_score(best):

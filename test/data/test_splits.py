@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 
 import pytest
@@ -7,6 +8,7 @@ from mtv_world_ros.cli import main
 from mtv_world_ros.cli.fits.success import result_kinds
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, PolicyError
 from mtv_world_ros.data import splits
+from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.episode_reader import list_episodes
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.data.splits import of_physics, recorded_kinds, refuse_test_kinds, select
@@ -66,8 +68,15 @@ def test_folder_without_a_card_is_scored_whole(dataset):
 
 
 def test_what_cannot_be_used_is_an_error(dataset, tmp_path_factory):
-    with pytest.raises(EpisodeError, match='holds no episodes'):
-        select(tmp_path_factory.mktemp('empty'))
+    empty = tmp_path_factory.mktemp('empty')
+    with pytest.raises(EpisodeError, match='holds no episodes.*; record some .*mtv-world collect'):
+        select(empty)
+    (empty / 'meta').mkdir()
+    (empty / 'meta' / 'info.json').write_text('{}')
+    hint = re.escape(f'import lerobot {empty} --robot ROBOT --out DIR makes episodes of')
+    for read in (select, BagReader):
+        with pytest.raises(EpisodeError, match=f'it is a LeRobot data set, which .*{hint}'):
+            read(empty)
     card = json.loads((dataset / 'dataset.json').read_text())
     card['splits']['test'] = ['gone']
     (dataset / 'dataset.json').write_text(json.dumps(card))

@@ -1,11 +1,14 @@
 import csv
 import json
 import shutil
+from typing import Any
 
 import numpy as np
 import pytest
 
+from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, TrajectoryError
+from mtv_world_ros.core.files import plain
 from mtv_world_ros.evaluation import episode_scorer
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate
 from mtv_world_ros.evaluation.references import with_actions
@@ -175,6 +178,43 @@ def test_an_episode_is_judged_by_the_task_that_it_defines(make_pipeline, make_ep
     make_episode(data / 'own', **{**shift_right_episode(tmp_path), 'metadata': {}})
     undefined = judged()
     assert 'task' not in undefined['settings'] and _UNKNOWN in undefined['result']['reasons'][0]
+
+
+class Turn:
+    """One of two processes; the other one's values are given, or do not count."""
+
+    count = 2
+
+    def __init__(self, number: int, other: list[Any]) -> None:
+        self.number, self.other, self.given = number, other, []
+
+    def of_all(self, value: Any) -> list[Any]:
+        self.given.append(value)
+        return [value, *self.other]
+
+
+def test_processes_share_the_episodes_and_the_first_one_writes_the_summary(
+    make_pipeline, recordings, episodes, tmp_path
+):
+    paths, options = [*episodes, tmp_path / 'nothing'], EvaluationConfig(actions=('true',))
+
+    def scored(out, peers=None):
+        oracle = OracleWorldModel(recordings)
+        summary = evaluate(
+            make_pipeline(oracle), paths, out, options, peers=peers, show_progress=False
+        )
+        return {**summary.metrics, 'provenance': None}, oracle.num_calls
+
+    whole, num_calls = scored(tmp_path / 'whole')
+    helper = Turn(1, [([], {})])
+    assert 0 < scored(tmp_path / 'out', helper)[1] < num_calls
+    assert not (tmp_path / 'out' / 'metrics.json').exists()
+    found, rest = scored(tmp_path / 'out', Turn(0, helper.given))
+    assert 0 < rest < num_calls
+    others = {key for key in whole if key.startswith('seconds')} | {'real_time_factor'}
+    for key in whole.keys() - others:
+        assert plain(found[key]) == plain(whole[key]), key
+    assert read_json(tmp_path / 'out' / 'metrics.json')['num_episodes_failed'] == 1
 
 
 def test_results_without_a_name_are_not_taken_over(

@@ -13,16 +13,19 @@ import pytest
 
 from mtv_world_ros.cli import main
 from mtv_world_ros.cli.train import _evaluation_advice
+from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.data.episode_reader import read_episode
 from mtv_world_ros.data.recording import motion_digest
 from mtv_world_ros.model.card import read_card
 from mtv_world_ros.model.checkpoint import Checkpoint
+from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.training_config import TrainingRun
 from mtv_world_ros.training.training_run import HeldOut, HeldOutScores, train
 from mtv_world_ros.viewing.video import decode_video
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
-from test.support.sources import ONE_STEP
+from test.support.launched import torchrun
+from test.support.sources import ONE_STEP, set_options, TINY_MODEL
 
 NOT_GIVEN = {'describer': None, 'topics': None, 'calibration': None}
 
@@ -30,7 +33,7 @@ NOT_GIVEN = {'describer': None, 'topics': None, 'calibration': None}
 def test_the_best_checkpoint_by_the_judge_is_kept(episode, tiny, robot, tmp_path):
     scores = {1: float('nan'), 2: 0.3, 3: 0.5, 4: 0.4}
 
-    def judge(checkpoint: Path, step: int) -> HeldOutScores:
+    def judge(checkpoint: Path, step: int, _: Processes) -> HeldOutScores:
         assert read_card(checkpoint).trained_on['steps'] == step
         return HeldOutScores(score=scores[step], numbers={'j_moving': scores[step]})
 
@@ -94,6 +97,38 @@ def test_the_command_scores_held_out_episodes_as_evaluate_does(episode, tmp_path
     # a copy of an episode is the same episode, whatever the split says
     assert expected['provenance']['training episodes'] == 'trained on 1 of these 1'
     assert row['j_moving_low'] == pytest.approx(expected['views']['low']['j_moving'], abs=1e-4)
+
+
+@pytest.mark.slow
+def test_two_processes_share_the_held_out_episodes(tmp_path):
+    data, out, scores = (tmp_path / name for name in ('data', 'run', 'scores'))
+    words = ['collect', '--task', 'stack_blocks_two', '--episodes', '8', '--out', str(data)]
+    assert main([*words, '--seed', '0']) == 0
+    test = read_json(data / 'dataset.json')['splits']['test']
+    assert len(test) == 4
+    (damaged,) = (data / test[1]).glob('*.mcap')
+    damaged.write_bytes(b'damaged')
+    options = ['--threads', '1', '--dtype', 'float32']
+    words = ['train', str(data), '--out', str(out), *options, '--sample-every', '1']
+    words += ['--peak-tflops', '1', *set_options({**TINY_MODEL, 'optimizer.batch_size': 2})]
+    status, _, errors = torchrun(2, [*words, '--set=optimizer.steps=2'])
+    assert status == 0, errors
+    for step in (1, 2):
+        folder = out / 'held_out' / f'{step:07d}'
+        videos = sorted(path.stem for path in folder.glob('*.mp4'))
+        assert videos == sorted({*test} - {test[1]})
+        assert not (folder / 'episodes').exists()
+    words = ['evaluate', str(out / 'checkpoint'), str(data), '--out', str(scores), *options]
+    status = main([*words, '--no-report', '--no-ceiling', '--actions', 'true'])
+    assert status == 1  # one was not scored
+    found, expected = (read_json(path / 'metrics.json') for path in (folder, scores))
+    assert list(found['failed']) == list(expected['failed']) == [str(data / test[1])]
+    others = {'name', 'label', 'provenance', 'seconds_per_chunk', 'seconds_per_episode'}
+    for name in expected.keys() - others - {'real_time_factor'}:
+        assert found[name] == expected[name], name
+    (row,) = (row for row in map(json.loads, (out / 'log.jsonl').open())
+              if 'j_moving' in row and row['step'] == 2)  # fmt: skip
+    assert row['j_moving'] == pytest.approx(expected['overall']['j_moving'], abs=1e-4)
 
 
 def test_without_held_out_episodes_the_command_says_what_to_give(episode, tmp_path, capsys):
@@ -162,4 +197,4 @@ def test_a_training_ends_with_its_held_out_episodes_where_there_are_some(episode
 
 def test_a_negative_interval_is_refused():
     with pytest.raises(ConfigError, match='--sample-every is -1'):
-        HeldOut(lambda folder, step: HeldOutScores(score=0.0, numbers={}), -1)
+        HeldOut(lambda folder, step, processes: HeldOutScores(score=0.0, numbers={}), -1)

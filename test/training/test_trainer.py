@@ -21,7 +21,7 @@ from mtv_world_ros.training.training_config import (
     OptimizerConfig,
     TrainingRun,
 )
-from mtv_world_ros.training.training_run import find_episodes, train
+from mtv_world_ros.training.training_run import train
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
 from test.support.sources import losses_of, make_source, make_trainer
 
@@ -153,11 +153,6 @@ def test_trains_from_a_folder_to_a_checkpoint_that_serves(episode, tiny, robot, 
     assert json.loads((folder / 'world_model.json').read_text())['trained_on']['steps'] == 4
     assert json.loads((out / 'skipped.json').read_text()) == {}
     assert len((out / 'log.jsonl').read_text().splitlines()) == 1
-
-
-def test_a_folder_without_episodes_says_how_to_get_some(tmp_path):
-    with pytest.raises(TrainingError, match='mtv-world collect'):
-        find_episodes(tmp_path)
 
 
 @pytest.mark.parametrize(

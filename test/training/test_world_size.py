@@ -14,7 +14,7 @@ import torch
 
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.training.training_config import load_training_config
-from test.support.launched import start_torchrun, torchrun
+from test.support.launched import rank_pid, start_torchrun, torchrun
 from test.support.sources import (
     losses_of,
     make_trainer,
@@ -49,17 +49,6 @@ def step_of(out: Path) -> int:
         return 0
 
 
-def kill_rank(launcher: int, rank: int) -> None:
-    """Kill the process of a launcher that has a rank."""
-    children = Path(f'/proc/{launcher}/task/{launcher}/children').read_text().split()
-    for pid in children:
-        variables = Path(f'/proc/{pid}/environ').read_bytes().split(b'\0')
-        if f'RANK={rank}'.encode() in variables:
-            os.kill(int(pid), signal.SIGKILL)
-            return
-    raise AssertionError(f'no rank {rank} among {children}')
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ('first', 'then', 'count'), [([], [], 4), (SHARDED, SHARDED, 3), (SHARDED, [], 1)]
@@ -72,7 +61,7 @@ def test_a_killed_process_is_named_and_another_count_goes_on(
         while step_of(out) < 2:
             assert launcher.poll() is None and time.monotonic() < end
             time.sleep(0.01)
-        kill_rank(launcher.pid, 1)
+        os.kill(rank_pid(launcher.pid, 1), signal.SIGKILL)
         _, errors = launcher.communicate(timeout=600)
     assert launcher.returncode != 0
     assert 'rank      : 1' in errors and 'lost process 1' in errors, errors

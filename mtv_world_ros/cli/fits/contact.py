@@ -62,7 +62,7 @@ def add(commands: Commands) -> None:
 
 def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.core.progress import Progress
-    from mtv_world_ros.data.splits import refuse_test_kinds
+    from mtv_world_ros.data.splits import find_episodes, refuse_test_kinds
     from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
     from mtv_world_ros.physics.arms.arms import Arms
     from mtv_world_ros.physics.checkpoint_files import (
@@ -79,7 +79,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     )
     from mtv_world_ros.physics.fitting.response_fit import found_response
     from mtv_world_ros.robot.file import load_robot, robot_path
-    from mtv_world_ros.training.training_run import find_episodes, spread
+    from mtv_world_ros.training.training_run import spread
 
     folder = arguments.checkpoint / OBJECT_MOTION_FOLDER
     check_free(folder / CONTACT_FILE, arguments.overwrite)

@@ -32,6 +32,7 @@ from mtv_world_ros.core.errors import EpisodeError, MtvWorldError
 from mtv_world_ros.data.bag.foxglove import json_reader, protobuf_reader, Read, ros_reader
 from mtv_world_ros.data.bag.ros1 import MAGIC as ROS1_MAGIC
 from mtv_world_ros.data.bag.ros1 import Ros1Bag, Ros1Error
+from mtv_world_ros.data.other_formats import conversion_hint
 
 #: end of the names of ROS 1 bags
 ROS1_SUFFIX = '.bag'
@@ -225,7 +226,10 @@ class BagReader:
             file for file in sorted(self.path.iterdir()) if file.is_file() and is_storage(file)
         ]
         if not files:
-            raise EpisodeError(f"'{self.path}' is not a bag: it holds no .mcap or .db3 file")
+            raise EpisodeError(
+                f"'{self.path}' is not a bag: it holds no .mcap or .db3 file"
+                f'{conversion_hint(self.path)}'
+            )
         return files
 
     def _read_information(self) -> Mapping[str, Any]:

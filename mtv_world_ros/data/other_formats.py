@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+import shlex
 
 #: what a folder or file of a format is known by, and what converts it
 _ZARR = (
@@ -42,5 +43,6 @@ def conversion_hint(path: Path) -> str:
     if any('.tfrecord' in name for name in names):
         return f'; {_RLDS}'
     if (path / 'meta' / 'info.json').is_file():
-        return '; this is a LeRobot data set: mtv-world import lerobot'
+        words = ['mtv-world', 'import', 'lerobot', str(path), '--robot', 'ROBOT', '--out', 'DIR']
+        return f'; it is a LeRobot data set, which {shlex.join(words)} makes episodes of'
     return ''
