@@ -4,12 +4,14 @@
     python experiments/scale.py measure         formula against points of this machine
     python experiments/scale.py start           time to the first step of 1, 2 and 4 processes
     python experiments/scale.py data            start, memory and clips of 100 to 10,000 episodes
+    python experiments/scale.py speed           gain of two processes over one, on a quiet machine
     python experiments/scale.py ray             what Ray adds to a rollout
 
 The constants are those of the pages in `experiments/results` that each names. `measure` compares
 the CPU time of 1, 2 and 4 processes and of 100 to 10,000 episodes with the formula: constants are
 fitted to the smallest sizes, and the others are predicted. CPU time is taken, as it
-hardly depends on the load; of several processes, `start` takes that of the slowest.
+hardly depends on the load; of several processes, `start` takes that of the slowest. `speed` takes
+wall time, one process and two in turns.
 """
 
 from __future__ import annotations
@@ -198,11 +200,15 @@ def measured_process(what: str, work: Path, number: int) -> None:
     config, processes = load_training_config('small', changes), Processes('cpu')
     robot = load_robot(robot_path(config.video.robot))
     processes.any(False)
-    begun, begun_s = time.process_time(), time.perf_counter()
+    begun_s = time.perf_counter()
+    last = time.process_time(), begun_s
     found: dict[str, Any] = {}
 
     def lap(name: str) -> None:
-        found[name] = time.process_time() - begun - sum(found.values())
+        nonlocal last
+        now = time.process_time(), time.perf_counter()
+        found[name], found[f'{name}_wall'] = now[0] - last[0], now[1] - last[1]
+        last = now
 
     paths = list_episodes(work / 'episodes')[:number]
     cache = work / f'cache_{what}_{processes.count if what == "start" else number}'
@@ -313,22 +319,66 @@ _START_EPISODES = 16
 _STEPS = 50
 
 
-def train_cpu_s(processes: int, steps: int, work: Path) -> float:
-    """Return the CPU time of all processes of a small training [s]."""
+def train(processes: int, steps: int, work: Path) -> Path:
+    """Return the folder of a small training of some processes, one thread each."""
     data = work / 'data' / 'stack_blocks_two_00000'
     if not data.is_dir():
         shutil.copytree(share_path('resource', 'demo_episode'), data)
-    before = _children_cpu_s()
+    out = Path(tempfile.mkdtemp(dir=work))
     subprocess.run(
         [
             sys.executable, '-m', 'torch.distributed.run', '--standalone', '--nproc-per-node',
             str(processes), '-m', 'mtv_world_ros.cli', 'train', str(data.parent), '--preset',
             'small', '--threads', '1', '--peak-tflops', '1', '--set=optimizer.batch_size=4',
-            f'--set=optimizer.steps={steps}', '--out', str(work / f'run_{processes}_{steps}'),
+            f'--set=optimizer.steps={steps}', '--out', str(out),
         ],
         check=True, cwd=ROOT, capture_output=True,
     )  # fmt: skip
+    return out
+
+
+def train_cpu_s(processes: int, steps: int, work: Path) -> float:
+    """Return the CPU time of all processes of a small training [s]."""
+    before = _children_cpu_s()
+    train(processes, steps, work)
     return _children_cpu_s() - before
+
+
+def measure_speed(rounds: int = 3, steps: int = 30) -> int:
+    """Print wall times of training and encoding by one process and by two, in turns.
+
+    Args:
+        rounds: number of turns; the medians of the ratios count.
+        steps: steps of a training; the first ten do not count.
+    """
+    found: dict[str, list[tuple[float, float]]] = {'step of four clips': [], 'encoding': []}
+    with tempfile.TemporaryDirectory() as name:
+        work = Path(name)
+        copy_episodes(_START_EPISODES, work / 'episodes')
+        own_process('start', work, number=_START_EPISODES)  # decodes the episodes
+        for _ in range(rounds):
+            trained, encoded = [], []
+            for count in (1, 2):
+                log = (train(count, steps, work) / 'log.jsonl').read_text().splitlines()
+                rows = [json.loads(row) for row in log][1:]
+                trained.append(statistics.mean(1 / row['steps_per_second'] for row in rows))
+                shutil.rmtree(work / f'latents_{count}', ignore_errors=True)
+                parts = own_process('start', work, count=count, number=_START_EPISODES)
+                encoded.append(max(part['encode_wall'] for part in parts))
+            for key, pair in zip(found, (trained, encoded), strict=True):
+                found[key].append((pair[0], pair[1]))
+                print(f'{key}: {pair[0]:.2f} s, {pair[1]:.2f} s', file=sys.stderr, flush=True)
+    rows = [
+        [
+            key,
+            *(f'{statistics.median(pair[k] for pair in pairs):.2f}' for k in range(2)),
+            f'{statistics.median(one / two for one, two in pairs):.2f}',
+        ]
+        for key, pairs in found.items()
+    ]
+    print(f'wall time; medians of {rounds} turns; one thread a process\n')
+    print(Table(head=['what', '1 process [s]', '2 processes [s]', 'gain'], rows=rows).markdown())
+    return 0
 
 
 def predicted(sizes: Sequence[int], found: Sequence[float]) -> Callable[[int], float]:
@@ -399,7 +449,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    runs = {'measure': measure, 'ray': measure_ray, 'start': measure_start, 'data': measure_data}
+    runs = {
+        'measure': measure,
+        'ray': measure_ray,
+        'start': measure_start,
+        'data': measure_data,
+        'speed': measure_speed,
+    }
     parser.add_argument('what', nargs='?', choices=('tables', *runs), default='tables')
     parser.add_argument(
         '--work', type=Path, help='folder of a process that `start` or `data` starts'
